@@ -1,0 +1,7 @@
+"""States to frames: drawn (OpenCV) and learnt (networks). Knows nothing of control."""
+
+from renderers.camera import Camera
+from renderers.drawn import DrawnCartPole
+from renderers.learnt import LayeredRenderer, MLPRenderer
+
+__all__ = ["Camera", "DrawnCartPole", "LayeredRenderer", "MLPRenderer"]

@@ -1,0 +1,103 @@
+"""Learnt, differentiable renderers: cart position and pole angle to a frame in [0, 1]."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class MLPRenderer(nn.Module):
+    """The paper's renderer Psi (section 3.2.3): 4 layers, [32, 128, 256] hidden nodes, tanh. It stays blurry."""
+
+    def __init__(self, height: int, width: int) -> None:
+        super().__init__()
+        self.size = (height, width)
+        self.layers = nn.Sequential(
+            nn.Linear(3, 32),
+            nn.Tanh(),
+            nn.Linear(32, 128),
+            nn.Tanh(),
+            nn.Linear(128, 256),
+            nn.Tanh(),
+            nn.Linear(256, height * width),
+        )
+
+    def forward(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Frames (B, H, W) of cart positions (B,) in m and pole angles (B,) in rad."""
+        out: Tensor = self.layers(torch.stack((x, theta.sin(), theta.cos()), -1))
+        return out.unflatten(-1, self.size)
+
+
+class Layer(nn.Module):
+    """A learnt picture, with learnt opacity, that moves rigidly with the cart and may turn with the pole.
+
+    A point p of the frame (px) shows the picture at R(theta) (p - hinge(x)), where hinge(x) = origin + gain x is the
+    learnt camera. The picture has `detail` texels per pixel; `window` is (left, right, top, bottom) in px around the
+    hinge at theta = 0.
+    """
+
+    def __init__(self, window: tuple[float, float, float, float], turns: bool, detail: float = 2.0) -> None:
+        super().__init__()
+        left, right, top, bottom = window
+        columns, rows = int((right - left) * detail) + 1, int((bottom - top) * detail) + 1
+        self.turns = turns
+        self.register_buffer("centre", torch.tensor([(left + right) / 2, (top + bottom) / 2]))
+        self.register_buffer("extent", torch.tensor([(right - left) / 2, (bottom - top) / 2]))
+        self.shade = nn.Parameter(torch.zeros(1, rows, columns))
+        self.opacity = nn.Parameter(torch.full((1, rows, columns), -1.0))
+
+    def forward(self, offset: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """Premultiplied shade and opacity (B, H, W) at pixel offsets (B, H, W, 2) from the hinge."""
+        if self.turns:
+            sine, cosine = theta.sin()[:, None, None], theta.cos()[:, None, None]
+            column, row = offset.unbind(-1)
+            offset = torch.stack((cosine * column + sine * row, cosine * row - sine * column), -1)
+        opacity = self.opacity.sigmoid()
+        picture = torch.cat((self.shade.sigmoid() * opacity, opacity))
+        # Zero padding makes everything outside the window transparent.
+        shown = F.grid_sample(
+            picture.expand(len(offset), -1, -1, -1),
+            (offset - self.centre) / self.extent,
+            align_corners=True,
+            padding_mode="zeros",
+        )
+        return shown[:, 0], shown[:, 1]
+
+
+class LayeredRenderer(nn.Module):
+    """Ours: a learnt background and two learnt pictures, cart and pole, moved by a learnt camera.
+
+    What is known beforehand is only that a rigid cart slides and a rigid pole turns about a hinge on it; how they
+    look, where the hinge is in the frame and how many pixels a metre is are learnt from frames.
+    Frames are sharp at every state because nothing but pictures is stored.
+    """
+
+    def __init__(
+        self, height: int, width: int, column: float, row: float, scale: float, reach: float, detail: float = 2.0
+    ) -> None:
+        """A first guess of the camera: the hinge at x = 0 in px, px per m; `reach` is the pole's length in m."""
+        super().__init__()
+        length = reach * scale * 1.1
+        self.size = (height, width)
+        self.background = nn.Parameter(torch.zeros(height, width))
+        self.origin = nn.Parameter(torch.tensor([float(column), float(row)]))
+        self.gain = nn.Parameter(torch.tensor([float(scale), 0.0]))
+        self.tilt = nn.Parameter(torch.zeros(()))
+        across = 0.15 * length + 2
+        self.cart = Layer((-0.35 * length, 0.35 * length, -0.2 * length, 0.35 * length), False, detail)
+        self.pole = Layer((-across, across, -length, 0.2 * length), True, detail)
+
+    def forward(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Frames (B, H, W) of cart positions (B,) in m and pole angles (B,) in rad."""
+        height, width = self.size
+        rows = torch.arange(height, device=x.device, dtype=x.dtype)
+        columns = torch.arange(width, device=x.device, dtype=x.dtype)
+        pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
+        hinge = self.origin + self.gain * x[:, None]
+        offset = pixels - hinge[:, None, None]
+        frame = self.background.sigmoid().expand(len(x), -1, -1)
+        for layer in (self.cart, self.pole):
+            shade, opacity = layer(offset, theta + self.tilt)
+            frame = frame * (1 - opacity) + shade
+        return frame

@@ -1,0 +1,35 @@
+"""The effect without a name: a network that can stand for anything and explains nothing.
+
+Delta_phi of the paper (equation 10): the grounded model is f_hat(s, a) + Delta(history, phi).
+"""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from visadapt.effects.base import Effect, Stage
+from visadapt.history import History
+
+
+class Residual(Effect):
+    """Adds what a network reads from the last observations and actions to the state after each period.
+
+    Args:
+        network: maps a `History`, whose last action is the one being executed, to (B, n_state) in units of `scale`.
+        scale: (n_state,) typical size of a correction per period, in state units.
+    """
+
+    name = "residual"
+    stage = Stage.ANY
+    equation = "s' = f_hat(s, a) + scale * network(last observations, last actions)"
+    source = "the paper, equation 10"
+
+    def __init__(self, network: nn.Module, scale: Tensor) -> None:
+        super().__init__()
+        self.network = network
+        self.register_buffer("scale", scale.clone())
+
+    def delta(self, history: History) -> Tensor:
+        """Correction (B, n_state) to the state at the end of the period."""
+        out: Tensor = self.network(history)
+        return out * self.scale.to(out)

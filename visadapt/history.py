@@ -1,0 +1,53 @@
+"""What policies and residuals are allowed to see: the last observations and actions, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+LENGTH = 5
+"""Observations and actions kept (the paper, section 3.2.2)."""
+
+
+@dataclass(frozen=True)
+class History:
+    """The last observations (B, L, ...), oldest first, and the last actions (B, L, n_action).
+
+    For a policy the last action is the one before the last observation; for a residual (see `acting`) it is the
+    one being executed. An observation is a frame (H, W) in [0, 1] or a state (n_state,).
+    """
+
+    observations: Tensor
+    actions: Tensor
+
+    @classmethod
+    def start(cls, observation: Tensor, n_action: int, length: int = LENGTH) -> History:
+        """At the start of an episode: the first observation (B, ...) repeated, and zero actions."""
+        repeated = observation[:, None].expand(-1, length, *observation.shape[1:])
+        actions = torch.zeros(len(observation), length, n_action, device=observation.device, dtype=observation.dtype)
+        return cls(repeated.clone(), actions)
+
+    def acting(self, action: Tensor) -> History:
+        """The same observations, with `action` (B, n_action) as the last action."""
+        return History(self.observations, torch.cat((self.actions[:, 1:], action[:, None]), 1))
+
+    def observing(self, observation: Tensor) -> History:
+        """The same actions, with `observation` (B, ...) as the last observation."""
+        return History(torch.cat((self.observations[:, 1:], observation[:, None]), 1), self.actions)
+
+    def where(self, keep: Tensor, other: History) -> History:
+        """This history in the rows where `keep` (B,) holds, `other` in the rest."""
+        rows = keep.reshape(-1, *[1] * (self.observations.dim() - 1))
+        return History(
+            torch.where(rows, self.observations, other.observations),
+            torch.where(keep[:, None, None], self.actions, other.actions),
+        )
+
+    def detach(self) -> History:
+        """The same history, cut off from the graph."""
+        return History(self.observations.detach(), self.actions.detach())
+
+    def __getitem__(self, rows: Tensor | slice) -> History:
+        return History(self.observations[rows], self.actions[rows])

@@ -1,0 +1,87 @@
+"""Running a policy on a target."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from visadapt.history import History
+from visadapt.policies import Policy
+from visadapt.recordings import Episode
+from visadapt.targets import Observation, Target, TargetError
+
+See = Callable[[Observation], Tensor]
+"""What the policy is shown of an observation: (B, ...) floating point."""
+
+
+def see_frames(observation: Observation) -> Tensor:
+    """Frames (B, H, W) in [0, 1]."""
+    if observation.frame is None:
+        raise TargetError("the policy sees frames, but the target shows none: give it a camera")
+    return observation.frame.to(torch.get_default_dtype()) / 255
+
+
+def see_states(observation: Observation) -> Tensor:
+    """States (B, n_state)."""
+    return observation.state
+
+
+@dataclass(frozen=True)
+class Run:
+    """One episode that was run: its rows up to its end, and how it ended."""
+
+    episode: Episode
+    survived: bool
+    force: np.ndarray
+    """(T,) the disturbance in N as the target tells it, zeros where it does not: for films only"""
+
+
+@torch.no_grad()
+def run(target: Target, policy: Policy, see: See, batch: int, steps: int, generator: torch.Generator) -> list[Run]:
+    """Run `batch` episodes of at most `steps` steps each; an episode that ends is cut there, and marked.
+
+    Raises:
+        TargetError: the target shows a state that is not finite while its episode goes on, or no frame.
+    """
+    observation = target.reset(batch, generator)
+    history = History.start(see(observation), target.n_action)
+    rows: list[tuple[Observation, Tensor]] = []
+    length = torch.zeros(batch, dtype=torch.long)
+    running = observation.alive.clone()
+    for _ in range(steps):
+        if not bool(running.any()):
+            break
+        action = policy.act(history)
+        rows.append((observation, action))
+        observation = target.step(action)
+        broken = running & ~observation.state.isfinite().all(1)
+        if bool(broken.any()):
+            raise TargetError(
+                f"{target.name}: the state after step {len(rows)} is not finite (episode {int(broken.nonzero()[0])})"
+            )
+        length += running
+        running &= observation.alive
+        history = history.acting(action).observing(see(observation))
+    rows.append((observation, torch.zeros(batch, target.n_action)))
+    return [_cut(rows, b, int(length[b]), bool(running[b]), target.period) for b in range(batch)]
+
+
+def _cut(rows: list[tuple[Observation, Tensor]], b: int, length: int, survived: bool, period: float) -> Run:
+    kept = rows[: length + 1]
+    action = np.stack([action[b].numpy() for _, action in kept])
+    action[-1] = 0.0
+    frames = None
+    if kept[0][0].frame is not None:
+        frames = np.stack([seen.frame[b].numpy() for seen, _ in kept if seen.frame is not None])
+    episode = Episode(
+        time=np.arange(len(kept)) * period,
+        action=action,
+        state=np.stack([seen.state[b].numpy() for seen, _ in kept]),
+        frame=frames,
+    )
+    force = np.array([0.0 if seen.force is None else float(seen.force[b]) for seen, _ in kept])
+    return Run(episode, survived, force)

@@ -1,0 +1,79 @@
+"""A pole hinged on a cart that a motor pushes along a track.
+
+Barto, Sutton and Anderson (1983), "Neuronlike adaptive elements that can solve difficult learning control
+problems", appendix, without their friction terms (friction is an effect). Positive force and command push
+towards +x; a positive angle leans towards +x; 0 is upright.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from visadapt.systems.base import System, Variable
+
+
+@dataclass(frozen=True)
+class CartPole(System):
+    """A uniform pole on a cart. Defaults are the paper's CartPole (0.05 s between commands)."""
+
+    cart_mass: float = 1.0
+    """kg"""
+    pole_mass: float = 0.1
+    """kg"""
+    pole_half_length: float = 0.5
+    """m, from the hinge to the pole's centre of mass"""
+    max_force: float = 30.0
+    """N on the cart at a command of 1"""
+    gravity: float = 9.8
+    """m/s2"""
+
+    name: ClassVar[str] = "cartpole"
+    states: ClassVar[tuple[Variable, ...]] = (
+        Variable("x", "m", -1.5, 1.5),
+        Variable("x_dot", "m/s", -5.0, 5.0),
+        Variable("theta", "rad", -0.3, 0.3),
+        Variable("theta_dot", "rad/s", -10.0, 10.0),
+    )
+    actions: ClassVar[tuple[Variable, ...]] = (Variable("command", "1", -1.0, 1.0),)
+    loads: ClassVar[tuple[Variable, ...]] = (
+        Variable("cart_force", "N", -100.0, 100.0),
+        Variable("pivot_torque", "N m", -100.0, 100.0),
+    )
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not value > 0:
+                raise ValueError(f"cartpole: {field.name} must be positive, got {value!r}")
+
+    def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:
+        """Equations of Barto et al. with a force on the cart (N) and a torque at the pivot (N m) as loads."""
+        _, velocity, angle, angular_velocity = state.unbind(-1)
+        force, torque = load.unbind(-1)
+        total_mass = self.cart_mass + self.pole_mass
+        pole_moment = self.pole_mass * self.pole_half_length
+        sine, cosine = angle.sin(), angle.cos()
+        push = (
+            self.max_force * command[..., 0] + force + pole_moment * angular_velocity.square() * sine
+        ) / total_mass
+        angular_acceleration = (self.gravity * sine - cosine * push + torque / pole_moment) / (
+            self.pole_half_length * (4.0 / 3.0 - self.pole_mass * cosine.square() / total_mass)
+        )
+        acceleration = push - pole_moment * angular_acceleration * cosine / total_mass
+        return torch.stack((velocity, acceleration, angular_velocity, angular_acceleration), -1)
+
+    def energy(self, state: Tensor) -> Tensor:
+        """Kinetic plus potential energy in J, (B,): conserved without command, load and friction."""
+        _, velocity, angle, angular_velocity = state.unbind(-1)
+        moment = self.pole_mass * self.pole_half_length
+        inertia = 4.0 / 3.0 * moment * self.pole_half_length
+        return (
+            0.5 * (self.cart_mass + self.pole_mass) * velocity.square()
+            + moment * velocity * angular_velocity * angle.cos()
+            + 0.5 * inertia * angular_velocity.square()
+            + moment * self.gravity * angle.cos()
+        )

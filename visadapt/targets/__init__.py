@@ -1,0 +1,15 @@
+"""Targets: anything that can be run."""
+
+from visadapt.targets.base import Observation, Target, TargetError
+from visadapt.targets.synthetic import Start, SyntheticTarget, constant_force, no_effects, sine_force
+
+__all__ = [
+    "Observation",
+    "Start",
+    "SyntheticTarget",
+    "Target",
+    "TargetError",
+    "constant_force",
+    "no_effects",
+    "sine_force",
+]

@@ -1,0 +1,122 @@
+"""Synthetic targets: a world whose effects the learner does not see, filmed by a camera that stands still."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from renderers import DrawnCartPole
+from visadapt.effects import ConstantForce, DynamicsEffect, Effect, PeriodicForce
+from visadapt.systems import CartPole, System
+from visadapt.targets.base import Observation, Target, TargetError
+from visadapt.world import World, WorldState
+
+DrawEffects = Callable[[int, torch.Generator], Sequence[Effect]]
+"""Draws the effects of a batch of episodes: (batch, generator) to effects."""
+
+
+def no_effects(batch: int, generator: torch.Generator) -> Sequence[Effect]:
+    """The source itself."""
+    return ()
+
+
+def sine_force(batch: int, generator: torch.Generator) -> Sequence[Effect]:
+    """2 (sin(t + phase) + 1) N on the cart (the paper, section 3.2.2); each episode has a phase uniform in [-pi, pi]."""
+    phase = math.pi * (2 * torch.rand(batch, generator=generator) - 1)
+    return (PeriodicForce(amplitude=2.0, frequency=1 / (2 * math.pi), phase=phase, offset=2.0),)
+
+
+def constant_force(newtons: float) -> DrawEffects:
+    """The same force on the cart in every episode."""
+
+    def draw(batch: int, generator: torch.Generator) -> Sequence[Effect]:
+        return (ConstantForce(force=newtons),)
+
+    return draw
+
+
+@dataclass(frozen=True)
+class Start:
+    """Half-widths of the uniform distribution of the state at the start of an episode, around 0."""
+
+    x: float = 0.2
+    """m"""
+    x_dot: float = 0.1
+    """m/s"""
+    theta: float = 0.1
+    """rad"""
+    theta_dot: float = 0.1
+    """rad/s"""
+
+    def draw(self, batch: int, generator: torch.Generator) -> Tensor:
+        """States (batch, 4)."""
+        width = torch.tensor([self.x, self.x_dot, self.theta, self.theta_dot])
+        return width * (2 * torch.rand(batch, 4, generator=generator) - 1)
+
+
+class SyntheticTarget(Target):
+    """A cart-pole with hidden effects, integrated by another method and more finely (1 ms) than any source.
+
+    Args:
+        draw_effects: draws the hidden effects of a batch of episodes.
+        camera: draws its frames; without one, only states are seen and no position ends an episode.
+        system: its physics.
+        period: s between actions.
+        angle_limit: rad; the episode ends beyond it.
+    """
+
+    n_action = 1
+
+    def __init__(
+        self,
+        draw_effects: DrawEffects = no_effects,
+        camera: DrawnCartPole | None = None,
+        system: System | None = None,
+        period: float = 0.05,
+        start: Start | None = None,
+        angle_limit: float = 0.3,
+        name: str = "synthetic cart-pole",
+    ) -> None:
+        self.name = name
+        self.period = period
+        self.draw_effects = draw_effects
+        self.camera = camera
+        self.system = system or CartPole()
+        self.initial = start or Start()
+        self.angle_limit = angle_limit
+        self._world: World | None = None
+        self._at: WorldState | None = None
+
+    def reset(self, batch: int, generator: torch.Generator) -> Observation:
+        effects = self.draw_effects(batch, generator)
+        substeps = round(self.period / 0.001)
+        self._world = World(self.system, effects, self.period, "midpoint", substeps).requires_grad_(False)
+        self._at = self._world.start(self.initial.draw(batch, generator))
+        return self._observe()
+
+    def step(self, action: Tensor) -> Observation:
+        if self._world is None or self._at is None:
+            raise TargetError(f"{self.name}: step before reset")
+        with torch.no_grad():
+            self._at = self._world.step(self._at, action)
+        return self._observe()
+
+    def _observe(self) -> Observation:
+        assert self._world is not None and self._at is not None
+        state = self._at.state
+        alive = state.isfinite().all(1) & (state[:, 2].abs() <= self.angle_limit)
+        frame = None
+        if self.camera is not None:
+            alive &= state[:, 0].abs() <= self.camera.camera.reach
+            # A fallen cart-pole may be anywhere; the camera shows it at its last sensible place.
+            shown = state.nan_to_num().clamp(-10, 10).double().numpy()
+            frame = torch.from_numpy(self.camera(shown[:, 0], shown[:, 2]))
+        force = torch.zeros_like(state[:, 0])
+        for effect in self._world.effects:
+            if isinstance(effect, DynamicsEffect):
+                force = force + effect.load(self._at.time, state)[:, 0]
+        return Observation(state, alive, frame, force)
