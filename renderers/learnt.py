@@ -88,6 +88,11 @@ class LayeredRenderer(nn.Module):
         self.cart = Layer((-0.35 * length, 0.35 * length, -0.2 * length, 0.35 * length), False, detail)
         self.pole = Layer((-across, across, -length, 0.2 * length), True, detail)
 
+    @torch.no_grad()
+    def start_from(self, frames: Tensor) -> None:
+        """Begin with the median of frames (N, H, W) uint8 as the background: what stands still."""
+        self.background.copy_((frames.median(0).values / 255).clamp(0.01, 0.99).logit())
+
     def forward(self, x: Tensor, theta: Tensor) -> Tensor:
         """Frames (B, H, W) of cart positions (B,) in m and pole angles (B,) in rad."""
         height, width = self.size

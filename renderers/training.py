@@ -1,0 +1,51 @@
+"""Fitting a learnt renderer to frames of known cart positions and pole angles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from renderers.learnt import LayeredRenderer, MLPRenderer
+
+Progress = Callable[[int, int, float], None]
+"""Called with (steps done, steps in all, loss)."""
+
+
+def fit(
+    renderer: LayeredRenderer | MLPRenderer,
+    x: Tensor,
+    theta: Tensor,
+    frames: Tensor,
+    steps: int,
+    generator: torch.Generator,
+    batch: int = 32,
+    progress: Progress | None = None,
+) -> None:
+    """Minimise the mean squared error of the renderer's frames by Adam under a one-cycle rate.
+
+    Args:
+        x, theta: (N,) cart positions in m and pole angles in rad.
+        frames: (N, H, W) uint8, what a camera showed there.
+    """
+    if isinstance(renderer, LayeredRenderer):
+        renderer.start_from(frames)
+        camera = [renderer.origin, renderer.gain, renderer.tilt]
+        known = {id(parameter) for parameter in camera}
+        pictures = [parameter for parameter in renderer.parameters() if id(parameter) not in known]
+        groups = [{"params": pictures}, {"params": camera[:2]}, {"params": camera[2:]}]
+        rates = [0.1, 0.05, 0.003]
+    else:
+        groups, rates = [{"params": list(renderer.parameters())}], [2e-3]
+    optimiser = torch.optim.Adam(groups)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rates, total_steps=steps, pct_start=0.2)
+    for step in range(steps):
+        rows = torch.randint(len(frames), (batch,), generator=generator)
+        loss = (renderer(x[rows], theta[rows]) - frames[rows].to(x) / 255).square().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+        if progress is not None:
+            progress(step + 1, steps, float(loss))
