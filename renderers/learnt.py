@@ -37,6 +37,9 @@ class Layer(nn.Module):
     hinge at theta = 0.
     """
 
+    centre: Tensor
+    extent: Tensor
+
     def __init__(self, window: tuple[float, float, float, float], turns: bool, detail: float = 2.0) -> None:
         super().__init__()
         left, right, top, bottom = window

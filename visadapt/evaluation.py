@@ -43,7 +43,9 @@ def evaluate(
 
 def score(runs: list[Run]) -> Evaluation:
     """Scores of episodes whose second state is the cart's velocity."""
-    speeds = np.array([np.abs(r.episode.state[:, 1]).mean() for r in runs if r.survived and r.episode.state is not None])
+    speeds = np.array(
+        [np.abs(r.episode.state[:, 1]).mean() for r in runs if r.survived and r.episode.state is not None]
+    )
     return Evaluation(
         episodes=len(runs),
         survived=len(speeds),

@@ -39,6 +39,7 @@ class ActuatorDelay(ActuationEffect):
 
     def _reach(self, substep: float) -> int:
         """Substeps of the past that the delay can reach."""
-        if bool((self.delay < 0).any()):
-            raise ValueError(f"actuator_delay: delay must not be negative, got {float(self.delay.min())} s")
-        return math.floor(float(self.delay.max()) / substep) + 1
+        delay = self.get_parameter("delay").detach()
+        if not bool((delay >= 0).all()):
+            raise ValueError(f"actuator_delay: delay must not be negative, got {float(delay.min())} s")
+        return math.floor(float(delay.max()) / substep) + 1

@@ -82,7 +82,7 @@ class ActuationEffect(Effect):
         return commands[:, :0]
 
     def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
-        """Commands (B, S, n_action) over the S substeps of one period, each `substep` s long; returns new memory too."""
+        """What acts of the commands (B, S, n_action) over the S substeps, each `substep` s long, and the new memory."""
         raise NotImplementedError
 
 

@@ -23,6 +23,8 @@ class CartForce(DynamicsEffect):
 
 
 class ConstantForce(CartForce):
+    """A push that never lets up: a cable's weight, say."""
+
     name = "constant_force"
     equation = "F = force"
     source = "Newton's second law; the paper, section 3.2.1"
@@ -52,6 +54,8 @@ class PeriodicForce(CartForce):
 
 
 class ViscousFriction(CartForce):
+    """Friction in proportion to the cart's speed."""
+
     name = "viscous_friction"
     equation = "F = -coefficient x_dot"
     source = "Olsson et al. (1998), Friction models and friction compensation, section 2"

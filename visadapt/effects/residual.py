@@ -24,6 +24,8 @@ class Residual(Effect):
     equation = "s' = f_hat(s, a) + scale * network(last observations, last actions)"
     source = "the paper, equation 10"
 
+    scale: Tensor
+
     def __init__(self, network: nn.Module, scale: Tensor) -> None:
         super().__init__()
         self.network = network

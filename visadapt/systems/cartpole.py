@@ -57,9 +57,7 @@ class CartPole(System):
         total_mass = self.cart_mass + self.pole_mass
         pole_moment = self.pole_mass * self.pole_half_length
         sine, cosine = angle.sin(), angle.cos()
-        push = (
-            self.max_force * command[..., 0] + force + pole_moment * angular_velocity.square() * sine
-        ) / total_mass
+        push = (self.max_force * command[..., 0] + force + pole_moment * angular_velocity.square() * sine) / total_mass
         angular_acceleration = (self.gravity * sine - cosine * push + torque / pole_moment) / (
             self.pole_half_length * (4.0 / 3.0 - self.pole_mass * cosine.square() / total_mass)
         )

@@ -25,7 +25,7 @@ def no_effects(batch: int, generator: torch.Generator) -> Sequence[Effect]:
 
 
 def sine_force(batch: int, generator: torch.Generator) -> Sequence[Effect]:
-    """2 (sin(t + phase) + 1) N on the cart (the paper, section 3.2.2); each episode has a phase uniform in [-pi, pi]."""
+    """Draws 2 (cos(t + phase) + 1) N on the cart (the paper, section 3.2.2), the phase uniform over a turn."""
     phase = math.pi * (2 * torch.rand(batch, generator=generator) - 1)
     return (PeriodicForce(amplitude=2.0, frequency=1 / (2 * math.pi), phase=phase, offset=2.0),)
 
@@ -106,7 +106,8 @@ class SyntheticTarget(Target):
         return self._observe()
 
     def _observe(self) -> Observation:
-        assert self._world is not None and self._at is not None
+        assert self._world is not None
+        assert self._at is not None
         state = self._at.state
         alive = state.isfinite().all(1) & (state[:, 2].abs() <= self.angle_limit)
         frame = None
