@@ -8,6 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 
+class RecordingError(ValueError):
+    """A recording that cannot be used; the message is one line: which file and episode, and what would be right."""
+
+
 @dataclass(frozen=True)
 class Episode:
     """One uninterrupted run of T rows, state or frame or both.
@@ -16,7 +20,8 @@ class Episode:
     not executed, so T rows are T - 1 samples.
 
     Raises:
-        ValueError: rows that do not match, a clock that does not run forward, or a value that is not finite.
+        RecordingError: arrays of another shape or type, rows that do not match, a clock that does not run forward,
+            or a value that is not finite.
     """
 
     time: NDArray[np.floating]
@@ -29,22 +34,35 @@ class Episode:
     """(T, H, W)"""
 
     def __post_init__(self) -> None:
-        rows = len(self.time)
-        if rows < 1:
-            raise ValueError("an episode needs at least one row")
         if self.state is None and self.frame is None:
-            raise ValueError("an episode needs states or frames")
-        for name, values in (("action", self.action), ("state", self.state), ("frame", self.frame)):
-            if values is None:
-                continue
-            if len(values) != rows:
-                raise ValueError(f"an episode of {rows} rows has {len(values)} rows of {name}")
-            bad = ~np.isfinite(values.reshape(rows, -1)).all(1) if values.dtype != np.uint8 else np.zeros(rows, bool)
-            if bad.any():
-                raise ValueError(f"{name} is not finite in row {int(bad.argmax())} of {rows}")
+            raise RecordingError("an episode needs states or frames")
+        for name, axes in (("time", 1), ("action", 2), ("state", 2), ("frame", 3)):
+            values = getattr(self, name)
+            if values is not None:
+                self._check(name, values, axes)
         backwards = np.diff(self.time) <= 0
         if backwards.any():
-            raise ValueError(f"the clock does not run forward after row {int(backwards.argmax())}")
+            raise RecordingError(f"the clock does not run forward after row {int(backwards.argmax())}")
+
+    def _check(self, name: str, values: NDArray[np.generic], axes: int) -> None:
+        if values.ndim != axes:
+            raise RecordingError(
+                f"{name} has the shape {values.shape}; {axes} axes, of which time is the first, are right"
+            )
+        rows = len(self.time)
+        if rows < 1:
+            raise RecordingError("an episode needs at least one row")
+        if len(values) != rows:
+            raise RecordingError(f"an episode of {rows} rows has {len(values)} rows of {name}")
+        if name == "frame":
+            if values.dtype != np.uint8:
+                raise RecordingError(f"frame is of type {values.dtype}; uint8 is right")
+            return
+        if not np.issubdtype(values.dtype, np.floating):
+            raise RecordingError(f"{name} is of type {values.dtype}; floating point is right")
+        bad = ~np.isfinite(values.reshape(rows, -1)).all(1)
+        if bad.any():
+            raise RecordingError(f"{name} is not finite in row {int(bad.argmax())} of {rows}")
 
     @property
     def samples(self) -> int:

@@ -1,0 +1,149 @@
+"""Recordings as HDF5: one group for each episode, and in it the datasets time, action, state and frame.
+
+    /                       attributes format, version, state_names (optional), action_names (optional)
+    /episode_00000/time     (T,) s, floating point
+    /episode_00000/action   (T, n_action), floating point
+    /episode_00000/state    (T, n_state), floating point; state, frame, or both
+    /episode_00000/frame    (T, H, W) uint8, gzip
+
+All datasets carry a checksum (Fletcher-32), so that damaged bytes are an error and not data.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from visadapt.files import replacing
+from visadapt.recordings.episode import Episode, RecordingError
+
+FORMAT, VERSION = "visadapt recording", 1
+
+FRAMES_IN_CHUNK = 16
+"""Frames compressed together: reading one unpacks no more than these."""
+
+
+def write_recording(
+    path: str | os.PathLike[str],
+    episodes: Sequence[Episode],
+    state_names: Sequence[str] | None = None,
+    action_names: Sequence[str] | None = None,
+) -> None:
+    """Write episodes of unequal length; the file appears under its name once it is whole.
+
+    Raises:
+        RecordingError: no episodes, episodes that do not belong together, or names that do not fit their columns.
+        DiskFullError: the disk is full; what stood at `path` before stays.
+    """
+    path = Path(path)
+    _check_alike(path, episodes)
+    state = episodes[0].state
+    widths = {"state": 0 if state is None else state.shape[1], "action": episodes[0].action.shape[1]}
+    names = {"state": state_names, "action": action_names}
+    for kind, given in names.items():
+        if given is not None and len(given) != widths[kind]:
+            raise RecordingError(f"{path}: {len(given)} names for {widths[kind]} columns of {kind}")
+    with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["format"] = FORMAT
+        file.attrs["version"] = VERSION
+        for kind, given in names.items():
+            if given is not None:
+                file.attrs[f"{kind}_names"] = list(given)
+        for number, episode in enumerate(episodes):
+            _write_episode(file.create_group(_group_name(number)), episode)
+
+
+def read_recording(path: str | os.PathLike[str]) -> list[Episode]:
+    """All episodes of a file that `write_recording` wrote, in order.
+
+    Raises:
+        RecordingError: the file is missing, torn, of another format or version, or its rows make no episode;
+            the message is one line that says which file and episode, and what would be right.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise RecordingError(f"{path}: there is no such file")
+    try:
+        with h5py.File(path, "r") as file:
+            _check_version(path, file)
+            episodes = [_read_episode(path, file, number) for number in range(len(file))]
+    except OSError as error:
+        # The message of HDF5 is for its own developers, and may be several lines.
+        raise RecordingError(
+            f"{path}: not a readable HDF5 file, or cut short; a recording written by visadapt was expected"
+        ) from error
+    _check_alike(path, episodes)
+    return episodes
+
+
+def _group_name(number: int) -> str:
+    return f"episode_{number:05d}"
+
+
+def _write_episode(group: h5py.Group, episode: Episode) -> None:
+    for name in ("time", "action", "state"):
+        values = getattr(episode, name)
+        if values is not None:
+            group.create_dataset(name, data=values, fletcher32=True)
+    if episode.frame is not None:
+        rows, height, width = episode.frame.shape
+        chunks = (min(rows, FRAMES_IN_CHUNK), height, width)
+        group.create_dataset("frame", data=episode.frame, chunks=chunks, compression="gzip", fletcher32=True)
+
+
+def _check_version(path: Path, file: h5py.File) -> None:
+    if file.attrs.get("format") != FORMAT:
+        raise RecordingError(f"{path}: an HDF5 file, but its attribute 'format' is not {FORMAT!r}")
+    version = file.attrs.get("version")
+    if version != VERSION:
+        raise RecordingError(f"{path}: version {version} of the format; this visadapt reads version {VERSION}")
+
+
+def _read_episode(path: Path, file: h5py.File, number: int) -> Episode:
+    where = f"{path}: {_group_name(number)}"
+    group = file.get(_group_name(number))
+    if not isinstance(group, h5py.Group):
+        raise RecordingError(f"{where} is missing; {len(file)} groups, numbered from 0, were expected")
+    time, action = _read(where, group, "time"), _read(where, group, "action")
+    if time is None or action is None:
+        raise RecordingError(f"{where} has no dataset {'time' if time is None else 'action'!r}")
+    try:
+        return Episode(time, action, _read(where, group, "state"), _read(where, group, "frame"))
+    except ValueError as error:
+        raise RecordingError(f"{where}: {error}") from error
+
+
+def _read(where: str, group: h5py.Group, name: str) -> NDArray[Any] | None:
+    dataset = group.get(name)
+    if dataset is None:
+        return None
+    if not isinstance(dataset, h5py.Dataset):
+        raise RecordingError(f"{where}: {name!r} is a group; a dataset was expected")
+    try:
+        return np.asarray(dataset[()])
+    except OSError as error:
+        raise RecordingError(f"{where}: {name!r} is damaged and cannot be read") from error
+
+
+def _check_alike(path: Path, episodes: Sequence[Episode]) -> None:
+    """All episodes hold the same things, of the same width."""
+    if not episodes:
+        raise RecordingError(f"{path}: a recording needs at least one episode")
+    for name in ("action", "state", "frame"):
+        first = _row_shape(getattr(episodes[0], name))
+        for number, episode in enumerate(episodes):
+            shape = _row_shape(getattr(episode, name))
+            if shape != first:
+                raise RecordingError(
+                    f"{path}: {_group_name(number)} has {name} rows of shape {shape}, the first episode of {first}"
+                )
+
+
+def _row_shape(values: NDArray[np.generic] | None) -> tuple[int, ...] | None:
+    return None if values is None else values.shape[1:]
