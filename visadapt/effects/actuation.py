@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -24,11 +22,11 @@ class ActuatorDelay(ActuationEffect):
     table = (Parameter("delay", "s", 0.0, 0.3, 0.0),)
 
     def memory(self, commands: Tensor, substep: float) -> Tensor:
-        return torch.zeros_like(commands[:, :1]).expand(-1, self._reach(substep), -1)
+        return torch.zeros_like(commands[:, :1]).expand(-1, self._reach(commands, substep), -1)
 
     def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
         batch, count, width = commands.shape
-        shift = (self.value("delay", commands) / substep).expand(batch)
+        shift = self._shift(commands, substep).expand(batch)
         past = torch.cat((memory, commands), 1)
         whole = shift.detach().floor()
         part = (shift - whole)[:, None, None]
@@ -37,9 +35,13 @@ class ActuatorDelay(ActuationEffect):
         delayed = (1 - part) * past.gather(1, index) + part * past.gather(1, index - 1)
         return delayed, past[:, count:]
 
-    def _reach(self, substep: float) -> int:
+    def _shift(self, commands: Tensor, substep: float) -> Tensor:
+        """The delay in substeps, one for each row or one for all, in the precision of the commands."""
+        return self.value("delay", commands) / substep
+
+    def _reach(self, commands: Tensor, substep: float) -> int:
         """Substeps of the past that the delay can reach."""
-        delay = self.get_parameter("delay").detach()
-        if not bool((delay >= 0).all()):
-            raise ValueError(f"actuator_delay: delay must not be negative, got {float(delay.min())} s")
-        return math.floor(float(delay.max()) / substep) + 1
+        shift = self._shift(commands, substep).detach()
+        if not bool((shift >= 0).all()):
+            raise ValueError(f"actuator_delay: delay must not be negative, got {float(shift.min()) * substep:g} s")
+        return int(shift.max().floor()) + 1

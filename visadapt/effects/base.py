@@ -69,7 +69,9 @@ class Effect(nn.Module):
 
     def value(self, name: str, like: Tensor) -> Tensor:
         """The parameter `name` with the device and dtype of `like`."""
-        return self.get_parameter(name).to(like)
+        # Not get_parameter, which torch.func.functional_call's tensors do not pass.
+        values: Tensor = getattr(self, name)
+        return values.to(like)
 
 
 class ActuationEffect(Effect):

@@ -13,13 +13,13 @@ from visadapt.effects.base import DynamicsEffect, Parameter
 class CartForce(DynamicsEffect):
     """A force on the cart alone; subclasses give its size."""
 
-    def force(self, time: Tensor, state: Tensor) -> Tensor:
+    def push(self, time: Tensor, state: Tensor) -> Tensor:
         """Force in N, (B,)."""
         raise NotImplementedError
 
     def load(self, time: Tensor, state: Tensor) -> Tensor:
-        force = self.force(time, state)
-        return torch.stack((force, torch.zeros_like(force)), -1)
+        push = self.push(time, state)
+        return torch.stack((push, torch.zeros_like(push)), -1)
 
 
 class ConstantForce(CartForce):
@@ -31,7 +31,7 @@ class ConstantForce(CartForce):
     table = (Parameter("force", "N", -30.0, 30.0, 0.0),)
     indistinguishable_from = ("actuator_bias", "track_tilt")
 
-    def force(self, time: Tensor, state: Tensor) -> Tensor:
+    def push(self, time: Tensor, state: Tensor) -> Tensor:
         return self.value("force", state).expand_as(time)
 
 
@@ -48,7 +48,7 @@ class PeriodicForce(CartForce):
         Parameter("offset", "N", -30.0, 30.0, 0.0),
     )
 
-    def force(self, time: Tensor, state: Tensor) -> Tensor:
+    def push(self, time: Tensor, state: Tensor) -> Tensor:
         angle = 2 * math.pi * self.value("frequency", state) * time + self.value("phase", state)
         return self.value("amplitude", state) * angle.cos() + self.value("offset", state)
 
@@ -61,5 +61,5 @@ class ViscousFriction(CartForce):
     source = "Olsson et al. (1998), Friction models and friction compensation, section 2"
     table = (Parameter("coefficient", "N s/m", 0.0, 50.0, 0.0),)
 
-    def force(self, time: Tensor, state: Tensor) -> Tensor:
+    def push(self, time: Tensor, state: Tensor) -> Tensor:
         return -self.value("coefficient", state) * state[..., 1]
