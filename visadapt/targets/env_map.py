@@ -1,0 +1,177 @@
+"""What a gymnasium environment's numbers and frames mean to us: a small map, declared in code or in a TOML file."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from visadapt.systems import System
+from visadapt.targets.base import TargetError
+
+ASPECT_TOLERANCE = 0.01
+"""A crop may differ by this share from the frame's aspect: more would bend a rigid pole as it turns."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One entry of the environment's observation or action vector, and the straight line between it and ours."""
+
+    index: int
+    scale: float = 1.0
+    """a negative one turns the sign"""
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.index, int) or isinstance(self.index, bool) or self.index < 0:
+            raise TargetError(f"index must be a whole number from 0 on, got {self.index!r}")
+        for name, value in (("scale", self.scale), ("offset", self.offset)):
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+                raise TargetError(f"{name} must be a finite number, got {value!r}")
+        if self.scale == 0:
+            raise TargetError("scale must not be 0: it would say nothing")
+
+
+@dataclass(frozen=True)
+class EnvMap:
+    """The declared map of an environment.
+
+    In a TOML file it has the same names: tables `[states]` (`x = { index = 0 }`), `[limits]` and `[options]`, and
+    `actions`, `crop`, `contrast`, `width`, `height` above them.
+    """
+
+    states: Mapping[str, Entry]
+    """our state called so = scale observation[index] + offset, in SI units"""
+    actions: tuple[Entry, ...]
+    """action[index] = scale command + offset, one for each of our commands in [-1, 1]; entries not named get 0"""
+    crop: tuple[int, int, int, int]
+    """left, top, right, bottom in px of the environment's frame; right and bottom are the first px left out"""
+    contrast: tuple[float, float] = (0.0, 255.0)
+    """grey levels that become black and white"""
+    limits: Mapping[str, float] = field(default_factory=dict)
+    """an episode ends where |state called so| exceeds this, beside where the environment itself ends it"""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """what gymnasium.make is given besides: they decide the size of the frame and where its camera stands"""
+    width: int = 120
+    """px of the frames that are shown"""
+    height: int = 100
+    """px"""
+
+    def __post_init__(self) -> None:
+        if len(self.crop) != 4 or not all(isinstance(edge, int) for edge in self.crop):
+            raise TargetError(f"crop must be left, top, right, bottom in whole px, got {self.crop!r}")
+        left, top, right, bottom = self.crop
+        if not (0 <= left < right and 0 <= top < bottom):
+            raise TargetError(f"crop {self.crop} holds no pixel: left < right and top < bottom, all from 0 on")
+        wanted, got = self.width / self.height, (right - left) / (bottom - top)
+        if abs(got / wanted - 1) > ASPECT_TOLERANCE:
+            raise TargetError(
+                f"crop {self.crop} is {right - left} x {bottom - top} px, {got:.3f} wide for 1 high; "
+                f"frames of {self.width} x {self.height} px need {wanted:.3f}"
+            )
+        if len(self.contrast) != 2 or not self.contrast[0] < self.contrast[1]:
+            raise TargetError(f"contrast must be two rising grey levels, got {self.contrast!r}")
+        if not self.actions:
+            raise TargetError("actions is empty: say which entry of the environment's action our command sets")
+        for name, limit in self.limits.items():
+            if not limit > 0:
+                raise TargetError(f"limits: {name} must be positive, got {limit!r}")
+
+    @classmethod
+    def load(cls, path: str | Path) -> EnvMap:
+        """Read a map from a TOML file.
+
+        Raises:
+            TargetError: the file is missing or no TOML, a key is unknown, missing or impossible; names file and key.
+        """
+        try:
+            table = tomllib.loads(Path(path).read_text())
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise TargetError(f"{path}: cannot be read as TOML: {error}") from error
+        known = [item.name for item in fields(cls)]
+        needed = [item.name for item in fields(cls) if item.default is MISSING and item.default_factory is MISSING]
+        for key in table:
+            if key not in known:
+                raise TargetError(f"{path}: unknown key {key!r}; there are {', '.join(known)}")
+        for key in needed:
+            if key not in table:
+                raise TargetError(f"{path}: {key!r} is missing")
+        try:
+            states = {name: Entry(**entry) for name, entry in table.pop("states").items()}
+            actions = tuple(Entry(**entry) for entry in table.pop("actions"))
+            for key in {"crop", "contrast"} & table.keys():
+                table[key] = tuple(table[key])
+            return cls(states=states, actions=actions, **table)
+        except (TargetError, TypeError, AttributeError) as error:
+            raise TargetError(f"{path}: {error}") from error
+
+    def check(self, name: str, system: type[System], n_observation: int, n_action: int) -> None:
+        """Whether the map fits the environment called `name` and our system; raises TargetError where it does not."""
+        ours = [variable.name for variable in system.states]
+        if sorted(self.states) != sorted(ours):
+            raise TargetError(f"{name}: the map is of the states {', '.join(self.states)}; ours are {', '.join(ours)}")
+        for state in self.limits:
+            if state not in ours:
+                raise TargetError(f"{name}: the map limits {state!r}; our states are {', '.join(ours)}")
+        if len(self.actions) != len(system.actions):
+            raise TargetError(
+                f"{name}: the map has {len(self.actions)} actions, {system.name} has {len(system.actions)}"
+            )
+        for state, entry in self.states.items():
+            if entry.index >= n_observation:
+                raise TargetError(
+                    f"{name}: the map takes {state} from observation entry {entry.index}; "
+                    f"there are {n_observation}, counted from 0"
+                )
+        for entry in self.actions:
+            if entry.index >= n_action:
+                raise TargetError(
+                    f"{name}: the map sets action entry {entry.index}; there are {n_action}, counted from 0"
+                )
+
+    def state(self, observation: NDArray[np.floating], system: type[System]) -> NDArray[np.floating]:
+        """Our state (n_state,) in the order of our system."""
+        entries = [self.states[variable.name] for variable in system.states]
+        return np.array([entry.scale * observation[entry.index] + entry.offset for entry in entries])
+
+    def observation(
+        self, state: NDArray[np.floating], system: type[System], rest: NDArray[np.floating]
+    ) -> NDArray[np.floating]:
+        """The observation that means our state; entries that the map does not name are as in `rest`."""
+        out = np.array(rest, dtype=float)
+        for value, variable in zip(state, system.states, strict=True):
+            entry = self.states[variable.name]
+            out[entry.index] = (value - entry.offset) / entry.scale
+        return out
+
+    def action(self, command: NDArray[np.floating], size: int) -> NDArray[np.floating]:
+        """The environment's action (size,) for our command (n_action,) in [-1, 1]."""
+        out = np.zeros(size)
+        for value, entry in zip(command, self.actions, strict=True):
+            out[entry.index] = entry.scale * value + entry.offset
+        return out
+
+    def frame(self, name: str, picture: object) -> NDArray[np.uint8]:
+        """Our frame (height, width) of a picture (rows, columns, 3) or (rows, columns) uint8 of the environment."""
+        if not isinstance(picture, np.ndarray) or picture.dtype != np.uint8 or picture.ndim not in (2, 3):
+            got = f"{picture.dtype} {picture.shape}" if isinstance(picture, np.ndarray) else type(picture).__name__
+            raise TargetError(f"{name}: render() gave {got}; a picture (rows, columns, 3) of uint8 is needed")
+        left, top, right, bottom = self.crop
+        if right > picture.shape[1] or bottom > picture.shape[0]:
+            raise TargetError(
+                f"{name}: its frames are {picture.shape[1]} x {picture.shape[0]} px, "
+                f"but the crop reaches to column {right} and row {bottom}: change the crop or the frame's size"
+            )
+        # In floating point, so that a contrast stretch of a dark picture does not leave steps between grey levels.
+        part = picture[top:bottom, left:right].astype(np.float32)
+        grey = cv2.cvtColor(part, cv2.COLOR_RGB2GRAY) if part.ndim == 3 and part.shape[2] == 3 else part
+        small = cv2.resize(grey, (self.width, self.height), interpolation=cv2.INTER_AREA)
+        low, high = self.contrast
+        return np.clip(np.rint((small - low) * (255 / (high - low))), 0, 255).astype(np.uint8)

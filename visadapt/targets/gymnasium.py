@@ -1,0 +1,266 @@
+"""Any gymnasium environment with continuous actions and `render_mode="rgb_array"` as a target."""
+
+from __future__ import annotations
+
+import atexit
+import weakref
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from visadapt.systems import CartPole, System
+from visadapt.targets import mujoco_frames
+from visadapt.targets.base import Observation, Target, TargetError
+from visadapt.targets.env_map import EnvMap
+from visadapt.targets.synthetic import Start
+
+INSTALL = "pip install 'visadapt[mujoco]'"
+
+
+class GymnasiumTarget(Target):
+    """A batch of environments of one kind, made on demand and kept for the next reset.
+
+    Args:
+        env: the environment's id, or a function that makes one (with `render_mode="rgb_array"` and no time limit).
+        mapping: what its numbers and frames mean; `mapping.options` go to gymnasium.make, not to a function.
+        system: whose states and actions the mapping is to.
+        start: draws the state at the start of an episode in the place of the environment's own reset; only for
+            MuJoCo environments whose observation is all positions, then all velocities.
+        period: s between actions, where the environment does not say (`dt`, or `render_fps` of its metadata).
+        frames: whether frames are drawn at all.
+
+    Raises:
+        TargetError: gymnasium is not installed, the environment is not to be had, has discrete actions, no
+            rgb_array, or no period, or the mapping does not fit it.
+    """
+
+    def __init__(
+        self,
+        env: str | Callable[[], Any],
+        mapping: EnvMap,
+        system: type[System] = CartPole,
+        start: Start | None = None,
+        period: float | None = None,
+        frames: bool = True,
+        name: str | None = None,
+    ) -> None:
+        mujoco_frames.choose_backend()
+        try:
+            import gymnasium
+        except ImportError as error:
+            raise TargetError(f"gymnasium is not installed: {INSTALL}") from error
+        self._gymnasium = gymnasium
+        self._source = env
+        self.mapping = mapping
+        self.system = system
+        self.initial = start
+        self.frames = frames
+        self.name = name or (env if isinstance(env, str) else "gymnasium environment")
+        first = self._make()
+        self.name = name or (first.spec.id if first.spec is not None else type(first.unwrapped).__name__)
+        self.n_action = len(mapping.actions)
+        self._n_env_action = self._check(first)
+        self.period = period if period is not None else self._period(first)
+        self._mujoco = frames and mujoco_frames.is_mujoco(first)
+        if self._mujoco:
+            mujoco_frames.probe(self.name)
+        self._envs = [first]
+        self._closed_at_exit = False
+        self._steps = 0
+        self._observations: list[NDArray[np.floating]] = []
+        self._pictures: list[NDArray[np.uint8]] = []
+        self._alive: list[bool] = []
+
+    def reset(self, batch: int, generator: torch.Generator) -> Observation:
+        """Start `batch` new episodes, each environment seeded from the generator.
+
+        Raises:
+            TargetError: the environment shows something that is not finite, or no frame that the crop fits.
+        """
+        seeds = torch.randint(2**31 - 1, (batch,), generator=generator).tolist()
+        starts = None if self.initial is None else self.initial.draw(batch, generator).double().numpy()
+        while len(self._envs) < batch:
+            self._envs.append(self._make())
+        if self._mujoco:
+            mujoco_frames.share_viewer(self._envs)
+        self._steps = 0
+        self._observations, self._pictures = [], []
+        for b in range(batch):
+            seen, _ = self._envs[b].reset(seed=seeds[b])
+            if starts is not None:
+                seen = self._place(self._envs[b], np.asarray(seen), starts[b])
+            self._observations.append(self._finite(seen, b))
+            if self.frames:
+                self._pictures.append(self._draw(self._envs[b]))
+        self._alive = [self._inside(seen) for seen in self._observations]
+        return self._observe()
+
+    def step(self, action: Tensor) -> Observation:
+        """Execute the action (B, n_action) for one period; an episode that has ended stays as it was.
+
+        Raises:
+            TargetError: step before reset, an action of another shape or not finite, an environment that shows
+                something that is not finite or cuts its episodes short.
+        """
+        if action.shape != (len(self._alive), self.n_action) or not self._alive:
+            wanted = f"({len(self._alive)}, {self.n_action})" if self._alive else "a reset first"
+            raise TargetError(f"{self.name}: step with an action of shape {tuple(action.shape)}; it needs {wanted}")
+        if not bool(action.isfinite().all()):
+            raise TargetError(f"{self.name}: the action of step {self._steps} is not finite")
+        self._steps += 1
+        commands = action.detach().clamp(-1, 1).double().cpu().numpy()
+        for b, env in enumerate(self._envs[: len(self._alive)]):
+            if not self._alive[b]:
+                continue
+            ours = self.mapping.action(commands[b], self._n_env_action)
+            seen, _, terminated, truncated, _ = env.step(ours.astype(env.action_space.dtype))
+            if truncated and not terminated:
+                raise TargetError(
+                    f"{self.name}: cut the episode short after {self._steps} steps; make it without a time limit "
+                    "(gymnasium.make(..., max_episode_steps=-1))"
+                )
+            self._observations[b] = self._finite(seen, b)
+            if self.frames:
+                self._pictures[b] = self._draw(env)
+            self._alive[b] = not terminated and self._inside(self._observations[b])
+        return self._observe()
+
+    def close(self) -> None:
+        """Free the environments and what draws them; the target cannot be used afterwards."""
+        envs, self._envs, self._alive = self._envs, [], []
+        if envs and self._mujoco:
+            mujoco_frames.close_all(envs)
+        else:
+            for env in envs:
+                env.close()
+
+    def show(self, states: NDArray[np.floating]) -> NDArray[np.uint8]:
+        """Frames (N, H, W) uint8 of chosen states (N, n_state): to train a renderer, without a step of the target.
+
+        Raises:
+            TargetError: this environment cannot be put into a state.
+        """
+        seen, _ = self._envs[0].reset(seed=0)
+        pictures = []
+        for state in states:
+            self._place(self._envs[0], np.asarray(seen), state)
+            pictures.append(self._draw(self._envs[0]))
+        return np.stack(pictures)
+
+    def _make(self) -> Any:
+        if not isinstance(self._source, str):
+            return self._source()
+        gymnasium = self._gymnasium
+        render_mode = "rgb_array" if self.frames else None
+        try:
+            # Episodes end where the mapping says, not after so many steps.
+            return gymnasium.make(
+                self._source,
+                render_mode=render_mode,
+                max_episode_steps=-1,
+                disable_env_checker=True,
+                **self.mapping.options,
+            )
+        except gymnasium.error.DependencyNotInstalled as error:
+            advice = f"mujoco is not installed: {INSTALL}" if "mujoco" in str(error).lower() else _line(error)
+            raise TargetError(f"{self.name}: {advice}") from error
+        except (
+            Exception
+        ) as error:  # the constructor of anyone's environment: whatever it raises, the answer is one line
+            if mujoco_frames.is_blamed(error):
+                raise mujoco_frames.cannot_render(self.name, error) from error
+            raise TargetError(f"{self.name}: cannot be made: {_line(error)}") from error
+
+    def _check(self, env: Any) -> int:
+        """Raises TargetError where the environment cannot be a target; gives the length of its action."""
+        box = self._gymnasium.spaces.Box
+        if not isinstance(env.action_space, box) or len(env.action_space.shape) != 1:
+            raise TargetError(
+                f"{self.name}: its actions are {env.action_space}, but a policy here commands real numbers: "
+                "take an environment whose action space is a one-dimensional Box, such as InvertedPendulum-v5"
+            )
+        if not isinstance(env.observation_space, box) or len(env.observation_space.shape) != 1:
+            raise TargetError(
+                f"{self.name}: its observations are {env.observation_space}; a one-dimensional Box is needed"
+            )
+        modes = env.metadata.get("render_modes", [])
+        if self.frames and (env.render_mode != "rgb_array" or "rgb_array" not in modes):
+            raise TargetError(
+                f"{self.name}: its render_mode is {env.render_mode!r} (it has {', '.join(modes) or 'none'}); "
+                'frames need one made with render_mode="rgb_array"'
+            )
+        n_action = int(env.action_space.shape[0])
+        self.mapping.check(self.name, self.system, int(env.observation_space.shape[0]), n_action)
+        return n_action
+
+    def _period(self, env: Any) -> float:
+        period = getattr(env.unwrapped, "dt", None)
+        rate = env.metadata.get("render_fps")
+        if period is None and not rate:
+            raise TargetError(f"{self.name}: it does not say how long a step is; give `period` in s")
+        return float(period) if period is not None else 1 / float(rate)
+
+    def _place(self, env: Any, seen: NDArray[np.floating], state: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Put a MuJoCo environment into our state; its observation there."""
+        wanted = self.mapping.observation(state, self.system, seen)
+        body = env.unwrapped
+        n = getattr(getattr(body, "model", None), "nq", None)
+        if n is None or not hasattr(body, "set_state") or len(seen) != n + body.model.nv:
+            raise TargetError(f"{self.name}: cannot be put into a state: its observation is not positions, velocities")
+        body.set_state(wanted[:n], wanted[n:])
+        got = np.asarray(body._get_obs())
+        if not np.allclose(got, wanted, atol=1e-6):
+            raise TargetError(f"{self.name}: put into the observation {wanted}, it shows {got}")
+        return got
+
+    def _finite(self, seen: Any, episode: int) -> NDArray[np.floating]:
+        out = np.asarray(seen, dtype=float)
+        broken = np.flatnonzero(~np.isfinite(out))
+        if len(broken):
+            raise TargetError(
+                f"{self.name}: observation entry {broken[0]} is {out[broken[0]]} after step {self._steps} "
+                f"(episode {episode}); the environment must stay finite until it ends the episode"
+            )
+        return out
+
+    def _inside(self, seen: NDArray[np.floating]) -> bool:
+        state = self.mapping.state(seen, self.system)
+        return all(abs(state[self.system.index(name)]) <= limit for name, limit in self.mapping.limits.items())
+
+    def _draw(self, env: Any) -> NDArray[np.uint8]:
+        try:
+            if self._mujoco:
+                mujoco_frames.aim_viewer(env)
+            picture = env.render()
+        except Exception as error:  # a renderer of anyone's: whatever it raises, the answer is one line
+            if self._mujoco:
+                raise mujoco_frames.cannot_render(self.name, error) from error
+            raise TargetError(f"{self.name}: render() failed: {_line(error)}") from error
+        if not self._closed_at_exit:
+            # After the first frame, so that it runs before what the renderer registered while it drew: a viewer that
+            # is freed later than its display prints tracebacks.
+            atexit.register(_close, weakref.ref(self))
+            self._closed_at_exit = True
+        return self.mapping.frame(self.name, picture)
+
+    def _observe(self) -> Observation:
+        state = np.stack([self.mapping.state(seen, self.system) for seen in self._observations])
+        return Observation(
+            state=torch.tensor(state, dtype=torch.get_default_dtype()),
+            alive=torch.tensor(self._alive),
+            frame=torch.from_numpy(np.stack(self._pictures)) if self.frames else None,
+        )
+
+
+def _close(target: weakref.ref[GymnasiumTarget]) -> None:
+    alive = target()
+    if alive is not None:
+        alive.close()
+
+
+def _line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

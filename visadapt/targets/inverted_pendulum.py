@@ -1,0 +1,56 @@
+"""gymnasium's InvertedPendulum-v5 (MuJoCo) as a target, and the source model that its published numbers give."""
+
+from __future__ import annotations
+
+from visadapt.systems import CartPole
+from visadapt.targets.env_map import Entry, EnvMap
+from visadapt.targets.gymnasium import GymnasiumTarget
+from visadapt.targets.synthetic import Start
+
+REACH = 0.9
+"""m, how far the cart may go either way: the rail ends at 1 m, the frame 1.0 m from its middle."""
+
+MAP = EnvMap(
+    states={"x": Entry(0), "theta": Entry(1), "x_dot": Entry(2), "theta_dot": Entry(3)},
+    # Its control range is +-3 with a gear of 100: up to 300 N, 19 m/s2 on cart and pole, far too coarse to balance
+    # with. Our command 1 is its control 1, 100 N.
+    actions=(Entry(0, scale=1.0),),
+    crop=(0, 0, 240, 200),
+    # It has no light but the one at the camera: the brightest pixels have a grey level of about 130.
+    contrast=(0.0, 150.0),
+    limits={"theta": 0.3, "x": REACH},
+    options={
+        "width": 240,
+        "height": 200,
+        # Looks along +y from a point that does not move (body 0 is the world), so that +x is to the right.
+        "default_camera_config": {
+            "trackbodyid": 0,
+            "distance": 2.0,
+            "azimuth": 90.0,
+            "elevation": 0.0,
+            "lookat": (0.0, 0.0, 0.32),
+        },
+    },
+)
+"""The environment itself ends an episode at |theta| > 0.2 rad."""
+
+SOURCE = CartPole(
+    cart_mass=10.471975511965976,
+    pole_mass=5.018591641363306,
+    pole_half_length=0.3,
+    max_force=100.0,
+    gravity=9.81,
+)
+"""What an engineer reads off its model: masses, the pole's length, gear, gravity; a uniform rod without friction."""
+
+START = Start(x=0.2, x_dot=0.1, theta=0.1, theta_dot=0.1)
+"""Wider than the environment's own +-0.01, the same as the synthetic target's."""
+
+
+def inverted_pendulum(start: Start | None = START, frames: bool = True) -> GymnasiumTarget:
+    """InvertedPendulum-v5, 0.04 s between actions; `start=None` keeps its own reset, +-0.01 of everything.
+
+    Raises:
+        TargetError: gymnasium or mujoco is not installed, or nothing can render off-screen.
+    """
+    return GymnasiumTarget("InvertedPendulum-v5", MAP, CartPole, start, frames=frames)
