@@ -1,0 +1,179 @@
+import pytest
+import torch
+from torch import nn
+from torch.func import functional_call
+
+from tests.worlds import Mass, columns, run
+from visadapt.effects import ActuatorDelay, ConstantForce, Residual, ViscousFriction
+from visadapt.history import History
+from visadapt.systems import CartPole
+from visadapt.world import World
+
+
+class Linear(nn.Module):
+    """A residual network that is a matrix on the last observation and the action being executed."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = nn.Parameter(torch.linspace(-1, 1, 20, dtype=torch.float64).reshape(4, 5))
+
+    def forward(self, history):
+        return torch.cat((history.observations[:, -1], history.actions[:, -1]), 1) @ self.weight.T
+
+
+def inputs(batch=3, steps=4, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    state = 0.3 * torch.randn(batch, 4, generator=generator, dtype=torch.float64)
+    return state, 1.8 * torch.rand(steps, batch, 1, generator=generator, dtype=torch.float64) - 0.9
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"integrator": "leapfrog"}, "unknown integrator 'leapfrog'; there are euler, midpoint, rk4"),
+        ({"period": 0.0}, "positive, got 0.0 s"),
+        ({"period": float("nan")}, "positive, got nan s"),
+        ({"substeps": 0}, "positive, got 0.05 s and 0"),
+    ],
+)
+def test_settings_that_make_no_world(settings, message):
+    with pytest.raises(ValueError, match=message):
+        World(CartPole(), **settings)
+
+
+def test_a_mass_moves_as_newton_says():
+    world = World(Mass(), period=0.1, integrator="rk4", substeps=3)
+    states = run(world, columns(1.0, 0.5, 0, 0), [columns(0.8)] * 5)
+    elapsed = torch.arange(6, dtype=torch.float64) * 0.1
+    torch.testing.assert_close(states[:, 0, 0], 1.0 + 0.5 * elapsed + 0.5 * 0.4 * elapsed**2)
+    torch.testing.assert_close(states[:, 0, 1], 0.5 + 0.4 * elapsed)
+
+
+@pytest.mark.parametrize("substeps", [1, 7])
+def test_the_clock_runs_a_period_a_step_and_starts_at_zero_in_every_row(substeps):
+    world = World(CartPole(), period=0.04, substeps=substeps)
+    at = world.start(torch.zeros(2, 4, dtype=torch.float64))
+    assert at.time.tolist() == [0.0, 0.0]
+    for k in range(1, 4):
+        at = world.step(at, torch.zeros(2, 1, dtype=torch.float64))
+        assert at.time.tolist() == pytest.approx([0.04 * k] * 2)
+
+
+@pytest.mark.parametrize("integrator", ["euler", "midpoint", "rk4"])
+def test_more_substeps_come_closer_to_the_same_motion(integrator):
+    state, actions = inputs()
+    exact = run(World(CartPole(), substeps=500), state, actions)[-1]
+    errors = [
+        float((run(World(CartPole(), integrator=integrator, substeps=n), state, actions)[-1] - exact).abs().max())
+        for n in (1, 4, 16)
+    ]
+    assert errors[0] > 2 * errors[1] > 4 * errors[2]
+
+
+def test_a_step_is_pure():
+    world = World(CartPole(), [ActuatorDelay(delay=0.07), ConstantForce(force=2.0)], substeps=2)
+    state, actions = inputs()
+    at = world.step(world.start(state), actions[0])
+    before = (at.time.clone(), at.state.clone(), at.memory[0].clone())
+    once, again = world.step(at, actions[1]), world.step(at, actions[1])
+    assert torch.equal(once.state, again.state)
+    assert torch.equal(once.memory[0], again.memory[0])
+    assert all(torch.equal(a, b) for a, b in zip(before, (at.time, at.state, at.memory[0]), strict=True))
+
+
+def test_commands_beyond_one_are_cut():
+    state, _ = inputs()
+    world = World(CartPole())
+    strong = run(world, state, [torch.full((3, 1), 4.0, dtype=torch.float64)])
+    assert torch.equal(strong, run(world, state, [torch.ones(3, 1, dtype=torch.float64)]))
+
+
+def test_loads_of_several_effects_add_up():
+    state, actions = inputs()
+    together = World(CartPole(), [ConstantForce(force=2.0), ConstantForce(force=1.5)])
+    torch.testing.assert_close(
+        run(together, state, actions), run(World(CartPole(), [ConstantForce(force=3.5)]), state, actions)
+    )
+
+
+def test_the_order_of_effects_in_the_list_does_not_matter():
+    state, actions = inputs()
+    effects = [ViscousFriction(coefficient=2.0), ActuatorDelay(delay=0.06)]
+    one, other = World(CartPole(), effects, substeps=2), World(CartPole(), effects[::-1], substeps=2)
+    torch.testing.assert_close(run(one, state, actions), run(other, state, actions))
+
+
+def test_rows_can_be_taken_from_either_of_two_world_states():
+    world = World(CartPole(), [ActuatorDelay(delay=0.07)], substeps=2)
+    state, actions = inputs()
+    old = world.step(world.start(state), actions[0])
+    fresh = world.start(-state)
+    keep = torch.tensor([True, False, True])
+    mixed = old.where(keep, fresh)
+    after, kept, restarted = (world.step(at, actions[1]).state for at in (mixed, old, fresh))
+    torch.testing.assert_close(after, torch.where(keep[:, None], kept, restarted))
+    assert mixed.time.tolist() == pytest.approx([0.05, 0.0, 0.05])
+
+
+def test_a_detached_world_state_has_the_same_values_and_no_graph():
+    state, actions = inputs()
+    at = World(CartPole(), [ActuatorDelay(delay=0.07)]).start(state.requires_grad_())
+    at = World(CartPole(), [ActuatorDelay(delay=0.07)]).step(at, actions[0])
+    assert at.state.requires_grad
+    assert not at.detach().state.requires_grad
+    assert torch.equal(at.detach().state, at.state)
+
+
+class TestResidual:
+    SCALE = torch.tensor([0.1, 1.0, 0.2, 2.0], dtype=torch.float64)
+
+    def test_it_adds_its_scaled_output_to_the_state_after_the_period(self):
+        network, (state, actions) = Linear(), inputs()
+        history = History.start(state, 1)
+        world = World(CartPole(), [Residual(network, self.SCALE)])
+        added = world.step(world.start(state), actions[0], history).state - run(World(CartPole()), state, actions)[1]
+        expected = self.SCALE * (torch.cat((state, actions[0]), 1) @ network.weight.T)
+        torch.testing.assert_close(added, expected)
+
+    def test_it_sees_the_action_being_executed_and_those_before(self):
+        seen = []
+
+        class Watch(nn.Module):
+            def forward(self, history):
+                seen.append(history.actions[0, :, 0].tolist())
+                return torch.zeros_like(history.observations[:, -1])
+
+        world = World(CartPole(), [Residual(Watch(), self.SCALE)])
+        state, _ = inputs()
+        history, at = History.start(state, 1), world.start(state)
+        for value in (0.1, 0.2):
+            action = torch.full((3, 1), value, dtype=torch.float64)
+            at = world.step(at, action, history)
+            history = history.acting(action).observing(at.state)
+        assert seen == [[0, 0, 0, 0, 0.1], [0, 0, 0, 0.1, 0.2]]
+
+    def test_gradients_agree_with_finite_differences(self):
+        class TwoSteps(nn.Module):
+            def __init__(self):
+                super().__init__()
+                self.world = World(CartPole(), [Residual(Linear(), TestResidual.SCALE)])
+
+            def forward(self, state, first, second):
+                history, at = History.start(state, 1), self.world.start(state)
+                for action in (first, second):
+                    at = self.world.step(at, action, history)
+                    history = history.acting(action).observing(at.state)
+                return at.state
+
+        steps = TwoSteps()
+        (key, weight), *none = steps.named_parameters()
+        assert not none
+        state, actions = inputs(2)
+        values = [value.detach().clone().requires_grad_() for value in (state, actions[0], actions[1], weight)]
+        assert torch.autograd.gradcheck(lambda *v: functional_call(steps, {key: v[3]}, v[:3]), values)
+
+    def test_without_a_history_it_says_what_is_missing(self):
+        world = World(CartPole(), [Residual(Linear(), self.SCALE)])
+        state, actions = inputs()
+        with pytest.raises(ValueError, match="needs the history"):
+            world.step(world.start(state), actions[0])
