@@ -1,0 +1,160 @@
+"""A canvas for film frames: crisp text, anti-aliased lines and boxes in fractions of a pixel. Needs no display."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import matplotlib
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+Colour = tuple[int, int, int]
+"""Red, green, blue, 0 to 255."""
+Picture = NDArray[np.uint8]
+"""(H, W, 3), red, green, blue."""
+
+PAPER: Colour = (255, 255, 255)
+INK: Colour = (31, 41, 51)
+MUTED: Colour = (110, 122, 136)
+HAIRLINE: Colour = (216, 221, 227)
+TROUGH: Colour = (236, 239, 243)
+BLUE: Colour = (47, 103, 201)
+ORANGE: Colour = (222, 116, 22)
+TEAL: Colour = (14, 122, 112)
+RED: Colour = (190, 42, 42)
+
+FRACTION_BITS = 6
+"""OpenCV takes coordinates as whole numbers of 2**-FRACTION_BITS px."""
+
+
+class Canvas:
+    """An area to draw on. (0, 0) is the top left corner of the top left pixel; everything is clipped to the area."""
+
+    def __init__(self, width: int, height: int, colour: Colour = PAPER) -> None:
+        self.pixels: Picture = np.full((height, width, 3), colour, np.uint8)
+
+    def part(self, left: int, top: int, width: int, height: int) -> Canvas:
+        """A canvas that draws on a part of this one, with its own origin."""
+        inner = Canvas.__new__(Canvas)
+        inner.pixels = self.pixels[top : top + height, left : left + width]
+        return inner
+
+    def line(self, points: NDArray[np.floating], colour: Colour, thickness: int = 1) -> None:
+        """A polyline through points (n, 2)."""
+        if len(points) > 1:
+            cv2.polylines(self.pixels, [_fixed(points)], False, colour, thickness, cv2.LINE_AA, FRACTION_BITS)
+
+    def dashes(self, start: tuple[float, float], end: tuple[float, float], colour: Colour, length: float = 5.0) -> None:
+        """A straight dashed line, 1 px thick."""
+        a, b = np.array(start), np.array(end)
+        whole = float(np.linalg.norm(b - a))
+        for at in np.arange(0.0, whole, 2 * length):
+            stop = min(at + length, whole)
+            self.line(np.stack([a + (b - a) * at / whole, a + (b - a) * stop / whole]), colour)
+
+    def polygon(self, corners: Sequence[tuple[float, float]] | NDArray[np.floating], colour: Colour) -> None:
+        """A filled convex polygon."""
+        cv2.fillConvexPoly(self.pixels, _fixed(np.array(corners)), colour, cv2.LINE_AA, FRACTION_BITS)
+
+    def box(self, left: float, top: float, right: float, bottom: float, colour: Colour) -> None:
+        """A filled box; its edges blend with what is behind them in proportion to the pixels they cover."""
+        height, width = self.pixels.shape[:2]
+        rows, columns = _cover(top, bottom, height), _cover(left, right, width)
+        y, x = np.flatnonzero(rows), np.flatnonzero(columns)
+        if len(y) and len(x):
+            inside = (slice(y[0], y[-1] + 1), slice(x[0], x[-1] + 1))
+            self._blend(inside, rows[inside[0], None] * columns[inside[1]], colour)
+
+    def frame(self, left: int, top: int, right: int, bottom: int, colour: Colour = HAIRLINE) -> None:
+        """An outline 1 px thick, inside the box."""
+        for box in ((left, top, right, top + 1), (left, bottom - 1, right, bottom)):
+            self.box(*box, colour)
+        for box in ((left, top, left + 1, bottom), (right - 1, top, right, bottom)):
+            self.box(*box, colour)
+
+    def arrow(
+        self, tail: tuple[float, float], tip: tuple[float, float], colour: Colour, thickness: float = 6.0
+    ) -> None:
+        """A level arrow with a solid head; a short one is all head."""
+        length = abs(tip[0] - tail[0])
+        way, head, y = np.sign(tip[0] - tail[0]), min(length, 2.6 * thickness), tip[1]
+        neck, half = tip[0] - way * head, head / 2.6
+        if length > head:
+            self.box(min(tail[0], neck), y - thickness / 2, max(tail[0], neck), y + thickness / 2, colour)
+        self.polygon([(tip[0], y), (neck, y - half * 1.3), (neck, y + half * 1.3)], colour)
+
+    def text(
+        self,
+        x: float,
+        baseline: float,
+        string: str,
+        size: int,
+        colour: Colour = INK,
+        bold: bool = False,
+        align: Literal["left", "centre", "right"] = "left",
+    ) -> None:
+        """A line of text at x px, `size` px tall."""
+        mask, left, top, advance = _glyphs(string, size, bold)
+        start = round(x - {"left": 0.0, "centre": advance / 2, "right": advance}[align]) + left
+        row = round(baseline) + top
+        height, width = self.pixels.shape[:2]
+        upper, first = max(row, 0), max(start, 0)
+        lower, last = min(row + mask.shape[0], height), min(start + mask.shape[1], width)
+        if upper < lower and first < last:
+            cover = mask[upper - row : lower - row, first - start : last - start]
+            self._blend((slice(upper, lower), slice(first, last)), cover, colour)
+
+    def paste(self, left: int, top: int, picture: Picture) -> None:
+        """Puts a picture that fits on the canvas."""
+        self.pixels[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
+
+    def fade(self, share: float, colour: Colour = PAPER) -> None:
+        """Blends the whole area towards a colour."""
+        self._blend((slice(None), slice(None)), np.array(share, np.float32)[None, None], colour)
+
+    def _blend(self, inside: tuple[slice, slice], cover: NDArray[np.floating], colour: Colour) -> None:
+        below = self.pixels[inside].astype(np.float32)
+        blended = below + (np.array(colour, np.float32) - below) * cover[..., None]
+        self.pixels[inside] = np.round(blended).astype(np.uint8)
+
+
+def text_width(string: str, size: int, bold: bool = False) -> float:
+    """Width in px of a line of text."""
+    return _glyphs(string, size, bold)[3]
+
+
+@lru_cache(maxsize=4)
+def _font_file(bold: bool) -> Path:
+    # The one typeface that is there wherever matplotlib is; its digits are all equally wide, so numbers stand still.
+    return Path(matplotlib.get_data_path()) / "fonts" / "ttf" / ("DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf")
+
+
+@lru_cache(maxsize=64)
+def _font(size: int, bold: bool) -> ImageFont.FreeTypeFont:
+    return ImageFont.truetype(str(_font_file(bold)), size)
+
+
+@lru_cache(maxsize=4096)
+def _glyphs(string: str, size: int, bold: bool) -> tuple[NDArray[np.floating], int, int, float]:
+    """Cover (h, w) in [0, 1], its left and top edge from the origin of the baseline in px, and the text's advance."""
+    font = _font(size, bold)
+    left, top, right, bottom = (int(edge) for edge in font.getbbox(string, anchor="ls"))
+    image = Image.new("L", (max(right - left, 1), max(bottom - top, 1)))
+    ImageDraw.Draw(image).text((-left, -top), string, 255, font, anchor="ls")
+    return np.asarray(image, np.float32) / 255, left, top, float(font.getlength(string))
+
+
+def _fixed(points: NDArray[np.floating]) -> NDArray[np.int32]:
+    """Fixed-point coordinates; OpenCV has pixel centres at whole numbers, this canvas half a pixel further on."""
+    return np.round((points - 0.5) * 2**FRACTION_BITS).astype(np.int32)
+
+
+def _cover(start: float, stop: float, size: int) -> NDArray[np.floating]:
+    """(size,) how much of each pixel lies between two edges."""
+    edges = np.arange(size, dtype=np.float32)
+    return np.clip(np.minimum(edges + 1, stop) - np.maximum(edges, start), 0, 1)
