@@ -146,7 +146,8 @@ class TestRun:
         np.testing.assert_allclose(after, episode.state[1:], atol=1e-4)
 
     def test_an_episode_is_cut_where_it_ends_and_others_go_on(self):
-        runs = run(SyntheticTarget(start=Start(0, 0, 0.3, 0)), Still(), see_states, 12, 60, seeded())
+        weak = Feedback(gains=(0.0, 0.0, 0.1, 0.0))
+        runs = run(SyntheticTarget(start=Start(0, 0, 0.3, 0)), weak, see_states, 12, 60, seeded())
         lengths = [r.episode.samples for r in runs]
         assert len(set(lengths)) > 3
         for r in runs:
@@ -155,6 +156,8 @@ class TestRun:
             assert (angle[:-1] <= 0.3).all()
             assert angle[-1] > 0.3
             assert len(r.force) == len(r.episode.time)
+            assert r.episode.action[:-1].all()
+            assert not r.episode.action[-1], "the last action was not executed"
 
     @pytest.mark.parametrize("step", [0, 3])
     def test_a_policy_that_says_nan_is_an_error_that_names_the_step(self, step):

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+LITTLE = 2**18
+"""Bytes free on a disk at which a writer that failed for reasons it did not tell is taken to have run out of room."""
 
 
 class DiskFullError(OSError):
@@ -36,9 +40,11 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         _settle(temporary)
         temporary.replace(final)
     except BaseException as error:
+        # Asked before the temporary, which may be what fills the disk, is gone.
+        full = isinstance(error, Exception) and _is_full(error, final.parent)
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        if isinstance(error, Exception) and _is_full(error):
+        if full:
             raise DiskFullError(f"{final} was not written: disk full; free some space and run again") from error
         raise
 
@@ -49,13 +55,18 @@ def _settle(path: Path) -> None:
         os.fsync(file.fileno())
 
 
-def _is_full(error: BaseException | None) -> bool:
-    """Whether the disk was full; libraries (h5py, ffmpeg, torch) may chain or only quote the system's error."""
-    full = {errno.ENOSPC, errno.EDQUOT}
-    while error is not None:
-        if isinstance(error, OSError) and error.errno in full:
+def _is_full(error: BaseException, folder: Path) -> bool:
+    """Whether the disk was full: some libraries chain the system's error, some quote it, and some hide it."""
+    codes = {errno.ENOSPC, errno.EDQUOT}
+    link: BaseException | None = error
+    while link is not None:
+        if isinstance(link, OSError) and link.errno in codes:
             return True
-        if any(os.strerror(code) in str(error) for code in full):
+        if any(os.strerror(code) in str(link) for code in codes):
             return True
-        error = error.__cause__ or error.__context__
+        link = link.__cause__ or link.__context__
+    # torch.save says "unexpected pos", ffmpeg breaks its pipe.
+    if isinstance(error, OSError | RuntimeError):
+        with suppress(OSError):
+            return shutil.disk_usage(folder).free < LITTLE
     return False

@@ -49,7 +49,9 @@ def write_recording(
     for kind, given in names.items():
         if given is not None and len(given) != widths[kind]:
             raise RecordingError(f"{path}: {len(given)} names for {widths[kind]} columns of {kind}")
-    with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+    # In memory first: HDF5 takes the whole process down when the disk fills up below it. The episodes are in memory
+    # anyway, and larger.
+    with h5py.File("recording", "w", driver="core", backing_store=False) as file:
         file.attrs["format"] = FORMAT
         file.attrs["version"] = VERSION
         for kind, given in names.items():
@@ -57,6 +59,10 @@ def write_recording(
                 file.attrs[f"{kind}_names"] = list(given)
         for number, episode in enumerate(episodes):
             _write_episode(file.create_group(_group_name(number)), episode)
+        file.flush()
+        content = file.id.get_file_image()
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def read_recording(path: str | os.PathLike[str]) -> list[Episode]:
