@@ -91,8 +91,9 @@ class TestSynthetic:
         )
         assert force.min() < 0.1
         assert force.max() > 3.9
-        assert a.min() < -1.8
-        assert a.max() > 1.8
+        for part in (a, b):
+            assert part.min() < -1.8
+            assert part.max() > 1.8
 
     def test_starts_are_drawn_from_the_stated_distribution(self):
         start = Start(x=0.5, x_dot=0.2, theta=0.05, theta_dot=0.4)
