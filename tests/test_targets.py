@@ -17,38 +17,43 @@ def seeded(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-class Feedback(Policy):
-    """A linear state feedback that keeps the pole up; `broken_at` is the step at which it says NaN."""
+class Scripted(Policy):
+    """A policy that a test writes out: `command` gives (B, 1)."""
 
     n_action = 1
+
+    def __init__(self):
+        nn.Module.__init__(self)
+
+    def command(self, history):
+        """Does nothing, whatever it sees."""
+        return torch.zeros(len(history.observations), 1)
+
+    def forward(self, history):
+        return self.command(history)[:, None].expand(-1, HORIZON, 1)
+
+
+class Feedback(Scripted):
+    """A linear state feedback that keeps the pole up; `broken_at` is the step at which it says NaN."""
 
     def __init__(self, gains=(0.05, 0.1, 1.5, 0.3), broken_at=None):
         super().__init__()
-        self.gains = nn.Parameter(torch.tensor(gains))
+        self.gains = torch.tensor(gains)
         self.broken_at = broken_at
         self.steps = 0
 
-    def forward(self, history):
-        command = (history.observations[:, -1] * self.gains).sum(1)
+    def command(self, history):
+        command = (history.observations[:, -1] * self.gains).sum(1, keepdim=True).clamp(-1, 1)
         if self.steps == self.broken_at:
             command = command * math.nan
         self.steps += 1
-        return command[:, None, None].expand(-1, HORIZON, 1).clamp(-1, 1)
-
-
-class Still(Policy):
-    """Does nothing, whatever it sees."""
-
-    n_action = 1
-
-    def forward(self, history):
-        return torch.zeros(len(history.observations), HORIZON, 1)
+        return command
 
 
 class TestSynthetic:
     def test_the_same_seed_gives_the_same_episodes_and_another_others(self):
         target = SyntheticTarget(sine_force, DrawnCartPole())
-        one, same, other = (run(target, Still(), see_frames, 3, 8, seeded(s)) for s in (0, 0, 1))
+        one, same, other = (run(target, Scripted(), see_frames, 3, 8, seeded(s)) for s in (0, 0, 1))
         for a, b, c in zip(one, same, other, strict=True):
             np.testing.assert_array_equal(a.episode.state, b.episode.state)
             np.testing.assert_array_equal(a.episode.frame, b.episode.frame)
@@ -138,7 +143,7 @@ class TestRun:
         assert all(r.episode.samples == 60 for r in runs)
         episode = runs[2].episode
         np.testing.assert_allclose(episode.time, np.arange(61) * 0.05)
-        expected = (episode.state[:-1] * policy.gains.detach().numpy()).sum(1, keepdims=True).clip(-1, 1)
+        expected = (episode.state[:-1] * policy.gains.numpy()).sum(1, keepdims=True).clip(-1, 1)
         np.testing.assert_allclose(episode.action[:-1], expected, atol=1e-6)
         assert episode.action[-1] == 0
         source = World(CartPole(), substeps=4)
@@ -173,19 +178,19 @@ class TestRun:
                 return seen
 
         with pytest.raises(TargetError, match=r"state after step 1 is not finite \(episode 1\)"):
-            run(Broken(), Still(), see_states, 3, 10, seeded())
+            run(Broken(), Scripted(), see_states, 3, 10, seeded())
 
     def test_frames_asked_of_a_target_without_a_camera(self):
         with pytest.raises(TargetError, match="shows none: give it a camera"):
-            run(SyntheticTarget(), Still(), see_frames, 1, 3, seeded())
+            run(SyntheticTarget(), Scripted(), see_frames, 1, 3, seeded())
 
     def test_a_policy_of_frames_is_shown_frames_between_0_and_1_and_nothing_else(self):
         shown = []
 
-        class Watch(Still):
-            def forward(self, history):
+        class Watch(Scripted):
+            def command(self, history):
                 shown.append(history)
-                return super().forward(history)
+                return super().command(history)
 
         runs = run(SyntheticTarget(camera=DrawnCartPole()), Watch(), see_frames, 2, 4, seeded())
         latest = np.stack([history.observations[0, -1].numpy() for history in shown])
