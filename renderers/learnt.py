@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -50,22 +52,32 @@ class Layer(nn.Module):
         self.shade = nn.Parameter(torch.zeros(1, rows, columns))
         self.opacity = nn.Parameter(torch.full((1, rows, columns), -1.0))
 
-    def forward(self, offset: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Premultiplied shade and opacity (B, H, W) at pixel offsets (B, H, W, 2) from the hinge."""
-        if self.turns:
-            sine, cosine = theta.sin()[:, None, None], theta.cos()[:, None, None]
-            column, row = offset.unbind(-1)
-            offset = torch.stack((cosine * column + sine * row, cosine * row - sine * column), -1)
+    def forward(self, pixels: Tensor, hinge: Tensor, theta: Tensor) -> Tensor:
+        """Premultiplied shade and opacity (B, 2, H, W) at pixels (H, W, 3), each (column, row, 1).
+
+        `hinge` (B, 2) is in px, `theta` (B,) in rad.
+        """
+        sine, cosine = (theta.sin(), theta.cos()) if self.turns else (0 * theta, 0 * theta + 1)
+        turn = torch.stack((torch.stack((cosine, sine), -1), torch.stack((-sine, cosine), -1)), 1)
+        turn = turn / self.extent[:, None]
+        shift = -(turn @ hinge[..., None])[..., 0] - self.centre / self.extent
+        # One matrix product maps every pixel of a frame to its place in the picture.
+        place = pixels.flatten(0, 1) @ torch.cat((turn, shift[..., None]), -1).transpose(1, 2)
         opacity = self.opacity.sigmoid()
         picture = torch.cat((self.shade.sigmoid() * opacity, opacity))
         # Zero padding makes everything outside the window transparent.
-        shown = F.grid_sample(
-            picture.expand(len(offset), -1, -1, -1),
-            (offset - self.centre) / self.extent,
+        return F.grid_sample(
+            picture.expand(len(theta), -1, -1, -1),
+            place.unflatten(1, pixels.shape[:2]),
             align_corners=True,
             padding_mode="zeros",
         )
-        return shown[:, 0], shown[:, 1]
+
+    @property
+    def radius(self) -> float:
+        """Largest distance in px between the hinge and a row that the layer can cover, up or down."""
+        far = self.centre.abs() + self.extent
+        return float(far.norm() if self.turns else far[1])
 
 
 class LayeredRenderer(nn.Module):
@@ -99,13 +111,21 @@ class LayeredRenderer(nn.Module):
     def forward(self, x: Tensor, theta: Tensor) -> Tensor:
         """Frames (B, H, W) of cart positions (B,) in m and pole angles (B,) in rad."""
         height, width = self.size
-        rows = torch.arange(height, device=x.device, dtype=x.dtype)
         columns = torch.arange(width, device=x.device, dtype=x.dtype)
-        pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
         hinge = self.origin + self.gain * x[:, None]
-        offset = pixels - hinge[:, None, None]
         frame = self.background.sigmoid().expand(len(x), -1, -1)
         for layer in (self.cart, self.pole):
-            shade, opacity = layer(offset, theta + self.tilt)
-            frame = frame * (1 - opacity) + shade
+            first, last = self._rows(layer, hinge)
+            rows = torch.arange(first, last, device=x.device, dtype=x.dtype)
+            grid = torch.meshgrid(columns, rows, indexing="xy")
+            pixels = torch.stack((*grid, torch.ones_like(grid[0])), -1)
+            shade, opacity = layer(pixels, hinge, theta + self.tilt).unbind(1)
+            band = frame[:, first:last] * (1 - opacity) + shade
+            frame = torch.cat((frame[:, :first], band, frame[:, last:]), 1)
         return frame
+
+    def _rows(self, layer: Layer, hinge: Tensor) -> tuple[int, int]:
+        """First row, and the one after the last, that a layer can cover: the rest need not be computed."""
+        row = hinge.detach()[:, 1]
+        first = max(0, math.floor(float(row.min()) - layer.radius))
+        return first, max(first, min(self.size[0], math.ceil(float(row.max()) + layer.radius) + 1))

@@ -5,12 +5,14 @@ from __future__ import annotations
 from itertools import pairwise
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from visadapt.history import LENGTH, History
 
 CHANNELS = (8, 16, 32, 32)
 FEATURES = 128
+CHANGE_GAIN = 2.0
 
 
 class FrameEncoder(nn.Module):
@@ -31,12 +33,10 @@ class FrameEncoder(nn.Module):
         super().__init__()
         self.register_buffer("background", background.clone())
         self.register_buffer("contrast", torch.as_tensor(contrast, dtype=background.dtype))
-        layers: list[nn.Module] = []
-        for inputs, outputs in pairwise((LENGTH, *CHANNELS)):
-            layers += [nn.Conv2d(inputs, outputs, 3, stride=2, padding=1), nn.ReLU()]
-        self.convolutions = nn.Sequential(*layers, nn.Flatten())
-        with torch.no_grad():
-            width = self.convolutions(torch.zeros(1, LENGTH, *background.shape)).shape[1]
+        layers = [nn.Conv2d(i, o, 3, stride=2, padding=1) for i, o in pairwise((LENGTH, *CHANNELS))]
+        self.convolutions = nn.ModuleList(layers).to(memory_format=torch.channels_last)
+        rows, columns = (-(-size // 2 ** len(layers)) for size in background.shape)
+        width = CHANNELS[-1] * rows * columns
         self.join = nn.Sequential(nn.Linear(width + LENGTH * n_action, FEATURES), nn.ReLU())
 
     def forward(self, history: History) -> Tensor:
@@ -47,10 +47,24 @@ class FrameEncoder(nn.Module):
                 f"the network was made for frames of {tuple(self.background.shape)} (height, width), "
                 f"got {tuple(frames.shape[-2:])}"
             )
-        latest = frames[:, -1:] - self.background
-        changes = 2 * frames.diff(dim=1)
-        seen = self.convolutions(torch.cat((latest, changes), 1) / self.contrast)
-        return self.join(torch.cat((seen, history.actions.flatten(1)), 1))
+        seen = self._first(frames.contiguous(memory_format=torch.channels_last)).relu()
+        for convolution in self.convolutions[1:]:
+            seen = convolution(seen).relu()
+        return self.join(torch.cat((seen.flatten(1), history.actions.flatten(1)), 1))
+
+    def _first(self, frames: Tensor) -> Tensor:
+        """The first convolution, of the latest frame less the background and twice the differences of neighbours.
+
+        That map of the frames is linear, so it is folded into the kernel: the big tensors are touched once.
+        """
+        first = self.convolutions[0]
+        mix = frames.new_zeros(LENGTH, LENGTH)
+        mix[0, -1] = 1.0
+        for k in range(1, LENGTH):
+            mix[k, k], mix[k, k - 1] = CHANGE_GAIN, -CHANGE_GAIN
+        kernel = torch.einsum("ocij,cf->ofij", first.weight, mix / self.contrast)
+        still = F.conv2d(self.background[None, None], first.weight[:, :1] / self.contrast, stride=2, padding=1)
+        return F.conv2d(frames, kernel, first.bias, stride=2, padding=1) - still
 
 
 def mlp(*widths: int) -> nn.Sequential:
@@ -59,3 +73,43 @@ def mlp(*widths: int) -> nn.Sequential:
     for inputs, outputs in pairwise(widths):
         layers += [nn.Linear(inputs, outputs), nn.Tanh()]
     return nn.Sequential(*layers[:-1])
+
+
+class ImageResidualNetwork(nn.Module):
+    """A 4-layer CNN on the last 5 frames and 5 actions (the paper, section 3.2.3). It begins at zero."""
+
+    def __init__(self, background: Tensor, contrast: float, n_state: int, n_action: int = 1) -> None:
+        super().__init__()
+        self.encoder = FrameEncoder(background, contrast, n_action)
+        self.head = nn.Sequential(nn.Linear(FEATURES, 64), nn.ReLU(), nn.Linear(64, n_state))
+        _begin_at_zero(self.head)
+
+    def forward(self, history: History) -> Tensor:
+        """Corrections (B, n_state) in units of the residual's scale."""
+        out: Tensor = self.head(self.encoder(history))
+        return out
+
+
+class StateResidualNetwork(nn.Module):
+    """The paper's MLP with two hidden layers of 64, tanh (3.2.1), on state and action, or on 5 of each (3.2.2)."""
+
+    def __init__(self, n_state: int, n_action: int = 1, with_history: bool = False) -> None:
+        super().__init__()
+        self.with_history = with_history
+        self.layers = mlp((LENGTH if with_history else 1) * (n_state + n_action), 64, 64, n_state)
+        _begin_at_zero(self.layers)
+
+    def forward(self, history: History) -> Tensor:
+        """Corrections (B, n_state) in units of the residual's scale."""
+        states, actions = history.observations, history.actions
+        if not self.with_history:
+            states, actions = states[:, -1:], actions[:, -1:]
+        out: Tensor = self.layers(torch.cat((states.flatten(1), actions.flatten(1)), 1))
+        return out
+
+
+def _begin_at_zero(layers: nn.Sequential) -> None:
+    last = layers[-1]
+    assert isinstance(last, nn.Linear)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)

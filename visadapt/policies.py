@@ -1,10 +1,16 @@
-"""Policies: what the last observations and actions say to the next HORIZON actions at once, in [-1, 1]."""
+"""Policies: what the last observations and actions say to the next HORIZON actions at once, in [-1, 1].
+
+A policy may listen to a residual: the correction that the residual expects, were nothing done now, joins the
+policy's features. It is a function of the same observations and actions, so nothing privileged enters; but the
+policy need not learn to see again what grounding has learnt to see, and adapts in far fewer iterations.
+"""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
 
+from visadapt.effects import Residual
 from visadapt.history import LENGTH, History
 from visadapt.networks import FEATURES, FrameEncoder, mlp
 
@@ -13,44 +19,84 @@ HORIZON = 10
 
 
 class Policy(nn.Module):
-    """Base: `forward` plans (B, HORIZON, n_action)."""
+    """Base of policies; subclasses give features, and the layers that turn features and correction into a plan."""
 
-    n_action: int
+    def __init__(self, n_state: int, n_action: int) -> None:
+        super().__init__()
+        self.n_state = n_state
+        self.n_action = n_action
+        self.residual: Residual | None = None
+
+    def features(self, history: History) -> Tensor:
+        """What the policy itself makes of a history, (B, F)."""
+        raise NotImplementedError
+
+    def plan(self, features: Tensor, correction: Tensor) -> Tensor:
+        """Commands (B, HORIZON * n_action) before the last tanh, from features and the correction (B, n_state)."""
+        raise NotImplementedError
+
+    def forward(self, history: History) -> Tensor:
+        """Planned actions (B, HORIZON, n_action)."""
+        out = self.plan(self.features(history), self.correction(history)).tanh()
+        return out.unflatten(-1, (HORIZON, self.n_action))
 
     def act(self, history: History) -> Tensor:
         """The action (B, n_action) to execute now."""
         plan: Tensor = self(history)
         return plan[:, 0]
 
+    def correction(self, history: History) -> Tensor:
+        """What the residual expects if nothing is done, (B, n_state) in units of its scale; 0 without one."""
+        observations = history.observations
+        if self.residual is None:
+            return observations.new_zeros(len(observations), self.n_state)
+        with torch.no_grad():
+            nothing = observations.new_zeros(len(observations), self.n_action)
+            out: Tensor = self.residual.network(history.acting(nothing))
+        return out
+
 
 class ImagePolicy(Policy):
     """A 4-layer CNN on the last 5 frames and 5 actions (the paper, section 3.2.3)."""
 
-    def __init__(self, background: Tensor, contrast: float, n_action: int = 1) -> None:
-        super().__init__()
-        self.n_action = n_action
+    def __init__(self, background: Tensor, contrast: float, n_state: int = 4, n_action: int = 1) -> None:
+        super().__init__(n_state, n_action)
         self.encoder = FrameEncoder(background, contrast, n_action)
-        self.plan = nn.Sequential(nn.Linear(FEATURES, 64), nn.ReLU(), nn.Linear(64, HORIZON * n_action), nn.Tanh())
+        self.hidden = nn.Linear(FEATURES + n_state, 64)
+        self.out = nn.Linear(64, HORIZON * n_action)
+        _deafen(self.hidden, n_state)
 
-    def forward(self, history: History) -> Tensor:
-        out: Tensor = self.plan(self.encoder(history))
-        return out.unflatten(-1, (HORIZON, self.n_action))
+    def features(self, history: History) -> Tensor:
+        out: Tensor = self.encoder(history)
+        return out
+
+    def plan(self, features: Tensor, correction: Tensor) -> Tensor:
+        out: Tensor = self.out(self.hidden(torch.cat((features, correction), 1)).relu())
+        return out
 
 
 class StatePolicy(Policy):
     """The paper's MLP for balancing, 32-64-64-32-10, tanh (A.1.3), on the state, or on 5 states and actions."""
 
     def __init__(self, n_state: int, n_action: int = 1, with_history: bool = False) -> None:
-        super().__init__()
-        self.n_action = n_action
+        super().__init__(n_state, n_action)
         self.with_history = with_history
         inputs = LENGTH * (n_state + n_action) if with_history else n_state
-        self.layers = nn.Sequential(mlp(inputs, 32, 64, 64, 32, HORIZON * n_action), nn.Tanh())
+        self.first = nn.Linear(inputs + n_state, 32)
+        self.rest = mlp(32, 64, 64, 32, HORIZON * n_action)
+        _deafen(self.first, n_state)
 
-    def forward(self, history: History) -> Tensor:
+    def features(self, history: History) -> Tensor:
         if self.with_history:
-            seen = torch.cat((history.observations.flatten(1), history.actions.flatten(1)), 1)
-        else:
-            seen = history.observations[:, -1]
-        out: Tensor = self.layers(seen)
-        return out.unflatten(-1, (HORIZON, self.n_action))
+            return torch.cat((history.observations.flatten(1), history.actions.flatten(1)), 1)
+        return history.observations[:, -1]
+
+    def plan(self, features: Tensor, correction: Tensor) -> Tensor:
+        out: Tensor = self.rest(self.first(torch.cat((features, correction), 1)).tanh())
+        return out
+
+
+def _deafen(layer: nn.Linear, n_state: int) -> None:
+    """Begin with no weight on the correction: a residual changes nothing until the policy is tuned with it."""
+    with torch.no_grad():
+        layer.weight[:, -n_state:] = 0.0

@@ -84,6 +84,11 @@ class World(nn.Module):
         self._dynamics = [effect for effect in effects if isinstance(effect, DynamicsEffect)]
         self._residuals = [effect for effect in effects if isinstance(effect, Residual)]
 
+    @property
+    def has_residual(self) -> bool:
+        """Whether a step needs the history of observations and actions."""
+        return bool(self._residuals)
+
     def start(self, state: Tensor) -> WorldState:
         """The world at the start of an episode in the state (B, n_state)."""
         commands = torch.zeros(

@@ -1,0 +1,222 @@
+"""Policy learning by backpropagation through a world: the inner loop of Algorithm 1 and equation 11.
+
+A batch of simulated streams runs under the policy. At each iteration the policy plans K actions, the world
+(physics, effects, residual, renderer) carries them out, and the gradient of the cost flows back through all of it.
+Then every stream takes the first planned step. A stream that strays further than delta_div from the reference
+starts anew, and delta_div grows as training goes on, so the policy learns to recover from ever further off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from visadapt.checkpoints import load_tree, save_tree
+from visadapt.history import History
+from visadapt.learning.cost import Cost
+from visadapt.learning.windows import Observe, Windows
+from visadapt.policies import Policy
+from visadapt.world import World, WorldState
+
+Progress = Callable[[int, int, float], None]
+"""Called with (iterations done, iterations in all, loss)."""
+
+
+class DivergedError(RuntimeError):
+    """Training left the numbers: the message says where."""
+
+
+@dataclass(frozen=True)
+class TuneSettings:
+    """How a policy is trained in a world."""
+
+    cost: Cost
+    iterations: int
+    batch: int = 64
+    learning_rate: float = 1e-3
+    start_spread: tuple[float, ...] = (0.5, 0.3, 0.15, 0.3)
+    """half-widths of the uniform distribution of states that streams start from"""
+    kick: tuple[float, ...] = (0.0, 0.3, 0.0, 0.5)
+    """standard deviation of a random change of the state, met once in 20 steps: it widens what the policy meets"""
+    diverged: tuple[float, ...] = (1.5, 4.0, 0.5, 10.0)
+    """delta_div at the end of the curriculum: a stream starts anew where a state is beyond it"""
+    first_divergence: float = 0.1
+    """share of `diverged` that the curriculum begins with; it reaches 1 at half of the iterations"""
+    longest: int = 150
+    """steps after which a stream starts anew"""
+    recorded: float = 0.0
+    """share of the starts that are recorded windows of the target, histories and all"""
+    observation_noise: float = 0.01
+    """standard deviation of white noise on what the policy sees"""
+
+
+class Streams:
+    """A batch of simulated episodes in progress."""
+
+    def __init__(self, world: World, observe: Observe, windows: Windows | None, settings: TuneSettings) -> None:
+        self.world = world
+        self.observe = observe
+        self.windows = windows
+        self.settings = settings
+        self.at: WorldState
+        self.history: History
+        self.age: Tensor
+
+    @torch.no_grad()
+    def start(self, generator: torch.Generator) -> None:
+        """Start all streams, at random ages, so that they do not end together."""
+        self.at, self.history = self._fresh(generator)
+        self.age = torch.randint(self.settings.longest, (self.settings.batch,), generator=generator)
+
+    @torch.no_grad()
+    def advance(self, at: WorldState, action: Tensor, progress: float, generator: torch.Generator) -> None:
+        """Take the step to `at` under `action`; restart what strayed. `progress` in [0, 1] drives the curriculum."""
+        settings = self.settings
+        state = at.state
+        kicked = torch.rand(len(state), 1, generator=generator) < 0.05
+        kick = torch.tensor(settings.kick) * torch.randn(state.shape, generator=generator)
+        state = state + (kicked * kick).to(state)
+        self.at = WorldState(at.time, state, at.memory).detach()
+        self.history = self.history.acting(action).observing(self.observe(state)).detach()
+        self.age += 1
+        first = settings.first_divergence
+        limit = (first + (1 - first) * min(1.0, 2 * progress)) * torch.tensor(settings.diverged)
+        keep = (self.age < settings.longest) & (state.abs() <= limit.to(state)).all(1)
+        if not bool(keep.all()):
+            at, history = self._fresh(generator)
+            self.at = self.at.where(keep, at)
+            self.history = self.history.where(keep, history)
+            self.age = torch.where(keep, self.age, 0)
+
+    def _fresh(self, generator: torch.Generator) -> tuple[WorldState, History]:
+        settings = self.settings
+        spread = torch.tensor(settings.start_spread)
+        state = spread * (2 * torch.rand(settings.batch, len(spread), generator=generator) - 1)
+        history = History.start(self.observe(state), len(self.world.system.actions))
+        if self.windows is not None and settings.recorded > 0:
+            from_record = torch.rand(settings.batch, generator=generator) < settings.recorded
+            rows = torch.randint(len(self.windows), (settings.batch,), generator=generator)
+            state = torch.where(from_record[:, None], self.windows.state[rows], state)
+            history = self.windows.history(rows).where(from_record, history)
+        return self.world.start(state), history
+
+
+def tune(
+    policy: Policy,
+    world: World,
+    observe: Observe,
+    settings: TuneSettings,
+    generator: torch.Generator,
+    windows: Windows | None = None,
+    progress: Progress | None = None,
+    checkpoint: Path | None = None,
+) -> list[float]:
+    """Train `policy` in `world`, in place; returns the loss of every iteration.
+
+    Args:
+        observe: what the policy sees of a state; differentiable, it passes the gradient to a residual that looks.
+        windows: recorded starts, where settings.recorded asks for them.
+        checkpoint: where the training state is kept every 100 iterations and taken up again from.
+
+    Raises:
+        DivergedError: the loss is not finite.
+    """
+    world.requires_grad_(False)
+    optimiser = torch.optim.Adam(policy.parameters())
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, settings.learning_rate, total_steps=settings.iterations, pct_start=0.1
+    )
+    streams = Streams(world, observe, windows, settings)
+    losses: list[float] = []
+    if checkpoint is not None and checkpoint.exists():
+        losses = _resume(checkpoint, policy, optimiser, schedule, streams, generator)
+    else:
+        streams.start(generator)
+    policy.train()
+    for iteration in range(len(losses), settings.iterations):
+        noise = settings.observation_noise * torch.randn(streams.history.observations.shape, generator=generator)
+        seen = History(streams.history.observations + noise.to(streams.history.observations), streams.history.actions)
+        plan = policy(seen)
+        states, first = imagine(world, observe, streams.at, streams.history, plan)
+        loss = settings.cost(states, plan, streams.at.state).mean()
+        if not bool(loss.isfinite()):
+            raise DivergedError(f"the policy's loss is {float(loss.detach())} at iteration {iteration}")
+        optimiser.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+        streams.advance(first, plan[:, 0].detach(), iteration / settings.iterations, generator)
+        losses.append(float(loss.detach()))
+        if progress is not None:
+            progress(iteration + 1, settings.iterations, losses[-1])
+        if checkpoint is not None and (iteration + 1) % 100 == 0:
+            _keep(checkpoint, policy, optimiser, schedule, streams, generator, losses)
+    policy.eval()
+    return losses
+
+
+def imagine(
+    world: World, observe: Observe, at: WorldState, history: History, plan: Tensor
+) -> tuple[Tensor, WorldState]:
+    """Carry out a plan (B, K, n_action): the states that follow (B, K, n_state), and the world after the first step."""
+    states = []
+    first = at
+    for k in range(plan.shape[1]):
+        at = world.step(at, plan[:, k], history)
+        states.append(at.state)
+        if k == 0:
+            first = at
+        if world.has_residual and k + 1 < plan.shape[1]:
+            history = history.acting(plan[:, k]).observing(observe(at.state))
+    return torch.stack(states, 1), first
+
+
+def _keep(
+    path: Path,
+    policy: Policy,
+    optimiser: torch.optim.Optimizer,
+    schedule: torch.optim.lr_scheduler.LRScheduler,
+    streams: Streams,
+    generator: torch.Generator,
+    losses: list[float],
+) -> None:
+    tree: dict[str, Any] = {
+        "policy": policy.state_dict(),
+        "optimiser": optimiser.state_dict(),
+        "schedule": schedule.state_dict(),
+        "time": streams.at.time,
+        "state": streams.at.state,
+        "memory": list(streams.at.memory),
+        "observations": streams.history.observations,
+        "actions": streams.history.actions,
+        "age": streams.age,
+        "generator": generator.get_state(),
+        "losses": losses,
+    }
+    save_tree(path, tree)
+
+
+def _resume(
+    path: Path,
+    policy: Policy,
+    optimiser: torch.optim.Optimizer,
+    schedule: torch.optim.lr_scheduler.LRScheduler,
+    streams: Streams,
+    generator: torch.Generator,
+) -> list[float]:
+    tree = load_tree(path)
+    policy.load_state_dict(tree["policy"])
+    optimiser.load_state_dict(tree["optimiser"])
+    schedule.load_state_dict(tree["schedule"])
+    streams.at = WorldState(tree["time"], tree["state"], tuple(tree["memory"]))
+    streams.history = History(tree["observations"], tree["actions"])
+    streams.age = tree["age"]
+    generator.set_state(tree["generator"])
+    losses: list[float] = tree["losses"]
+    return losses
