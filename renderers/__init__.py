@@ -3,5 +3,14 @@
 from renderers.camera import Camera
 from renderers.drawn import DrawnCartPole
 from renderers.learnt import LayeredRenderer, MLPRenderer
+from renderers.weights import RendererError, load_renderer, save_renderer
 
-__all__ = ["Camera", "DrawnCartPole", "LayeredRenderer", "MLPRenderer"]
+__all__ = [
+    "Camera",
+    "DrawnCartPole",
+    "LayeredRenderer",
+    "MLPRenderer",
+    "RendererError",
+    "load_renderer",
+    "save_renderer",
+]

@@ -14,6 +14,7 @@ class MLPRenderer(nn.Module):
 
     def __init__(self, height: int, width: int) -> None:
         super().__init__()
+        self.arguments = {"height": height, "width": width}
         self.size = (height, width)
         self.layers = nn.Sequential(
             nn.Linear(3, 32),
@@ -34,9 +35,11 @@ class MLPRenderer(nn.Module):
 class Layer(nn.Module):
     """A learnt picture, with learnt opacity, that moves rigidly with the cart and may turn with the pole.
 
-    A point p of the frame (px) shows the picture at R(theta) (p - hinge(x)), where hinge(x) = origin + gain x is the
-    learnt camera. The picture has `detail` texels per pixel; `window` is (left, right, top, bottom) in px around the
-    hinge at theta = 0.
+    A point p of the frame (px) shows the picture at R(theta) (p - hinge(x)) + moved, where hinge(x) = origin + gain x
+    is the learnt camera and `moved` how far the origin is from its first guess: a better origin turns the picture
+    about another point but leaves it where it is at theta = 0, or every step of the camera would blur what the picture
+    has learnt so far. The picture has `detail` texels per pixel; `window` is (left, right, top, bottom) in px around
+    the first guess of the hinge at theta = 0.
     """
 
     centre: Tensor
@@ -50,17 +53,17 @@ class Layer(nn.Module):
         self.register_buffer("centre", torch.tensor([(left + right) / 2, (top + bottom) / 2]))
         self.register_buffer("extent", torch.tensor([(right - left) / 2, (bottom - top) / 2]))
         self.shade = nn.Parameter(torch.zeros(1, rows, columns))
-        self.opacity = nn.Parameter(torch.full((1, rows, columns), -1.0))
+        self.opacity = nn.Parameter(torch.full((1, rows, columns), -2.0))
 
-    def forward(self, pixels: Tensor, hinge: Tensor, theta: Tensor) -> Tensor:
+    def forward(self, pixels: Tensor, hinge: Tensor, theta: Tensor, moved: Tensor) -> Tensor:
         """Premultiplied shade and opacity (B, 2, H, W) at pixels (H, W, 3), each (column, row, 1).
 
-        `hinge` (B, 2) is in px, `theta` (B,) in rad.
+        `hinge` (B, 2) and `moved` (2,) are in px, `theta` (B,) in rad.
         """
         sine, cosine = (theta.sin(), theta.cos()) if self.turns else (0 * theta, 0 * theta + 1)
         turn = torch.stack((torch.stack((cosine, sine), -1), torch.stack((-sine, cosine), -1)), 1)
         turn = turn / self.extent[:, None]
-        shift = -(turn @ hinge[..., None])[..., 0] - self.centre / self.extent
+        shift = -(turn @ hinge[..., None])[..., 0] + (moved - self.centre) / self.extent
         # One matrix product maps every pixel of a frame to its place in the picture.
         place = pixels.flatten(0, 1) @ torch.cat((turn, shift[..., None]), -1).transpose(1, 2)
         opacity = self.opacity.sigmoid()
@@ -88,13 +91,25 @@ class LayeredRenderer(nn.Module):
     Frames are sharp at every state because nothing but pictures is stored.
     """
 
+    guess: Tensor
+
     def __init__(
         self, height: int, width: int, column: float, row: float, scale: float, reach: float, detail: float = 2.0
     ) -> None:
         """A first guess of the camera: the hinge at x = 0 in px, px per m; `reach` is the pole's length in m."""
         super().__init__()
+        self.arguments = {
+            "height": height,
+            "width": width,
+            "column": float(column),
+            "row": float(row),
+            "scale": float(scale),
+            "reach": float(reach),
+            "detail": float(detail),
+        }
         length = reach * scale * 1.1
         self.size = (height, width)
+        self.register_buffer("guess", torch.tensor([float(column), float(row)]), persistent=False)
         self.background = nn.Parameter(torch.zeros(height, width))
         self.origin = nn.Parameter(torch.tensor([float(column), float(row)]))
         self.gain = nn.Parameter(torch.tensor([float(scale), 0.0]))
@@ -110,22 +125,23 @@ class LayeredRenderer(nn.Module):
 
     def forward(self, x: Tensor, theta: Tensor) -> Tensor:
         """Frames (B, H, W) of cart positions (B,) in m and pole angles (B,) in rad."""
-        height, width = self.size
+        width = self.size[1]
         columns = torch.arange(width, device=x.device, dtype=x.dtype)
         hinge = self.origin + self.gain * x[:, None]
         frame = self.background.sigmoid().expand(len(x), -1, -1)
+        moved = self.origin - self.guess
         for layer in (self.cart, self.pole):
-            first, last = self._rows(layer, hinge)
+            first, last = self._rows(layer, hinge, moved)
             rows = torch.arange(first, last, device=x.device, dtype=x.dtype)
             grid = torch.meshgrid(columns, rows, indexing="xy")
             pixels = torch.stack((*grid, torch.ones_like(grid[0])), -1)
-            shade, opacity = layer(pixels, hinge, theta + self.tilt).unbind(1)
+            shade, opacity = layer(pixels, hinge, theta + self.tilt, moved).unbind(1)
             band = frame[:, first:last] * (1 - opacity) + shade
             frame = torch.cat((frame[:, :first], band, frame[:, last:]), 1)
         return frame
 
-    def _rows(self, layer: Layer, hinge: Tensor) -> tuple[int, int]:
+    def _rows(self, layer: Layer, hinge: Tensor, moved: Tensor) -> tuple[int, int]:
         """First row, and the one after the last, that a layer can cover: the rest need not be computed."""
-        row = hinge.detach()[:, 1]
-        first = max(0, math.floor(float(row.min()) - layer.radius))
-        return first, max(first, min(self.size[0], math.ceil(float(row.max()) + layer.radius) + 1))
+        row, radius = hinge.detach()[:, 1], layer.radius + float(moved.detach().norm())
+        first = max(0, math.floor(float(row.min()) - radius))
+        return first, max(first, min(self.size[0], math.ceil(float(row.max()) + radius) + 1))

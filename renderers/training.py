@@ -48,4 +48,4 @@ def fit(
         optimiser.step()
         schedule.step()
         if progress is not None:
-            progress(step + 1, steps, float(loss))
+            progress(step + 1, steps, float(loss.detach()))
