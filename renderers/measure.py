@@ -27,7 +27,7 @@ EDGE = 3
 def measure(frames: NDArray[np.uint8] | NDArray[np.floating], scene: DrawnCartPole) -> tuple[Floats, Floats]:
     """Cart positions (B,) in m and pole angles (B,) in rad, seen in frames (B, H, W), uint8 or in [0, 1].
 
-    NaN where no cart is seen, or less than a third of the pole. A cart cut by the frame's edge is placed by its other
+    NaN where no cart is seen, or less than half of the pole. A cart cut by the frame's edge is placed by its other
     edge. The pole must stand above the cart (|theta| < 80 degrees): in front of cart and track little is seen of it,
     and it hides the cart.
     """
@@ -62,6 +62,8 @@ def _cart(frame: Floats, scene: DrawnCartPole) -> float:
     covered = np.where(profile > FAINT, profile, 0.0)
     right = middle - 0.5 + _run(covered[middle:])
     left = middle + 0.5 - _run(covered[middle::-1])
+    if right - left > 2 * (half + EDGE):
+        return math.nan
     if covered[: middle + 1].all() and covered[0] > 0.5:
         return right - half
     if covered[middle:].all() and covered[-1] > 0.5:
@@ -93,7 +95,7 @@ def _pole(frame: Floats, scene: DrawnCartPole, column: float) -> float:
     angle = math.atan2(float((sure * right).sum()), float((sure * up).sum()))
     for _ in range(4):
         reach = _visible(scene, column, angle)
-        if reach < tip / 3:
+        if reach < tip / 2:
             return math.nan
         # Only what lies along the line so far, and only as far out as the frame shows the pole's whole width.
         away, along = _about_line(camera.row, column, angle, rows, columns)

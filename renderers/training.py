@@ -29,17 +29,20 @@ def fit(
         x, theta: (N,) cart positions in m and pole angles in rad.
         frames: (N, H, W) uint8, what a camera showed there.
     """
+    if steps < 3:
+        raise ValueError(f"steps is {steps}, must be at least 3")
+    renderer.start_from(frames)
     if isinstance(renderer, LayeredRenderer):
-        renderer.start_from(frames)
         camera = [renderer.origin, renderer.gain, renderer.tilt]
         known = {id(parameter) for parameter in camera}
         pictures = [parameter for parameter in renderer.parameters() if id(parameter) not in known]
         groups = [{"params": pictures}, {"params": camera[:2]}, {"params": camera[2:]}]
         rates = [0.1, 0.05, 0.003]
     else:
-        groups, rates = [{"params": list(renderer.parameters())}], [2e-3]
-    optimiser = torch.optim.Adam(groups)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rates, total_steps=steps, pct_start=0.2)
+        groups, rates = [{"params": list(renderer.parameters())}], [4e-3]
+    # Fused, since most of a step of the MLP, whose last layer has 3 million weights, would be the optimiser's.
+    optimiser = torch.optim.Adam(groups, fused=True)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rates, total_steps=steps, pct_start=max(0.2, 2 / steps))
     for step in range(steps):
         rows = torch.randint(len(frames), (batch,), generator=generator)
         loss = (renderer(x[rows], theta[rows]) - frames[rows].to(x) / 255).square().mean()
