@@ -1,0 +1,244 @@
+"""States from frames alone: poses by the learnt renderer, velocities by a smoother over the source physics.
+
+What the source leaves out is an unknown load d (a force on the cart, a torque at the pivot), constant over a period
+and drifting from one to the next, and shocks e to the cart that come and go within one (a command that acts late):
+
+    s_{t+1} = f(s_t, a_t; d_t) + q_e e_t    f the source physics; e the force of white noise on the cart, integrated
+    d_{t+1} = d_t + q w_t                   w white; an intensity q for each load
+    y_t     = (x_t, theta_t) + c v_t        v_t ~ N(0, R_t), R_t from the fit of the renderer to frame t
+
+The one-step gap of the smoothed states, s_{t+1} - f(s_t, a_t), is the smoothed load and shock, and stays what
+grounding can learn from. q, q_e and c are those of the largest likelihood (Schweppe 1965, IEEE Trans. Inf. Theory
+11(1)) under a wide prior, which decides where an episode is too short to. A load that changes within a period is
+seen in the places alone, so its part of the velocities stays uncertain. The smoother is the extended Kalman
+filter and the recursion of Rauch, Tung and Striebel (1965, AIAA Journal 3(8)), run again around its own result: the
+Gauss-Newton iteration for the most probable path (Bell 1994, SIAM J. Optim. 4(3)).
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from visadapt.effects import DynamicsEffect
+from visadapt.learning.poses import PoseFinder, Poses
+from visadapt.learning.smoothing import Noise, Path, Problem, likeliest, smooth
+from visadapt.recordings import Episode
+from visadapt.world import World
+
+SHOCK = 0.03
+"""m/s2, the unit of shocks: they are expected to be smaller than what a load drifts by in a period (unit 1 m/s2)."""
+
+SMOOTHINGS = 4
+"""Times that the physics are linearised around the path so far; the noise is fitted in the first two."""
+
+ACCELERATION = 10.0
+"""m/s2 and rad/s2, what a load may do before anything is seen (standard deviation)."""
+
+
+BRIDGED = 10
+"""Rows in a row without a usable frame that the physics may bridge: upright, errors grow by e in about 5 rows."""
+
+
+class TrackingError(ValueError):
+    """Frames from which no states can be estimated; the message is one line."""
+
+
+class TrackingWarning(UserWarning):
+    """Some frames were left out: the renderer does not explain them."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """An episode with the states that its frames tell, and how they were found."""
+
+    episode: Episode
+    """with `state` (T, n_state)"""
+    deviation: NDArray[np.floating]
+    """(T, n_state) standard deviation of the states"""
+    misfit: NDArray[np.floating]
+    """(T,) root mean square of frame less rendered frame, in grey levels of [0, 1]"""
+    explained: NDArray[np.bool_]
+    """(T,) whether the frame was used"""
+
+
+class Tracker:
+    """Estimates states from frames; the grid of rendered poses is made once, for all episodes.
+
+    Args:
+        renderer: learnt, of x (B,) in m and theta (B,) in rad to frames (B, H, W) in [0, 1].
+        world: the source physics, without effects.
+        reach: m, largest |x| at which the cart is looked for; None for the range of the system's table.
+        lean: rad, largest |theta| at which the pole is looked for.
+
+    Raises:
+        TrackingError: a world with effects, which would explain away the gap that is looked for.
+    """
+
+    def __init__(self, renderer: nn.Module, world: World, reach: float | None = None, lean: float = 0.5) -> None:
+        if len(world.effects):
+            raise TrackingError(
+                f"tracking needs the source physics alone, got a world with {len(world.effects)} effects"
+            )
+        system = world.system
+        self.world = world
+        self._seen = [system.index("x"), system.index("theta")]
+        self._rates = [system.index("x_dot"), system.index("theta_dot")]
+        across = system.states[self._seen[0]]
+        self.poses = PoseFinder(renderer, max(-across.low, across.high) if reach is None else reach, lean)
+
+    def track(self, episodes: Sequence[Episode]) -> list[Track]:
+        """Tracks of episodes (frames and actions; states, if any, are not read), with one noise fitted to all.
+
+        Raises:
+            TrackingError: an episode without frames, with frames of another size or a clock of another period, or
+                whose frames the renderer does not explain, most of them or more than `BRIDGED` in a row.
+
+        An episode of one or two rows does not tell a load from a velocity, so its gap comes out as none.
+        """
+        found = [self._see(number, episode) for number, episode in enumerate(episodes)]
+        commands = [torch.as_tensor(episode.action, dtype=torch.float64)[:-1] for episode in episodes]
+        paths = [self._first_guess(poses) for poses in found]
+        noise: Noise | None = None
+        for turn in range(SMOOTHINGS):
+            problems = [self._linearise(*parts) for parts in zip(found, commands, paths, strict=True)]
+            if turn < 2:
+                noise = likeliest(problems, noise)
+            assert noise is not None
+            smoothed = [smooth(problem, noise) for problem in problems]
+            paths = [path.mean for path in smoothed]
+        return [self._track(*parts) for parts in zip(episodes, found, smoothed, strict=True)]
+
+    def _see(self, number: int, episode: Episode) -> Poses:
+        if episode.frame is None:
+            raise TrackingError(f"episode {number} has no frames to estimate states from")
+        height, width = self.poses.size
+        if episode.frame.shape[1:] != (height, width):
+            raise TrackingError(
+                f"episode {number} has frames of {episode.frame.shape[1]} x {episode.frame.shape[2]} "
+                f"(height x width); the renderer draws {height} x {width}"
+            )
+        periods = np.diff(episode.time)
+        if len(periods) and np.abs(periods - self.world.period).max() > 0.01 * self.world.period:
+            worst = float(periods[np.abs(periods - self.world.period).argmax()])
+            raise TrackingError(f"episode {number} has rows {worst:g} s apart; the period is {self.world.period:g} s")
+        poses = self.poses(torch.from_numpy(np.ascontiguousarray(episode.frame)))
+        missed = (~poses.explained).nonzero()[:, 0]
+        if len(missed):
+            first = int(missed[0])
+            line = (
+                f"episode {number}: the renderer does not explain {len(missed)} of {len(poses.misfit)} frames, row "
+                f"{first} the first (misfit {float(poses.misfit[first]):.3f}, at most {self.poses.limit:.3f} is right)"
+            )
+            if 2 * len(missed) > len(poses.misfit) or _longest(~poses.explained) > BRIDGED:
+                raise TrackingError(line)
+            warnings.warn(f"{line}; they were left out", TrackingWarning, stacklevel=3)
+        return poses
+
+    def _first_guess(self, poses: Poses) -> Tensor:
+        """States and loads (T, n_state + n_load): poses as seen, velocities by differences, no load."""
+        system, rows = self.world.system, np.arange(len(poses.place))
+        used = poses.explained.numpy()
+        seen = np.stack([np.interp(rows, rows[used], column[used]) for column in poses.place.numpy().T], 1)
+        guess = torch.zeros(len(rows), len(system.states) + len(system.loads), dtype=torch.float64)
+        guess[:, self._seen] = torch.from_numpy(seen)
+        if len(rows) > 1:
+            guess[:, self._rates] = torch.from_numpy(np.gradient(seen, axis=0) / self.world.period)
+        return guess
+
+    def _linearise(self, poses: Poses, command: Tensor, path: Tensor) -> Problem:
+        """The problem with the physics replaced by their tangents along the path (T, n_state + n_load)."""
+        n = path.shape[1]
+        before = path[:-1].clone().requires_grad_()
+        after = self._step(before, command)
+        # Rows do not know each other, so one sweep back gives an entry's derivatives for all of them.
+        sweeps = [torch.autograd.grad(after[:, k].sum(), before, retain_graph=True)[0] for k in range(n)]
+        transition = torch.stack(sweeps, 1)
+        offset = after.detach() - (transition @ path[:-1, :, None])[..., 0]
+        unit, drift = self._drifts()
+        wide = torch.tensor([(v.high - v.low) / 2 for v in self.world.system.states], dtype=path.dtype)
+        return Problem(
+            transition=transition,
+            offset=offset,
+            observed=self._seen,
+            value=poses.place,
+            noise=poses.covariance,
+            used=poses.explained,
+            drift=drift,
+            start=torch.diag(torch.cat((wide, ACCELERATION * unit)).square()),
+        )
+
+    def _step(self, at: Tensor, command: Tensor) -> Tensor:
+        """One period of the source physics under the loads that the rows (B, n_state + n_load) end with."""
+        source, n = self.world, len(self.world.system.states)
+        load = at[:, n:]
+        world = World(source.system, (_Load(load),), source.period, source.integrator, source.substeps)
+        return torch.cat((world.step(world.start(at[:, :n]), command).state, load), 1)
+
+    def _drifts(self) -> tuple[Tensor, Tensor]:
+        """Loads (n_load,) that accelerate cart and pole, each its own, by 1 m/s2 and 1 rad/s2 in the upright rest.
+
+        And the covariances (n_load + 1, n_state + n_load, n_state + n_load) of state and load after a period in which
+        each of these loads drifted by 1 such unit, and after shocks of `SHOCK` on average over the period.
+        """
+        system, h = self.world.system, self.world.period
+        states, loads = len(system.states), len(system.loads)
+        rest = torch.zeros(loads, states, dtype=torch.float64)
+        nothing = torch.zeros(loads, len(system.actions), dtype=torch.float64)
+        newtons = torch.eye(loads, dtype=torch.float64)
+        change = system.derivative(rest, nothing, newtons) - system.derivative(rest, nothing, 0 * newtons)
+        unit = 1 / change[:, self._rates].diagonal().abs()
+        drift = torch.zeros(loads + 1, states + loads, states + loads, dtype=torch.float64)
+        for k in range(loads):
+            drift[k, states + k, states + k] = unit[k].square()
+        # Velocity and place after white acceleration of variance 1 / h (Bar-Shalom, Li and Kirubarajan 2001, section
+        # 6.2.2): their common part, and the part of the place that depends on when in the period it came.
+        pushed = SHOCK * unit[0] * change[0, self._rates]
+        both, late = torch.zeros(2, states + loads, dtype=torch.float64)
+        both[self._rates], both[self._seen], late[self._seen] = pushed * h, pushed * h**2 / 2, pushed * h**2 / 12**0.5
+        drift[-1] = both.outer(both) + late.outer(late)
+        return unit, drift
+
+    def _track(self, episode: Episode, poses: Poses, path: Path) -> Track:
+        n = len(self.world.system.states)
+        kind = episode.action.dtype
+        deviation = path.covariance.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()
+        return Track(
+            episode=replace(episode, state=path.mean[:, :n].numpy().astype(kind)),
+            deviation=deviation[:, :n].numpy().astype(kind),
+            misfit=poses.misfit.numpy(),
+            explained=poses.explained.numpy(),
+        )
+
+
+def estimate_states(
+    episode: Episode, renderer: nn.Module, world: World, reach: float | None = None, lean: float = 0.5
+) -> Episode:
+    """The episode with the states that its frames tell; for several episodes a `Tracker` is faster and does better.
+
+    Arguments and errors are those of `Tracker` and its `track`.
+    """
+    return Tracker(renderer, world, reach, lean).track([episode])[0].episode
+
+
+def _longest(missed: Tensor) -> int:
+    """Most rows (T,) missed one after the other."""
+    used = torch.cat((torch.tensor([-1]), (~missed).nonzero()[:, 0], torch.tensor([len(missed)])))
+    return int(used.diff().max()) - 1
+
+
+class _Load(DynamicsEffect):
+    """A load for each row (B, n_load). It has no name, so that it is in no catalogue."""
+
+    def __init__(self, rows: Tensor) -> None:
+        super().__init__()
+        self.rows = rows
+
+    def load(self, time: Tensor, state: Tensor) -> Tensor:
+        return self.rows
