@@ -172,7 +172,10 @@ def picture(
 
 def main(settings: Settings) -> None:
     """Train, and say where the files are."""
-    train(settings)
+    try:
+        train(settings)
+    except (ValueError, OSError) as error:
+        raise SystemExit(str(error)) from error
     for kind in settings.kinds:
         print(settings.out / FILES[kind])
 
