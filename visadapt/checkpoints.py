@@ -64,6 +64,23 @@ def load_weights(module: nn.Module, weights: Mapping[str, Tensor], origin: Path)
     module.load_state_dict(dict(weights))
 
 
+def save_network(path: Path, network: nn.Module, settings: Mapping[str, Any]) -> None:
+    """Write a network's weights and buffers (its normalisers among them) with the settings it was trained under."""
+    save_tree(path, {"class": type(network).__name__, "settings": dict(settings), "weights": network.state_dict()})
+
+
+def load_network(path: Path, network: nn.Module) -> dict[str, Any]:
+    """Load what `save_network` wrote into a network of the same class; returns the settings."""
+    tree = load_tree(path)
+    if not isinstance(tree, dict) or tree.keys() != {"class", "settings", "weights"}:
+        raise CheckpointError(f"{path}: a checkpoint, but not of a network")
+    if tree["class"] != type(network).__name__:
+        raise CheckpointError(f"{path}: holds a {tree['class']}, a {type(network).__name__} is needed")
+    load_weights(network, tree["weights"], path)
+    settings: dict[str, Any] = tree["settings"]
+    return settings
+
+
 def _strip(node: Any, tensors: dict[str, Tensor]) -> Any:
     if isinstance(node, Tensor):
         name = str(len(tensors))

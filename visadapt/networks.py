@@ -13,6 +13,8 @@ from visadapt.history import LENGTH, History
 CHANNELS = (8, 16, 32, 32)
 FEATURES = 128
 CHANGE_GAIN = 2.0
+KINEMATICS = 2 * LENGTH
+"""The latest position and its LENGTH - 1 changes, for each of the two things that move: cart and pole."""
 
 
 class FrameEncoder(nn.Module):
@@ -31,13 +33,15 @@ class FrameEncoder(nn.Module):
 
     def __init__(self, background: Tensor, contrast: float, n_action: int) -> None:
         super().__init__()
+        self.n_action = n_action
         self.register_buffer("background", background.clone())
         self.register_buffer("contrast", torch.as_tensor(contrast, dtype=background.dtype))
         layers = [nn.Conv2d(i, o, 3, stride=2, padding=1) for i, o in pairwise((LENGTH, *CHANNELS))]
-        self.convolutions = nn.ModuleList(layers).to(memory_format=torch.channels_last)
+        self.convolutions = nn.ModuleList(layers).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         rows, columns = (-(-size // 2 ** len(layers)) for size in background.shape)
         width = CHANNELS[-1] * rows * columns
         self.join = nn.Sequential(nn.Linear(width + LENGTH * n_action, FEATURES), nn.ReLU())
+        self.readout = nn.Linear(FEATURES, KINEMATICS)
 
     def forward(self, history: History) -> Tensor:
         """Features (B, FEATURES) of frames (B, LENGTH, H, W) in [0, 1] and actions (B, LENGTH, n_action)."""
@@ -51,6 +55,11 @@ class FrameEncoder(nn.Module):
         for convolution in self.convolutions[1:]:
             seen = convolution(seen).relu()
         return self.join(torch.cat((seen.flatten(1), history.actions.flatten(1)), 1))
+
+    def kinematics(self, history: History) -> Tensor:
+        """Positions and angles seen, (B, KINEMATICS), in units of `learning.perception.Paths.scale`."""
+        out: Tensor = self.readout(self(history))
+        return out
 
     def _first(self, frames: Tensor) -> Tensor:
         """The first convolution, of the latest frame less the background and twice the differences of neighbours.
@@ -76,18 +85,26 @@ def mlp(*widths: int) -> nn.Sequential:
 
 
 class ImageResidualNetwork(nn.Module):
-    """A 4-layer CNN on the last 5 frames and 5 actions (the paper, section 3.2.3). It begins at zero."""
+    """A 4-layer CNN on the last 5 frames and 5 actions (the paper, section 3.2.3). It begins at zero.
+
+    Between the convolutions and the output stand the positions and angles that the frames show, read as
+    `learning.perception` taught it in the source: a few hundred samples are too few to learn to see as well.
+    """
 
     def __init__(self, background: Tensor, contrast: float, n_state: int, n_action: int = 1) -> None:
         super().__init__()
         self.encoder = FrameEncoder(background, contrast, n_action)
-        self.head = nn.Sequential(nn.Linear(FEATURES, 64), nn.ReLU(), nn.Linear(64, n_state))
+        self.head = mlp(KINEMATICS + LENGTH * n_action, 64, 64, n_state)
         _begin_at_zero(self.head)
 
     def forward(self, history: History) -> Tensor:
         """Corrections (B, n_state) in units of the residual's scale."""
-        out: Tensor = self.head(self.encoder(history))
+        out: Tensor = self.head(self.embed(history))
         return out
+
+    def embed(self, history: History) -> Tensor:
+        """What the head reads, (B, KINEMATICS + LENGTH * n_action)."""
+        return torch.cat((self.encoder.kinematics(history), history.actions.flatten(1)), 1)
 
 
 class StateResidualNetwork(nn.Module):
@@ -96,16 +113,20 @@ class StateResidualNetwork(nn.Module):
     def __init__(self, n_state: int, n_action: int = 1, with_history: bool = False) -> None:
         super().__init__()
         self.with_history = with_history
-        self.layers = mlp((LENGTH if with_history else 1) * (n_state + n_action), 64, 64, n_state)
-        _begin_at_zero(self.layers)
+        self.head = mlp((LENGTH if with_history else 1) * (n_state + n_action), 64, 64, n_state)
+        _begin_at_zero(self.head)
 
     def forward(self, history: History) -> Tensor:
         """Corrections (B, n_state) in units of the residual's scale."""
+        out: Tensor = self.head(self.embed(history))
+        return out
+
+    def embed(self, history: History) -> Tensor:
+        """What the head reads: states and actions, (B, inputs)."""
         states, actions = history.observations, history.actions
         if not self.with_history:
             states, actions = states[:, -1:], actions[:, -1:]
-        out: Tensor = self.layers(torch.cat((states.flatten(1), actions.flatten(1)), 1))
-        return out
+        return torch.cat((states.flatten(1), actions.flatten(1)), 1)
 
 
 def _begin_at_zero(layers: nn.Sequential) -> None:

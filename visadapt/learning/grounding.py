@@ -1,4 +1,8 @@
-"""Grounding: the residual learns what the source leaves out (equation 10)."""
+"""Grounding: the residual learns what the source leaves out (equation 10).
+
+What the residual's network has learnt to see beforehand stays as it is; its head is fitted, from where the last
+round left it, to all samples so far.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +25,16 @@ Progress = Callable[[int, int, float], None]
 class GroundSettings:
     """How a residual is fitted."""
 
-    steps: int = 600
+    steps: int = 2000
     """optimisation steps at most"""
     batch: int = 64
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     weight_decay: float = 1e-2
     held_out: float = 0.2
     """share of the samples, whole stretches of time, that only choose when to stop"""
     every: int = 25
     """steps between looks at the held-out samples"""
-    patience: int = 8
+    patience: int = 12
     """looks without a better held-out loss before stopping"""
 
 
@@ -61,37 +65,44 @@ def ground(
     target = gap(source, windows)
     residual.scale.copy_(target.square().mean(0).sqrt().clamp(min=1e-9))
     target = target / residual.scale
+    network = residual.network
+    seen = _embed(residual, windows)
     train, held_out = split(len(windows), settings.held_out, generator)
-    parameters = [parameter for parameter in residual.network.parameters()]
-    for parameter in parameters:
-        parameter.requires_grad_(True)
-    optimiser = torch.optim.AdamW(parameters, settings.learning_rate, weight_decay=settings.weight_decay)
-    best, best_weights, waited = float("inf"), copy.deepcopy(residual.network.state_dict()), 0
+    network.head.requires_grad_(True)
+    optimiser = torch.optim.AdamW(network.head.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
+    best, best_weights, waited = float("inf"), copy.deepcopy(network.head.state_dict()), 0
     losses: list[GroundLoss] = []
     running = 0.0
     for step in range(settings.steps + 1):
         if step % settings.every == 0:
-            score = _loss(residual, windows, target, held_out)
+            with torch.no_grad():
+                score = float((network.head(seen[held_out]) - target[held_out]).square().mean())
             losses.append(GroundLoss(step, running / settings.every if step else score, score))
             running = 0.0
             if progress is not None:
                 progress(step, settings.steps, score)
             if score < best:
-                best, best_weights, waited = score, copy.deepcopy(residual.network.state_dict()), 0
+                best, best_weights, waited = score, copy.deepcopy(network.head.state_dict()), 0
             else:
                 waited += 1
             if waited > settings.patience or step == settings.steps:
                 break
         rows = train[torch.randint(len(train), (settings.batch,), generator=generator)]
-        loss = _error(residual, windows, target, rows)
+        loss = (network.head(seen[rows]) - target[rows]).square().mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         running += float(loss.detach())
-    residual.network.load_state_dict(best_weights)
-    for parameter in parameters:
-        parameter.requires_grad_(False)
+    network.head.load_state_dict(best_weights)
+    network.head.requires_grad_(False)
     return losses
+
+
+@torch.no_grad()
+def _embed(residual: Residual, windows: Windows) -> Tensor:
+    """What the head reads in every window, (N, ...)."""
+    parts = torch.arange(len(windows)).split(256)
+    return torch.cat([residual.network.embed(windows.history(p).acting(windows.action[p])) for p in parts])
 
 
 def split(count: int, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -106,14 +117,3 @@ def split(count: int, share: float, generator: torch.Generator) -> tuple[Tensor,
         torch.cat([stretches[int(k)] for k in order[held:]]),
         torch.cat([stretches[int(k)] for k in order[:held]]),
     )
-
-
-def _error(residual: Residual, windows: Windows, target: Tensor, rows: Tensor) -> Tensor:
-    out: Tensor = residual.network(windows.history(rows).acting(windows.action[rows]))
-    return (out - target[rows]).square().mean()
-
-
-@torch.no_grad()
-def _loss(residual: Residual, windows: Windows, target: Tensor, rows: Tensor) -> float:
-    parts = [_error(residual, windows, target, part) * len(part) for part in rows.split(256)]
-    return float(torch.stack(parts).sum() / len(rows))

@@ -16,9 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from visadapt.checkpoints import load_tree, save_tree
 from visadapt.history import History
 from visadapt.learning.cost import Cost
+from visadapt.learning.resume import EVERY, Training
 from visadapt.learning.windows import Observe, Windows
 from visadapt.policies import Policy
 from visadapt.world import World, WorldState
@@ -93,6 +93,23 @@ class Streams:
             self.history = self.history.where(keep, history)
             self.age = torch.where(keep, self.age, 0)
 
+    def kept(self) -> dict[str, Any]:
+        """All that `restore` needs."""
+        return {
+            "time": self.at.time,
+            "state": self.at.state,
+            "memory": list(self.at.memory),
+            "observations": self.history.observations,
+            "actions": self.history.actions,
+            "age": self.age,
+        }
+
+    def restore(self, kept: dict[str, Any]) -> None:
+        """Go on from what `kept` gave."""
+        self.at = WorldState(kept["time"], kept["state"], tuple(kept["memory"]))
+        self.history = History(kept["observations"], kept["actions"])
+        self.age = kept["age"]
+
     def _fresh(self, generator: torch.Generator) -> tuple[WorldState, History]:
         settings = self.settings
         spread = torch.tensor(settings.start_spread)
@@ -121,7 +138,7 @@ def tune(
     Args:
         observe: what the policy sees of a state; differentiable, it passes the gradient to a residual that looks.
         windows: recorded starts, where settings.recorded asks for them.
-        checkpoint: where the training state is kept every 100 iterations and taken up again from.
+        checkpoint: where the training state is kept now and then and taken up again from.
 
     Raises:
         DivergedError: the loss is not finite.
@@ -131,10 +148,12 @@ def tune(
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, settings.learning_rate, total_steps=settings.iterations, pct_start=0.1
     )
+    training = Training(policy, optimiser, schedule, generator)
     streams = Streams(world, observe, windows, settings)
     losses: list[float] = []
     if checkpoint is not None and checkpoint.exists():
-        losses = _resume(checkpoint, policy, optimiser, schedule, streams, generator)
+        losses, kept = training.resume(checkpoint)
+        streams.restore(kept)
     else:
         streams.start(generator)
     policy.train()
@@ -155,8 +174,8 @@ def tune(
         losses.append(float(loss.detach()))
         if progress is not None:
             progress(iteration + 1, settings.iterations, losses[-1])
-        if checkpoint is not None and (iteration + 1) % 100 == 0:
-            _keep(checkpoint, policy, optimiser, schedule, streams, generator, losses)
+        if checkpoint is not None and (iteration + 1) % EVERY == 0:
+            training.keep(checkpoint, losses, streams.kept())
     policy.eval()
     return losses
 
@@ -176,47 +195,3 @@ def imagine(
             history = history.acting(plan[:, k]).observing(observe(at.state))
     return torch.stack(states, 1), first
 
-
-def _keep(
-    path: Path,
-    policy: Policy,
-    optimiser: torch.optim.Optimizer,
-    schedule: torch.optim.lr_scheduler.LRScheduler,
-    streams: Streams,
-    generator: torch.Generator,
-    losses: list[float],
-) -> None:
-    tree: dict[str, Any] = {
-        "policy": policy.state_dict(),
-        "optimiser": optimiser.state_dict(),
-        "schedule": schedule.state_dict(),
-        "time": streams.at.time,
-        "state": streams.at.state,
-        "memory": list(streams.at.memory),
-        "observations": streams.history.observations,
-        "actions": streams.history.actions,
-        "age": streams.age,
-        "generator": generator.get_state(),
-        "losses": losses,
-    }
-    save_tree(path, tree)
-
-
-def _resume(
-    path: Path,
-    policy: Policy,
-    optimiser: torch.optim.Optimizer,
-    schedule: torch.optim.lr_scheduler.LRScheduler,
-    streams: Streams,
-    generator: torch.Generator,
-) -> list[float]:
-    tree = load_tree(path)
-    policy.load_state_dict(tree["policy"])
-    optimiser.load_state_dict(tree["optimiser"])
-    schedule.load_state_dict(tree["schedule"])
-    streams.at = WorldState(tree["time"], tree["state"], tuple(tree["memory"]))
-    streams.history = History(tree["observations"], tree["actions"])
-    streams.age = tree["age"]
-    generator.set_state(tree["generator"])
-    losses: list[float] = tree["losses"]
-    return losses

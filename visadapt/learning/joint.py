@@ -1,0 +1,202 @@
+"""Joint learning of residual and policy: Algorithm 1 of the paper, round after round.
+
+Each round executes the policy in the target for B counted samples, grounds the residual on all samples so far, and
+tunes the policy by backpropagation through renderer, residual and physics. Every stage of a round leaves one file,
+under its final name only once it is whole; an interrupted run goes on after the last whole stage.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from visadapt.checkpoints import load_tree, load_weights, save_tree
+from visadapt.console import Report, staged
+from visadapt.effects import Residual
+from visadapt.learning.grounding import GroundLoss, GroundSettings, ground
+from visadapt.learning.ledger import Ledger
+from visadapt.learning.policy import TuneSettings, tune
+from visadapt.learning.windows import Observe, Windows
+from visadapt.policies import Policy
+from visadapt.recordings import Episode, read_recording, write_recording
+from visadapt.rollout import See, run
+from visadapt.targets import Target, TargetError
+from visadapt.world import World
+
+Label = Callable[[Episode], Episode]
+"""Gives an episode the states that grounding learns from; see `AdaptSettings`."""
+
+
+@dataclass(frozen=True)
+class AdaptSettings:
+    """How a policy is adapted to a target."""
+
+    tune: TuneSettings
+    ground: GroundSettings
+    budget: int = 1000
+    """N: target samples in all"""
+    round_samples: int = 200
+    """B: target samples in a round"""
+    observations: str = "camera"
+    """what grounding shows the residual: one of `windows.SOURCES`"""
+    longest_episode: int = 250
+    """steps"""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.round_samples < 1:
+            raise ValueError(f"a round needs at least 1 sample, got B = {self.round_samples}")
+        if self.budget < self.round_samples:
+            raise ValueError(
+                f"the budget N = {self.budget} is smaller than a round of B = {self.round_samples} samples: "
+                "raise N or lower B"
+            )
+
+    @property
+    def rounds(self) -> int:
+        """ceil(N / B)"""
+        return math.ceil(self.budget / self.round_samples)
+
+
+@dataclass(frozen=True)
+class Round:
+    """What a round did: its losses over optimisation steps, and the samples counted when it began to learn."""
+
+    samples: int
+    grounding: list[tuple[int, float, float]]
+    """(step, training loss, held-out loss)"""
+    policy: list[float]
+    """loss by iteration"""
+
+
+@dataclass(frozen=True)
+class Adapted:
+    """The outcome of `adapt`; policy and residual were changed in place."""
+
+    ledger: Ledger
+    rounds: list[Round]
+    episodes: list[Episode]
+
+
+def adapt(
+    policy: Policy,
+    residual: Residual,
+    source: World,
+    target: Target,
+    observe: Observe,
+    see: See,
+    settings: AdaptSettings,
+    folder: Path,
+    label: Label | None = None,
+    report: Report | None = None,
+) -> Adapted:
+    """Run Algorithm 1 in `folder`, going on from what is there.
+
+    Args:
+        policy, residual: the networks, changed in place; the policy listens to the residual.
+        source: the physics known beforehand.
+        observe: what a camera would show of a simulated state: the learnt renderer, or the identity.
+        see: what the policy is shown of the target.
+        label: estimates the states of an episode from what a camera saw; without it, the target's own are used.
+
+    Raises:
+        TargetError: the target misbehaves. BudgetExceeded: a step more than the budget.
+        CheckpointError: `folder` holds a run of other networks.
+    """
+    grounded = World(source.system, [residual], source.period, source.integrator, source.substeps)
+    policy.residual = residual
+    ledger = Ledger(settings.budget)
+    episodes: list[Episode] = []
+    rounds: list[Round] = []
+    for number in range(settings.rounds):
+        here = folder / f"round-{number + 1:02d}"
+        name = f"round {number + 1}/{settings.rounds}"
+        wanted = min(settings.round_samples, ledger.left)
+        new = _collected(here / "recording.h5", policy, target, see, wanted, settings, _generator(settings, number, 0))
+        for episode in new:
+            ledger.count(f"{name}: data", episode.samples)
+        episodes += [label(episode) for episode in new] if label is not None else new
+        windows = Windows.cut(episodes, settings.observations, observe)
+        grounding = _grounded(
+            here / "residual.safetensors",
+            lambda progress, w=windows, n=number: ground(  # type: ignore[misc]
+                residual, source, w, settings.ground, _generator(settings, n, 1), progress
+            ),
+            residual,
+            staged(report, f"{name}: ground"),
+        )
+        losses = _tuned(here, policy, grounded, observe, settings, windows, number, staged(report, f"{name}: tune"))
+        rounds.append(Round(ledger.used, grounding, losses))
+    return Adapted(ledger, rounds, episodes)
+
+
+def _generator(settings: AdaptSettings, number: int, stage: int) -> torch.Generator:
+    """Each stage draws from its own stream, so that a resumed run draws the same."""
+    return torch.Generator().manual_seed(1_000_000 * settings.seed + 10 * number + stage)
+
+
+def _collected(
+    path: Path,
+    policy: Policy,
+    target: Target,
+    see: See,
+    wanted: int,
+    settings: AdaptSettings,
+    generator: torch.Generator,
+) -> list[Episode]:
+    """Episodes of `wanted` samples under the current policy, one after the other as on a machine."""
+    if path.exists():
+        return read_recording(path)
+    episodes: list[Episode] = []
+    left = wanted
+    while left > 0:
+        episode = run(target, policy, see, 1, min(left, settings.longest_episode), generator)[0].episode
+        if episode.samples == 0:
+            raise TargetError(f"{target.name}: the episode is over before its first step")
+        episodes.append(episode)
+        left -= episode.samples
+    write_recording(path, episodes)
+    return episodes
+
+
+def _grounded(
+    path: Path,
+    fit: Callable[[Callable[[int, int, float], None] | None], list[GroundLoss]],
+    residual: Residual,
+    progress: Callable[[int, int, float], None] | None,
+) -> list[tuple[int, float, float]]:
+    if path.exists():
+        tree = load_tree(path)
+        load_weights(residual, tree["weights"], path)
+        return [(int(step), float(train), float(held)) for step, train, held in tree["losses"]]
+    losses = [(loss.step, loss.train, loss.held_out) for loss in fit(progress)]
+    save_tree(path, {"weights": residual.state_dict(), "losses": losses})
+    return losses
+
+
+def _tuned(
+    here: Path,
+    policy: Policy,
+    grounded: World,
+    observe: Observe,
+    settings: AdaptSettings,
+    windows: Windows,
+    number: int,
+    progress: Callable[[int, int, float], None] | None,
+) -> list[float]:
+    path, partial = here / "policy.safetensors", here / "policy.partial.safetensors"
+    if path.exists():
+        tree = load_tree(path)
+        load_weights(policy, tree["weights"], path)
+        losses: list[float] = tree["losses"]
+        return losses
+    generator = _generator(settings, number, 2)
+    losses = tune(policy, grounded, observe, settings.tune, generator, windows, progress, partial)
+    save_tree(path, {"weights": policy.state_dict(), "losses": losses})
+    partial.unlink(missing_ok=True)
+    return losses
+

@@ -1,0 +1,119 @@
+"""Learning to see: a frame encoder is taught, in the source alone, where cart and pole are and how they moved.
+
+Windows of frames are rendered along random smooth paths that obey no dynamics at all, so nothing about any target
+and nothing about any force is learnt here: only kinematics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from visadapt.history import LENGTH, History
+from visadapt.learning.resume import EVERY, Training
+from visadapt.networks import FrameEncoder
+
+Progress = Callable[[int, int, float], None]
+"""Called with (iterations done, iterations in all, loss)."""
+
+
+@dataclass(frozen=True)
+class Paths:
+    """The distribution of random paths of one coordinate, and the units that its estimates are given in.
+
+    Uniform position; normal velocity; at every period a new normal acceleration.
+    """
+
+    reach: float
+    """half-width of the first position"""
+    velocity: float
+    """standard deviation, per s"""
+    acceleration: float
+    """standard deviation, per s2"""
+
+    def draw(self, batch: int, length: int, period: float, generator: torch.Generator) -> Tensor:
+        """Positions (batch, length), `period` s apart."""
+        start = self.reach * (2 * torch.rand(batch, 1, generator=generator) - 1)
+        velocity = self.velocity * torch.randn(batch, 1, generator=generator)
+        pushes = self.acceleration * torch.randn(batch, length - 1, generator=generator)
+        gained = period * pushes
+        before = velocity + gained.cumsum(1) - gained
+        return torch.cat((start, start + (period * before + period**2 / 2 * pushes).cumsum(1)), 1)
+
+    def scale(self, period: float) -> Tensor:
+        """(LENGTH,) typical size of the position and of its changes per period."""
+        return torch.tensor([self.reach / 2] + [self.velocity * period] * (LENGTH - 1))
+
+
+@dataclass(frozen=True)
+class PerceptionSettings:
+    """How an encoder learns to see."""
+
+    iterations: int = 4000
+    streams: int = 32
+    """paths rendered in an iteration"""
+    length: int = 8
+    """frames of a path; each gives length - 4 windows"""
+    learning_rate: float = 2e-3
+    pixel_noise: float = 0.004
+    """standard deviation of white noise on the frames"""
+    cart: Paths = Paths(reach=1.3, velocity=0.4, acceleration=2.0)
+    pole: Paths = Paths(reach=0.2, velocity=0.4, acceleration=4.0)
+
+
+def kinematics(positions: Tensor) -> Tensor:
+    """The latest of positions (..., LENGTH), and their changes, (..., LENGTH)."""
+    return torch.cat((positions[..., -1:], positions.diff(dim=-1)), -1)
+
+
+def learn_to_see(
+    encoder: FrameEncoder,
+    render: Callable[[Tensor, Tensor], Tensor],
+    period: float,
+    settings: PerceptionSettings,
+    generator: torch.Generator,
+    progress: Progress | None = None,
+    checkpoint: Path | None = None,
+) -> list[float]:
+    """Teach `encoder`, in place, to read positions and changes from 5 rendered frames; returns the losses.
+
+    The loss weighs, beside positions and changes, the changes of changes: a force shows in them alone.
+    """
+    optimiser = torch.optim.AdamW(encoder.parameters(), weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, settings.learning_rate, total_steps=settings.iterations, pct_start=0.1
+    )
+    scale = torch.cat((settings.cart.scale(period), settings.pole.scale(period)))
+    training = Training(encoder, optimiser, schedule, generator)
+    losses: list[float] = []
+    if checkpoint is not None and checkpoint.exists():
+        losses, _ = training.resume(checkpoint)
+    for iteration in range(len(losses), settings.iterations):
+        paths = [
+            coordinate.draw(settings.streams, settings.length, period, generator)
+            for coordinate in (settings.cart, settings.pole)
+        ]
+        with torch.no_grad():
+            frames = render(paths[0].flatten(), paths[1].flatten()).unflatten(0, paths[0].shape)
+            frames = frames + settings.pixel_noise * torch.randn(frames.shape, generator=generator)
+        windows = frames.unfold(1, LENGTH, 1).permute(0, 1, 4, 2, 3).flatten(0, 1)
+        truth = torch.cat([kinematics(path.unfold(1, LENGTH, 1).flatten(0, 1)) for path in paths], 1) / scale
+        actions = torch.zeros(len(windows), LENGTH, encoder.n_action)
+        error = encoder.kinematics(History(windows, actions)) - truth
+        bends = torch.cat([error[:, 1:LENGTH].diff(dim=1), error[:, LENGTH + 1 :].diff(dim=1)], 1)
+        loss = error.square().mean() + 8 * bends.square().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(encoder.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+        losses.append(float(loss.detach()))
+        if progress is not None:
+            progress(iteration + 1, settings.iterations, losses[-1])
+        if checkpoint is not None and (iteration + 1) % EVERY == 0:
+            training.keep(checkpoint, losses, {})
+    return losses

@@ -1,0 +1,158 @@
+"""Control from pixels: the pieces of one task put together, pretraining in the source, adaptation to a target."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from renderers import LayeredRenderer
+from visadapt.checkpoints import load_network, save_network
+from visadapt.console import Report, staged
+from visadapt.effects import Residual
+from visadapt.learning.cost import CENTRED_CARTPOLE
+from visadapt.learning.grounding import GroundSettings
+from visadapt.learning.joint import Adapted, AdaptSettings, Label, adapt
+from visadapt.learning.perception import PerceptionSettings, learn_to_see
+from visadapt.learning.policy import TuneSettings, tune
+from visadapt.networks import FrameEncoder, ImageResidualNetwork
+from visadapt.policies import ImagePolicy
+from visadapt.rollout import see_frames
+from visadapt.targets import Target
+from visadapt.world import World
+
+CONTRAST = 0.2
+"""Grey levels, of 1, that frames are divided by before the networks see them."""
+
+
+@dataclass(frozen=True)
+class PixelSettings:
+    """How a task from pixels is trained; defaults are the CartPole's."""
+
+    perception: PerceptionSettings = field(default_factory=PerceptionSettings)
+    source: TuneSettings = field(default_factory=lambda: TuneSettings(CENTRED_CARTPOLE, iterations=2500))
+    """the policy in the source"""
+    adapted: TuneSettings = field(
+        default_factory=lambda: TuneSettings(
+            CENTRED_CARTPOLE,
+            iterations=150,
+            batch=32,
+            learning_rate=5e-4,
+            start_spread=(0.3, 0.1, 0.1, 0.1),
+            # A kick would look like a force to the residual, which would go on pushing.
+            kick=(0.0, 0.0, 0.0, 0.0),
+            longest=25,
+            recorded=0.8,
+        )
+    )
+    """the policy in the grounded source, in each round"""
+    ground: GroundSettings = field(default_factory=GroundSettings)
+
+
+class PixelTask:
+    """A source world and a renderer of its states, with the networks that see through it.
+
+    Args:
+        source: the physics known beforehand; its states begin with x, x_dot, theta, theta_dot.
+        renderer: states to frames, trained.
+    """
+
+    def __init__(self, source: World, renderer: LayeredRenderer, settings: PixelSettings | None = None) -> None:
+        self.source = source
+        self.renderer = renderer.requires_grad_(False).eval()
+        self.settings = settings or PixelSettings()
+        self.background = renderer.background.sigmoid().detach()
+
+    def observe(self, state: Tensor) -> Tensor:
+        """What the camera would show of simulated states: frames (B, H, W) in [0, 1]."""
+        frame: Tensor = self.renderer(state[:, 0], state[:, 2])
+        return frame
+
+    def encoder(self) -> FrameEncoder:
+        """A new encoder."""
+        return FrameEncoder(self.background, CONTRAST, n_action=1)
+
+    def policy(self) -> ImagePolicy:
+        """A new policy."""
+        return ImagePolicy(self.background, CONTRAST)
+
+    def residual(self, encoder: FrameEncoder) -> Residual:
+        """A new residual that sees as `encoder` does, and begins at zero."""
+        network = ImageResidualNetwork(self.background, CONTRAST, n_state=4)
+        network.encoder.load_state_dict(encoder.state_dict())
+        return Residual(network, torch.ones(4))
+
+    def pretrain(self, folder: Path, seed: int, report: Report | None = None) -> tuple[FrameEncoder, ImagePolicy]:
+        """Train encoder and policy in the source alone, in `folder`, going on from what is there."""
+        torch.manual_seed(seed)
+        encoder, policy = self.encoder(), self.policy()
+        seen = folder / "encoder.safetensors"
+        if seen.exists():
+            load_network(seen, encoder)
+        else:
+            settings, generator = self.settings.perception, torch.Generator().manual_seed(seed)
+            partial = folder / "encoder.partial.safetensors"
+            learn_to_see(
+                encoder, self.renderer, self.source.period, settings, generator, staged(report, "perception"), partial
+            )
+            save_network(seen, encoder, {"seed": seed, **asdict(settings)})
+            partial.unlink(missing_ok=True)
+        learnt = folder / "policy.safetensors"
+        if learnt.exists():
+            load_network(learnt, policy)
+        else:
+            policy.encoder.load_state_dict(encoder.state_dict())
+            generator = torch.Generator().manual_seed(seed + 1)
+            partial = folder / "policy.partial.safetensors"
+            tune(
+                policy,
+                self.source,
+                self.observe,
+                self.settings.source,
+                generator,
+                progress=staged(report, "source policy"),
+                checkpoint=partial,
+            )
+            save_network(learnt, policy, {"seed": seed, **asdict(self.settings.source)})
+            partial.unlink(missing_ok=True)
+        return encoder, policy
+
+    def load(self, folder: Path) -> tuple[FrameEncoder, ImagePolicy]:
+        """Encoder and policy that `pretrain` left in `folder`; raises CheckpointError where they do not fit."""
+        encoder, policy = self.encoder(), self.policy()
+        load_network(folder / "encoder.safetensors", encoder)
+        load_network(folder / "policy.safetensors", policy)
+        return encoder, policy
+
+    def adapt(
+        self,
+        policy: ImagePolicy,
+        encoder: FrameEncoder,
+        target: Target,
+        folder: Path,
+        budget: int,
+        round_samples: int,
+        seed: int,
+        observations: str = "camera",
+        label: Label | None = None,
+        report: Report | None = None,
+    ) -> Adapted:
+        """Adapt `policy`, in place, to `target` with at most `budget` counted samples: Algorithm 1 in `folder`."""
+        torch.manual_seed(seed)
+        settings = AdaptSettings(
+            self.settings.adapted, self.settings.ground, budget, round_samples, observations, seed=seed
+        )
+        return adapt(
+            policy,
+            self.residual(encoder),
+            self.source,
+            target,
+            self.observe,
+            see_frames,
+            settings,
+            folder,
+            label,
+            report,
+        )
