@@ -14,7 +14,6 @@ from pathlib import Path
 
 import tyro
 
-from renderers import load_renderer
 from visadapt.console import reporting
 from visadapt.pixels import PixelTask
 from visadapt.systems import CartPole
@@ -34,7 +33,7 @@ class Settings:
 
 def main(settings: Settings) -> None:
     """Train encoder and policy and put them into `assets`."""
-    task = PixelTask(World(CartPole()), load_renderer(settings.assets / "renderer.safetensors"))
+    task = PixelTask.load_renderer(World(CartPole()), settings.assets / "renderer.safetensors")
     with reporting() as report:
         task.pretrain(settings.work, settings.seed, report)
     for name in ("encoder.safetensors", "policy.safetensors"):

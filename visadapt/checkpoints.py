@@ -104,5 +104,3 @@ def _restore(node: Any, tensors: dict[str, Tensor]) -> Any:
     if kind == "list":
         return [_restore(value, tensors) for value in content]
     return content
-
-

@@ -84,53 +84,51 @@ def mlp(*widths: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-class ImageResidualNetwork(nn.Module):
-    """A 4-layer CNN on the last 5 frames and 5 actions (the paper, section 3.2.3). It begins at zero.
+class ResidualNetwork(nn.Module):
+    """Base of residual networks: what is seen, and a head on it that grounding fits. It begins at zero."""
 
-    Between the convolutions and the output stand the positions and angles that the frames show, read as
+    def __init__(self, inputs: int, n_state: int) -> None:
+        super().__init__()
+        self.head = mlp(inputs, 64, 64, n_state)
+        last = self.head[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
+    def embed(self, history: History) -> Tensor:
+        """What the head reads, (B, inputs)."""
+        raise NotImplementedError
+
+    def forward(self, history: History) -> Tensor:
+        """Corrections (B, n_state) in units of the residual's scale."""
+        out: Tensor = self.head(self.embed(history))
+        return out
+
+
+class ImageResidualNetwork(ResidualNetwork):
+    """A 4-layer CNN on the last 5 frames and 5 actions (the paper, section 3.2.3).
+
+    Between the convolutions and the head stand the positions and angles that the frames show, read as
     `learning.perception` taught it in the source: a few hundred samples are too few to learn to see as well.
     """
 
     def __init__(self, background: Tensor, contrast: float, n_state: int, n_action: int = 1) -> None:
-        super().__init__()
+        super().__init__(KINEMATICS + LENGTH * n_action, n_state)
         self.encoder = FrameEncoder(background, contrast, n_action)
-        self.head = mlp(KINEMATICS + LENGTH * n_action, 64, 64, n_state)
-        _begin_at_zero(self.head)
-
-    def forward(self, history: History) -> Tensor:
-        """Corrections (B, n_state) in units of the residual's scale."""
-        out: Tensor = self.head(self.embed(history))
-        return out
 
     def embed(self, history: History) -> Tensor:
-        """What the head reads, (B, KINEMATICS + LENGTH * n_action)."""
         return torch.cat((self.encoder.kinematics(history), history.actions.flatten(1)), 1)
 
 
-class StateResidualNetwork(nn.Module):
+class StateResidualNetwork(ResidualNetwork):
     """The paper's MLP with two hidden layers of 64, tanh (3.2.1), on state and action, or on 5 of each (3.2.2)."""
 
     def __init__(self, n_state: int, n_action: int = 1, with_history: bool = False) -> None:
-        super().__init__()
+        super().__init__((LENGTH if with_history else 1) * (n_state + n_action), n_state)
         self.with_history = with_history
-        self.head = mlp((LENGTH if with_history else 1) * (n_state + n_action), 64, 64, n_state)
-        _begin_at_zero(self.head)
-
-    def forward(self, history: History) -> Tensor:
-        """Corrections (B, n_state) in units of the residual's scale."""
-        out: Tensor = self.head(self.embed(history))
-        return out
 
     def embed(self, history: History) -> Tensor:
-        """What the head reads: states and actions, (B, inputs)."""
         states, actions = history.observations, history.actions
         if not self.with_history:
             states, actions = states[:, -1:], actions[:, -1:]
         return torch.cat((states.flatten(1), actions.flatten(1)), 1)
-
-
-def _begin_at_zero(layers: nn.Sequential) -> None:
-    last = layers[-1]
-    assert isinstance(last, nn.Linear)
-    nn.init.zeros_(last.weight)
-    nn.init.zeros_(last.bias)

@@ -8,17 +8,19 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from renderers import LayeredRenderer
+from renderers import LayeredRenderer, RendererError, load_renderer
 from visadapt.checkpoints import load_network, save_network
 from visadapt.console import Report, staged
 from visadapt.effects import Residual
 from visadapt.learning.cost import CENTRED_CARTPOLE
 from visadapt.learning.grounding import GroundSettings
-from visadapt.learning.joint import Adapted, AdaptSettings, Label, adapt
+from visadapt.learning.joint import Adapted, AdaptSettings, adapt
 from visadapt.learning.perception import PerceptionSettings, learn_to_see
 from visadapt.learning.policy import TuneSettings, tune
+from visadapt.learning.tracking import Tracker
 from visadapt.networks import FrameEncoder, ImageResidualNetwork
 from visadapt.policies import ImagePolicy
+from visadapt.recordings import Episode
 from visadapt.rollout import see_frames
 from visadapt.targets import Target
 from visadapt.world import World
@@ -64,6 +66,14 @@ class PixelTask:
         self.renderer = renderer.requires_grad_(False).eval()
         self.settings = settings or PixelSettings()
         self.background = renderer.background.sigmoid().detach()
+
+    @classmethod
+    def load_renderer(cls, source: World, path: Path, settings: PixelSettings | None = None) -> PixelTask:
+        """A task seen through the renderer in a file; raises RendererError where it is not a LayeredRenderer."""
+        renderer = load_renderer(path)
+        if not isinstance(renderer, LayeredRenderer):
+            raise RendererError(f"{path}: holds a {type(renderer).__name__}, a LayeredRenderer is needed")
+        return cls(source, renderer, settings)
 
     def observe(self, state: Tensor) -> Tensor:
         """What the camera would show of simulated states: frames (B, H, W) in [0, 1]."""
@@ -126,6 +136,11 @@ class PixelTask:
         load_network(folder / "policy.safetensors", policy)
         return encoder, policy
 
+    def label(self, episodes: list[Episode]) -> list[Episode]:
+        """The same episodes with states estimated from their frames alone; too short ones, of 1 or 2 rows, go."""
+        tracker = Tracker(self.renderer, self.source)
+        return [track.episode for track in tracker.track([episode for episode in episodes if len(episode.time) > 2])]
+
     def adapt(
         self,
         policy: ImagePolicy,
@@ -136,10 +151,16 @@ class PixelTask:
         round_samples: int,
         seed: int,
         observations: str = "camera",
-        label: Label | None = None,
+        told_states: bool = False,
         report: Report | None = None,
     ) -> Adapted:
-        """Adapt `policy`, in place, to `target` with at most `budget` counted samples: Algorithm 1 in `folder`."""
+        """Adapt `policy`, in place, to `target` with at most `budget` counted samples: Algorithm 1 in `folder`.
+
+        Args:
+            observations: whether grounding shows the residual the "camera"'s frames, or "rendered" ones.
+            told_states: whether grounding learns from states that the target tells, as the paper does, or from
+                states estimated from frames alone.
+        """
         torch.manual_seed(seed)
         settings = AdaptSettings(
             self.settings.adapted, self.settings.ground, budget, round_samples, observations, seed=seed
@@ -153,6 +174,6 @@ class PixelTask:
             see_frames,
             settings,
             folder,
-            label,
+            None if told_states else self.label,
             report,
         )

@@ -39,13 +39,13 @@ class StateSettings:
     adapted: TuneSettings = field(
         default_factory=lambda: TuneSettings(
             PAPER_CARTPOLE,
-            iterations=400,
-            learning_rate=1e-3,
+            iterations=800,
+            learning_rate=2e-3,
             start_spread=(0.3, 0.2, 0.1, 0.2),
             kick=(0.0, 0.0, 0.0, 0.0),
             diverged=ANYWHERE,
-            longest=40,
-            recorded=0.7,
+            longest=120,
+            recorded=0.4,
             observation_noise=0.0,
         )
     )
@@ -57,7 +57,9 @@ def observe(state: Tensor) -> Tensor:
     return state
 
 
-def pretrain(source: World, settings: StateSettings, path: Path, seed: int, report: Report | None = None) -> StatePolicy:
+def pretrain(
+    source: World, settings: StateSettings, path: Path, seed: int, report: Report | None = None
+) -> StatePolicy:
     """The policy of the source, trained there or read from `path`."""
     torch.manual_seed(seed)
     policy = StatePolicy(n_state=4, with_history=settings.with_history)

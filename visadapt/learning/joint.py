@@ -27,8 +27,8 @@ from visadapt.rollout import See, run
 from visadapt.targets import Target, TargetError
 from visadapt.world import World
 
-Label = Callable[[Episode], Episode]
-"""Gives an episode the states that grounding learns from; see `AdaptSettings`."""
+Label = Callable[[list[Episode]], list[Episode]]
+"""Gives the episodes of a round the states that grounding learns from."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def adapt(
         source: the physics known beforehand.
         observe: what a camera would show of a simulated state: the learnt renderer, or the identity.
         see: what the policy is shown of the target.
-        label: estimates the states of an episode from what a camera saw; without it, the target's own are used.
+        label: estimates the states from what a camera saw; without it, the states that the target tells are used.
 
     Raises:
         TargetError: the target misbehaves. BudgetExceeded: a step more than the budget.
@@ -119,7 +119,7 @@ def adapt(
         new = _collected(here / "recording.h5", policy, target, see, wanted, settings, _generator(settings, number, 0))
         for episode in new:
             ledger.count(f"{name}: data", episode.samples)
-        episodes += [label(episode) for episode in new] if label is not None else new
+        episodes += new if label is None else label(new)
         windows = Windows.cut(episodes, settings.observations, observe)
         grounding = _grounded(
             here / "residual.safetensors",
@@ -199,4 +199,3 @@ def _tuned(
     save_tree(path, {"weights": policy.state_dict(), "losses": losses})
     partial.unlink(missing_ok=True)
     return losses
-

@@ -194,4 +194,3 @@ def imagine(
         if world.has_residual and k + 1 < plan.shape[1]:
             history = history.acting(plan[:, k]).observing(observe(at.state))
     return torch.stack(states, 1), first
-

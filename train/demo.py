@@ -1,0 +1,148 @@
+"""From a policy that fails on the target to one that holds it, from pixels: what `make demo` runs.
+
+    python -m train.demo [--from-scratch] [--budget 1000] [--out runs/demo]
+
+A CartPole policy was trained in the source simulator. On the target a hidden force of 2 (sin t + 1) N pushes the
+cart. The demo executes the policy there for at most `budget` counted samples, learns what is different from the
+camera's frames alone, tunes the policy by backpropagation through renderer, residual and physics, and writes
+
+    film.mp4      source, target before, target after, side by side
+    film.png      a still of it
+    losses.png    both losses over the rounds
+    metrics.json  scores, the ledger of target samples, settings and versions
+
+Interrupt it anywhere; started again, it goes on and ends with the same numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+
+from renderers import DrawnCartPole
+from train import renderer as renderer_training
+from visadapt.console import reporting
+from visadapt.evaluation import EPISODES, STEPS, Evaluation, evaluate
+from visadapt.learning.joint import Adapted
+from visadapt.panels import Panel
+from visadapt.pixels import PixelTask
+from visadapt.plots import Round, plot_losses
+from visadapt.policies import Policy
+from visadapt.rollout import Run, run, see_frames
+from visadapt.runs import once, open_run, write_json
+from visadapt.systems import CartPole
+from visadapt.targets import SyntheticTarget, Target, TargetError, no_effects, sine_force
+from visadapt.video import write_film, write_still
+from visadapt.world import World
+
+FILM_SEED, SCORE_SEED = 12, 2026
+"""Starts and phases of the film and of the final evaluation: never those of training, which counts from 0."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is adapted, and where results go."""
+
+    from_scratch: bool = False
+    """train renderer, encoder and source policy too, instead of taking them from assets/"""
+    budget: int = 1000
+    """N: target samples in all, all counted"""
+    round_samples: int = 200
+    """B: target samples in a round"""
+    observations: str = "camera"
+    """frames that ground the residual: the target's own ("camera"), or rendered from estimated states ("rendered")"""
+    told_states: bool = False
+    """learn from states that the target tells, as the paper does, instead of from its frames alone"""
+    episodes: int = EPISODES
+    """episodes of each evaluation"""
+    seed: int = 0
+    out: Path = Path("runs/demo")
+    assets: Path = Path("assets")
+
+
+def main(settings: Settings) -> None:
+    """Run the demo in `settings.out`, going on from what is there."""
+    out = settings.out / "from-scratch" if settings.from_scratch else settings.out
+    about = open_run(out, {key: value for key, value in asdict(settings).items() if key not in ("out", "assets")})
+    scene = DrawnCartPole()
+    source, target = SyntheticTarget(no_effects, scene), SyntheticTarget(sine_force, scene)
+    renderer = _renderer(settings, out)
+    with reporting() as report:
+        task = PixelTask.load_renderer(World(CartPole()), renderer)
+        if settings.from_scratch:
+            encoder, policy = task.pretrain(out, settings.seed, report)
+        else:
+            encoder, policy = task.load(settings.assets)
+        scores: dict[str, dict[str, Any]] = {}
+        films: list[tuple[str, Run]] = []
+
+        def look(name: str, title: str, where: Target) -> None:
+            """Score the policy as it is now, and film one episode."""
+            scores[name] = once(out / f"{name}.json", lambda: _score(where, policy, settings))
+            print(f"{title}: {_said(scores[name])}", flush=True)
+            films.append((title, _one(where, policy)))
+
+        look("source", "Source, 0 samples", source)
+        look("before", "Target, before", target)
+        adapted = task.adapt(
+            policy,
+            encoder,
+            target,
+            out,
+            settings.budget,
+            settings.round_samples,
+            settings.seed,
+            settings.observations,
+            settings.told_states,
+            report,
+        )
+        look("after", f"Target, after {adapted.ledger.used:,} samples", target)
+        panels = [Panel.redrawn(title, filmed, scene) for title, filmed in films]
+        write_still(out / "film.png", panels, t=3.0)
+        write_film(
+            out / "film.mp4", panels, target.period, lambda done, total: report("film", done, total, float("nan"))
+        )
+    plot_losses(out / "losses.png", _curves(adapted))
+    write_json(out / "metrics.json", {"ledger": asdict(adapted.ledger), "scores": scores, **about})
+    print(f"film.mp4, film.png, losses.png and metrics.json are in {out}")
+
+
+def _renderer(settings: Settings, out: Path) -> Path:
+    if not settings.from_scratch:
+        return settings.assets / "renderer.safetensors"
+    path = out / "renderer.safetensors"
+    if not path.exists():
+        renderer_training.train(renderer_training.Settings(kinds=("layered",), out=out))
+    return path
+
+
+def _score(target: Target, policy: Policy, settings: Settings) -> dict[str, object]:
+    return asdict(evaluate(target, policy, see_frames, SCORE_SEED, settings.episodes)[0])
+
+
+def _one(target: Target, policy: Policy) -> Run:
+    return run(target, policy, see_frames, 1, STEPS, torch.Generator().manual_seed(FILM_SEED))[0]
+
+
+def _said(score: dict[str, Any]) -> str:
+    return str(Evaluation(**score))
+
+
+def _curves(adapted: Adapted) -> list[Round]:
+    return [
+        Round(samples=each.samples, grounding=each.grounding, policy=list(enumerate(each.policy)))
+        for each in adapted.rounds
+    ]
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Settings, description=__doc__))
+    except (TargetError, ValueError, OSError) as error:
+        raise SystemExit(f"demo: {error}") from error
+    except KeyboardInterrupt:
+        raise SystemExit("interrupted: run it again to go on") from None
