@@ -166,6 +166,9 @@ class TestTracks:
         np.testing.assert_allclose(track.episode.state[0, [0, 2]], episode.state[0, [0, 2]], atol=3e-3)
         assert (track.deviation[0, [1, 3]] > 1).all()
 
+    def test_no_episodes_have_no_tracks(self, tracker):
+        assert tracker.track([]) == []
+
     def test_several_episodes_share_their_noise(self, tracker):
         episodes = [record(constant_force(2.0), 12, seed=seed) for seed in range(3)]
         for episode, track in zip(episodes, tracker.track([blind(e) for e in episodes]), strict=True):

@@ -48,12 +48,12 @@ def load_tree(path: Path) -> Any:
 
 
 def load_weights(module: nn.Module, weights: Mapping[str, Tensor], origin: Path) -> None:
-    """Load weights into a module; raises CheckpointError naming the first key that does not fit and both shapes."""
+    """Load weights into a module; raises CheckpointError naming the first misfit, both shapes and dtypes."""
     own = module.state_dict()
     for key, value in own.items():
         if key not in weights:
             raise CheckpointError(f"{origin}: made for another architecture: {key} is missing")
-        if weights[key].shape != value.shape:
+        if weights[key].shape != value.shape or weights[key].dtype != value.dtype:
             raise CheckpointError(
                 f"{origin}: made for another architecture: {key} is {tuple(weights[key].shape)} "
                 f"{weights[key].dtype}, this network needs {tuple(value.shape)} {value.dtype}"

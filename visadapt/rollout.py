@@ -48,6 +48,7 @@ def run(target: Target, policy: Policy, see: See, batch: int, steps: int, genera
         TargetError: the target shows a state that is not finite while its episode goes on, or no frame.
     """
     observation = target.reset(batch, generator)
+    _check_finite(target, observation, torch.ones_like(observation.alive), "the first state")
     history = History.start(see(observation), target.n_action)
     rows: list[tuple[Observation, Tensor]] = []
     length = torch.zeros(batch, dtype=torch.long)
@@ -58,16 +59,18 @@ def run(target: Target, policy: Policy, see: See, batch: int, steps: int, genera
         action = policy.act(history)
         rows.append((observation, action))
         observation = target.step(action)
-        broken = running & ~observation.state.isfinite().all(1)
-        if bool(broken.any()):
-            raise TargetError(
-                f"{target.name}: the state after step {len(rows)} is not finite (episode {int(broken.nonzero()[0])})"
-            )
+        _check_finite(target, observation, running, f"the state after step {len(rows)}")
         length += running
         running &= observation.alive
         history = history.acting(action).observing(see(observation))
     rows.append((observation, torch.zeros(batch, target.n_action)))
     return [_cut(rows, b, int(length[b]), bool(running[b]), target.period) for b in range(batch)]
+
+
+def _check_finite(target: Target, observation: Observation, rows: Tensor, which: str) -> None:
+    broken = rows & ~observation.state.isfinite().all(1)
+    if bool(broken.any()):
+        raise TargetError(f"{target.name}: {which} is not finite (episode {int(broken.nonzero()[0])})")
 
 
 def _cut(rows: list[tuple[Observation, Tensor]], b: int, length: int, survived: bool, period: float) -> Run:

@@ -102,6 +102,8 @@ class Tracker:
 
         An episode of one or two rows does not tell a load from a velocity, so its gap comes out as none.
         """
+        if not episodes:
+            return []
         found = [self._see(number, episode) for number, episode in enumerate(episodes)]
         commands = [torch.as_tensor(episode.action, dtype=torch.float64)[:-1] for episode in episodes]
         paths = [self._first_guess(poses) for poses in found]

@@ -1,0 +1,131 @@
+import numpy as np
+import pytest
+import torch
+
+from visadapt.history import LENGTH, History
+from visadapt.learning.windows import Windows
+from visadapt.recordings import Episode
+
+
+def episode(number, rows, frames=True, states=True):
+    """Values that say where they are from: state 100 n + t, action (10 n + t) / 1000, the last 9; frame 20 n + t."""
+    at = np.arange(rows)
+    action = (10 * number + at)[:, None] / 1000
+    action[-1] = 9.0
+    return Episode(
+        time=at * 0.05,
+        action=action,
+        state=(100.0 * number + at)[:, None] + np.array([0.0, 0.25]) if states else None,
+        frame=np.full((rows, 2, 3), 0, np.uint8) + (20 * number + at).astype(np.uint8)[:, None, None]
+        if frames
+        else None,
+    )
+
+
+TWO = [episode(1, 8), episode(2, 3)]
+"""7 and 2 samples."""
+
+
+class TestAlignment:
+    def test_a_sample_is_a_state_the_action_there_and_the_state_after(self):
+        windows = Windows.cut(TWO, "state")
+        assert len(windows) == 9
+        assert windows.state[:, 0].tolist() == [100, 101, 102, 103, 104, 105, 106, 200, 201]
+        assert windows.next_state[:, 0].tolist() == [101, 102, 103, 104, 105, 106, 107, 201, 202]
+        assert windows.state[:, 1].tolist() == [value + 0.25 for value in windows.state[:, 0].tolist()]
+        actions = [0.010, 0.011, 0.012, 0.013, 0.014, 0.015, 0.016, 0.020, 0.021]
+        assert windows.action[:, 0].tolist() == pytest.approx(actions)
+        assert windows.episode.tolist() == [0] * 7 + [1] * 2
+
+    def test_the_history_shows_the_5_latest_rows_and_stands_still_before_the_episode(self):
+        windows = Windows.cut(TWO, "state")
+        history = windows.history(torch.arange(9))
+        wanted = {
+            0: [100, 100, 100, 100, 100],
+            2: [100, 100, 100, 101, 102],
+            6: [102, 103, 104, 105, 106],
+            7: [200, 200, 200, 200, 200],
+            8: [200, 200, 200, 200, 201],
+        }
+        for row, states in wanted.items():
+            assert history.observations[row, :, 0].tolist() == states
+
+    def test_past_actions_are_those_before_the_one_taken_now_and_zero_before_the_episode(self):
+        windows = Windows.cut(TWO, "state")
+        wanted = {
+            0: [0, 0, 0, 0, 0],
+            2: [0, 0, 0, 0.010, 0.011],
+            6: [0.011, 0.012, 0.013, 0.014, 0.015],
+            7: [0, 0, 0, 0, 0],
+            8: [0, 0, 0, 0, 0.020],
+        }
+        for row, actions in wanted.items():
+            assert windows.history(torch.tensor([row])).actions[0, :, 0].tolist() == pytest.approx(actions)
+
+    def test_it_is_the_history_that_a_policy_had_when_it_chose_the_action(self):
+        windows = Windows.cut(TWO, "state")
+        state = torch.as_tensor(TWO[0].state, dtype=torch.float32)
+        action = torch.as_tensor(TWO[0].action, dtype=torch.float32)
+        lived = History.start(state[:1], 1)
+        for t in range(7):
+            found = windows.history(torch.tensor([t]))
+            assert torch.equal(found.observations, lived.observations)
+            assert torch.equal(found.actions, lived.actions)
+            lived = lived.acting(action[t : t + 1]).observing(state[t + 1 : t + 2])
+
+    def test_the_action_of_the_last_row_was_not_executed_and_is_nowhere(self):
+        windows = Windows.cut(TWO, "state")
+        assert windows.action.max() < 1
+        assert windows.past_actions.max() < 1
+
+    def test_an_episode_of_one_row_adds_no_sample_and_shifts_no_other(self):
+        windows = Windows.cut([episode(1, 3), episode(3, 1), episode(2, 3)], "camera")
+        assert windows.state[:, 0].tolist() == [100, 101, 200, 201]
+        assert (255 * windows.history(torch.tensor([3])).observations[0, :, 0, 0]).round().tolist() == [40] * 4 + [41]
+
+
+class TestSources:
+    def test_camera_frames_are_the_cameras_and_rendered_ones_the_renderers(self):
+        def observe(state):
+            return ((state[:, 0] - 100) / 10)[:, None, None].expand(-1, 2, 3)
+
+        row = torch.tensor([6])
+        camera, rendered = Windows.cut(TWO[:1], "camera", observe), Windows.cut(TWO[:1], "rendered", observe)
+        for windows, wanted in ((camera, [22, 23, 24, 25, 26]), (rendered, [51, 76, 102, 128, 153])):
+            seen = windows.history(row).observations
+            assert seen.shape == (1, LENGTH, 2, 3)
+            assert seen.dtype == torch.float32
+            assert (255 * seen[0, :, 1, 2]).round().tolist() == pytest.approx(wanted, abs=1)
+        assert torch.equal(camera.next_state, rendered.next_state)
+
+    def test_rendered_frames_need_no_camera_and_bytes_do_not_overflow(self):
+        windows = Windows.cut([episode(1, 3, frames=False)], "rendered", lambda state: state[:, :, None] - 101.0)
+        assert windows.observations[:, 0, 0].tolist() == [0, 0, 255]
+
+    def test_states_are_shown_as_they_are(self):
+        seen = Windows.cut(TWO, "state").history(torch.tensor([8])).observations
+        assert seen[0].tolist() == [[200.0, 200.25]] * 4 + [[201.0, 201.25]]
+
+
+class TestErrors:
+    @pytest.mark.parametrize("source", ["camera", "rendered", "state"])
+    def test_an_episode_without_states_is_named(self, source):
+        with pytest.raises(ValueError, match="episode 1 has no states"):
+            Windows.cut([TWO[0], episode(2, 3, states=False)], source, lambda state: state)
+
+    def test_an_episode_without_frames_is_named(self):
+        with pytest.raises(ValueError, match="episode 1 has no camera frames"):
+            Windows.cut([TWO[0], episode(2, 3, frames=False)], "camera")
+
+    def test_rendered_without_a_renderer(self):
+        with pytest.raises(ValueError, match="need a renderer"):
+            Windows.cut(TWO, "rendered")
+
+    def test_an_unknown_source_is_quoted_and_those_there_are_listed(self):
+        with pytest.raises(ValueError, match="'frames'; there are camera, rendered, state"):
+            Windows.cut(TWO, "frames")
+
+    @pytest.mark.parametrize("episodes", [[], [episode(1, 1)]])
+    def test_no_sample_at_all(self, episodes):
+        with pytest.raises(ValueError, match="no sample"):
+            Windows.cut(episodes, "state")
