@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from visadapt.history import LENGTH, History
+from visadapt.systems import System
 
 CHANNELS = (8, 16, 32, 32)
 FEATURES = 128
@@ -109,15 +110,50 @@ class ImageResidualNetwork(ResidualNetwork):
     """A 4-layer CNN on the last 5 frames and 5 actions (the paper, section 3.2.3).
 
     Between the convolutions and the head stand the positions and angles that the frames show, read as
-    `learning.perception` taught it in the source: a few hundred samples are too few to learn to see as well.
+    `learning.perception` taught it in the source: a few hundred samples are too few to learn to see as well. The
+    head reads them, the actions, and the accelerations that the source does not explain (`unexplained`).
+
+    Args:
+        system: the source physics, whose states are x, x_dot, theta, theta_dot.
+        period: s between frames.
+        scale: (KINEMATICS,) units of the encoder's readout.
     """
 
-    def __init__(self, background: Tensor, contrast: float, n_state: int, n_action: int = 1) -> None:
-        super().__init__(KINEMATICS + LENGTH * n_action, n_state)
+    scale: Tensor
+    EXPECTED = 2.0
+    """m/s2 and rad/s2: unexplained accelerations are given to the head in units of this"""
+
+    def __init__(self, background: Tensor, contrast: float, system: System, period: float, scale: Tensor) -> None:
+        n_action = len(system.actions)
+        super().__init__(KINEMATICS + LENGTH * n_action + 2 * (LENGTH - 2), len(system.states))
         self.encoder = FrameEncoder(background, contrast, n_action)
+        self.system = system
+        self.period = period
+        self.register_buffer("scale", scale.clone())
 
     def embed(self, history: History) -> Tensor:
-        return torch.cat((self.encoder.kinematics(history), history.actions.flatten(1)), 1)
+        kinematics = self.encoder.kinematics(history)
+        unexplained = self.unexplained(kinematics * self.scale, history.actions) / self.EXPECTED
+        return torch.cat((kinematics, history.actions.flatten(1), unexplained.flatten(1)), 1)
+
+    def unexplained(self, kinematics: Tensor, actions: Tensor) -> Tensor:
+        """Accelerations of cart and pole beyond the source's, (B, LENGTH - 2, 2), at all frames but first and last.
+
+        At a frame the measured acceleration is the second difference of positions. Over the two periods around it
+        the source's is the mean of those under the action before and the action after.
+        `kinematics` (B, KINEMATICS) is in SI units, latest positions and changes; actions are (B, LENGTH, n_action).
+        """
+        latest = kinematics[:, [0, LENGTH]]
+        changes = torch.stack((kinematics[:, 1:LENGTH], kinematics[:, LENGTH + 1 :]), -1)
+        back = changes.flip(1).cumsum(1).flip(1)
+        positions = latest[:, None] - back[:, 1:]
+        velocities = (changes[:, 1:] + changes[:, :-1]) / (2 * self.period)
+        states = torch.stack((positions, velocities), -1).flatten(-2)
+        load = states.new_zeros(*states.shape[:-1], len(self.system.loads))
+        before = self.system.derivative(states, actions[:, : LENGTH - 2], load)
+        after = self.system.derivative(states, actions[:, 1 : LENGTH - 1], load)
+        measured = changes.diff(dim=1) / self.period**2
+        return measured - (before + after)[..., 1::2] / 2
 
 
 class StateResidualNetwork(ResidualNetwork):

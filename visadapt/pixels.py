@@ -15,7 +15,7 @@ from visadapt.effects import Residual
 from visadapt.learning.cost import CENTRED_CARTPOLE
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.joint import Adapted, AdaptSettings, adapt
-from visadapt.learning.perception import PerceptionSettings, learn_to_see
+from visadapt.learning.perception import PerceptionSettings, learn_to_see, scale
 from visadapt.learning.policy import TuneSettings, tune
 from visadapt.learning.tracking import Tracker
 from visadapt.networks import FrameEncoder, ImageResidualNetwork
@@ -90,7 +90,8 @@ class PixelTask:
 
     def residual(self, encoder: FrameEncoder) -> Residual:
         """A new residual that sees as `encoder` does, and begins at zero."""
-        network = ImageResidualNetwork(self.background, CONTRAST, n_state=4)
+        unit = scale(self.settings.perception, self.source.period)
+        network = ImageResidualNetwork(self.background, CONTRAST, self.source.system, self.source.period, unit)
         network.encoder.load_state_dict(encoder.state_dict())
         return Residual(network, torch.ones(4))
 

@@ -19,12 +19,18 @@ HORIZON = 10
 
 
 class Policy(nn.Module):
-    """Base of policies; subclasses give features, and the layers that turn features and correction into a plan."""
+    """Base of policies; subclasses give features, and the layers that turn them into a plan.
+
+    The correction enters in two ways, both of no weight at first: among the features, and straight into the plan as
+    a feed-forward, since what is known to push can be pushed against.
+    """
 
     def __init__(self, n_state: int, n_action: int) -> None:
         super().__init__()
         self.n_state = n_state
         self.n_action = n_action
+        self.feedforward = nn.Linear(n_state, HORIZON * n_action, bias=False)
+        nn.init.zeros_(self.feedforward.weight)
         self.residual: Residual | None = None
 
     def features(self, history: History) -> Tensor:
@@ -37,7 +43,8 @@ class Policy(nn.Module):
 
     def forward(self, history: History) -> Tensor:
         """Planned actions (B, HORIZON, n_action)."""
-        out = self.plan(self.features(history), self.correction(history)).tanh()
+        correction = self.correction(history)
+        out = (self.plan(self.features(history), correction) + self.feedforward(correction)).tanh()
         return out.unflatten(-1, (HORIZON, self.n_action))
 
     def act(self, history: History) -> Tensor:

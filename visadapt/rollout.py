@@ -41,8 +41,19 @@ class Run:
 
 
 @torch.no_grad()
-def run(target: Target, policy: Policy, see: See, batch: int, steps: int, generator: torch.Generator) -> list[Run]:
+def run(
+    target: Target,
+    policy: Policy,
+    see: See,
+    batch: int,
+    steps: int,
+    generator: torch.Generator,
+    exploration: float = 0.0,
+) -> list[Run]:
     """Run `batch` episodes of at most `steps` steps each; an episode that ends is cut there, and marked.
+
+    Args:
+        exploration: standard deviation of white noise on the commands, so that what they do shows in the data.
 
     Raises:
         TargetError: the target shows a state that is not finite while its episode goes on, or no frame.
@@ -57,6 +68,8 @@ def run(target: Target, policy: Policy, see: See, batch: int, steps: int, genera
         if not bool(running.any()):
             break
         action = policy.act(history)
+        if exploration > 0:
+            action = (action + exploration * torch.randn(action.shape, generator=generator).to(action)).clamp(-1, 1)
         rows.append((observation, action))
         observation = target.step(action)
         _check_finite(target, observation, running, f"the state after step {len(rows)}")

@@ -32,7 +32,7 @@ class Cost:
 PAPER_CARTPOLE = Cost(state=(0.0, 3.0, 10.0, 1.0))
 """A.1.3: angle 10, cart velocity 3, angular velocity 1; the cart may be anywhere."""
 
-CENTRED_CARTPOLE = Cost(state=(10.0, 1.0, 30.0, 1.0))
+CENTRED_CARTPOLE = Cost(state=(20.0, 10.0, 100.0, 1.0))
 """Ours for a camera that stands still: the cart is drawn back to the middle of the frame.
 
 In a 10-step plan a weight on position alone pushes the wrong way first; with 30 on the angle the closed loop of

@@ -45,6 +45,8 @@ class AdaptSettings:
     """what grounding shows the residual: one of `windows.SOURCES`"""
     longest_episode: int = 250
     """steps"""
+    exploration: float = 0.05
+    """standard deviation of white noise on the commands while data are collected"""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -154,7 +156,8 @@ def _collected(
     episodes: list[Episode] = []
     left = wanted
     while left > 0:
-        episode = run(target, policy, see, 1, min(left, settings.longest_episode), generator)[0].episode
+        steps = min(left, settings.longest_episode)
+        episode = run(target, policy, see, 1, steps, generator, settings.exploration)[0].episode
         if episode.samples == 0:
             raise TargetError(f"{target.name}: the episode is over before its first step")
         episodes.append(episode)

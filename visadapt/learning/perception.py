@@ -65,6 +65,11 @@ class PerceptionSettings:
     pole: Paths = Paths(reach=0.2, velocity=0.4, acceleration=4.0)
 
 
+def scale(settings: PerceptionSettings, period: float) -> Tensor:
+    """(KINEMATICS,) units in which an encoder taught under `settings` gives positions and changes."""
+    return torch.cat((settings.cart.scale(period), settings.pole.scale(period)))
+
+
 def kinematics(positions: Tensor) -> Tensor:
     """The latest of positions (..., LENGTH), and their changes, (..., LENGTH)."""
     return torch.cat((positions[..., -1:], positions.diff(dim=-1)), -1)
@@ -87,7 +92,7 @@ def learn_to_see(
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, settings.learning_rate, total_steps=settings.iterations, pct_start=0.1
     )
-    scale = torch.cat((settings.cart.scale(period), settings.pole.scale(period)))
+    unit = scale(settings, period)
     training = Training(encoder, optimiser, schedule, generator)
     losses: list[float] = []
     if checkpoint is not None and checkpoint.exists():
@@ -101,7 +106,7 @@ def learn_to_see(
             frames = render(paths[0].flatten(), paths[1].flatten()).unflatten(0, paths[0].shape)
             frames = frames + settings.pixel_noise * torch.randn(frames.shape, generator=generator)
         windows = frames.unfold(1, LENGTH, 1).permute(0, 1, 4, 2, 3).flatten(0, 1)
-        truth = torch.cat([kinematics(path.unfold(1, LENGTH, 1).flatten(0, 1)) for path in paths], 1) / scale
+        truth = torch.cat([kinematics(path.unfold(1, LENGTH, 1).flatten(0, 1)) for path in paths], 1) / unit
         actions = torch.zeros(len(windows), LENGTH, encoder.n_action)
         error = encoder.kinematics(History(windows, actions)) - truth
         bends = torch.cat([error[:, 1:LENGTH].diff(dim=1), error[:, LENGTH + 1 :].diff(dim=1)], 1)

@@ -70,7 +70,7 @@ class Streams:
     @torch.no_grad()
     def start(self, generator: torch.Generator) -> None:
         """Start all streams, at random ages, so that they do not end together."""
-        self.at, self.history = self._fresh(generator)
+        self.at, self.history = self._fresh(self._limit(0.0), generator)
         self.age = torch.randint(self.settings.longest, (self.settings.batch,), generator=generator)
 
     @torch.no_grad()
@@ -84,11 +84,10 @@ class Streams:
         self.at = WorldState(at.time, state, at.memory).detach()
         self.history = self.history.acting(action).observing(self.observe(state)).detach()
         self.age += 1
-        first = settings.first_divergence
-        limit = (first + (1 - first) * min(1.0, 2 * progress)) * torch.tensor(settings.diverged)
-        keep = (self.age < settings.longest) & (state.abs() <= limit.to(state)).all(1)
+        limit = self._limit(progress)
+        keep = (self.age < settings.longest) & (state.abs() <= limit).all(1)
         if not bool(keep.all()):
-            at, history = self._fresh(generator)
+            at, history = self._fresh(limit, generator)
             self.at = self.at.where(keep, at)
             self.history = self.history.where(keep, history)
             self.age = torch.where(keep, self.age, 0)
@@ -110,16 +109,24 @@ class Streams:
         self.history = History(kept["observations"], kept["actions"])
         self.age = kept["age"]
 
-    def _fresh(self, generator: torch.Generator) -> tuple[WorldState, History]:
+    def _limit(self, progress: float) -> Tensor:
+        """delta_div now, (n_state,)."""
+        first = self.settings.first_divergence
+        return (first + (1 - first) * min(1.0, 2 * progress)) * torch.tensor(self.settings.diverged)
+
+    def _fresh(self, limit: Tensor, generator: torch.Generator) -> tuple[WorldState, History]:
         settings = self.settings
-        spread = torch.tensor(settings.start_spread)
+        spread = torch.minimum(torch.tensor(settings.start_spread), limit)
         state = spread * (2 * torch.rand(settings.batch, len(spread), generator=generator) - 1)
         history = History.start(self.observe(state), len(self.world.system.actions))
-        if self.windows is not None and settings.recorded > 0:
+        # A fall on record is beyond delta_div; starting from it would drown what can be learnt.
+        windows = self.windows
+        near = () if windows is None else (windows.state.abs() <= limit).all(1).nonzero()[:, 0]
+        if windows is not None and len(near):
             from_record = torch.rand(settings.batch, generator=generator) < settings.recorded
-            rows = torch.randint(len(self.windows), (settings.batch,), generator=generator)
-            state = torch.where(from_record[:, None], self.windows.state[rows], state)
-            history = self.windows.history(rows).where(from_record, history)
+            rows = near[torch.randint(len(near), (settings.batch,), generator=generator)]
+            state = torch.where(from_record[:, None], windows.state[rows], state)
+            history = windows.history(rows).where(from_record, history)
         return self.world.start(state), history
 
 
