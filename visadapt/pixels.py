@@ -39,12 +39,14 @@ class PixelSettings:
     adapted: TuneSettings = field(
         default_factory=lambda: TuneSettings(
             CENTRED_CARTPOLE,
-            iterations=150,
+            iterations=100,
             batch=32,
             learning_rate=5e-4,
             start_spread=(0.3, 0.1, 0.1, 0.1),
             # A kick would look like a force to the residual, which would go on pushing.
             kick=(0.0, 0.0, 0.0, 0.0),
+            diverged=(1.2, 2.0, 0.25, 3.0),
+            first_divergence=0.4,
             longest=25,
             recorded=0.8,
         )

@@ -82,6 +82,19 @@ class Adapted:
     ledger: Ledger
     rounds: list[Round]
     episodes: list[Episode]
+    folder: Path
+
+    def restore(self, policy: Policy, samples: int) -> None:
+        """Give `policy`, and the residual it listens to, the weights they had after `samples` counted samples.
+
+        Raises:
+            ValueError: no round ended there.
+        """
+        ends = [each.samples for each in self.rounds]
+        if samples not in ends:
+            raise ValueError(f"no round ended at {samples} samples; rounds ended at {', '.join(map(str, ends))}")
+        path = _weights(self.folder, ends.index(samples))
+        load_weights(policy, load_tree(path)["weights"], path)
 
 
 def adapt(
@@ -115,7 +128,7 @@ def adapt(
     episodes: list[Episode] = []
     rounds: list[Round] = []
     for number in range(settings.rounds):
-        here = folder / f"round-{number + 1:02d}"
+        here = _weights(folder, number).parent
         name = f"round {number + 1}/{settings.rounds}"
         wanted = min(settings.round_samples, ledger.left)
         new = _collected(here / "recording.h5", policy, target, see, wanted, settings, _generator(settings, number, 0))
@@ -133,7 +146,12 @@ def adapt(
         )
         losses = _tuned(here, policy, grounded, observe, settings, windows, number, staged(report, f"{name}: tune"))
         rounds.append(Round(ledger.used, grounding, losses))
-    return Adapted(ledger, rounds, episodes)
+    return Adapted(ledger, rounds, episodes, folder)
+
+
+def _weights(folder: Path, number: int) -> Path:
+    """Where round `number`, counted from 0, leaves the policy."""
+    return folder / f"round-{number + 1:02d}" / "policy.safetensors"
 
 
 def _generator(settings: AdaptSettings, number: int, stage: int) -> torch.Generator:

@@ -1,0 +1,106 @@
+"""The CartPole from states: a constant force (the paper's Table 1) and 2(sin t + 1) N (its figure 3).
+
+    python -m benchmarks.cartpole_states
+
+Each seed trains its own source policy and adapts it: to a constant force of 3.3 N, under which the unadapted policy
+drifts at about 1 m/s, with 50 samples and networks that see one state; to the time-variant force, with networks that
+see 5 states and actions, with 50 samples in one round and in rounds of 100 up to 1,000. Scored on 100 episodes as it
+stands after 50, 100, 200, 500 and 1,000 counted samples. No camera, so only a pole beyond 0.3 rad ends an episode.
+
+Writes results/cartpole_states.csv and assets/curve_states.png. Interrupt it anywhere; started again, it goes on.
+"""
+
+from __future__ import annotations
+
+import copy
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+import tyro
+
+from benchmarks.table import read_rows, say, speed_row, write_rows
+from visadapt.evaluation import Evaluation, evaluate
+from visadapt.plots import plot_curve
+from visadapt.policies import StatePolicy
+from visadapt.rollout import see_states
+from visadapt.runs import once, open_run
+from visadapt.states import StateSettings, adapt_states, pretrain
+from visadapt.systems import CartPole
+from visadapt.targets import SyntheticTarget, constant_force, sine_force
+from visadapt.world import World
+
+FORCE = 3.3
+"""N"""
+CONSTANT, SINE = f"CartPole, states, constant {FORCE} N", "CartPole, states, 2(sin t + 1) N"
+OURS = "ours, states"
+SCORE_SEED = 2026
+PLANS = {CONSTANT: ((50, 50, (50,)),), SINE: ((50, 50, (50,)), (1000, 100, (100, 200, 500, 1000)))}
+"""experiment: (budget, samples in a round, samples after which the policy is scored)"""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is run, and where."""
+
+    seeds: int = 3
+    episodes: int = 100
+    jobs: int = 2
+    """seeds at once, one core each"""
+    work: Path = Path("runs/cartpole_states")
+    out: Path = Path("results/cartpole_states.csv")
+    picture: Path = Path("assets/curve_states.png")
+
+
+def main(settings: Settings) -> None:
+    """Run what is missing, then write the table."""
+    jobs = [(experiment, seed) for experiment in PLANS for seed in range(settings.seeds)]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(settings.jobs, mp_context=context) as pool:
+        found = dict(zip(jobs, pool.map(_scores, [settings] * len(jobs), *zip(*jobs, strict=True)), strict=True))
+    rows = []
+    for experiment, plans in PLANS.items():
+        scores = [found[experiment, seed] for seed in range(settings.seeds)]
+        rows += [
+            speed_row(experiment, "unadapted", domain, 0, [each[domain] for each in scores])
+            for domain in ("source", "target")
+        ]
+        for samples in sorted(samples for plan in plans for samples in plan[2]):
+            rows.append(speed_row(experiment, OURS, "adapted", samples, [each[str(samples)] for each in scores]))
+    write_rows(settings.out, rows)
+    plot_curve(settings.picture, [row for row in read_rows(settings.out) if row["experiment"] == SINE], paper=None)
+    for row in rows:
+        say(row)
+
+
+def _scores(settings: Settings, experiment: str, seed: int) -> dict[str, Evaluation]:
+    """Scores of one seed of an experiment, by samples; before adaptation by domain."""
+    torch.set_num_threads(1)
+    folder = settings.work / ("constant" if experiment == CONSTANT else "sine") / f"seed-{seed}"
+    training = StateSettings(with_history=experiment == SINE)
+    open_run(folder, {"seed": seed, "episodes": settings.episodes, "plans": PLANS[experiment], **asdict(training)})
+    source = World(CartPole())
+    target = SyntheticTarget(constant_force(FORCE) if experiment == CONSTANT else sine_force)
+    unadapted = pretrain(source, training, folder / "policy.safetensors", seed)
+
+    def score(name: str, policy: StatePolicy, where: SyntheticTarget) -> Evaluation:
+        def fresh() -> dict[str, object]:
+            return asdict(evaluate(where, policy, see_states, SCORE_SEED, settings.episodes)[0])
+
+        return Evaluation(**once(folder / f"score-{name}.json", fresh))
+
+    scores = {"source": score("source", unadapted, SyntheticTarget()), "target": score("target", unadapted, target)}
+    for budget, round_samples, scored in PLANS[experiment]:
+        policy = copy.deepcopy(unadapted)
+        work = folder / f"budget-{budget}"
+        adapted = adapt_states(policy, source, target, training, work, budget, round_samples, seed)
+        for samples in scored:
+            adapted.restore(policy, samples)
+            scores[str(samples)] = score(str(samples), policy, target)
+    return scores
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings, description=__doc__))

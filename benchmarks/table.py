@@ -1,0 +1,79 @@
+"""The tables under results/: one row per measure, the same columns everywhere (DESIGN.md)."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from visadapt.evaluation import Evaluation
+from visadapt.files import replacing
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row. `samples` are counted target samples; `failed` episodes are never in `mean`."""
+
+    experiment: str
+    system: str
+    method: str
+    domain: str
+    """source, target or adapted"""
+    samples: int
+    measure: str
+    unit: str
+    mean: float
+    std: float
+    episodes: int
+    failed: int
+    seeds: int
+
+
+def speed_row(
+    experiment: str, method: str, domain: str, samples: int, scores: Sequence[Evaluation], system: str = "cartpole"
+) -> Row:
+    """Mean cart speed over the surviving episodes of all seeds (one Evaluation each), with its spread over them."""
+    weights = np.array([score.survived for score in scores], float)
+    means = np.array([score.mean_speed if score.survived else 0.0 for score in scores])
+    spreads = np.array([score.std_speed if score.survived else 0.0 for score in scores])
+    total = weights.sum()
+    mean = float((weights * means).sum() / total) if total else float("nan")
+    variance = float((weights * (spreads**2 + (means - mean) ** 2)).sum() / total) if total else float("nan")
+    episodes = sum(score.episodes for score in scores)
+    return Row(
+        experiment=experiment,
+        system=system,
+        method=method,
+        domain=domain,
+        samples=samples,
+        measure="mean cart speed",
+        unit="m/s",
+        mean=round(mean, 4),
+        std=round(variance**0.5, 4),
+        episodes=episodes,
+        failed=episodes - int(total),
+        seeds=len(scores),
+    )
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Write the rows as CSV, whole or not at all."""
+    with replacing(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(Row)], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(asdict(row) for row in rows)
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV as they stand there."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def say(row: Row) -> None:
+    """Print a row of speeds."""
+    up = f"{row.episodes - row.failed} of {row.episodes} up"
+    print(f"{row.domain:8} {row.samples:5} samples  {row.mean:.3f} +- {row.std:.3f} {row.unit}, {up}  ({row.method})")
