@@ -32,9 +32,10 @@ class Cost:
 PAPER_CARTPOLE = Cost(state=(0.0, 3.0, 10.0, 1.0))
 """A.1.3: angle 10, cart velocity 3, angular velocity 1; the cart may be anywhere."""
 
-CENTRED_CARTPOLE = Cost(state=(20.0, 10.0, 100.0, 1.0))
+CENTRED_CARTPOLE = Cost(state=(30.0, 6.0, 100.0, 1.0))
 """Ours for a camera that stands still: the cart is drawn back to the middle of the frame.
 
-In a 10-step plan a weight on position alone pushes the wrong way first; with 30 on the angle the closed loop of
-the linearised cart-pole has eigenvalues of at most 0.967 per step.
+The linearised cart-pole under the resulting 10-step plan has eigenvalues of at most 0.985 per step, comes to rest
+0.7 m off per N of a constant force left uncompensated, and moves at 0.16 m/s per N of a force at 1 rad/s. With a
+weight of 1 on the velocity it would draw back faster, but resonate with such a force at 0.26 m/s per N.
 """
