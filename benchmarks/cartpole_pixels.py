@@ -20,11 +20,11 @@ from pathlib import Path
 import torch
 import tyro
 
-from benchmarks.table import read_rows, say, speed_row, write_rows
 from renderers import DrawnCartPole
 from visadapt.evaluation import Evaluation, evaluate
 from visadapt.pixels import PixelTask
 from visadapt.plots import plot_curve
+from visadapt.results import read_rows, say, speed_row, write_rows
 from visadapt.rollout import see_frames
 from visadapt.runs import once, open_run
 from visadapt.systems import CartPole

@@ -21,10 +21,10 @@ from pathlib import Path
 import torch
 import tyro
 
-from benchmarks.table import read_rows, say, speed_row, write_rows
 from visadapt.evaluation import Evaluation, evaluate
 from visadapt.plots import plot_curve
 from visadapt.policies import StatePolicy
+from visadapt.results import read_rows, say, speed_row, write_rows
 from visadapt.rollout import see_states
 from visadapt.runs import once, open_run
 from visadapt.states import StateSettings, adapt_states, pretrain

@@ -5,15 +5,14 @@ Each table stands between the lines `<!-- table: NAME -->` and `<!-- end -->`.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.cartpole_pixels import EXPERIMENT as PIXELS
 from benchmarks.cartpole_pixels import OURS as FRAMES_ALONE
 from benchmarks.cartpole_states import CONSTANT, OURS, SINE
-from benchmarks.table import read_rows
 from visadapt.files import replacing
+from visadapt.results import read_rows
 
 RESULTS = Path("results")
 CURVE = (50, 100, 200, 500, 1000)
@@ -63,10 +62,8 @@ def grounding(rows: Rows) -> list[list[str]]:
 def pendulum(rows: Rows) -> list[list[str]]:
     """InvertedPendulum-v5."""
     table = [["InvertedPendulum-v5, mean cart speed in m/s", "counted samples", "here", "episodes up", "seeds"]]
-    for row in rows:
-        if row["system"].startswith("InvertedPendulum") and row["measure"] == "mean cart speed":
-            table.append([f"{row['method']}, {row['domain']}", f"{int(row['samples']):,}", *_said(row)])
-    return table
+    ours = [row for row in rows if row["system"].startswith("InvertedPendulum") and row["measure"] == "mean cart speed"]
+    return table + [[f"{row['method']}, {row['domain']}", f"{int(row['samples']):,}", *_said(row)] for row in ours]
 
 
 def _cells(rows: Rows, experiment: str, method: str, domain: str, samples: int) -> list[str]:
@@ -100,7 +97,8 @@ def main() -> None:
         header, *body = make(rows)
         lines = ["| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *body)]
         block = f"<!-- table: {name} -->\n" + "\n".join(lines) + "\n<!-- end -->"
-        text = re.sub(rf"<!-- table: {name} -->.*?<!-- end -->", lambda _, b=block: b, text, flags=re.DOTALL)
+        before, rest = text.split(f"<!-- table: {name} -->", 1)
+        text = before + block + rest.split("<!-- end -->", 1)[1]
     with replacing(readme) as temporary:
         temporary.write_text(text)
 

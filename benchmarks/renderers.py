@@ -9,7 +9,6 @@ Writes results/renderers.csv and prints it as a table.
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,11 +23,8 @@ from rich.table import Table
 
 from renderers import DrawnCartPole, LayeredRenderer, MLPRenderer, RendererError, load_renderer
 from renderers.measure import measure
-from visadapt.files import replacing
+from visadapt.results import Row, write_rows
 
-NAMES = "experiment system method domain samples measure unit mean std episodes failed seeds"
-COLUMNS = tuple(NAMES.split())
-Row = dict[str, str | float | int]
 Floats = NDArray[np.floating]
 
 
@@ -127,7 +123,7 @@ def _times(method: str, renderer: LayeredRenderer | MLPRenderer, settings: Setti
     for name, work in (("forward", forward), ("forward and backward", both)):
         taken = _timed(work, settings.repeats)
         label = f"time of {name}, batch of {settings.batch}, {settings.threads} thread(s), median"
-        rows.append(_row(method, label, "ms", float(np.median(taken)), "", std=float(taken.std())))
+        rows.append(_row(method, label, "ms", float(np.median(taken)), None, std=float(taken.std())))
     torch.set_num_threads(before)
     return rows
 
@@ -148,34 +144,23 @@ def _variance(frames: Floats) -> float:
 
 
 def _row(
-    method: str, measure: str, unit: str, mean: float, episodes: int | str, failed: int = 0, std: float | str = ""
+    method: str, measure: str, unit: str, mean: float, episodes: int | None, failed: int = 0, std: float | None = None
 ) -> Row:
     """`episodes` counts frames here; `failed` those from which nothing could be read."""
-    known: Row = {"experiment": "renderers", "system": "cartpole", "domain": "source"}
-    rest: Row = {"method": method, "measure": measure, "unit": unit, "mean": mean, "std": std}
-    empty: Row = dict.fromkeys(COLUMNS, "")
-    return {**empty, **known, **rest, "episodes": episodes, "failed": failed}
-
-
-def write(path: Path, rows: list[Row]) -> None:
-    """Write the rows as CSV."""
-    with replacing(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({key: f"{value:.4g}" if isinstance(value, float) else value for key, value in row.items()})
+    mean, std = float(f"{mean:.4g}"), None if std is None else float(f"{std:.4g}")
+    return Row("renderers", "cartpole", method, "source", None, measure, unit, mean, std, episodes, failed, None)
 
 
 def show(rows: list[Row]) -> None:
     """Print the rows: one line per measure, one column per method."""
-    methods = list(dict.fromkeys(str(row["method"]) for row in rows))
+    methods = list(dict.fromkeys(row.method for row in rows))
     table = Table("measure", "unit", *methods, title="Renderers of the cart-pole, held-out states")
-    for name, unit in dict.fromkeys((str(row["measure"]), str(row["unit"])) for row in rows):
+    for name, unit in dict.fromkeys((row.measure, row.unit) for row in rows):
         cells = []
         for method in methods:
-            found = next((row for row in rows if row["method"] == method and row["measure"] == name), None)
-            unread = f" ({found['failed']} unread)" if found is not None and found["failed"] else ""
-            cells.append("" if found is None else f"{found['mean']:.3g}{unread}")
+            found = next((row for row in rows if row.method == method and row.measure == name), None)
+            unread = f" ({found.failed} unread)" if found is not None and found.failed else ""
+            cells.append("" if found is None else f"{found.mean:.3g}{unread}")
         table.add_row(name, unit, *cells)
     Console().print(table)
 
@@ -184,7 +169,7 @@ def main(settings: Settings) -> None:
     """Compare, write, print."""
     try:
         rows = compare(settings)
-        write(settings.out, rows)
+        write_rows(settings.out, rows)
     except (RendererError, OSError) as error:
         raise SystemExit(str(error)) from error
     show(rows)

@@ -29,7 +29,7 @@ from visadapt.console import reporting
 from visadapt.evaluation import EPISODES, STEPS, Evaluation, evaluate
 from visadapt.learning.joint import Adapted
 from visadapt.panels import Panel
-from visadapt.pixels import PixelTask
+from visadapt.pixels import PixelSettings, PixelTask
 from visadapt.plots import Round, plot_losses
 from visadapt.policies import Policy
 from visadapt.rollout import Run, run, see_frames
@@ -67,12 +67,14 @@ class Settings:
 def main(settings: Settings) -> None:
     """Run the demo in `settings.out`, going on from what is there."""
     out = settings.out / "from-scratch" if settings.from_scratch else settings.out
-    about = open_run(out, {key: value for key, value in asdict(settings).items() if key not in ("out", "assets")})
+    training = PixelSettings()
+    chosen = {key: value for key, value in asdict(settings).items() if key not in ("out", "assets")}
+    about = open_run(out, {**chosen, "training": asdict(training)})
     scene = DrawnCartPole()
     source, target = SyntheticTarget(no_effects, scene), SyntheticTarget(sine_force, scene)
     renderer = _renderer(settings, out)
     with reporting() as report:
-        task = PixelTask.load_renderer(World(CartPole()), renderer)
+        task = PixelTask.load_renderer(World(CartPole()), renderer, training)
         if settings.from_scratch:
             encoder, policy = task.pretrain(out, settings.seed, report)
         else:

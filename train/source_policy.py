@@ -9,13 +9,14 @@ Interrupt it anywhere; started again, it goes on and ends with the same weights.
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import tyro
 
 from visadapt.console import reporting
-from visadapt.pixels import PixelTask
+from visadapt.pixels import PixelSettings, PixelTask
+from visadapt.runs import open_run
 from visadapt.systems import CartPole
 from visadapt.world import World
 
@@ -33,7 +34,9 @@ class Settings:
 
 def main(settings: Settings) -> None:
     """Train encoder and policy and put them into `assets`."""
-    task = PixelTask.load_renderer(World(CartPole()), settings.assets / "renderer.safetensors")
+    training = PixelSettings()
+    open_run(settings.work, {"seed": settings.seed, **asdict(training)})
+    task = PixelTask.load_renderer(World(CartPole()), settings.assets / "renderer.safetensors", training)
     with reporting() as report:
         task.pretrain(settings.work, settings.seed, report)
     for name in ("encoder.safetensors", "policy.safetensors"):

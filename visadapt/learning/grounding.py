@@ -85,6 +85,8 @@ def ground(
                 best, best_weights, waited = score, copy.deepcopy(network.head.state_dict()), 0
             else:
                 waited += 1
+            if waited > settings.patience and progress is not None:
+                progress(settings.steps, settings.steps, best)
             if waited > settings.patience or step == settings.steps:
                 break
         rows = train[torch.randint(len(train), (settings.batch,), generator=generator)]

@@ -15,21 +15,21 @@ from visadapt.files import replacing
 
 @dataclass(frozen=True)
 class Row:
-    """One row. `samples` are counted target samples; `failed` episodes are never in `mean`."""
+    """One row. `samples` are counted target samples; `failed` episodes are never in `mean`; None does not apply."""
 
     experiment: str
     system: str
     method: str
     domain: str
     """source, target or adapted"""
-    samples: int
+    samples: int | None
     measure: str
     unit: str
     mean: float
-    std: float
-    episodes: int
+    std: float | None
+    episodes: int | None
     failed: int
-    seeds: int
+    seeds: int | None
 
 
 def speed_row(
@@ -75,5 +75,6 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 def say(row: Row) -> None:
     """Print a row of speeds."""
-    up = f"{row.episodes - row.failed} of {row.episodes} up"
+    episodes = row.episodes or 0
+    up = f"{episodes - row.failed} of {episodes} up"
     print(f"{row.domain:8} {row.samples:5} samples  {row.mean:.3f} +- {row.std:.3f} {row.unit}, {up}  ({row.method})")
