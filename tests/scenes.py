@@ -3,6 +3,9 @@
 import torch
 
 from renderers import LayeredRenderer
+from visadapt.learning.perception import PerceptionSettings, scale
+from visadapt.networks import ImageResidualNetwork
+from visadapt.systems import CartPole
 
 HEIGHT, WIDTH = 20, 24
 CONTRAST = 0.2
@@ -41,3 +44,9 @@ def stir(module, seed=0, spread=1.0):
             inputs = weight[0].numel() if weight.dim() > 1 else 10
             weight.copy_(spread * inputs**-0.5 * torch.randn(weight.shape, generator=generator))
     return module
+
+
+def image_residual_network(renderer):
+    """A residual network for the small renderer's frames, 0.05 s apart, of the default cart-pole."""
+    unit = scale(PerceptionSettings(), 0.05)
+    return ImageResidualNetwork(background(renderer), CONTRAST, CartPole(), 0.05, unit)

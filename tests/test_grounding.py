@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes import CONTRAST, background, observing, small_renderer
+from tests.scenes import image_residual_network, observing, small_renderer
 from visadapt.effects import ConstantForce, Residual
 from visadapt.learning.grounding import GroundSettings, gap, ground, split
 from visadapt.learning.windows import Windows
-from visadapt.networks import ImageResidualNetwork, StateResidualNetwork
+from visadapt.networks import StateResidualNetwork
 from visadapt.recordings import Episode
 from visadapt.systems import CartPole
 from visadapt.world import World
@@ -117,7 +117,7 @@ class TestOnStates:
 def test_on_frames_the_head_is_fitted_and_what_sees_stays_as_it_is():
     torch.manual_seed(0)
     renderer = small_renderer()
-    network = ImageResidualNetwork(background(renderer), CONTRAST, n_state=4)
+    network = image_residual_network(renderer)
     residual = Residual(network, torch.ones(4))
     windows = Windows.cut(recorded(1, count=4, rows=11), "rendered", observing(renderer))
     before = {key: value.clone() for key, value in residual.state_dict().items()}

@@ -2,10 +2,11 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from tests.scenes import CONTRAST, HEIGHT, WIDTH, background, small_renderer, stir
+from tests.scenes import CONTRAST, HEIGHT, WIDTH, background, image_residual_network, small_renderer, stir
 from visadapt.effects import ConstantForce, Residual
 from visadapt.history import LENGTH, History
-from visadapt.networks import FrameEncoder, ImageResidualNetwork, StateResidualNetwork
+from visadapt.networks import FrameEncoder, StateResidualNetwork
+from visadapt.policies import StatePolicy
 from visadapt.systems import CartPole
 from visadapt.world import World
 
@@ -74,9 +75,8 @@ class TestFrameEncoder:
 
 def networks(dtype=torch.float32):
     torch.manual_seed(1)
-    scene = background(small_renderer())
     return {
-        "image": (ImageResidualNetwork(scene, CONTRAST, n_state=4).to(dtype), histories(4, dtype=dtype)),
+        "image": (image_residual_network(small_renderer()).to(dtype), histories(4, dtype=dtype)),
         "state": (StateResidualNetwork(4).to(dtype), states(4, dtype=dtype)),
         "history": (StateResidualNetwork(4, with_history=True).to(dtype), states(4, dtype=dtype)),
     }
@@ -132,3 +132,49 @@ def test_without_history_a_state_network_sees_the_latest_state_and_action_alone(
     older.actions[:, :-1] += 1.0
     with torch.no_grad():
         assert torch.equal(network(history), network(older)) != with_history
+
+
+class TestUnexplained:
+    """The accelerations that the residual is shown beside what it sees, from exact positions."""
+
+    @staticmethod
+    def seen(effects, steps=10):
+        """What is unexplained at the middle frames of all windows along the start of an episode."""
+        generator = torch.Generator().manual_seed(0)
+        world = World(CartPole(), effects, substeps=20).double()
+        at = world.start(torch.tensor([[0.1, 0.2, 0.05, -0.1]], dtype=torch.float64))
+        states, actions = [at.state[0]], []
+        for _ in range(steps):
+            actions.append(0.1 * torch.randn(1, generator=generator, dtype=torch.float64))
+            at = world.step(at, actions[-1][None])
+            states.append(at.state[0])
+        path, done = torch.stack(states), torch.stack(actions)
+        positions = path[:-1, [0, 2]].unfold(0, LENGTH, 1)
+        changes = positions.diff(dim=-1)
+        kinematics = torch.cat((positions[..., -1:], changes), -1).flatten(1)
+        network = image_residual_network(small_renderer()).double()
+        return network.unexplained(kinematics, done.unfold(0, LENGTH, 1).transpose(1, 2))
+
+    def test_without_a_gap_nothing_is_left(self):
+        # The commands alone give accelerations of some 3 m/s2 and 4 rad/s2.
+        left = self.seen([])
+        assert float(left.detach().abs().max()) < 0.1
+
+    def test_a_force_on_the_cart_is_left_as_the_accelerations_it_gives_near_upright(self):
+        # A force F on an upright cart-pole: x_ddot = F / (M - 3/4 m), theta_ddot = -3/4 x_ddot / l.
+        left = self.seen([ConstantForce(force=2.0)])
+        cart = 2.0 / (1.1 - 0.75 * 0.1)
+        expected = torch.tensor([cart, -0.75 * cart / 0.5], dtype=torch.float64)
+        torch.testing.assert_close(left.detach().mean((0, 1)), expected, rtol=0.02, atol=0.0)
+
+
+def test_a_policy_pushes_against_what_its_residual_expects_once_the_feedforward_has_weight():
+    policy = StatePolicy(n_state=4)
+    residual = Residual(StateResidualNetwork(4), torch.ones(4))
+    policy.residual = residual
+    history = states(3)
+    quiet = policy.act(history).atanh()
+    with torch.no_grad():
+        residual.network.head[-1].bias.copy_(torch.tensor([0.0, 1.0, 0.0, 0.0]))
+        policy.feedforward.weight[:, 1] = -0.25
+    torch.testing.assert_close(policy.act(history).atanh(), quiet - 0.25)

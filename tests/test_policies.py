@@ -1,10 +1,10 @@
 import pytest
 import torch
 
-from tests.scenes import CONTRAST, HEIGHT, WIDTH, background, small_renderer, stir
+from tests.scenes import CONTRAST, HEIGHT, WIDTH, background, image_residual_network, small_renderer, stir
 from visadapt.effects import Residual
 from visadapt.history import LENGTH, History
-from visadapt.networks import ImageResidualNetwork, StateResidualNetwork
+from visadapt.networks import StateResidualNetwork
 from visadapt.policies import HORIZON, ImagePolicy, StatePolicy
 
 KINDS = ["image", "state", "history"]
@@ -19,9 +19,7 @@ def made(kind, n_action=1, dtype=torch.float32):
 
 def residual(kind, dtype=torch.float32):
     if kind == "image":
-        return Residual(ImageResidualNetwork(background(small_renderer()), CONTRAST, n_state=4), torch.ones(4)).to(
-            dtype
-        )
+        return Residual(image_residual_network(small_renderer()), torch.ones(4)).to(dtype)
     return Residual(StateResidualNetwork(4, with_history=kind == "history"), torch.ones(4)).to(dtype)
 
 

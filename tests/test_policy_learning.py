@@ -1,14 +1,13 @@
 import pytest
 import torch
 
-from tests.scenes import CONTRAST, background, observing, small_renderer, stir
+from tests.scenes import CONTRAST, background, image_residual_network, observing, small_renderer, stir
 from visadapt.effects import ActuatorDelay, ConstantForce, Residual
 from visadapt.evaluation import evaluate
 from visadapt.history import History
 from visadapt.learning.cost import PAPER_CARTPOLE, Cost
 from visadapt.learning.policy import DivergedError, TuneSettings, imagine, tune
 from visadapt.learning.windows import Windows
-from visadapt.networks import ImageResidualNetwork
 from visadapt.policies import ImagePolicy, StatePolicy
 from visadapt.recordings import Episode
 from visadapt.rollout import see_states
@@ -36,7 +35,7 @@ class Imagined:
     def __init__(self):
         self.renderer = small_renderer(dtype=torch.float64)
         self.observe = observing(self.renderer)
-        self.network = ImageResidualNetwork(background(self.renderer), CONTRAST, n_state=4).double()
+        self.network = image_residual_network(self.renderer).double()
         stir(self.network, 1)
         residual = Residual(self.network, torch.full((4,), 0.5)).double()
         self.world = World(CartPole(), [residual, ConstantForce(force=1.0)]).requires_grad_(False)

@@ -151,6 +151,18 @@ class TestRun:
         after = source.step(at, torch.from_numpy(episode.action[:-1])).state
         np.testing.assert_allclose(after, episode.state[1:], atol=1e-4)
 
+    def test_exploration_is_noise_on_the_commands_that_are_recorded_and_executed(self):
+        quiet, noisy = (
+            run(SyntheticTarget(), Feedback(), see_states, 20, 50, seeded(4), exploration)[0].episode
+            for exploration in (0.0, 0.05)
+        )
+        first = noisy.action[0] - quiet.action[0]
+        assert first != 0
+        meant = noisy.state[:-1] @ np.array([0.05, 0.1, 1.5, 0.3])
+        spread = np.std(noisy.action[:-1, 0] - meant)
+        assert 0.035 < spread < 0.065
+        assert not np.allclose(noisy.state[1], quiet.state[1])
+
     def test_an_episode_is_cut_where_it_ends_and_others_go_on(self):
         weak = Feedback(gains=(0.0, 0.0, 0.1, 0.0))
         runs = run(SyntheticTarget(start=Start(0, 0, 0.3, 0)), weak, see_states, 12, 60, seeded())
