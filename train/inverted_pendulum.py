@@ -1,0 +1,247 @@
+"""From a policy that never saw the target to one tuned on it, from pixels: gymnasium's InvertedPendulum-v5 (MuJoCo).
+
+    python -m train.inverted_pendulum [--budget 500] [--seeds 0 1 2] [--out runs/inverted_pendulum]
+
+The target is one that no one here wrote. The source model is a cart-pole with the masses, length, gear and gravity
+that the environment publishes; nothing else is told. In order:
+
+    1. the renderer learns how the environment looks, from its frames at set states: a calibration of the camera that
+       runs no step of the target and is not counted
+    2. encoder and policy are trained in the source model alone, seen through that renderer
+    3. for every seed: at most `budget` counted samples of the target, states estimated from their frames alone, a
+       residual grounded on them and the policy tuned through renderer, residual and physics, round by round
+    4. scores before and after, and what viscous friction and pole damping would explain of the gap that was met
+
+Writes film.mp4, film.png (before, and after with the first seed), losses.png, renderer.png and metrics.json to `out`,
+and the rows of results/inverted_pendulum.csv. Interrupt it anywhere; started again, it goes on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from PIL import Image
+from torch import Tensor
+
+from renderers import LayeredRenderer, load_renderer, save_renderer
+from renderers.training import fit
+from train.demo import FILM_SEED, SCORE_SEED
+from visadapt.console import Report, reporting, staged
+from visadapt.evaluation import EPISODES, STEPS, Evaluation, evaluate
+from visadapt.files import replacing
+from visadapt.learning.cost import Cost
+from visadapt.learning.grounding import gap
+from visadapt.learning.perception import Paths, PerceptionSettings
+from visadapt.learning.policy import TuneSettings
+from visadapt.learning.windows import Windows
+from visadapt.panels import Panel
+from visadapt.pixels import PixelSettings, PixelTask
+from visadapt.plots import Round, plot_losses
+from visadapt.policies import Policy
+from visadapt.recordings import Episode
+from visadapt.results import Row, speed_row, write_rows
+from visadapt.rollout import Run, run, see_frames
+from visadapt.runs import once, open_run, write_json
+from visadapt.targets import Observation, SyntheticTarget, Target, TargetError
+from visadapt.targets.gymnasium import GymnasiumTarget
+from visadapt.targets.inverted_pendulum import MAP, REACH, SOURCE, START, inverted_pendulum
+from visadapt.video import write_film, write_still
+from visadapt.world import World
+
+ANGLE_LIMIT = 0.2
+"""rad, beyond which the environment ends an episode"""
+GUESS = (59.5, 68.8, 60.0, 0.75)
+"""Where a look at the frames puts the hinge at x = 0 (px), a metre (px) and, generously, the pole's tip (m)."""
+COST = Cost(state=(50.0, 3.0, 100.0, 0.3))
+"""Receding over 10 steps of 0.04 s, the linearised source has eigenvalues of at most 0.967 under it; a force of 10 N
+that swings at 1 rad/s moves the cart by 0.12 m/s."""
+SEE = PerceptionSettings(iterations=2000, cart=Paths(0.8, 0.3, 3.0), pole=Paths(0.15, 0.4, 6.0))
+INSIDE = (REACH - 0.05, 1.0, ANGLE_LIMIT - 0.01, 1.5)
+LEARN = TuneSettings(
+    COST, 1500, start_spread=(0.4, 0.2, 0.12, 0.2), kick=(0.0, 0.1, 0.0, 0.2), diverged=INSIDE, first_divergence=0.3
+)
+ADAPT = TuneSettings(
+    COST, 100, 32, 5e-4, (0.3, 0.1, 0.08, 0.1), (0.0,) * 4, INSIDE, first_divergence=0.4, longest=25, recorded=0.8
+)
+TRAINING = PixelSettings(SEE, LEARN, ADAPT)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is adapted, and where results go."""
+
+    budget: int = 500
+    """N: target samples in all, all counted"""
+    round_samples: int = 100
+    """B: target samples in a round"""
+    seeds: tuple[int, ...] = (0,)
+    """of the adaptations; renderer and source policy are made once, with seed 0"""
+    frames: int = 4000
+    """of set states, that the renderer is trained on"""
+    renderer_steps: int = 800
+    episodes: int = EPISODES
+    """episodes of each evaluation"""
+    out: Path = Path("runs/inverted_pendulum")
+    results: Path = Path("results/inverted_pendulum.csv")
+
+
+class SeenSource(SyntheticTarget):
+    """The source physics, integrated finely, seen through the learnt renderer; it ends where the environment would."""
+
+    def __init__(self, task: PixelTask) -> None:
+        super().__init__(system=SOURCE, period=task.source.period, start=START, angle_limit=ANGLE_LIMIT)
+        self.task = task
+
+    def _observe(self) -> Observation:
+        seen = super()._observe()
+        with torch.no_grad():
+            frame = self.task.observe(seen.state.nan_to_num().clamp(-10, 10))
+        inside = seen.state[:, 0].abs() <= REACH
+        return replace(seen, alive=seen.alive & inside, frame=(255 * frame).round().clamp(0, 255).byte())
+
+
+def main(settings: Settings) -> None:
+    """Do the whole job in `settings.out`, going on from what is there."""
+    out = settings.out
+    told = {key: value for key, value in asdict(settings).items() if key not in ("out", "results", "seeds")}
+    about = open_run(out, {**told, "training": asdict(TRAINING)})
+    target = inverted_pendulum()
+    scores: dict[str, dict[str, Any]] = {}
+    adaptations: dict[int, dict[str, Any]] = {}
+    films: list[tuple[str, Run]] = []
+
+    def look(name: str, where: Target, policy: Policy) -> None:
+        scores[name] = once(out / f"{name}.json", lambda: _score(where, policy, settings.episodes))
+        print(f"{name}: {Evaluation(**scores[name])}", flush=True)
+
+    with reporting() as report:
+        world = World(SOURCE, period=target.period)
+        task = PixelTask(world, _renderer(settings, target, report), TRAINING)
+        _, policy = task.pretrain(out / "source", 0, report)
+        look("source", SeenSource(task), policy)
+        look("before", target, policy)
+        films.append(("InvertedPendulum-v5, before", _one(target, policy)))
+        for seed in settings.seeds:
+            encoder, policy = task.load(out / "source")
+            work, budget, in_round = out / f"seed-{seed}", settings.budget, settings.round_samples
+            adapted = task.adapt(policy, encoder, target, work, budget, in_round, seed, report=report)
+            look(f"after-{seed}", target, policy)
+            adaptations[seed] = {"ledger": asdict(adapted.ledger), "gap": _gap(task.source, adapted.episodes)}
+            if len(films) == 1:
+                films.append((f"after {adapted.ledger.used:,} samples", _one(target, policy)))
+                rounds = [
+                    Round(samples=r.samples, grounding=r.grounding, policy=[*enumerate(r.policy)])
+                    for r in adapted.rounds
+                ]
+                plot_losses(out / "losses.png", rounds)
+        panels = _panels(films)
+        write_still(out / "film.png", panels, t=1.0)
+        write_film(out / "film.mp4", panels, target.period, lambda k, n: report("film", k, n, float("nan")))
+    about = {**about, "seeds": settings.seeds, "not counted": f"{settings.frames} frames at set states"}
+    write_json(out / "metrics.json", {"scores": scores, "adaptations": adaptations, **about})
+    write_rows(settings.results, _rows(scores, adaptations))
+    print(f"film.mp4, film.png, losses.png and metrics.json are in {out}, the table is {settings.results}")
+
+
+def _renderer(settings: Settings, target: GymnasiumTarget, report: Report) -> LayeredRenderer:
+    """Learnt from the environment's frames at set states, or as an earlier run left it."""
+    path = settings.out / "renderer.safetensors"
+    if path.exists():
+        found = load_renderer(path)
+        assert isinstance(found, LayeredRenderer)
+        return found
+    generator = torch.Generator().manual_seed(0)
+    reach = torch.tensor([1.0, 0.0, 0.35, 0.0])
+    states = reach * (2 * torch.rand(settings.frames, 4, generator=generator) - 1)
+    frames = torch.from_numpy(target.show(states.double().numpy()))
+    torch.manual_seed(0)
+    height, width = frames.shape[1:]
+    renderer = LayeredRenderer(height, width, *GUESS)
+    x, theta = states[:, 0], states[:, 2]
+    fit(renderer, x, theta, frames, settings.renderer_steps, generator, 32, staged(report, "renderer"))
+    with torch.no_grad():
+        learnt = (255 * renderer(x[:4], theta[:4])).round().clamp(0, 255).byte()
+    picture = np.vstack([np.hstack(list(row)) for row in (frames[:4].numpy(), learnt.numpy())])
+    with replacing(settings.out / "renderer.png") as temporary:
+        Image.fromarray(picture).save(temporary, "PNG")
+    with replacing(path) as temporary:
+        save_renderer(temporary, renderer, {"frames": settings.frames, "steps": settings.renderer_steps, "seed": 0})
+    return renderer
+
+
+def _score(target: Target, policy: Policy, episodes: int) -> dict[str, object]:
+    return asdict(evaluate(target, policy, see_frames, SCORE_SEED, episodes)[0])
+
+
+def _one(target: Target, policy: Policy) -> Run:
+    return run(target, policy, see_frames, 1, STEPS, torch.Generator().manual_seed(FILM_SEED))[0]
+
+
+def _panels(films: Sequence[tuple[str, Run]]) -> list[Panel]:
+    """The runs as the environment draws them at the states that they went through, larger than the policy sees them."""
+    options = {**MAP.options, "width": 480, "height": 400}
+    view = replace(MAP, crop=(0, 0, 480, 400), width=480, height=400, options=options)
+    large = GymnasiumTarget("InvertedPendulum-v5", view)
+    panels = []
+    for title, filmed in films:
+        assert filmed.episode.state is not None
+        picture = large.show(filmed.episode.state)
+        panels.append(Panel(title, filmed, picture, angle_limit=ANGLE_LIMIT, force_known=False))
+    return panels
+
+
+def _gap(source: World, episodes: list[Episode]) -> dict[str, float]:
+    """Viscous friction and pole damping that explain most of the gap in the velocities, by least squares.
+
+    From the states that the frames told, so from nothing privileged; `explained` is their share of its mean square.
+    """
+    windows = Windows.cut(episodes, "state")
+    left = gap(source, windows)[:, 1::2]
+    state = (windows.state + windows.next_state) / 2
+
+    def pushed(load: Tensor) -> Tensor:
+        """Velocities (N, 2) gained in a period under a load (N, 2) of force and torque."""
+        with_load, without = (source.system.derivative(state, windows.action, at) for at in (load, 0 * load))
+        return source.period * (with_load - without)[:, 1::2]
+
+    nothing = torch.zeros(len(state))
+    friction = pushed(torch.stack((-state[:, 1], nothing), 1))
+    damping = pushed(torch.stack((nothing, -state[:, 3]), 1))
+    unit = left.square().mean(0).sqrt()
+    design = torch.stack([(part / unit).flatten() for part in (friction, damping)], 1)
+    wanted = (left / unit).flatten()
+    found = torch.linalg.lstsq(design, wanted[:, None]).solution[:, 0]
+    explained = 1 - (wanted - design @ found).square().mean() / wanted.square().mean()
+    return {"viscous_friction": float(found[0]), "pole_damping": float(found[1]), "explained": float(explained)}
+
+
+def _rows(scores: dict[str, dict[str, Any]], adaptations: dict[int, dict[str, Any]]) -> list[Row]:
+    """Speeds before and after, and what the gap is: the spread of these is over seeds."""
+    used = max(sum(steps for _, steps in each["ledger"]["entries"]) for each in adaptations.values())
+    what, system, method = "inverted_pendulum", "InvertedPendulum-v5", "ours, frames alone"
+    after = [Evaluation(**scores[f"after-{seed}"]) for seed in adaptations]
+    rows = [
+        speed_row(what, "unadapted", "source", 0, [Evaluation(**scores["source"])], system),
+        speed_row(what, "unadapted", "target", 0, [Evaluation(**scores["before"])], system),
+        speed_row(what, method, "adapted", used, after, system),
+    ]
+    for key, unit in {"viscous_friction": "N s/m", "pole_damping": "N m s/rad", "explained": "1"}.items():
+        found = np.array([each["gap"][key] for each in adaptations.values()])
+        mean, std = round(float(found.mean()), 4), round(float(found.std()), 4)
+        rows.append(Row(what, system, method, "target", used, f"gap: {key}", unit, mean, std, None, 0, len(found)))
+    return rows
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Settings, description=__doc__))
+    except (TargetError, ValueError, OSError) as error:
+        raise SystemExit(f"inverted_pendulum: {error}") from error
+    except KeyboardInterrupt:
+        raise SystemExit("interrupted: run it again to go on") from None
