@@ -141,7 +141,7 @@ def main(settings: Settings) -> None:
                 ]
                 plot_losses(out / "losses.png", rounds)
         panels = _panels(films)
-        write_still(out / "film.png", panels, t=1.0)
+        write_still(out / "film.png", panels, t=5.0)
         write_film(out / "film.mp4", panels, target.period, lambda k, n: report("film", k, n, float("nan")))
     about = {**about, "seeds": settings.seeds, "not counted": f"{settings.frames} frames at set states"}
     write_json(out / "metrics.json", {"scores": scores, "adaptations": adaptations, **about})
