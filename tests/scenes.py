@@ -4,7 +4,7 @@ import torch
 
 from renderers import LayeredRenderer
 from visadapt.learning.perception import PerceptionSettings, scale
-from visadapt.networks import ImageResidualNetwork
+from visadapt.networks import ImageResidualNetwork, StateResidualNetwork
 from visadapt.systems import CartPole
 
 HEIGHT, WIDTH = 20, 24
@@ -50,3 +50,8 @@ def image_residual_network(renderer):
     """A residual network for the small renderer's frames, 0.05 s apart, of the default cart-pole."""
     unit = scale(PerceptionSettings(), 0.05)
     return ImageResidualNetwork(background(renderer), CONTRAST, CartPole(), 0.05, unit)
+
+
+def state_residual_network(with_history):
+    """A residual network for states 0.05 s apart of the default cart-pole."""
+    return StateResidualNetwork(4, system=CartPole() if with_history else None, period=0.05)

@@ -3,6 +3,7 @@ import dataclasses
 import pytest
 import torch
 
+from tests.scenes import state_residual_network
 from visadapt.checkpoints import CheckpointError
 from visadapt.effects import Residual
 from visadapt.learning.cost import PAPER_CARTPOLE
@@ -52,7 +53,7 @@ class Counted(SyntheticTarget):
 def run(folder, settings, target=None, report=None, with_history=False):
     torch.manual_seed(0)
     policy = StatePolicy(4, with_history=with_history)
-    residual = Residual(StateResidualNetwork(4, with_history=with_history), torch.ones(4))
+    residual = Residual(state_residual_network(with_history), torch.ones(4))
     source = World(CartPole(), integrator="euler")
     adapted = adapt(
         policy,

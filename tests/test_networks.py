@@ -2,7 +2,16 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from tests.scenes import CONTRAST, HEIGHT, WIDTH, background, image_residual_network, small_renderer, stir
+from tests.scenes import (
+    CONTRAST,
+    HEIGHT,
+    WIDTH,
+    background,
+    image_residual_network,
+    small_renderer,
+    state_residual_network,
+    stir,
+)
 from visadapt.effects import ConstantForce, Residual
 from visadapt.history import LENGTH, History
 from visadapt.networks import FrameEncoder, StateResidualNetwork
@@ -78,7 +87,7 @@ def networks(dtype=torch.float32):
     return {
         "image": (image_residual_network(small_renderer()).to(dtype), histories(4, dtype=dtype)),
         "state": (StateResidualNetwork(4).to(dtype), states(4, dtype=dtype)),
-        "history": (StateResidualNetwork(4, with_history=True).to(dtype), states(4, dtype=dtype)),
+        "history": (state_residual_network(True).to(dtype), states(4, dtype=dtype)),
     }
 
 
@@ -125,7 +134,7 @@ class TestResidualNetworks:
 
 @pytest.mark.parametrize("with_history", [False, True])
 def test_without_history_a_state_network_sees_the_latest_state_and_action_alone(with_history):
-    network = stir(StateResidualNetwork(4, with_history=with_history))
+    network = stir(state_residual_network(with_history))
     history = states(5)
     older = History(history.observations.clone(), history.actions.clone())
     older.observations[:, :-1] += 1.0
@@ -166,6 +175,21 @@ class TestUnexplained:
         cart = 2.0 / (1.1 - 0.75 * 0.1)
         expected = torch.tensor([cart, -0.75 * cart / 0.5], dtype=torch.float64)
         torch.testing.assert_close(left.detach().mean((0, 1)), expected, rtol=0.02, atol=0.0)
+
+
+def test_on_states_a_force_is_left_and_without_one_nothing():
+    for newtons in (0.0, 2.0):
+        world = World(CartPole(), [ConstantForce(force=newtons)], substeps=20)
+        at = world.start(torch.tensor([[0.1, 0.2, 0.05, -0.1]]))
+        seen, action = [at.state], torch.full((1, 1), 0.05)
+        for _ in range(LENGTH - 1):
+            at = world.step(at, action)
+            seen.append(at.state)
+        left = state_residual_network(True).unexplained(
+            CartPole(), torch.stack(seen, 1), action[:, None].expand(1, LENGTH, 1)
+        )
+        cart = newtons / (1.1 - 0.75 * 0.1)
+        torch.testing.assert_close(left.mean((0, 1)), torch.tensor([cart, -0.75 * cart / 0.5]), rtol=0.02, atol=0.02)
 
 
 def test_a_policy_pushes_against_what_its_residual_expects_once_the_feedforward_has_weight():

@@ -1,10 +1,18 @@
 import pytest
 import torch
 
-from tests.scenes import CONTRAST, HEIGHT, WIDTH, background, image_residual_network, small_renderer, stir
+from tests.scenes import (
+    CONTRAST,
+    HEIGHT,
+    WIDTH,
+    background,
+    image_residual_network,
+    small_renderer,
+    state_residual_network,
+    stir,
+)
 from visadapt.effects import Residual
 from visadapt.history import LENGTH, History
-from visadapt.networks import StateResidualNetwork
 from visadapt.policies import HORIZON, ImagePolicy, StatePolicy
 
 KINDS = ["image", "state", "history"]
@@ -20,7 +28,7 @@ def made(kind, n_action=1, dtype=torch.float32):
 def residual(kind, dtype=torch.float32):
     if kind == "image":
         return Residual(image_residual_network(small_renderer()), torch.ones(4)).to(dtype)
-    return Residual(StateResidualNetwork(4, with_history=kind == "history"), torch.ones(4)).to(dtype)
+    return Residual(state_residual_network(kind == "history"), torch.ones(4)).to(dtype)
 
 
 def observations(kind, count, seed, batch=3, dtype=torch.float32):

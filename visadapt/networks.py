@@ -14,6 +14,8 @@ from visadapt.systems import System
 CHANNELS = (8, 16, 32, 32)
 FEATURES = 128
 CHANGE_GAIN = 2.0
+EXPECTED = 2.0
+"""m/s2 and rad/s2: unexplained accelerations are given to a residual's head in units of this"""
 KINEMATICS = 2 * LENGTH
 """The latest position and its LENGTH - 1 changes, for each of the two things that move: cart and pole."""
 
@@ -120,8 +122,6 @@ class ImageResidualNetwork(ResidualNetwork):
     """
 
     scale: Tensor
-    EXPECTED = 2.0
-    """m/s2 and rad/s2: unexplained accelerations are given to the head in units of this"""
 
     def __init__(self, background: Tensor, contrast: float, system: System, period: float, scale: Tensor) -> None:
         n_action = len(system.actions)
@@ -133,7 +133,7 @@ class ImageResidualNetwork(ResidualNetwork):
 
     def embed(self, history: History) -> Tensor:
         kinematics = self.encoder.kinematics(history)
-        unexplained = self.unexplained(kinematics * self.scale, history.actions) / self.EXPECTED
+        unexplained = self.unexplained(kinematics * self.scale, history.actions) / EXPECTED
         return torch.cat((kinematics, history.actions.flatten(1), unexplained.flatten(1)), 1)
 
     def unexplained(self, kinematics: Tensor, actions: Tensor) -> Tensor:
@@ -157,14 +157,31 @@ class ImageResidualNetwork(ResidualNetwork):
 
 
 class StateResidualNetwork(ResidualNetwork):
-    """The paper's MLP with two hidden layers of 64, tanh (3.2.1), on state and action, or on 5 of each (3.2.2)."""
+    """The paper's MLP with two hidden layers of 64, tanh (3.2.1), on state and action, or on 5 of each (3.2.2).
 
-    def __init__(self, n_state: int, n_action: int = 1, with_history: bool = False) -> None:
-        super().__init__((LENGTH if with_history else 1) * (n_state + n_action), n_state)
-        self.with_history = with_history
+    On a history, given the source's `system` and the `period` in s, it also reads the accelerations that the source
+    leaves unexplained between the states: a force that changes shows there and nowhere else.
+    """
+
+    def __init__(self, n_state: int, n_action: int = 1, system: System | None = None, period: float = 0.0) -> None:
+        history = 0 if system is None else LENGTH
+        super().__init__(max(1, history) * (n_state + n_action) + max(0, history - 1) * n_state // 2, n_state)
+        self.system = system
+        self.period = period
 
     def embed(self, history: History) -> Tensor:
         states, actions = history.observations, history.actions
-        if not self.with_history:
-            states, actions = states[:, -1:], actions[:, -1:]
-        return torch.cat((states.flatten(1), actions.flatten(1)), 1)
+        if self.system is None:
+            return torch.cat((states[:, -1], actions[:, -1]), 1)
+        unexplained = self.unexplained(self.system, states, actions) / EXPECTED
+        return torch.cat((states.flatten(1), actions.flatten(1), unexplained.flatten(1)), 1)
+
+    def unexplained(self, system: System, states: Tensor, actions: Tensor) -> Tensor:
+        """Mean accelerations beyond the source's over the periods between states, (B, LENGTH - 1, n_state / 2).
+
+        The source's is the mean of those at both ends of a period, under the action held over it.
+        """
+        load = states.new_zeros(*states.shape[:-1], len(system.loads))[:, 1:]
+        ends = [system.derivative(part, actions[:, :-1], load) for part in (states[:, :-1], states[:, 1:])]
+        measured = states.diff(dim=1) / self.period
+        return (measured - (ends[0] + ends[1]) / 2)[..., 1::2]

@@ -39,13 +39,14 @@ class StateSettings:
     adapted: TuneSettings = field(
         default_factory=lambda: TuneSettings(
             PAPER_CARTPOLE,
-            iterations=800,
+            iterations=400,
             learning_rate=2e-3,
             start_spread=(0.3, 0.2, 0.1, 0.2),
             kick=(0.0, 0.0, 0.0, 0.0),
-            diverged=ANYWHERE,
-            longest=120,
-            recorded=0.4,
+            diverged=(1e9, 2.0, 0.25, 3.0),
+            first_divergence=0.4,
+            longest=25,
+            recorded=0.8,
             observation_noise=0.0,
         )
     )
@@ -85,6 +86,7 @@ def adapt_states(
 ) -> Adapted:
     """Adapt `policy`, in place, to `target` with at most `budget` counted samples: Algorithm 1 in `folder`."""
     torch.manual_seed(seed)
-    residual = Residual(StateResidualNetwork(n_state=4, with_history=settings.with_history), torch.ones(4))
+    system = source.system if settings.with_history else None
+    residual = Residual(StateResidualNetwork(n_state=4, system=system, period=source.period), torch.ones(4))
     plan = AdaptSettings(settings.adapted, settings.ground, budget, round_samples, "state", seed=seed)
     return adapt(policy, residual, source, target, observe, see_states, plan, folder, report=report)
