@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes import image_residual_network, observing, small_renderer
+from tests.scenes import image_residual_network, observing, small_renderer, state_residual_network
 from visadapt.effects import ConstantForce, Residual
 from visadapt.learning.grounding import GroundSettings, gap, ground, split
 from visadapt.learning.windows import Windows
@@ -43,7 +43,7 @@ class TestOnStates:
     @pytest.mark.parametrize("with_history", [False, True])
     def test_more_than_nine_tenths_of_the_one_step_gap_closes_on_episodes_not_seen(self, with_history):
         torch.manual_seed(0)
-        residual = Residual(StateResidualNetwork(4, with_history=with_history), torch.ones(4))
+        residual = Residual(state_residual_network(with_history), torch.ones(4))
         windows, unseen = Windows.cut(recorded(1), "state"), Windows.cut(recorded(2), "state")
         settings = GroundSettings(steps=500)
         losses = ground(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))

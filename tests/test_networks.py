@@ -1,6 +1,7 @@
 import pytest
 import torch
 import torch.nn.functional as F
+from torch import nn
 
 from tests.scenes import (
     CONTRAST,
@@ -194,11 +195,13 @@ def test_on_states_a_force_is_left_and_without_one_nothing():
 
 def test_a_policy_pushes_against_what_its_residual_expects_once_the_feedforward_has_weight():
     policy = StatePolicy(n_state=4)
-    residual = Residual(StateResidualNetwork(4), torch.ones(4))
-    policy.residual = residual
+    network = StateResidualNetwork(4)
+    policy.residual = Residual(network, torch.ones(4))
     history = states(3)
     quiet = policy.act(history).atanh()
     with torch.no_grad():
-        residual.network.head[-1].bias.copy_(torch.tensor([0.0, 1.0, 0.0, 0.0]))
+        last = network.head[-1]
+        assert isinstance(last, nn.Linear)
+        last.bias.copy_(torch.tensor([0.0, 1.0, 0.0, 0.0]))
         policy.feedforward.weight[:, 1] = -0.25
     torch.testing.assert_close(policy.act(history).atanh(), quiet - 0.25)

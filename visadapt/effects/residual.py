@@ -5,18 +5,18 @@ Delta_phi of the paper (equation 10): the grounded model is f_hat(s, a) + Delta(
 
 from __future__ import annotations
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from visadapt.effects.base import Effect, Stage
 from visadapt.history import History
-from visadapt.networks import ResidualNetwork
 
 
 class Residual(Effect):
     """Adds what a network reads from the last observations and actions to the state after each period.
 
     Args:
-        network: reads a `History` whose last action is the one being executed.
+        network: maps a `History`, whose last action is the one being executed, to (B, n_state) in units of `scale`;
+            only a `networks.ResidualNetwork` can be grounded.
         scale: (n_state,) typical size of a correction per period, in state units.
     """
 
@@ -27,9 +27,9 @@ class Residual(Effect):
 
     scale: Tensor
 
-    def __init__(self, network: ResidualNetwork, scale: Tensor) -> None:
+    def __init__(self, network: nn.Module, scale: Tensor) -> None:
         super().__init__()
-        self.network: ResidualNetwork = network
+        self.network = network
         self.register_buffer("scale", scale.clone())
 
     def delta(self, history: History) -> Tensor:

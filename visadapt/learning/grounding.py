@@ -15,6 +15,7 @@ from torch import Tensor
 
 from visadapt.effects import Residual
 from visadapt.learning.windows import Windows
+from visadapt.networks import ResidualNetwork
 from visadapt.world import World
 
 Progress = Callable[[int, int, float], None]
@@ -66,7 +67,9 @@ def ground(
     residual.scale.copy_(target.square().mean(0).sqrt().clamp(min=1e-9))
     target = target / residual.scale
     network = residual.network
-    seen = _embed(residual, windows)
+    if not isinstance(network, ResidualNetwork):
+        raise TypeError(f"grounding fits the head of a ResidualNetwork, not a {type(network).__name__}")
+    seen = _embed(network, windows)
     train, held_out = split(len(windows), settings.held_out, generator)
     network.head.requires_grad_(True)
     optimiser = torch.optim.AdamW(network.head.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
@@ -101,10 +104,10 @@ def ground(
 
 
 @torch.no_grad()
-def _embed(residual: Residual, windows: Windows) -> Tensor:
+def _embed(network: ResidualNetwork, windows: Windows) -> Tensor:
     """What the head reads in every window, (N, ...)."""
     parts = torch.arange(len(windows)).split(256)
-    return torch.cat([residual.network.embed(windows.history(p).acting(windows.action[p])) for p in parts])
+    return torch.cat([network.embed(windows.history(p).acting(windows.action[p])) for p in parts])
 
 
 def split(count: int, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
