@@ -48,7 +48,7 @@ def curve(rows: Rows) -> list[list[str]]:
     ):
         before = _cells(rows, experiment, "unadapted", "target", 0)
         after = [_cells(rows, experiment, method, "adapted", samples) for samples in CURVE]
-        table.append([name, *(f"{cells[0]} ({cells[1]})" for cells in (before, *after))])
+        table.append([name, *(f"{speed} ({up})" if up else speed for speed, up, _ in (before, *after))])
     return table
 
 
