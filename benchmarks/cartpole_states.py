@@ -2,10 +2,11 @@
 
     python -m benchmarks.cartpole_states
 
-Each seed trains its own source policy and adapts it: to a constant force of 3.3 N, under which the unadapted policy
-drifts at 0.6 to 0.9 m/s and a larger one fells it, with 50 samples and networks that see one state; to the time-variant force, with networks that
-see 5 states and actions, with 50 samples in one round and in rounds of 100 up to 1,000. Scored on 100 episodes as it
-stands after 50, 100, 200, 500 and 1,000 counted samples. No camera, so only a pole beyond 0.3 rad ends an episode.
+Each seed trains its own source policy and adapts it. To a constant force of 3.3 N, under which the unadapted policy
+drifts at 0.6 to 0.9 m/s and beyond which it falls, with 50 samples and networks that see one state. To the
+time-variant force, with networks that see 5 states and actions, with 50 samples in one round and in rounds of 100 up
+to 1,000. Scored on 100 episodes as it stands after 50, 100, 200, 500 and 1,000 counted samples. There is no camera,
+so only a pole beyond 0.3 rad ends an episode.
 
 Writes results/cartpole_states.csv and assets/curve_states.png. Interrupt it anywhere; started again, it goes on.
 """
