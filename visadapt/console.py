@@ -6,11 +6,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bars
 from rich.progress import TimeRemainingColumn as TimeLeftColumn
 
 Report = Callable[[str, int, int, float], None]
 """Called with (stage, steps done, steps in all, loss)."""
+
+Progress = Callable[[int, int, float], None]
+"""Called with (steps done, steps in all, loss): the report of one stage."""
 
 
 @contextmanager
@@ -27,7 +31,7 @@ def reporting() -> Iterator[Report]:
         TimeLeftColumn(),
     )
     stages: dict[str, TaskID] = {}
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
+    with Bars(*columns, console=console, disable=not console.is_terminal) as bars:
 
         def report(stage: str, done: int, total: int, loss: float) -> None:
             if stage not in stages:
@@ -41,7 +45,7 @@ def reporting() -> Iterator[Report]:
         yield report
 
 
-def staged(report: Report | None, stage: str) -> Callable[[int, int, float], None] | None:
+def staged(report: Report | None, stage: str) -> Progress | None:
     """The report of one stage, or None where nothing is reported."""
     if report is None:
         return None

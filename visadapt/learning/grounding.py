@@ -7,19 +7,16 @@ round left it, to all samples so far.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from visadapt.console import Progress
 from visadapt.effects import Residual
 from visadapt.learning.windows import Windows
 from visadapt.networks import ResidualNetwork
 from visadapt.world import World
-
-Progress = Callable[[int, int, float], None]
-"""Called with (steps done, steps at most, held-out loss)."""
 
 
 @dataclass(frozen=True)

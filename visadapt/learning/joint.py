@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 from visadapt.checkpoints import load_tree, load_weights, save_tree
-from visadapt.console import Report, staged
+from visadapt.console import Progress, Report, staged
 from visadapt.effects import Residual
 from visadapt.learning.grounding import GroundLoss, GroundSettings, ground
 from visadapt.learning.ledger import Ledger
@@ -186,9 +186,9 @@ def _collected(
 
 def _grounded(
     path: Path,
-    fit: Callable[[Callable[[int, int, float], None] | None], list[GroundLoss]],
+    fit: Callable[[Progress | None], list[GroundLoss]],
     residual: Residual,
-    progress: Callable[[int, int, float], None] | None,
+    progress: Progress | None,
 ) -> list[tuple[int, float, float]]:
     if path.exists():
         tree = load_tree(path)
@@ -207,7 +207,7 @@ def _tuned(
     settings: AdaptSettings,
     windows: Windows,
     number: int,
-    progress: Callable[[int, int, float], None] | None,
+    progress: Progress | None,
 ) -> list[float]:
     path, partial = here / "policy.safetensors", here / "policy.partial.safetensors"
     if path.exists():

@@ -13,12 +13,10 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from visadapt.console import Progress
 from visadapt.history import LENGTH, History
 from visadapt.learning.resume import EVERY, Training
 from visadapt.networks import FrameEncoder
-
-Progress = Callable[[int, int, float], None]
-"""Called with (iterations done, iterations in all, loss)."""
 
 
 @dataclass(frozen=True)

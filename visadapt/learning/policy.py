@@ -8,7 +8,6 @@ starts anew, and delta_div grows as training goes on, so the policy learns to re
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,15 +15,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from visadapt.console import Progress
 from visadapt.history import History
 from visadapt.learning.cost import Cost
 from visadapt.learning.resume import EVERY, Training
 from visadapt.learning.windows import Observe, Windows
 from visadapt.policies import Policy
 from visadapt.world import World, WorldState
-
-Progress = Callable[[int, int, float], None]
-"""Called with (iterations done, iterations in all, loss)."""
 
 
 class DivergedError(RuntimeError):
