@@ -37,7 +37,7 @@ class Imagined:
         self.observe = observing(self.renderer)
         self.network = image_residual_network(self.renderer).double()
         stir(self.network, 1)
-        residual = Residual(self.network, torch.full((4,), 0.5)).double()
+        residual = Residual(self.network, torch.full((4,), 0.02)).double()
         self.world = World(CartPole(), [residual, ConstantForce(force=1.0)]).requires_grad_(False)
         state = torch.randn(4, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         state = state * torch.tensor([0.4, 0.3, 0.1, 0.3])

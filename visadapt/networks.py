@@ -88,15 +88,18 @@ def mlp(*widths: int) -> nn.Sequential:
 
 
 class ResidualNetwork(nn.Module):
-    """Base of residual networks: what is seen, and a head on it that grounding fits. It begins at zero."""
+    """Base of residual networks: what is seen, and a head on it that grounding fits. It begins at zero.
 
-    def __init__(self, inputs: int, n_state: int) -> None:
+    Args:
+        head: either linear, or layers whose last one is linear.
+    """
+
+    def __init__(self, head: nn.Linear | nn.Sequential) -> None:
         super().__init__()
-        self.head = mlp(inputs, 64, 64, n_state)
-        last = self.head[-1]
-        assert isinstance(last, nn.Linear)
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
+        self.head = head
+        last = head[-1] if isinstance(head, nn.Sequential) else head
+        for weight in last.parameters():
+            nn.init.zeros_(weight)
 
     def embed(self, history: History) -> Tensor:
         """What the head reads, (B, inputs)."""
@@ -113,7 +116,9 @@ class ImageResidualNetwork(ResidualNetwork):
 
     Between the convolutions and the head stand the positions and angles that the frames show, read as
     `learning.perception` taught it in the source: a few hundred samples are too few to learn to see as well. The
-    head reads them, the actions, and the accelerations that the source does not explain (`unexplained`).
+    head reads them, the actions, and the accelerations that the source does not explain (`unexplained`). It is linear
+    and knows no constant: where the source explains everything it has nothing to say. An MLP in its place learns from
+    a few hundred samples where along the track the target happened to push, and is wrong on the next episode.
 
     Args:
         system: the source physics, whose states are x, x_dot, theta, theta_dot.
@@ -125,7 +130,8 @@ class ImageResidualNetwork(ResidualNetwork):
 
     def __init__(self, background: Tensor, contrast: float, system: System, period: float, scale: Tensor) -> None:
         n_action = len(system.actions)
-        super().__init__(KINEMATICS + LENGTH * n_action + 2 * (LENGTH - 2), len(system.states))
+        inputs = KINEMATICS + LENGTH * n_action + 2 * (LENGTH - 2)
+        super().__init__(nn.Linear(inputs, len(system.states), bias=False))
         self.encoder = FrameEncoder(background, contrast, n_action)
         self.system = system
         self.period = period
@@ -165,7 +171,8 @@ class StateResidualNetwork(ResidualNetwork):
 
     def __init__(self, n_state: int, n_action: int = 1, system: System | None = None, period: float = 0.0) -> None:
         history = 0 if system is None else LENGTH
-        super().__init__(max(1, history) * (n_state + n_action) + max(0, history - 1) * n_state // 2, n_state)
+        inputs = max(1, history) * (n_state + n_action) + max(0, history - 1) * n_state // 2
+        super().__init__(mlp(inputs, 64, 64, n_state))
         self.system = system
         self.period = period
 

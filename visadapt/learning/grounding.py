@@ -1,7 +1,7 @@
 """Grounding: the residual learns what the source leaves out (equation 10).
 
-What the residual's network has learnt to see beforehand stays as it is; its head is fitted, from where the last
-round left it, to all samples so far.
+What the residual's network has learnt to see beforehand stays as it is; its head is fitted to all samples so far: a
+linear one by ridge regression, an MLP by descent.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import copy
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from visadapt.console import Progress
 from visadapt.effects import Residual
@@ -21,8 +21,10 @@ from visadapt.world import World
 
 @dataclass(frozen=True)
 class GroundSettings:
-    """How a residual is fitted."""
+    """How a residual is fitted; all but the first are for heads fitted by descent."""
 
+    ridge: float = 10.0
+    """weight of the squared coefficients of a linear head, in samples"""
     steps: int = 2000
     """optimisation steps at most"""
     batch: int = 64
@@ -59,7 +61,7 @@ def ground(
     generator: torch.Generator,
     progress: Progress | None = None,
 ) -> list[GroundLoss]:
-    """Fit `residual` to all windows so far, in place, keeping the weights that did best on held-out stretches."""
+    """Fit `residual` to all windows so far, in place."""
     target = gap(source, windows)
     residual.scale.copy_(target.square().mean(0).sqrt().clamp(min=1e-9))
     target = target / residual.scale
@@ -68,21 +70,53 @@ def ground(
         raise TypeError(f"grounding fits the head of a ResidualNetwork, not a {type(network).__name__}")
     seen = _embed(network, windows)
     train, held_out = split(len(windows), settings.held_out, generator)
-    network.head.requires_grad_(True)
-    optimiser = torch.optim.AdamW(network.head.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
-    best, best_weights, waited = float("inf"), copy.deepcopy(network.head.state_dict()), 0
+    if isinstance(network.head, nn.Linear):
+        return _solve(network.head, seen, target, train, held_out, settings)
+    return _descend(network.head, seen, target, train, held_out, settings, generator, progress)
+
+
+@torch.no_grad()
+def _solve(
+    head: nn.Linear, seen: Tensor, target: Tensor, train: Tensor, held_out: Tensor, settings: GroundSettings
+) -> list[GroundLoss]:
+    """Fit a linear head to all samples. The losses are those before, and of a fit to the training samples alone."""
+    losses = []
+    everything = torch.arange(len(seen))
+    for step, rows in enumerate((everything[:0], train, everything)):
+        inputs = seen[rows]
+        penalty = settings.ridge * torch.eye(seen.shape[1]).to(seen)
+        head.weight.copy_(torch.linalg.solve(inputs.T @ inputs + penalty, inputs.T @ target[rows]).T)
+        error = (head(seen) - target).square().mean(1)
+        losses.append(GroundLoss(step, float(error[train].mean()), float(error[held_out].mean())))
+    return losses[:2]
+
+
+def _descend(
+    head: nn.Module,
+    seen: Tensor,
+    target: Tensor,
+    train: Tensor,
+    held_out: Tensor,
+    settings: GroundSettings,
+    generator: torch.Generator,
+    progress: Progress | None,
+) -> list[GroundLoss]:
+    """Fit a head to the training samples, from what it is, keeping the weights that did best on the held-out ones."""
+    head.requires_grad_(True)
+    optimiser = torch.optim.AdamW(head.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
+    best, best_weights, waited = float("inf"), copy.deepcopy(head.state_dict()), 0
     losses: list[GroundLoss] = []
     running = 0.0
     for step in range(settings.steps + 1):
         if step % settings.every == 0:
             with torch.no_grad():
-                score = float((network.head(seen[held_out]) - target[held_out]).square().mean())
+                score = float((head(seen[held_out]) - target[held_out]).square().mean())
             losses.append(GroundLoss(step, running / settings.every if step else score, score))
             running = 0.0
             if progress is not None:
                 progress(step, settings.steps, score)
             if score < best:
-                best, best_weights, waited = score, copy.deepcopy(network.head.state_dict()), 0
+                best, best_weights, waited = score, copy.deepcopy(head.state_dict()), 0
             else:
                 waited += 1
             if waited > settings.patience and progress is not None:
@@ -90,13 +124,13 @@ def ground(
             if waited > settings.patience or step == settings.steps:
                 break
         rows = train[torch.randint(len(train), (settings.batch,), generator=generator)]
-        loss = (network.head(seen[rows]) - target[rows]).square().mean()
+        loss = (head(seen[rows]) - target[rows]).square().mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         running += float(loss.detach())
-    network.head.load_state_dict(best_weights)
-    network.head.requires_grad_(False)
+    head.load_state_dict(best_weights)
+    head.requires_grad_(False)
     return losses
 
 

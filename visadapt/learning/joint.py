@@ -7,6 +7,7 @@ under its final name only once it is whole; an interrupted run goes on after the
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -124,6 +125,8 @@ def adapt(
     """
     grounded = World(source.system, [residual], source.period, source.integrator, source.substeps)
     policy.residual = residual
+    # Every round fits it anew: a head that has seen what is now held out would look best left alone.
+    untaught = copy.deepcopy(residual.state_dict())
     ledger = Ledger(settings.budget)
     episodes: list[Episode] = []
     rounds: list[Round] = []
@@ -136,6 +139,7 @@ def adapt(
             ledger.count(f"{name}: data", episode.samples)
         episodes += new if label is None else label(new)
         windows = Windows.cut(episodes, settings.observations, observe)
+        residual.load_state_dict(untaught)
         grounding = _grounded(
             here / "residual.safetensors",
             lambda progress, w=windows, n=number: ground(  # type: ignore[misc]

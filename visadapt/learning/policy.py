@@ -36,6 +36,8 @@ class TuneSettings:
     iterations: int
     batch: int = 64
     learning_rate: float = 1e-3
+    feedforward_rate: float = 5e-3
+    """learning rate of the weights that pass the residual's correction straight into the plan: they begin at zero"""
     start_spread: tuple[float, ...] = (0.5, 0.3, 0.15, 0.3)
     """half-widths of the uniform distribution of states that streams start from"""
     kick: tuple[float, ...] = (0.0, 0.3, 0.0, 0.5)
@@ -148,10 +150,12 @@ def tune(
         DivergedError: the loss is not finite.
     """
     world.requires_grad_(False)
-    optimiser = torch.optim.Adam(policy.parameters())
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, settings.learning_rate, total_steps=settings.iterations, pct_start=0.1
-    )
+    groups: list[dict[str, list[nn.Parameter]]] = [{"params": []}, {"params": []}]
+    for name, weight in policy.named_parameters():
+        groups[name.startswith("feedforward")]["params"].append(weight)
+    optimiser = torch.optim.Adam(groups)
+    rates = [settings.learning_rate, settings.feedforward_rate]
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rates, total_steps=settings.iterations, pct_start=0.1)
     training = Training(policy, optimiser, schedule, generator)
     streams = Streams(world, observe, windows, settings)
     losses: list[float] = []
