@@ -98,7 +98,7 @@ class TestOnStates:
             overshot.append(losses[-1].held_out > 1.05 * best)
         assert any(overshot)
 
-    def test_the_same_seed_gives_the_same_weights_and_another_round_goes_on_from_them(self):
+    def test_the_same_seed_gives_the_same_weights_and_fitted_again_it_goes_on_from_them(self):
         windows = Windows.cut(recorded(1), "state")
         settings = GroundSettings(steps=100)
         found = []
@@ -114,18 +114,45 @@ class TestOnStates:
         assert second[0].held_out == pytest.approx(min(loss.held_out for loss in first), rel=1e-3)
 
 
-def test_on_frames_the_head_is_fitted_and_what_sees_stays_as_it_is():
-    torch.manual_seed(0)
-    renderer = small_renderer()
-    network = image_residual_network(renderer)
-    residual = Residual(network, torch.ones(4))
-    windows = Windows.cut(recorded(1, count=4, rows=11), "rendered", observing(renderer))
-    before = {key: value.clone() for key, value in residual.state_dict().items()}
-    losses = ground(residual, SOURCE, windows, GroundSettings(steps=100), torch.Generator().manual_seed(0))
-    for key, value in residual.state_dict().items():
-        if key.startswith("network.encoder"):
-            assert torch.equal(value, before[key]), key
-    assert min(loss.held_out for loss in losses) < 0.5 * losses[0].held_out
+class TestOnFrames:
+    @pytest.fixture
+    def seen(self):
+        """A residual network that sees frames, and windows of a world with a force."""
+        torch.manual_seed(0)
+        renderer = small_renderer()
+        windows = Windows.cut(recorded(1, count=4, rows=11), "rendered", observing(renderer))
+        return Residual(image_residual_network(renderer), torch.ones(4)), windows
+
+    def test_the_head_is_fitted_and_what_sees_stays_as_it_is(self, seen):
+        residual, windows = seen
+        before = {key: value.clone() for key, value in residual.state_dict().items()}
+        losses = ground(residual, SOURCE, windows, GroundSettings(), torch.Generator().manual_seed(0))
+        for key, value in residual.state_dict().items():
+            if key.startswith("network.encoder"):
+                assert torch.equal(value, before[key]), key
+        assert losses[1].held_out < 0.5 * losses[0].held_out
+
+    def test_a_linear_head_solves_the_ridge_equations_on_all_samples(self, seen):
+        residual, windows = seen
+        ridge = 3.0
+        ground(residual, SOURCE, windows, GroundSettings(ridge=ridge), torch.Generator().manual_seed(0))
+        head = residual.network.head
+        with torch.no_grad():
+            history = windows.history(torch.arange(len(windows))).acting(windows.action)
+            inputs = residual.network.embed(history).double()
+        weight = head.weight.detach().double()
+        left = gap(SOURCE, windows).double() / residual.scale - inputs @ weight.T
+        # The gradient of the squared errors and the penalty vanishes.
+        np.testing.assert_allclose((left.T @ inputs).numpy(), (ridge * weight).numpy(), atol=1e-3)
+
+    def test_what_it_says_of_held_out_samples_comes_from_the_others_alone(self, seen):
+        residual, windows = seen
+        settings = GroundSettings()
+        losses = ground(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
+        _, held = split(len(windows), settings.held_out, torch.Generator().manual_seed(0))
+        assert [loss.step for loss in losses] == [0, 1]
+        error = (gap_left(windows, residual)[held] / residual.scale).square().mean()
+        assert losses[1].held_out > float(error)
 
 
 class TestSplit:

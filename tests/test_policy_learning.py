@@ -1,7 +1,15 @@
 import pytest
 import torch
 
-from tests.scenes import CONTRAST, background, image_residual_network, observing, small_renderer, stir
+from tests.scenes import (
+    CONTRAST,
+    background,
+    image_residual_network,
+    observing,
+    small_renderer,
+    state_residual_network,
+    stir,
+)
 from visadapt.effects import ActuatorDelay, ConstantForce, Residual
 from visadapt.evaluation import evaluate
 from visadapt.history import History
@@ -37,7 +45,7 @@ class Imagined:
         self.observe = observing(self.renderer)
         self.network = image_residual_network(self.renderer).double()
         stir(self.network, 1)
-        residual = Residual(self.network, torch.full((4,), 0.02)).double()
+        residual = Residual(self.network, torch.full((4,), 0.1)).double()
         self.world = World(CartPole(), [residual, ConstantForce(force=1.0)]).requires_grad_(False)
         state = torch.randn(4, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         state = state * torch.tensor([0.4, 0.3, 0.1, 0.3])
@@ -168,6 +176,19 @@ class TestOnStates:
             losses = tune(StatePolicy(4), world, identity, settings, torch.Generator().manual_seed(0), windows)
             costs.append(losses[0])
         assert costs[1] > 3 * costs[0]
+
+    @pytest.mark.parametrize("rate", [0.0, 1e-2])
+    def test_what_passes_the_correction_straight_on_has_a_rate_of_its_own(self, rate):
+        torch.manual_seed(0)
+        policy = StatePolicy(4)
+        policy.residual = Residual(stir(state_residual_network(with_history=False)), torch.full((4,), 0.01))
+        before = policy.first.weight.detach().clone()
+        settings = TuneSettings(PAPER_CARTPOLE, 3, 4, learning_rate=1e-3, feedforward_rate=rate)
+        world = World(CartPole(), [policy.residual], integrator="euler")
+        tune(policy, world, identity, settings, torch.Generator().manual_seed(0))
+        moved = float(policy.feedforward.weight.detach().abs().max())
+        assert moved == pytest.approx(2.3 * rate, rel=0.5)
+        assert not torch.equal(policy.first.weight, before)
 
     def test_a_loss_that_is_not_a_number_is_an_error_that_says_when(self):
         settings = TuneSettings(PAPER_CARTPOLE, 5, 4)

@@ -78,3 +78,19 @@ class TestJson:
             write_json(path, {"a": 2, "b": object()})
         assert read_json(path) == {"a": 1}
         assert list(tmp_path.iterdir()) == [path]
+
+    def test_what_is_not_finite_is_null_for_strict_readers(self, tmp_path):
+        def refuse(constant):
+            raise AssertionError(constant)
+
+        path = tmp_path / "metrics.json"
+        nan, inf = float("nan"), float("inf")
+        write_json(path, {"speed": nan, "scores": [{"speed": -inf}, (inf, 0.5)]})
+        assert json.loads(path.read_text(), parse_constant=refuse) == {
+            "speed": None,
+            "scores": [{"speed": None}, [None, 0.5]],
+        }
+
+    def test_settings_that_are_not_finite_are_still_the_same_settings(self, tmp_path):
+        open_run(tmp_path, {"limit": float("inf")})
+        open_run(tmp_path, {"limit": float("inf")})

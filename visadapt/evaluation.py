@@ -20,15 +20,15 @@ class Evaluation:
 
     episodes: int
     survived: int
-    mean_speed: float
-    """m/s, mean over surviving episodes of the mean |x_dot| over the episode; NaN where none survived"""
-    std_speed: float
+    mean_speed: float | None
+    """m/s, mean over surviving episodes of the mean |x_dot| over the episode; None where none survived"""
+    std_speed: float | None
     """m/s, spread over surviving episodes"""
     mean_length: float
     """steps until the end, over all episodes"""
 
     def __str__(self) -> str:
-        speed = f"{self.mean_speed:.3f} m/s" if self.survived else "no speed"
+        speed = f"{self.mean_speed:.3f} m/s" if self.mean_speed is not None else "no speed"
         return f"{speed}, {self.survived} of {self.episodes} episodes up"
 
 
@@ -49,7 +49,7 @@ def score(runs: list[Run]) -> Evaluation:
     return Evaluation(
         episodes=len(runs),
         survived=len(speeds),
-        mean_speed=float(speeds.mean()) if len(speeds) else float("nan"),
-        std_speed=float(speeds.std()) if len(speeds) else float("nan"),
+        mean_speed=float(speeds.mean()) if len(speeds) else None,
+        std_speed=float(speeds.std()) if len(speeds) else None,
         mean_length=float(np.mean([r.episode.samples for r in runs])),
     )

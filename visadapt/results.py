@@ -37,8 +37,8 @@ def speed_row(
 ) -> Row:
     """Mean cart speed over the surviving episodes of all seeds (one Evaluation each), with its spread over them."""
     weights = np.array([score.survived for score in scores], float)
-    means = np.array([score.mean_speed if score.survived else 0.0 for score in scores])
-    spreads = np.array([score.std_speed if score.survived else 0.0 for score in scores])
+    means = np.array([score.mean_speed or 0.0 for score in scores])
+    spreads = np.array([score.std_speed or 0.0 for score in scores])
     total = weights.sum()
     mean = float((weights * means).sum() / total) if total else float("nan")
     variance = float((weights * (spreads**2 + (means - mean) ** 2)).sum() / total) if total else float("nan")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -25,7 +26,7 @@ def open_run(folder: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
         RunError: the folder holds a run with other settings.
     """
     path = folder / "settings.json"
-    wanted = json.loads(json.dumps(dict(settings), default=str))
+    wanted = json.loads(json.dumps(_finite(settings), default=str))
     if path.exists():
         found = read_json(path)["settings"]
         if found != wanted:
@@ -66,6 +67,16 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON object, whole or not at all."""
+    """Write a JSON object, whole or not at all; what is not finite is written as null, as strict readers ask."""
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n")
+        temporary.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, float):
+        return content if math.isfinite(content) else None
+    if isinstance(content, Mapping):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    return content
