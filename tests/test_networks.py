@@ -199,6 +199,7 @@ def test_a_policy_pushes_against_what_its_residual_expects_once_the_feedforward_
     policy.residual = Residual(network, torch.ones(4))
     history = states(3)
     quiet = policy.act(history).atanh()
+    assert isinstance(network.head, nn.Sequential)
     with torch.no_grad():
         last = network.head[-1]
         assert isinstance(last, nn.Linear)

@@ -20,27 +20,22 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 import tyro
 
 from renderers import DrawnCartPole
 from train import renderer as renderer_training
+from train.scoring import curves, filmed, score
 from visadapt.console import reporting
-from visadapt.evaluation import EPISODES, STEPS, Evaluation, evaluate
-from visadapt.learning.joint import Adapted
+from visadapt.evaluation import EPISODES, Evaluation
 from visadapt.panels import Panel
 from visadapt.pixels import PixelSettings, PixelTask
-from visadapt.plots import Round, plot_losses
-from visadapt.policies import Policy
-from visadapt.rollout import Run, run, see_frames
+from visadapt.plots import plot_losses
+from visadapt.rollout import Run
 from visadapt.runs import once, open_run, write_json
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, Target, TargetError, no_effects, sine_force
 from visadapt.video import write_film, write_still
 from visadapt.world import World
-
-FILM_SEED, SCORE_SEED = 12, 2026
-"""Starts and phases of the film and of the final evaluation: never those of training, which counts from 0."""
 
 
 @dataclass(frozen=True)
@@ -84,9 +79,9 @@ def main(settings: Settings) -> None:
 
         def look(name: str, title: str, where: Target) -> None:
             """Score the policy as it is now, and film one episode."""
-            scores[name] = once(out / f"{name}.json", lambda: _score(where, policy, settings))
-            print(f"{title}: {_said(scores[name])}", flush=True)
-            films.append((title, _one(where, policy)))
+            scores[name] = once(out / f"{name}.json", lambda: score(where, policy, settings.episodes))
+            print(f"{title}: {Evaluation(**scores[name])}", flush=True)
+            films.append((title, filmed(where, policy)))
 
         look("source", "Source, 0 samples", source)
         look("before", "Target, before", target)
@@ -103,12 +98,12 @@ def main(settings: Settings) -> None:
             report,
         )
         look("after", f"Target, after {adapted.ledger.used:,} samples", target)
-        panels = [Panel.redrawn(title, filmed, scene) for title, filmed in films]
+        panels = [Panel.redrawn(title, shown, scene) for title, shown in films]
         write_still(out / "film.png", panels, t=3.0)
         write_film(
             out / "film.mp4", panels, target.period, lambda done, total: report("film", done, total, float("nan"))
         )
-    plot_losses(out / "losses.png", _curves(adapted))
+    plot_losses(out / "losses.png", curves(adapted))
     write_json(out / "metrics.json", {"ledger": asdict(adapted.ledger), "scores": scores, **about})
     print(f"film.mp4, film.png, losses.png and metrics.json are in {out}")
 
@@ -120,25 +115,6 @@ def _renderer(settings: Settings, out: Path) -> Path:
     if not path.exists():
         renderer_training.train(renderer_training.Settings(kinds=("layered",), out=out))
     return path
-
-
-def _score(target: Target, policy: Policy, settings: Settings) -> dict[str, object]:
-    return asdict(evaluate(target, policy, see_frames, SCORE_SEED, settings.episodes)[0])
-
-
-def _one(target: Target, policy: Policy) -> Run:
-    return run(target, policy, see_frames, 1, STEPS, torch.Generator().manual_seed(FILM_SEED))[0]
-
-
-def _said(score: dict[str, Any]) -> str:
-    return str(Evaluation(**score))
-
-
-def _curves(adapted: Adapted) -> list[Round]:
-    return [
-        Round(samples=each.samples, grounding=each.grounding, policy=list(enumerate(each.policy)))
-        for each in adapted.rounds
-    ]
 
 
 if __name__ == "__main__":

@@ -31,9 +31,9 @@ from torch import Tensor
 
 from renderers import LayeredRenderer, load_renderer, save_renderer
 from renderers.training import fit
-from train.demo import FILM_SEED, SCORE_SEED
+from train.scoring import curves, filmed, score
 from visadapt.console import Report, reporting, staged
-from visadapt.evaluation import EPISODES, STEPS, Evaluation, evaluate
+from visadapt.evaluation import EPISODES, Evaluation
 from visadapt.files import replacing
 from visadapt.learning.cost import Cost
 from visadapt.learning.grounding import gap
@@ -42,11 +42,11 @@ from visadapt.learning.policy import TuneSettings
 from visadapt.learning.windows import Windows
 from visadapt.panels import Panel
 from visadapt.pixels import PixelSettings, PixelTask
-from visadapt.plots import Round, plot_losses
+from visadapt.plots import plot_losses
 from visadapt.policies import Policy
 from visadapt.recordings import Episode
 from visadapt.results import Row, speed_row, write_rows
-from visadapt.rollout import Run, run, see_frames
+from visadapt.rollout import Run
 from visadapt.runs import once, open_run, write_json
 from visadapt.targets import Observation, SyntheticTarget, Target, TargetError
 from visadapt.targets.gymnasium import GymnasiumTarget
@@ -67,7 +67,16 @@ LEARN = TuneSettings(
     COST, 1500, start_spread=(0.4, 0.2, 0.12, 0.2), kick=(0.0, 0.1, 0.0, 0.2), diverged=INSIDE, first_divergence=0.3
 )
 ADAPT = TuneSettings(
-    COST, 100, 32, 5e-4, (0.3, 0.1, 0.08, 0.1), (0.0,) * 4, INSIDE, first_divergence=0.4, longest=25, recorded=0.8
+    COST,
+    iterations=100,
+    batch=32,
+    learning_rate=5e-4,
+    start_spread=(0.3, 0.1, 0.08, 0.1),
+    kick=(0.0,) * 4,
+    diverged=INSIDE,
+    first_divergence=0.4,
+    longest=25,
+    recorded=0.8,
 )
 TRAINING = PixelSettings(SEE, LEARN, ADAPT)
 
@@ -117,7 +126,7 @@ def main(settings: Settings) -> None:
     films: list[tuple[str, Run]] = []
 
     def look(name: str, where: Target, policy: Policy) -> None:
-        scores[name] = once(out / f"{name}.json", lambda: _score(where, policy, settings.episodes))
+        scores[name] = once(out / f"{name}.json", lambda: score(where, policy, settings.episodes))
         print(f"{name}: {Evaluation(**scores[name])}", flush=True)
 
     with reporting() as report:
@@ -126,7 +135,7 @@ def main(settings: Settings) -> None:
         _, policy = task.pretrain(out / "source", 0, report)
         look("source", SeenSource(task), policy)
         look("before", target, policy)
-        films.append(("InvertedPendulum-v5, before", _one(target, policy)))
+        films.append(("InvertedPendulum-v5, before", filmed(target, policy)))
         for seed in settings.seeds:
             encoder, policy = task.load(out / "source")
             work, budget, in_round = out / f"seed-{seed}", settings.budget, settings.round_samples
@@ -134,12 +143,8 @@ def main(settings: Settings) -> None:
             look(f"after-{seed}", target, policy)
             adaptations[seed] = {"ledger": asdict(adapted.ledger), "gap": _gap(task.source, adapted.episodes)}
             if len(films) == 1:
-                films.append((f"after {adapted.ledger.used:,} samples", _one(target, policy)))
-                rounds = [
-                    Round(samples=r.samples, grounding=r.grounding, policy=[*enumerate(r.policy)])
-                    for r in adapted.rounds
-                ]
-                plot_losses(out / "losses.png", rounds)
+                films.append((f"after {adapted.ledger.used:,} samples", filmed(target, policy)))
+                plot_losses(out / "losses.png", curves(adapted))
         panels = _panels(films)
         write_still(out / "film.png", panels, t=5.0)
         write_film(out / "film.mp4", panels, target.period, lambda k, n: report("film", k, n, float("nan")))
@@ -175,24 +180,16 @@ def _renderer(settings: Settings, target: GymnasiumTarget, report: Report) -> La
     return renderer
 
 
-def _score(target: Target, policy: Policy, episodes: int) -> dict[str, object]:
-    return asdict(evaluate(target, policy, see_frames, SCORE_SEED, episodes)[0])
-
-
-def _one(target: Target, policy: Policy) -> Run:
-    return run(target, policy, see_frames, 1, STEPS, torch.Generator().manual_seed(FILM_SEED))[0]
-
-
 def _panels(films: Sequence[tuple[str, Run]]) -> list[Panel]:
     """The runs as the environment draws them at the states that they went through, larger than the policy sees them."""
     options = {**MAP.options, "width": 480, "height": 400}
     view = replace(MAP, crop=(0, 0, 480, 400), width=480, height=400, options=options)
     large = GymnasiumTarget("InvertedPendulum-v5", view)
     panels = []
-    for title, filmed in films:
-        assert filmed.episode.state is not None
-        picture = large.show(filmed.episode.state)
-        panels.append(Panel(title, filmed, picture, angle_limit=ANGLE_LIMIT, force_known=False))
+    for title, shown in films:
+        assert shown.episode.state is not None
+        picture = large.show(shown.episode.state)
+        panels.append(Panel(title, shown, picture, angle_limit=ANGLE_LIMIT, force_known=False))
     return panels
 
 

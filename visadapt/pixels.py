@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -139,10 +140,16 @@ class PixelTask:
         load_network(folder / "policy.safetensors", policy)
         return encoder, policy
 
+    @cached_property
+    def tracker(self) -> Tracker:
+        """Estimates states from frames."""
+        return Tracker(self.renderer, self.source)
+
     def label(self, episodes: list[Episode]) -> list[Episode]:
         """The same episodes with states estimated from their frames alone; too short ones, of 1 or 2 rows, go."""
-        tracker = Tracker(self.renderer, self.source)
-        return [track.episode for track in tracker.track([episode for episode in episodes if len(episode.time) > 2])]
+        return [
+            track.episode for track in self.tracker.track([episode for episode in episodes if len(episode.time) > 2])
+        ]
 
     def adapt(
         self,

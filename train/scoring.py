@@ -1,0 +1,35 @@
+"""What the adaptations from pixels share: scores, episodes for the film, curves of the losses."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import torch
+
+from visadapt.evaluation import STEPS, evaluate
+from visadapt.learning.joint import Adapted
+from visadapt.plots import Round
+from visadapt.policies import Policy
+from visadapt.rollout import Run, run, see_frames
+from visadapt.targets import Target
+
+FILM_SEED, SCORE_SEED = 12, 2026
+"""Starts and phases of the film and of the final evaluation: never those of training, which counts from 0."""
+
+
+def score(target: Target, policy: Policy, episodes: int) -> dict[str, object]:
+    """The Evaluation of a policy that sees frames, as JSON takes it."""
+    return asdict(evaluate(target, policy, see_frames, SCORE_SEED, episodes)[0])
+
+
+def filmed(target: Target, policy: Policy) -> Run:
+    """The episode that is shown."""
+    return run(target, policy, see_frames, 1, STEPS, torch.Generator().manual_seed(FILM_SEED))[0]
+
+
+def curves(adapted: Adapted) -> list[Round]:
+    """Losses round by round, for `plot_losses`."""
+    return [
+        Round(samples=each.samples, grounding=each.grounding, policy=list(enumerate(each.policy)))
+        for each in adapted.rounds
+    ]
