@@ -2,5 +2,6 @@
 
 from visadapt.recordings.episode import Episode, RecordingError
 from visadapt.recordings.hdf5 import read_recording, write_recording
+from visadapt.recordings.recording import Recording
 
-__all__ = ["Episode", "RecordingError", "read_recording", "write_recording"]
+__all__ = ["Episode", "Recording", "RecordingError", "read_recording", "write_recording"]
