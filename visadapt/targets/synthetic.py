@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from renderers import DrawnCartPole
-from visadapt.effects import ConstantForce, DynamicsEffect, Effect, PeriodicForce
+from visadapt.effects import ConstantForce, Effect, PeriodicForce
 from visadapt.systems import CartPole, System
 from visadapt.targets.base import Observation, Target, TargetError
 from visadapt.world import World, WorldState
@@ -90,25 +90,24 @@ class SyntheticTarget(Target):
         self.angle_limit = angle_limit
         self._world: World | None = None
         self._at: WorldState | None = None
+        self._generator: torch.Generator | None = None
 
     def reset(self, batch: int, generator: torch.Generator) -> Observation:
         effects = self.draw_effects(batch, generator)
         substeps = round(self.period / 0.001)
+        self._generator = generator
         self._world = World(self.system, effects, self.period, "midpoint", substeps).requires_grad_(False)
-        self._at = self._world.start(self.initial.draw(batch, generator))
-        return self._observe()
+        return self._observe(self._world, self._world.start(self.initial.draw(batch, generator)))
 
     def step(self, action: Tensor) -> Observation:
         if self._world is None or self._at is None:
             raise TargetError(f"{self.name}: step before reset")
         with torch.no_grad():
-            self._at = self._world.step(self._at, action)
-        return self._observe()
+            return self._observe(self._world, self._world.step(self._at, action))
 
-    def _observe(self) -> Observation:
-        assert self._world is not None
-        assert self._at is not None
-        state = self._at.state
+    def _observe(self, world: World, at: WorldState) -> Observation:
+        measured, self._at = world.measure(at, self._generator)
+        state = at.state
         alive = state.isfinite().all(1) & (state[:, 2].abs() <= self.angle_limit)
         frame = None
         if self.camera is not None:
@@ -116,8 +115,4 @@ class SyntheticTarget(Target):
             # A fallen cart-pole may be anywhere; the camera shows it at its last sensible place.
             shown = state.nan_to_num().clamp(-10, 10).double().numpy()
             frame = torch.from_numpy(self.camera(shown[:, 0], shown[:, 2]))
-        force = torch.zeros_like(state[:, 0])
-        for effect in self._world.effects:
-            if isinstance(effect, DynamicsEffect):
-                force = force + effect.load(self._at.time, state)[:, 0]
-        return Observation(state, alive, frame, force)
+        return Observation(measured, alive, frame, world.load(at)[:, 0])
