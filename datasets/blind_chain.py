@@ -62,7 +62,7 @@ class Actuation:
         u = u * (1 + p["directional_gain.share"] * np.sign(u)) + p["even_motor.coefficient"] * u**2
         u = u * (1 - p["fading_gain.rate"] * t)
         u = p["actuator_gain.scale"] * u + p["actuator_bias.offset"]
-        constant = np.maximum(p["actuator_lag.time_constant"], 1e-9)
+        constant = np.maximum(p["actuator_lag.time_constant"], 1e-12)
         before, self.lagged = self.lagged, u + (self.lagged - u) * np.exp(-h / constant)
         # Mean of an exponential over the substep; without a lag that is u itself.
         return u + constant / h * (before - self.lagged)
