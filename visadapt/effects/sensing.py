@@ -39,22 +39,22 @@ class MeasurementDelay(SensingEffect):
     ) -> tuple[Tensor, Tensor]:
         number = memory[:, -1, -1] + 1
         rows = torch.cat((memory, torch.cat((measured, number[:, None]), 1)[:, None]), 1)
-        shift = torch.minimum(self._shift(measured, period), number)
+        shift = self._shift(measured, period)
+        # Not torch.minimum, which halves the gradient where both are equal: in every first row without a delay.
+        shift = torch.where(shift < number, shift, number)
         whole = shift.detach().floor()
         index = torch.arange(len(rows), device=rows.device), rows.shape[1] - 1 - whole.long()
-        later = rows[index]
-        earlier = rows[index[0], index[1] - 1]
+        later, earlier = rows[index], rows[index[0], index[1] - 1]
         back = (shift - whole)[:, None]  # periods before the later row
-        positions, velocities = _POSITIONS, _VELOCITIES
-        end, start = later[:, positions], earlier[:, positions]
-        end_slope, start_slope = period * later[:, velocities], period * earlier[:, velocities]
+        end, start = later[:, _POSITIONS], earlier[:, _POSITIONS]
+        end_slope, start_slope = period * later[:, _VELOCITIES], period * earlier[:, _VELOCITIES]
         # The cubic in `back`, which runs from the later row (0) to the earlier one (1).
         bend = 3 * (start - end) + 2 * end_slope + start_slope
         twist = 2 * (end - start) - end_slope - start_slope
         position = end - back * (end_slope - back * (bend + back * twist))
         velocity = (end_slope - back * (2 * bend + 3 * back * twist)) / period
         out = measured.clone()
-        out[:, positions], out[:, velocities] = position, velocity
+        out[:, _POSITIONS], out[:, _VELOCITIES] = position, velocity
         return out, rows[:, 1:]
 
     def _shift(self, state: Tensor, period: float) -> Tensor:
@@ -144,7 +144,10 @@ class PositionOffset(SensingEffect):
 
 
 class Dropout(SensingEffect):
-    """Rows that are lost: with probability `rate`, all of a row repeats the row measured last."""
+    """Rows that are lost: with probability `rate`, all of a row repeats the row measured last.
+
+    The first row of an episode is never lost: there is none before it.
+    """
 
     name = "dropout"
     equation = "measured_k = measured_(k-1) with probability rate"
@@ -153,7 +156,8 @@ class Dropout(SensingEffect):
     no_gradient = "whether a row is lost is drawn, yes or no"
 
     def memory(self, state: Tensor, period: float) -> Tensor:
-        return state[:, None]
+        # Behind the row measured last, whether there is one.
+        return torch.cat((state, torch.zeros_like(state[:, :1])), 1)[:, None]
 
     def apply_to(
         self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
@@ -161,9 +165,9 @@ class Dropout(SensingEffect):
         if generator is None:
             raise ValueError("dropout is random: it needs a torch.Generator")
         drawn = torch.rand(len(measured), generator=generator, device=generator.device).to(measured)
-        lost = drawn < self.value("rate", measured)
-        out = torch.where(lost[:, None], memory[:, 0], measured)
-        return out, out[:, None]
+        lost = (drawn < self.value("rate", measured)) & (memory[:, 0, -1] > 0)
+        out = torch.where(lost[:, None], memory[:, 0, :-1], measured)
+        return out, torch.cat((out, torch.ones_like(out[:, :1])), 1)[:, None]
 
 
 _POSITIONS = [CartPole.index("x"), CartPole.index("theta")]

@@ -97,17 +97,21 @@ class SyntheticTarget(Target):
         substeps = round(self.period / 0.001)
         self._generator = generator
         self._world = World(self.system, effects, self.period, "midpoint", substeps).requires_grad_(False)
-        return self._observe(self._world, self._world.start(self.initial.draw(batch, generator)))
+        self._at = self._world.start(self.initial.draw(batch, generator))
+        return self._observe()
 
     def step(self, action: Tensor) -> Observation:
         if self._world is None or self._at is None:
             raise TargetError(f"{self.name}: step before reset")
         with torch.no_grad():
-            return self._observe(self._world, self._world.step(self._at, action))
+            self._at = self._world.step(self._at, action)
+        return self._observe()
 
-    def _observe(self, world: World, at: WorldState) -> Observation:
-        measured, self._at = world.measure(at, self._generator)
-        state = at.state
+    def _observe(self) -> Observation:
+        assert self._world is not None
+        assert self._at is not None
+        measured, self._at = self._world.measure(self._at, self._generator)
+        state = self._at.state
         alive = state.isfinite().all(1) & (state[:, 2].abs() <= self.angle_limit)
         frame = None
         if self.camera is not None:
@@ -115,4 +119,4 @@ class SyntheticTarget(Target):
             # A fallen cart-pole may be anywhere; the camera shows it at its last sensible place.
             shown = state.nan_to_num().clamp(-10, 10).double().numpy()
             frame = torch.from_numpy(self.camera(shown[:, 0], shown[:, 2]))
-        return Observation(measured, alive, frame, world.load(at)[:, 0])
+        return Observation(measured, alive, frame, self._world.load(self._at)[:, 0])
