@@ -118,7 +118,7 @@ def make(settings: Settings) -> list[Draft]:
     if settings.count < 1:
         raise ValueError(f"count is {settings.count}, must be at least 1")
     difficulty = DIFFICULTIES[settings.kind]
-    seeds = np.random.SeedSequence(settings.seed).spawn(settings.count + 1)
+    seeds = np.random.SeedSequence([settings.seed, list(DIFFICULTIES).index(settings.kind)]).spawn(settings.count + 1)
     # Shares as even as the count allows, in an order that says nothing.
     edges = np.cumsum(list(difficulty.mix.values()))
     places = (np.arange(settings.count) + 0.5) / settings.count
