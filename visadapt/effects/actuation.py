@@ -70,17 +70,12 @@ class ActuatorBacklash(ActuationEffect):
 
     def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
         half = self.column("width", commands) / 2
-        low, high = commands - half, commands + half
-        # A clamp of a clamp is a clamp, so all prefixes of the recurrence come in log2(S) rounds (Blelloch 1990).
-        reach = 1
-        while reach < commands.shape[1]:
-            earlier = low[:, :-reach], high[:, :-reach]
-            later = low[:, reach:], high[:, reach:]
-            low = torch.cat((low[:, :reach], _clamp(earlier[0], *later)), 1)
-            high = torch.cat((high[:, :reach], _clamp(earlier[1], *later)), 1)
-            reach *= 2
-        follows = _clamp(memory, low, high)
-        return follows, follows[:, -1:]
+        follows, output = memory[:, 0], []
+        for low, high in zip((commands - half).unbind(1), (commands + half).unbind(1), strict=True):
+            # Not clamp: without play, low = high, the gradient is that of the side the output comes from.
+            follows = torch.where(follows < low, low, torch.where(follows > high, high, follows))
+            output.append(follows)
+        return torch.stack(output, 1), follows[:, None]
 
 
 class ActuatorDeadzone(ActuationEffect):
@@ -165,8 +160,3 @@ class ActuatorLag(ActuationEffect):
         before = torch.cat((memory, after[:, :-1]), 1)
         # The mean of command + (before - command) exp(-t / time_constant) over the substep.
         return commands + (before - commands) * ratio * -(-rate).expm1(), after[:, -1:]
-
-
-def _clamp(value: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """`value` between low and high; at low = high the gradient is that of the side it comes from."""
-    return torch.where(value < low, low, torch.where(value > high, high, value))
