@@ -30,11 +30,13 @@ NONE: dict[str, float] = {
     "frozen_zone.end": -np.inf,
     "frozen_zone.holds_rate": 0.0,
     "dropout.rate": 0.0,
-    "position_drift.rate": 0.0,
+    "encoder_ripple.amplitude": 0.0,
+    "encoder_ripple.wavelength": 1.0,
+    "encoder_ripple.phase": 0.0,
     "angle_drift.rate": 0.0,
     "angle_quantisation.step": 0.0,
 }
-"""every parameter of both chains where it does nothing: s, units of the command, rad, 1/s; drifts in m/s and rad/s"""
+"""every parameter of both chains where it does nothing: s, units of the command, m, rad, 1/s, rad/s"""
 
 
 class Actuation:
@@ -110,7 +112,8 @@ class Sensing:
         y[:2] *= p["sensor_scale.position"]
         y[2:] *= p["sensor_scale.angle"]
         y[2] += p["angle_offset.offset"]
-        y[0] += p["position_drift.rate"] * t
+        turns = state[0] / p["encoder_ripple.wavelength"]
+        y[0] += p["encoder_ripple.amplitude"] * np.sin(2 * np.pi * turns + p["encoder_ripple.phase"])
         y[2] += p["angle_drift.rate"] * t
         return y
 

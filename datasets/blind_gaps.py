@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 
 from datasets.blind_control import draw_driver
-from datasets.blind_kinds import FOREIGN, KINDS, NAMED, Shape
+from datasets.blind_kinds import FOREIGN, INSEPARABLE, KINDS, NAMED, Shape
 from datasets.blind_plant import PERIOD, Array
 from datasets.blind_simulation import Case, Run, simulate
 
@@ -142,9 +142,8 @@ def _attempt(drafts: list[Draft], difficulty: Difficulty, excitation: float) -> 
     kept = [(draft, case) for draft, case, run in zip(drafts, cases, bare, strict=True) if _stayed(run)]
     parts: list[list[Job]] = []
     for draft, case in kept:
-        kinds = FOREIGN if draft.mixture == "foreign" else NAMED
-        chosen = draft.rng.choice(len(kinds), SIZES[draft.mixture], replace=False)
-        parts.append([_draw_job(draft.rng, kinds[i].name, case, difficulty) for i in chosen])
+        chosen = _draw_kinds(draft.rng, draft.mixture)
+        parts.append([_draw_job(draft.rng, name, case, difficulty) for name in chosen])
     _seek([job for own in parts for job in own], difficulty.velocities, deviations)
     weakest, strongest = difficulty.strengths
     ready = []
@@ -161,6 +160,14 @@ def _attempt(drafts: list[Draft], difficulty: Difficulty, excitation: float) -> 
 def _stayed(run: Run) -> bool:
     x, theta = run.reach
     return x <= CART_REACH and theta <= POLE_REACH
+
+
+def _draw_kinds(rng: np.random.Generator, mixture: str) -> list[str]:
+    kinds = FOREIGN if mixture == "foreign" else NAMED
+    while True:
+        chosen = [kinds[i].name for i in rng.choice(len(kinds), SIZES[mixture], replace=False)]
+        if not any(together <= set(chosen) for together in INSEPARABLE):
+            return chosen
 
 
 def _draw_case(rng: np.random.Generator, difficulty: Difficulty, excitation: float) -> Case:

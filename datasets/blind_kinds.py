@@ -218,11 +218,28 @@ FOREIGN: tuple[Kind, ...] = (
     Kind("directional_gain", "actuation", 0.01, 0.7, _signed("share"), _sign),
     Kind("even_motor", "actuation", 0.02, 4.0, _signed("coefficient"), _sign),
     Kind("fading_gain", "actuation", 0.002, 0.15, _plain("rate")),
-    Kind("position_drift", "sensing", 0.0003, 0.1, _signed("rate"), _sign),
+    # A drift of the position at a steady rate would be another inertial frame, which no data show.
+    Kind(
+        "encoder_ripple",
+        "sensing",
+        0.0003,
+        0.1,
+        _shaped("amplitude"),
+        lambda rng, _: {"wavelength": _log(rng, 0.1, 0.4), "phase": float(rng.uniform(-np.pi, np.pi))},
+    ),
     Kind("angle_drift", "sensing", 0.0003, 0.05, _signed("rate"), _sign),
     Kind("angle_quantisation", "sensing", 0.002, 0.15, _plain("step")),
 )
 """what no name of the catalogue stands for"""
+
+INSEPARABLE: tuple[frozenset[str], ...] = (
+    frozenset({"actuator_bias", "constant_force"}),
+    frozenset({"actuator_delay", "measurement_delay"}),
+    frozenset({"actuator_gain", "cart_mass", "pole_mass"}),
+    frozenset({"track_tilt", "angle_offset", "constant_force"}),
+    frozenset({"track_tilt", "angle_offset", "actuator_bias"}),
+)
+"""never together in one recording: other sizes of some of them, or of fewer, make the same data"""
 
 KINDS: dict[str, Kind] = {kind.name: kind for kind in NAMED + FOREIGN}
 """by name"""
