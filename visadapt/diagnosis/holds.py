@@ -15,6 +15,9 @@ from torch import Tensor
 DISTINCT = 0.5
 """Share of different numbers among a channel's readings from which on it counts as continuous."""
 
+GRID = 120
+"""Places tried for either edge of a zone in which a sensor stands still."""
+
 POLE = (2, 3)
 """Columns of the state that a worn angle sensor holds."""
 
@@ -47,3 +50,26 @@ def find_holds(measured: Sequence[Tensor], channels: tuple[int, ...]) -> Holds:
         lost.append(whole)
         frozen.append(still)
     return Holds(used, lost, frozen)
+
+
+def zone(held: Tensor, angle: Tensor, deviation: float) -> tuple[float, float, float]:
+    """Start and end of the angles at which a sensor stands still, and the deviation of either.
+
+    Args:
+        held: (N,) whether the reading was held.
+        angle: (N,) true angles, known to `deviation`.
+
+    Maximum likelihood with a normal error of the angles, over the edges between the angles met.
+    """
+    inside = angle[held]
+    low = torch.linspace(float(inside.min()) - 3 * deviation, float(inside.median()), GRID, dtype=angle.dtype)
+    high = torch.linspace(float(inside.median()), float(inside.max()) + 3 * deviation, GRID, dtype=angle.dtype)
+    below = torch.special.ndtr((low[:, None] - angle) / deviation)
+    above = torch.special.ndtr((angle - high[:, None]) / deviation)
+    chance = (1 - below[:, None] - above[None]).clamp(1e-6, 1 - 1e-6)
+    score = torch.where(held, chance.log(), (1 - chance).log()).sum(-1)
+    weight = (score - score.max()).exp()
+    weight = weight / weight.sum()
+    start, end = (weight.sum(1) * low).sum(), (weight.sum(0) * high).sum()
+    spread = (weight.sum(1) * (low - start).square()).sum() + (weight.sum(0) * (high - end).square()).sum()
+    return float(start), float(end), float((spread / 2).sqrt())

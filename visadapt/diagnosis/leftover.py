@@ -73,7 +73,9 @@ class BlackBox:
     @classmethod
     def fit(cls, family: Family, fits: Fits, counts: Tensor) -> BlackBox:
         """To the windows that count (W,)."""
-        places = {name: _ends(place, family.rows.inside > 0) for name, place in _variables(family, fits.state[0]).items()}
+        places = {
+            name: _ends(place, family.rows.inside > 0) for name, place in variables_of(family, fits.state[0]).items()
+        }
         empty = cls(torch.zeros(0), places)
         columns = empty._columns(family, fits)
         innovations = Innovations(family, fits)
@@ -88,9 +90,9 @@ class BlackBox:
         return self._columns(family, fits) @ self.weights
 
     def _columns(self, family: Family, fits: Fits) -> Tensor:
-        loads = _loads(family, fits)
+        loads = loads_of(family, fits)
         columns = []
-        for name, place in _variables(family, fits.state[0]).items():
+        for name, place in variables_of(family, fits.state[0]).items():
             _, bumps = _bumps(place, self.places[name])
             weighted = bumps[:, :-1] * family.rows.inside[:, 1:, None]
             columns += [loads[..., k, None] * weighted[:, :, None] for k in range(loads.shape[-1])]
@@ -101,8 +103,8 @@ def functions(family: Family, fits: Fits) -> list[Function]:
     """Every function of the black box beside a fitted set, the most evident first."""
     rows, system = family.rows, family.system
     state = fits.state[0]
-    loads = _loads(family, fits)
-    variables = _variables(family, state)
+    loads = loads_of(family, fits)
+    variables = variables_of(family, state)
     kinds, drives, readings, places = [], [], [], []
     for name, place in variables.items():
         centres, bumps = _bumps(place, _ends(place, rows.inside > 0))
@@ -133,7 +135,7 @@ def functions(family: Family, fits: Fits) -> list[Function]:
     return sorted(out, key=lambda function: -function.evidence)
 
 
-def _variables(family: Family, state: Tensor) -> dict[str, Tensor]:
+def variables_of(family: Family, state: Tensor) -> dict[str, Tensor]:
     """(W, T) of every variable."""
     rows = family.rows
     index = rows.first[:, None] + torch.arange(rows.shape[1])
@@ -143,7 +145,7 @@ def _variables(family: Family, state: Tensor) -> dict[str, Tensor]:
     return {**out, "command": command, "previous_command": before, "time": rows.time}
 
 
-def _loads(family: Family, fits: Fits) -> Tensor:
+def loads_of(family: Family, fits: Fits) -> Tensor:
     """What a unit of each load, held for a period, adds to the states, (W, T - 1, n, loads)."""
     pushed = Family(family.system, [*family.effects, Push], family.rows)
     theta = torch.cat((fits.theta[0, : len(family.table)], torch.zeros(len(Push.table), dtype=torch.float64)))

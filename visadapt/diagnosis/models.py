@@ -11,7 +11,15 @@ import torch
 from torch import Tensor, nn
 
 from visadapt.diagnosis.data import Rows
-from visadapt.effects import ActuationEffect, CoulombFriction, DynamicsEffect, Effect, FrictionPatch, Gust, SensingEffect
+from visadapt.effects import (
+    ActuationEffect,
+    CoulombFriction,
+    DynamicsEffect,
+    Effect,
+    FrictionPatch,
+    Gust,
+    SensingEffect,
+)
 from visadapt.integrators import rk4
 from visadapt.systems import System
 from visadapt.world import place_in_chain
@@ -31,7 +39,9 @@ FINE = 4
 class Family:
     """All simulators that a set of effects, with any parameters, makes of a source; K parameters in all."""
 
-    def __init__(self, system: System, effects: Sequence[type[Effect]], rows: Rows, substeps: int | None = None) -> None:
+    def __init__(
+        self, system: System, effects: Sequence[type[Effect]], rows: Rows, substeps: int | None = None
+    ) -> None:
         self.system = system
         self.effects = tuple(effects)
         self.rows = rows
@@ -136,7 +146,9 @@ def linearise(family: Family, theta: Tensor, state: Tensor) -> Linearised:
         return shifted[alike][:, None].expand(-1, windows * used, -1).flatten(0, 1)
 
     time = family.rows.time[:, :-1].expand(len(alike), -1, -1).flatten()
-    after = family.step(parameters(rows - 1), commands[alike, :, :-1].flatten(0, 2), time, moved[:, :, :-1].flatten(0, 2))
+    after = family.step(
+        parameters(rows - 1), commands[alike, :, :-1].flatten(0, 2), time, moved[:, :, :-1].flatten(0, 2)
+    )
     after = after.reshape(len(alike), windows, rows - 1, n)
     seen = family.measure(parameters(rows), moved.flatten(0, 2)).reshape(len(alike), windows, rows, -1)
 

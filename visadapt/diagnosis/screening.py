@@ -49,10 +49,10 @@ def screen(
 ) -> list[Lead]:
     """The best lead of every candidate beside the one fitted set in `fits`, best first."""
     seen = Innovations(Family(system, effects, rows), fits)
-    spans = _spans(rows, fits.state[0])
+    seen_at = spans(rows, fits.state[0])
     leads = []
     for effect in candidates:
-        shapes, linear = grid(effect, spans)
+        shapes, linear = grid(effect, seen_at)
         answer = seen.answer(*_columns(system, [*effects, effect], fits, rows, shapes, linear))
         lead = _best(effect, shapes, linear, seen.error, answer.reshape(len(answer), len(shapes), -1))
         if lead is not None:
@@ -94,7 +94,8 @@ def _values(parameter: Parameter) -> Tensor:
     return torch.cat([neutral + shares * (end - neutral) for end in (low, high) if end != neutral])
 
 
-def _spans(rows: Rows, state: Tensor) -> dict[str, tuple[float, float]]:
+def spans(rows: Rows, state: Tensor) -> dict[str, tuple[float, float]]:
+    """By unit, the least and the greatest time, position and angle of states (W, T, n)."""
     inside = rows.inside > 0
 
     def span(values: Tensor) -> tuple[float, float]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from visadapt.console import Progress
 from visadapt.diagnosis.data import Rows
 from visadapt.diagnosis.fitting import Fits, fit, rough
 from visadapt.diagnosis.models import Family
@@ -78,10 +79,12 @@ class Search:
         self.fitted: dict[frozenset[str], Fitted] = {}
         self.fit([((), first_fits(system, rows))], CAREFUL)
 
-    def run(self) -> list[Fitted]:
-        """All sets that were fitted, the most probable first."""
+    def run(self, progress: Progress | None = None) -> None:
+        """Grow sets while that makes them more probable; then try their neighbours."""
         beam = [self.source]
-        for _ in range(MOST):
+        for size in range(MOST):
+            if progress is not None:
+                progress(size, MOST, -self.best.evidence)
             before = self.best
             children = self.extend(beam)
             if not children:
@@ -95,7 +98,8 @@ class Search:
             self.polish()
             if self.best.names == before.names:
                 break
-        return self.ranked
+        if progress is not None:
+            progress(MOST, MOST, -self.best.evidence)
 
     @property
     def source(self) -> Fitted:
@@ -146,6 +150,24 @@ class Search:
         close = [f for f in self.ranked if f.evidence > best - within][:most]
         self.fit([(f.effects, f.fits) for f in close], CAREFUL)
 
+    def single(self, effect: type[Effect]) -> Fitted:
+        """One effect alone."""
+        key = frozenset({effect.name})
+        if key not in self.fitted:
+            self.fit([((effect,), self._lead(self.source, effect))], QUICK)
+        return self.fitted[key]
+
+    def exchange(self, whole: Fitted, gone: type[Effect], new: type[Effect]) -> Fitted:
+        """A set with one of its effects exchanged for another."""
+        kept = tuple(e for e in whole.effects if e is not gone)
+        base = self.fitted.get(frozenset(e.name for e in kept)) or self.fit([(kept, _shrunk(whole, gone))], QUICK)[0]
+        return self.fit([((*base.effects, new), self._lead(base, new))], CAREFUL)[0]
+
+    def _lead(self, base: Fitted, effect: type[Effect]) -> Fits:
+        leads = screen(self.system, base.effects, base.fits, self.rows, [effect])
+        nothing = tuple(p.neutral if p.neutral is not None else 0.5 * (p.low + p.high) for p in effect.table)
+        return _grown(base.fits, leads[0].values if leads else nothing)
+
     def leftover(self, sets: Sequence[Fitted]) -> list[float]:
         """Log likelihood that process noise adds to each set: how much it leaves unexplained."""
         families = [Family(self.system, f.effects, self.rows) for f in sets]
@@ -193,7 +215,9 @@ def evidence(effects: Effects, fits: Fits, catalogue: int) -> float:
             size = max(abs(float(fits.theta[0, k]) - parameter.neutral), math.sqrt(float(sure[k])))
             sides = 1 + (parameter.low < parameter.neutral < parameter.high)
             density[k] = -math.log(sides * DECADES * math.log(10) * size)
-    occam = float(density.sum()) + 0.5 * len(table) * math.log(2 * math.pi) - 0.5 * float(torch.linalg.slogdet(whole)[1])
+    occam = (
+        float(density.sum()) + 0.5 * len(table) * math.log(2 * math.pi) - 0.5 * float(torch.linalg.slogdet(whole)[1])
+    )
     return float(fits.likelihood[0]) + min(0.0, occam) + len(effects) * (PRIOR - math.log(max(1, catalogue)))
 
 
