@@ -12,12 +12,15 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import io
 import json
 import multiprocessing
 import os
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -59,14 +62,17 @@ class Settings:
 
 
 def ours(path: Path) -> Answer:
-    """What `visadapt diagnose` says."""
+    """What the command `visadapt diagnose` writes, run in this process."""
     # By name, and here: a worker that runs a baseline need not load torch.
-    visadapt = importlib.import_module("visadapt")
-    recordings = importlib.import_module("visadapt.recordings")
-    systems = importlib.import_module("visadapt.systems")
-    worlds = importlib.import_module("visadapt.world")
-    recording = recordings.read_csv([path], system=systems.CartPole, columns=None)
-    answer: Answer = visadapt.diagnose(recording, worlds.World(systems.CartPole()), catalogue=None, seed=0).to_json()
+    cli = importlib.import_module("visadapt.cli")
+    said = io.StringIO()
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "answer.json"
+        with redirect_stdout(said), redirect_stderr(said):
+            status = cli.main(["diagnose", str(path), "--system", "cartpole", "--json", str(out)])
+        if status != 0:
+            raise RuntimeError(f"exit status {status}: {said.getvalue().strip()}")
+        answer: Answer = json.loads(out.read_text(encoding="utf-8"))
     return answer
 
 
