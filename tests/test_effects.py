@@ -1,3 +1,4 @@
+import importlib.util
 import math
 import pickle
 
@@ -8,15 +9,24 @@ from hypothesis import strategies as st
 from torch import nn
 from torch.func import functional_call
 
-from tests.worlds import Mass, columns, run
-from visadapt.effects import EFFECTS, ActuatorDelay, ConstantForce, Effect, PeriodicForce, ViscousFriction
+from visadapt.effects import EFFECTS, ConstantForce, Effect, Stage
 from visadapt.systems import CartPole
 from visadapt.world import World
 
 NAMED = sorted(EFFECTS.keys() - {"residual"})
 """The effects with parameters; the residual, a network, has tests of its own in test_world.py."""
 
+SMOOTH = [name for name in NAMED if not EFFECTS[name].no_gradient]
+
 PERIOD, STEPS = 0.05, 3
+
+STRONG = {
+    "actuator_saturation": {"limit": 0.3},
+    "gust": {"start": 0.02, "end": 0.1, "force": 5.0},
+    "friction_patch": {"start": -1.0, "end": 1.0, "coefficient": 10.0},
+    "frozen_zone": {"start": -0.3, "end": 0.4},
+}
+"""Parameters that show in a few steps, where 80 % of every range do not."""
 
 
 def from_table(name, batch=None):
@@ -46,6 +56,17 @@ def inputs(batch, seed=0):
     return state, actions
 
 
+def readings(world, state, actions):
+    """What is measured (STEPS + 1, B, 4) of a run."""
+    generator = torch.Generator().manual_seed(1)
+    measured, at = world.measure(world.start(state), generator)
+    seen = [measured]
+    for action in actions:
+        measured, at = world.measure(world.step(at, action), generator)
+        seen.append(measured)
+    return torch.stack(seen)
+
+
 class Steps(nn.Module):
     """A few steps of a world as one function of its parameters, the state and the actions."""
 
@@ -54,7 +75,7 @@ class Steps(nn.Module):
         self.world = world
 
     def forward(self, state, actions):
-        return run(self.world, state, actions)[-1]
+        return readings(self.world, state, actions)
 
 
 def assert_gradients_agree(function, values, limits):
@@ -86,6 +107,11 @@ def assert_gradients_agree(function, values, limits):
 class TestContract:
     """What every effect promises, whoever writes it."""
 
+    def test_it_is_at_a_stage_and_those_it_is_mistaken_for_are_mistaken_for_it(self, name):
+        assert EFFECTS[name].stage in Stage
+        for twin in EFFECTS[name].indistinguishable_from:
+            assert name in EFFECTS[twin].indistinguishable_from
+
     def test_it_states_equation_source_units_and_ranges(self, name):
         effect = EFFECTS[name]
         assert effect.name == name
@@ -106,12 +132,79 @@ class TestContract:
 
     @given(data=st.data())
     @settings(max_examples=10)
+    def test_neutral_parameters_change_nothing(self, name, data):
+        values = data.draw(from_table(name))
+        values |= {p.name: p.neutral for p in EFFECTS[name].table if p.neutral is not None}
+        state, actions = inputs(4)
+        torch.testing.assert_close(
+            readings(world_of(build(name, values)), state, actions),
+            readings(world_of(), state, actions),
+            rtol=0,
+            atol=1e-12,
+        )
+
+    def test_it_does_something(self, name):
+        values = STRONG.get(name, {p.name: p.low + 0.8 * (p.high - p.low) for p in EFFECTS[name].table})
+        state, actions = inputs(4)
+        moved = readings(world_of(build(name, values)), state, actions) - readings(world_of(), state, actions)
+        assert moved.abs().max() > 1e-4
+
+    @given(data=st.data())
+    @settings(max_examples=5)
+    def test_it_pickles(self, name, data):
+        effect = build(name, data.draw(from_table(name)))
+        copy = pickle.loads(pickle.dumps(effect))
+        state, actions = inputs(2)
+        assert type(copy) is type(effect)
+        assert torch.equal(readings(world_of(copy), state, actions), readings(world_of(effect), state, actions))
+
+    def test_device_and_dtype_come_from_the_tensors(self, name):
+        values = {p.name: 0.5 * (p.low + p.high) for p in EFFECTS[name].table}
+        world = world_of(EFFECTS[name](**values))
+        state, actions = inputs(2)
+        assert readings(world, state, actions).dtype == torch.float64
+        assert readings(world, state.float(), actions.float()).dtype == torch.float32
+
+    def test_what_its_linear_parameters_add_is_proportional_to_them(self, name):
+        table = EFFECTS[name].table
+        linear = [p for p in table if p.linear]
+        values = STRONG.get(name, {p.name: p.low + 0.7 * (p.high - p.low) for p in table})
+        (state, actions), h = inputs(4), PERIOD
+
+        def added(share):
+            """What the effect adds when its linear parameters have gone a share of the way from neutral."""
+            own = values | {p.name: p.neutral + share * (values[p.name] - p.neutral) for p in linear}
+            effect = build(name, own)
+            if effect.stage is Stage.DYNAMICS:
+                return effect.load(torch.linspace(0.03, 0.09, 4, dtype=torch.float64), state, CartPole())
+            if effect.stage is Stage.ACTUATION:
+                commands = actions.transpose(0, 1)
+                return effect.apply_to(commands, effect.memory(commands, h), h)[0] - commands
+            return effect.apply_to(state, effect.memory(state, h), h, torch.Generator())[0] - state
+
+        if linear:
+            assert added(1.0).abs().max() > 1e-3
+            torch.testing.assert_close(added(0.0), torch.zeros_like(added(0.0)), rtol=0, atol=1e-12)
+            torch.testing.assert_close(added(0.3), 0.3 * added(1.0), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+class TestSmoothContract:
+    """What every effect promises but those that say why they have no gradient."""
+
+    @given(data=st.data())
+    @settings(max_examples=10)
     def test_gradients_agree_with_finite_differences(self, name, data):
         world = Steps(world_of(build(name, data.draw(from_table(name)))))
         parameters = dict(world.named_parameters())
-        limits = {p.name: (p.low, p.high) for p in EFFECTS[name].table}
+        # Beyond the value that switches an effect off there may be none at all: a negative delay.
+        limits = {
+            p.name: (p.low if p.neutral == p.low else -math.inf, p.high if p.neutral == p.high else math.inf)
+            for p in EFFECTS[name].table
+        }
         state, actions = inputs(2)
-        weights = torch.tensor([1.0, -0.7, 0.4, 0.3], dtype=torch.float64)
+        # Every reading counts, each with its own weight.
+        weights = torch.linspace(-1, 1, 8 * (STEPS + 1), dtype=torch.float64).reshape(STEPS + 1, 2, 4)
 
         def total(state, actions, *values):
             out = functional_call(world, dict(zip(parameters, values, strict=True)), (state, actions))
@@ -125,138 +218,62 @@ class TestContract:
 
     @given(data=st.data())
     @settings(max_examples=10)
-    def test_neutral_parameters_change_nothing(self, name, data):
-        values = data.draw(from_table(name))
-        values |= {p.name: p.neutral for p in EFFECTS[name].table if p.neutral is not None}
-        state, actions = inputs(4)
-        torch.testing.assert_close(
-            run(world_of(build(name, values)), state, actions), run(world_of(), state, actions), rtol=0, atol=1e-12
-        )
-
-    def test_it_does_something(self, name):
-        values = {p.name: p.low + 0.8 * (p.high - p.low) for p in EFFECTS[name].table}
-        state, actions = inputs(4)
-        moved = run(world_of(build(name, values)), state, actions) - run(world_of(), state, actions)
-        assert moved[-1].abs().max() > 1e-4
-
-    @given(data=st.data())
-    @settings(max_examples=10)
     def test_a_row_does_not_depend_on_its_batch(self, name, data):
         """Nor on whether its parameters are scalars or entries of (B,)."""
         batch = 3
         values = data.draw(from_table(name, batch))
         state, actions = inputs(batch)
-        together = run(world_of(build(name, values)), state, actions)
+        together = readings(world_of(build(name, values)), state, actions)
         for b in range(batch):
             own = {key: value[b] for key, value in values.items()}
-            alone = run(world_of(build(name, own)), state[b : b + 1], actions[:, b : b + 1])
+            alone = readings(world_of(build(name, own)), state[b : b + 1], actions[:, b : b + 1])
             torch.testing.assert_close(together[:, b], alone[:, 0], rtol=1e-10, atol=1e-12)
 
-    @given(data=st.data())
-    @settings(max_examples=5)
-    def test_it_pickles(self, name, data):
-        effect = build(name, data.draw(from_table(name)))
-        copy = pickle.loads(pickle.dumps(effect))
-        state, actions = inputs(2)
-        assert type(copy) is type(effect)
-        assert torch.equal(run(world_of(copy), state, actions), run(world_of(effect), state, actions))
 
-    def test_device_and_dtype_come_from_the_tensors(self, name):
-        values = {p.name: 0.5 * (p.low + p.high) for p in EFFECTS[name].table}
-        world = world_of(EFFECTS[name](**values))
+def test_an_effect_without_gradient_says_why():
+    assert {name: EFFECTS[name].no_gradient for name in set(NAMED) - set(SMOOTH)} == {
+        "dropout": "whether a row is lost is drawn, yes or no"
+    }
+
+
+def test_the_catalogue_is_complete():
+    assert set(NAMED) == {
+        *("actuator_gain", "actuator_bias", "actuator_delay", "actuator_lag", "actuator_deadzone"),
+        *("actuator_saturation", "actuator_backlash", "constant_force", "periodic_force", "gust"),
+        *("viscous_friction", "coulomb_friction", "quadratic_drag", "friction_patch", "spring", "pole_damping"),
+        *("track_tilt", "cart_mass", "pole_mass", "pole_length", "angle_offset", "position_offset"),
+        *("measurement_delay", "sensor_scale", "frozen_zone", "dropout"),
+    }
+
+
+def test_an_effect_in_a_file_of_its_own_joins_by_being_imported(tmp_path):
+    path = tmp_path / "my_rig.py"
+    path.write_text(
+        """
+from visadapt.effects import DynamicsEffect, Parameter
+
+
+class Fan(DynamicsEffect):
+    name = "fan"
+    equation = "F = force"
+    source = "the lab"
+    table = (Parameter("force", "N", 0.0, 2.0, 0.0, linear=True),)
+
+    def load(self, time, state, system):
+        return super().load(time, state, system) + self.value("force", state)
+"""
+    )
+    spec = importlib.util.spec_from_file_location("my_rig", path)
+    try:
+        spec.loader.exec_module(importlib.util.module_from_spec(spec))
         state, actions = inputs(2)
-        assert run(world, state, actions).dtype == torch.float64
-        assert run(world, state.float(), actions.float()).dtype == torch.float32
+        moved = readings(world_of(build("fan", {"force": 1.0})), state, actions)
+        assert (moved - readings(world_of(), state, actions)).abs().max() > 1e-3
+    finally:
+        EFFECTS.pop("fan", None)
 
 
 def test_two_effects_cannot_share_a_name():
     with pytest.raises(ValueError, match=r"'constant_force' is taken by visadapt\.effects\.forces\.ConstantForce"):
         type("Mine", (Effect,), {"name": "constant_force"})
     assert EFFECTS["constant_force"] is ConstantForce
-
-
-class TestActuatorDelay:
-    ACTIONS = (0.6, -0.9, 0.3, 0.8, -0.2)
-
-    def velocities(self, delay, substeps):
-        """x_dot after each period of a mass of 2 kg under the delayed commands."""
-        world = World(Mass(), [ActuatorDelay(delay=delay).double()], PERIOD, "rk4", substeps)
-        return run(world, columns(0, 0, 0, 0), [columns(a) for a in self.ACTIONS])[1:, 0, 1].tolist()
-
-    def impulse(self, delay, time):
-        """Integral over the time of command(t - delay), the commands held over a period each and 0 before."""
-        total = 0.0
-        for k, action in enumerate(self.ACTIONS):
-            total += action * (min(max(time - delay - k * PERIOD, 0.0), PERIOD))
-        return total
-
-    @pytest.mark.parametrize("substeps", [1, 4, 5])
-    @pytest.mark.parametrize("delay", [0.0, 0.05, 0.1, 0.02, 0.013, 0.0771, 0.3])
-    def test_the_velocity_is_that_of_the_delayed_command(self, delay, substeps):
-        expected = [self.impulse(delay, (k + 1) * PERIOD) / 2.0 for k in range(len(self.ACTIONS))]
-        assert self.velocities(delay, substeps) == pytest.approx(expected, abs=1e-8)
-
-    def test_a_delay_of_whole_periods_is_the_same_commands_later(self):
-        state, actions = inputs(2)
-        late = torch.cat((torch.zeros_like(actions[:2]), actions[:1]))
-        torch.testing.assert_close(
-            run(world_of(ActuatorDelay(delay=2 * PERIOD)), state, actions),
-            run(world_of(), state, late),
-            atol=1e-6,
-            rtol=0,
-        )
-
-    @pytest.mark.parametrize("count", range(1, 61))
-    def test_delays_of_whole_substeps_in_single_precision(self, count):
-        """Where 0.35 / 0.05 is 7 in one precision and 6.9999999 in another, the memory must still reach."""
-        world = World(Mass(), [ActuatorDelay(delay=count * 0.01)], PERIOD, "euler", 5)
-        actions = torch.ones(14, 1, 1)
-        reached = run(world, torch.zeros(1, 4), actions)[-1, 0, 1].detach()
-        assert float(reached) == pytest.approx((0.7 - count * 0.01) / 2.0, abs=1e-5)
-
-    @pytest.mark.parametrize("delay", [-0.01, float("nan")])
-    def test_a_negative_delay_is_an_error(self, delay):
-        with pytest.raises(ValueError, match="delay must not be negative, got"):
-            world_of(ActuatorDelay(delay=delay)).start(columns(0, 0, 0, 0))
-
-
-class TestForces:
-    def test_a_positive_constant_force_pushes_towards_positive_x(self):
-        state = columns(0, 0, 0, 0)
-        end = run(world_of(ConstantForce(force=3.0).double(), system=Mass()), state, [columns(0.0)] * 4)[-1, 0]
-        assert end[:2].tolist() == pytest.approx([0.5 * 1.5 * 0.2**2, 1.5 * 0.2])
-
-    def test_a_constant_force_is_like_a_constant_command(self):
-        state, actions = inputs(3)
-        pushed = run(world_of(ConstantForce(force=3.0)), state, actions)
-        torch.testing.assert_close(pushed, run(world_of(), state, actions + 3.0 / 30.0))
-
-    def test_viscous_friction_lets_a_speed_die_away_exponentially(self):
-        world = World(Mass(), [ViscousFriction(coefficient=5.0).double()], PERIOD, "rk4", 20)
-        for start in (0.8, -0.8):
-            seen = run(world, columns(0, start, 0, 0), [columns(0.0)] * 8)[:, 0, 1].tolist()
-            expected = [start * math.exp(-5.0 / 2.0 * k * PERIOD) for k in range(9)]
-            assert seen == pytest.approx(expected, rel=1e-7)
-
-    @given(data=st.data())
-    @settings(max_examples=20)
-    def test_a_periodic_force_is_its_formula_and_acts_on_the_cart_alone(self, data):
-        v = data.draw(from_table("periodic_force"))
-        time = torch.linspace(0, 3, 7, dtype=torch.float64)
-        effect = build("periodic_force", v)
-        v = {key: float(value) for key, value in effect.state_dict().items()}
-        load = effect.load(time, torch.zeros(7, 4, dtype=torch.float64)).detach()
-        for t, (force, torque) in zip(time.tolist(), load.tolist(), strict=True):
-            expected = v["amplitude"] * math.cos(2 * math.pi * v["frequency"] * t + v["phase"]) + v["offset"]
-            assert force == pytest.approx(expected, rel=1e-9, abs=1e-9)
-            assert torque == 0.0
-
-    def test_the_phase_of_a_periodic_force_counts_from_the_start_of_the_episode(self):
-        # The impulse of 2 (sin t + 1) N over T is 2 (1 - cos T + T).
-        effect = PeriodicForce(amplitude=2.0, frequency=1 / (2 * math.pi), phase=-math.pi / 2, offset=2.0)
-        seen = run(World(Mass(), [effect], PERIOD, "rk4", 5), columns(0, 0, 0, 0), [columns(0.0)] * 60)[
-            :, 0, 1
-        ].tolist()
-        for k in (1, 20, 60):
-            elapsed = k * PERIOD
-            assert seen[k] == pytest.approx((1 - math.cos(elapsed) + elapsed), abs=1e-6)

@@ -254,7 +254,7 @@ def test_pendulum_is_near_its_source_model(pendulum):
     assert ((after - expected).square().mean(0).sqrt() < 0.4 * moved).all()
     # The published masses are those of the model that runs.
     body = pendulum._envs[0].unwrapped.model
-    np.testing.assert_allclose(body.body_mass[1:], [SOURCE.cart_mass, SOURCE.pole_mass])
+    np.testing.assert_allclose(body.body_mass[1:], [float(SOURCE.cart_mass), float(SOURCE.pole_mass)])
     assert body.body_ipos[2][2] == pytest.approx(SOURCE.pole_half_length)
     assert body.actuator_gear[0, 0] == pytest.approx(SOURCE.max_force)
 

@@ -117,6 +117,22 @@ def test_an_impossible_parameter_is_named_with_its_value(name, value):
         CartPole(**{name: value})
 
 
+@pytest.mark.parametrize("name", ["cart_mass", "pole_mass", "pole_half_length", "max_force", "gravity"])
+def test_a_parameter_may_be_one_for_each_row(name):
+    values = torch.tensor([0.5, 2.0], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    arguments = [torch.randn(2, n, generator=generator, dtype=torch.float64) for n in (4, 1, 2)]
+    together = CartPole(**{name: values})
+    for row, value in enumerate(values.tolist()):
+        alone = CartPole(**{name: value})
+        own = [argument[row : row + 1] for argument in arguments]
+        torch.testing.assert_close(together.derivative(*arguments)[row], alone.derivative(*own)[0])
+        torch.testing.assert_close(together.energy(arguments[0])[row], alone.energy(own[0])[0])
+    assert getattr(together.to(torch.zeros(1)), name).dtype == torch.float32
+    with pytest.raises(ValueError, match=f"{name} must be positive"):
+        CartPole(**{name: torch.tensor([1.0, 0.0])})
+
+
 @pytest.mark.parametrize("system", SYSTEMS.values())
 def test_every_system_says_what_its_variables_are(system):
     for variable in (*system.states, *system.actions, *system.loads):

@@ -6,6 +6,7 @@ import torch
 from torch import nn
 
 from renderers import DrawnCartPole
+from visadapt.effects import AngleOffset, Dropout
 from visadapt.policies import HORIZON, Policy
 from visadapt.rollout import run, see_frames, see_states
 from visadapt.systems import CartPole
@@ -107,6 +108,21 @@ class TestSynthetic:
         assert bool((state.abs() <= width).all())
         torch.testing.assert_close(state.std(0), width / math.sqrt(3), rtol=0.1, atol=0)
         assert bool((state.mean(0).abs() < 0.05 * width).all())
+
+    def test_sensors_show_in_what_is_measured_and_not_in_when_an_episode_ends(self):
+        def sensors(batch, generator):
+            return (AngleOffset(offset=0.4), Dropout(rate=0.5))
+
+        target, plain = SyntheticTarget(sensors), SyntheticTarget()
+        seen, true = target.reset(50, seeded()), plain.reset(50, seeded())
+        offset = torch.tensor([0.0, 0.0, 0.4, 0.0])
+        torch.testing.assert_close(seen.state, true.state + offset)
+        assert bool(seen.alive.all())
+        before = seen.state
+        seen, true = target.step(torch.zeros(50, 1)), plain.step(torch.zeros(50, 1))
+        lost = (seen.state == before).all(1)
+        assert 10 < int(lost.sum()) < 40
+        torch.testing.assert_close(seen.state[~lost], true.state[~lost] + offset)
 
     def test_frames_show_the_state(self):
         camera = DrawnCartPole()

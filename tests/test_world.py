@@ -4,10 +4,18 @@ from torch import nn
 from torch.func import functional_call
 
 from tests.worlds import Mass, columns, run
-from visadapt.effects import ActuatorDelay, ConstantForce, Residual, ViscousFriction
+from visadapt.effects import (
+    ActuatorDelay,
+    AngleOffset,
+    CartMass,
+    ConstantForce,
+    MeasurementDelay,
+    Residual,
+    ViscousFriction,
+)
 from visadapt.history import History
 from visadapt.systems import CartPole
-from visadapt.world import World
+from visadapt.world import ACTUATION_CHAIN, SENSING_CHAIN, World, place_in_chain
 
 
 class Linear(nn.Module):
@@ -122,6 +130,53 @@ def test_a_detached_world_state_has_the_same_values_and_no_graph():
     assert at.state.requires_grad
     assert not at.detach().state.requires_grad
     assert torch.equal(at.detach().state, at.state)
+
+
+class TestMeasuring:
+    def test_without_sensing_effects_the_reading_is_the_state(self):
+        world = World(CartPole(), [ActuatorDelay(delay=0.07), ConstantForce(force=2.0)])
+        state, actions = inputs()
+        at = world.step(world.start(state), actions[0])
+        measured, after = world.measure(at)
+        assert torch.equal(measured, at.state)
+        assert all(torch.equal(a, b) for a, b in zip(at.memory, after.memory, strict=True))
+
+    def test_sensing_changes_what_is_read_and_not_what_happens(self):
+        state, actions = inputs()
+        effects = [AngleOffset(offset=0.1), MeasurementDelay(delay=0.06), ActuatorDelay(delay=0.03)]
+        world, blind = World(CartPole(), effects), World(CartPole(), effects[2:])
+        at, unread = world.start(state), blind.start(state)
+        for action in actions:
+            _, at = world.measure(at)
+            at, unread = world.step(at, action), blind.step(unread, action)
+            assert torch.equal(at.state, unread.state)
+        assert (world.measure(at)[0] - at.state).abs().max() > 0.05
+
+    def test_reading_is_pure_and_rows_can_be_taken_from_either_of_two_worlds(self):
+        state, actions = inputs()
+        world = World(CartPole(), [MeasurementDelay(delay=0.07), ActuatorDelay(delay=0.03)])
+        old = world.step(world.measure(world.start(state))[1], actions[0])
+        fresh = world.start(-state)
+        keep = torch.tensor([True, False, True])
+        mixed, kept, restarted = (world.measure(at)[0] for at in (old.where(keep, fresh), old, fresh))
+        torch.testing.assert_close(mixed, torch.where(keep[:, None], kept, restarted))
+        assert torch.equal(world.measure(old)[0], kept)
+
+    def test_effects_of_a_stage_have_their_place_and_others_come_last(self):
+        assert place_in_chain(ActuatorDelay) == 0
+        assert place_in_chain(MeasurementDelay(delay=0.0)) < place_in_chain(AngleOffset)
+        assert place_in_chain(ConstantForce) == len(ACTUATION_CHAIN + SENSING_CHAIN)
+
+
+def test_the_load_of_an_instant_is_that_of_all_effects_on_the_altered_system():
+    effects = [ConstantForce(force=2.0), ViscousFriction(coefficient=3.0), CartMass(scale=2.0)]
+    world = World(CartPole(), effects)
+    load = world.requires_grad_(False).load(world.start(columns(0, -0.5, 0, 0)))
+    assert load[0].tolist() == pytest.approx([3.5, 0.0])
+    altered = world.altered(load)
+    assert isinstance(altered, CartPole)
+    assert float(altered.cart_mass) == 2.0
+    assert world.system == CartPole()
 
 
 class TestResidual:

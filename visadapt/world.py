@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
-from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, Residual
+from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, Residual, SensingEffect
 from visadapt.history import History
 from visadapt.integrators import INTEGRATORS
 from visadapt.systems import System
@@ -24,6 +24,17 @@ ACTUATION_CHAIN = (
 )
 """The order in which actuation effects act; any other comes last."""
 
+SENSING_CHAIN = (
+    # First: it interpolates the true motion, and what follows then sees the state as it was.
+    "measurement_delay",
+    "frozen_zone",
+    "sensor_scale",
+    "angle_offset",
+    "position_offset",
+    "dropout",
+)
+"""The order in which sensing effects act; any other comes last."""
+
 
 @dataclass(frozen=True)
 class WorldState:
@@ -32,6 +43,7 @@ class WorldState:
     time: Tensor
     state: Tensor
     memory: tuple[Tensor, ...] = ()
+    """what each actuation effect remembers, then what each sensing effect does, (B, any, any) each"""
 
     def detach(self) -> WorldState:
         """The same, cut off from the graph."""
@@ -78,9 +90,8 @@ class World(nn.Module):
         self.integrator = integrator
         self.substeps = substeps
         self.effects = nn.ModuleList(effects)
-        self._actuation = sorted(
-            (effect for effect in effects if isinstance(effect, ActuationEffect)), key=_place_in_chain
-        )
+        self._actuation = sorted((e for e in effects if isinstance(e, ActuationEffect)), key=place_in_chain)
+        self._sensing = sorted((e for e in effects if isinstance(e, SensingEffect)), key=place_in_chain)
         self._dynamics = [effect for effect in effects if isinstance(effect, DynamicsEffect)]
         self._residuals = [effect for effect in effects if isinstance(effect, Residual)]
 
@@ -94,8 +105,9 @@ class World(nn.Module):
         commands = torch.zeros(
             len(state), self.substeps, len(self.system.actions), device=state.device, dtype=state.dtype
         )
-        memory = tuple(effect.memory(commands, self.period / self.substeps) for effect in self._actuation)
-        return WorldState(torch.zeros_like(state[:, 0]), state, memory)
+        acting = tuple(effect.memory(commands, self.period / self.substeps) for effect in self._actuation)
+        sensing = tuple(effect.memory(state, self.period) for effect in self._sensing)
+        return WorldState(torch.zeros_like(state[:, 0]), state, acting + sensing)
 
     def step(self, at: WorldState, action: Tensor, history: History | None = None) -> WorldState:
         """One period on, with `action` (B, n_action) in [-1, 1] held over it.
@@ -105,27 +117,58 @@ class World(nn.Module):
         h = self.period / self.substeps
         commands = action.clamp(-1, 1)[:, None].expand(-1, self.substeps, -1)
         memory = []
-        for effect, remembered in zip(self._actuation, at.memory, strict=True):
+        for effect, remembered in zip(self._actuation, at.memory, strict=False):
             commands, remembered = effect.apply_to(commands, remembered, h)
             memory.append(remembered)
         integrate = INTEGRATORS[self.integrator]
+        system = self.altered(at.state)
         time, state = at.time, at.state
         for k in range(self.substeps):
             command = commands[:, k]
-            state = integrate(lambda t, s, u=command: self._derivative(t, s, u), time, state, h)  # type: ignore[misc]
+
+            def derivative(t: Tensor, s: Tensor, u: Tensor = command) -> Tensor:
+                return system.derivative(s, u, self._load(t, s, system))
+
+            state = integrate(derivative, time, state, h)
             time = time + h
         for residual in self._residuals:
             if history is None:
                 raise ValueError("a world with a residual needs the history of observations and actions")
             state = state + residual.delta(history.acting(action)).to(state)
-        return WorldState(time, state, tuple(memory))
+        return WorldState(time, state, (*memory, *at.memory[len(memory) :]))
 
-    def _derivative(self, time: Tensor, state: Tensor, command: Tensor) -> Tensor:
-        load = torch.zeros(len(state), len(self.system.loads), device=state.device, dtype=state.dtype)
+    def measure(self, at: WorldState, generator: torch.Generator | None = None) -> tuple[Tensor, WorldState]:
+        """What sensors read (B, n_state) of the row `at`, and the world with that row read.
+
+        A row is read once: after `start`, then after each `step`. Without sensing effects the reading is the state.
+        `generator` is needed by random effects alone.
+        """
+        first = len(self._actuation)
+        measured = at.state
+        memory = list(at.memory)
+        for k, effect in enumerate(self._sensing, first):
+            measured, memory[k] = effect.apply_to(measured, memory[k], self.period, generator)
+        return measured, replace(at, memory=tuple(memory))
+
+    def load(self, at: WorldState) -> Tensor:
+        """Sum of the loads (B, n_load) of all effects at an instant."""
+        return self._load(at.time, at.state, self.altered(at.state))
+
+    def altered(self, like: Tensor) -> System:
+        """The system with the parameters that effects give it, with the device and dtype of `like`."""
+        system = self.system
         for effect in self._dynamics:
-            load = load + effect.load(time, state)
-        return self.system.derivative(state, command, load)
+            system = effect.alter(system)
+        return system if system is self.system else system.to(like)
+
+    def _load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+        load = torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)
+        for effect in self._dynamics:
+            load = load + effect.load(time, state, system)
+        return load
 
 
-def _place_in_chain(effect: Effect) -> int:
-    return ACTUATION_CHAIN.index(effect.name) if effect.name in ACTUATION_CHAIN else len(ACTUATION_CHAIN)
+def place_in_chain(effect: Effect | type[Effect]) -> int:
+    """Where an actuation or sensing effect acts among the others of its stage: the sorting key."""
+    chain = ACTUATION_CHAIN + SENSING_CHAIN
+    return chain.index(effect.name) if effect.name in chain else len(chain)

@@ -1,4 +1,10 @@
-"""Effects on the command between the controller and the motor."""
+"""Effects on the command between the controller and the motor.
+
+The command is held constant over each substep. An effect may change it inside one (a delay of half a substep, a lag);
+what acts then is its mean over the substep: exact for the impulse, and smooth in the parameters. Widths, limits and
+offsets are in units of the command. The textbook forms of the piecewise linear ones (dead zone, saturation,
+backlash) are kept: they are continuous in command and parameter, with one-sided derivatives at their kinks.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +17,16 @@ from visadapt.effects.base import ActuationEffect, Parameter
 class ActuatorDelay(ActuationEffect):
     """A pure delay of any length, also a fraction of a substep.
 
-    The command is held constant over each substep, so a delayed command can change inside one; what acts is its
-    mean over the substep. That is exact in the limit of fine substeps and differentiable in the delay. Before an
-    episode begins the command was zero.
+    A delayed command can change inside a substep; what acts is its mean over the substep. That is exact in the limit
+    of fine substeps and differentiable in the delay. Against measurement_delay only the begin of an episode could
+    tell, and there only if its first state were known without noise and not at rest.
     """
 
     name = "actuator_delay"
     equation = "u(t) = command(t - delay)"
     source = "Franklin, Powell and Workman (1998), Digital Control of Dynamic Systems, section 4.3.3"
-    table = (Parameter("delay", "s", 0.0, 0.3, 0.0),)
+    table = (Parameter("delay", "s", 0.0, 0.2, 0.0),)
+    indistinguishable_from = ("measurement_delay",)
 
     def memory(self, commands: Tensor, substep: float) -> Tensor:
         return torch.zeros_like(commands[:, :1]).expand(-1, self._reach(commands, substep), -1)
@@ -45,3 +52,111 @@ class ActuatorDelay(ActuationEffect):
         if not bool((shift >= 0).all()):
             raise ValueError(f"actuator_delay: delay must not be negative, got {float(shift.min()) * substep:g} s")
         return int(shift.max().floor()) + 1
+
+
+class ActuatorBacklash(ActuationEffect):
+    """Play in the transmission: the output stays until the command has crossed it, then follows at half its width.
+
+    The output begins at 0, in the middle of the play.
+    """
+
+    name = "actuator_backlash"
+    equation = "u_k = min(max(u_(k-1), command_k - width/2), command_k + width/2)"
+    source = "Tao and Kokotovic (1996), Adaptive Control of Systems with Actuator and Sensor Nonlinearities, chapter 2"
+    table = (Parameter("width", "1", 0.0, 1.0, 0.0),)
+
+    def memory(self, commands: Tensor, substep: float) -> Tensor:
+        return torch.zeros_like(commands[:, :1])
+
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
+        half = self.column("width", commands) / 2
+        follows, output = memory[:, 0], []
+        for low, high in zip((commands - half).unbind(1), (commands + half).unbind(1), strict=True):
+            # Not clamp: without play, low = high, the gradient is that of the side the output comes from.
+            follows = torch.where(follows < low, low, torch.where(follows > high, high, follows))
+            output.append(follows)
+        return torch.stack(output, 1), follows[:, None]
+
+
+class ActuatorDeadzone(ActuationEffect):
+    """Commands too small to move anything (static friction in a gear, a valve's overlap); larger ones lose `width`."""
+
+    name = "actuator_deadzone"
+    equation = "u = sign(command) max(|command| - width, 0)"
+    source = "Tao and Kokotovic (1996), Adaptive Control of Systems with Actuator and Sensor Nonlinearities, chapter 2"
+    table = (Parameter("width", "1", 0.0, 0.6, 0.0),)
+
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
+        # The sign stays outside: a clamp between equal limits would have no gradient in a width of 0.
+        return commands.sign() * (commands.abs() - self.column("width", commands)).clamp_min(0), memory
+
+
+class ActuatorSaturation(ActuationEffect):
+    """The largest command that the motor follows: a supply or a current limit. Commands end at 1 anyway."""
+
+    name = "actuator_saturation"
+    equation = "u = min(max(command, -limit), limit)"
+    source = "Khalil (2002), Nonlinear Systems, section 1.2.7"
+    table = (Parameter("limit", "1", 0.02, 1.0, 1.0),)
+
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
+        limit = self.column("limit", commands)
+        return torch.minimum(torch.maximum(commands, -limit), limit), memory
+
+
+class ActuatorGain(ActuationEffect):
+    """A motor stronger or weaker than the source's.
+
+    Cart and pole both heavier by a factor look like the gain divided by it.
+    """
+
+    name = "actuator_gain"
+    equation = "u = scale command"
+    source = "Franklin, Powell and Emami-Naeini (2015), Feedback Control of Dynamic Systems, section 2.3"
+    table = (Parameter("scale", "1", 0.4, 2.0, 1.0, linear=True),)
+
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
+        return self.column("scale", commands) * commands, memory
+
+
+class ActuatorBias(ActuationEffect):
+    """A command that is there when none is given; a force of max_force * offset."""
+
+    name = "actuator_bias"
+    equation = "u = command + offset"
+    source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (additive actuator fault)"
+    table = (Parameter("offset", "1", -0.35, 0.35, 0.0, linear=True),)
+    indistinguishable_from = ("constant_force",)
+
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
+        return commands + self.column("offset", commands), memory
+
+
+class ActuatorLag(ActuationEffect):
+    """A motor that follows its command as a first-order system does: its current, its electronics."""
+
+    name = "actuator_lag"
+    equation = "time_constant du/dt = command - u, u(0) = 0"
+    source = "Franklin, Powell and Emami-Naeini (2015), Feedback Control of Dynamic Systems, section 3.1"
+    table = (Parameter("time_constant", "s", 0.0, 0.3, 0.0),)
+
+    def memory(self, commands: Tensor, substep: float) -> Tensor:
+        return torch.zeros_like(commands[:, :1])
+
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
+        ratio = self.column("time_constant", commands) / substep
+        # exp(-1000) is 0 in every precision, and so are its derivatives: the limit is exact, and nothing divides by 0.
+        rate = ratio.clamp_min(1e-3).reciprocal()
+        left = (-rate).exp()  # of an old value after a substep
+        # u after each substep, if it were 0 at first: all prefixes of a linear recurrence in log2(S) rounds.
+        after = -(-rate).expm1() * commands
+        reach, weight = 1, left
+        while reach < commands.shape[1]:
+            after = torch.cat((after[:, :reach], after[:, reach:] + weight * after[:, :-reach]), 1)
+            weight = weight.square()
+            reach *= 2
+        count = torch.arange(1, commands.shape[1] + 1, device=commands.device, dtype=commands.dtype)[None, :, None]
+        after = after + (-rate * count).exp() * memory
+        before = torch.cat((memory, after[:, :-1]), 1)
+        # The mean of command + (before - command) exp(-t / time_constant) over the substep.
+        return commands + (before - commands) * ratio * -(-rate).expm1(), after[:, -1:]

@@ -9,10 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
+
+from visadapt.systems import System
+
+SystemKind = TypeVar("SystemKind", bound=System)
 
 
 class Stage(StrEnum):
@@ -20,6 +24,7 @@ class Stage(StrEnum):
 
     ACTUATION = "actuation"
     DYNAMICS = "dynamics"
+    SENSING = "sensing"
     ANY = "any"
 
 
@@ -27,7 +32,10 @@ class Stage(StrEnum):
 class Parameter:
     """One parameter of an effect: its unit, the range searched, and the value at which the effect vanishes.
 
-    `neutral` is None for a parameter (a phase, say) that shapes the effect and cannot switch it off.
+    `neutral` is None for a parameter (a phase, say) that shapes the effect and cannot switch it off; where several
+    have one, the effect vanishes when all of them take it. `linear` holds where what the effect adds (to the load,
+    the command or the measured value) is proportional to value - neutral while its nonlinear parameters are fixed;
+    what several linear parameters add is a sum.
     """
 
     name: str
@@ -35,6 +43,7 @@ class Parameter:
     low: float
     high: float
     neutral: float | None
+    linear: bool = False
 
 
 class Effect(nn.Module):
@@ -47,6 +56,8 @@ class Effect(nn.Module):
     table: ClassVar[tuple[Parameter, ...]] = ()
     indistinguishable_from: ClassVar[tuple[str, ...]] = ()
     """Effects that passive data cannot separate from this one."""
+    no_gradient: ClassVar[str] = ""
+    """Why there is no gradient in the parameters; empty where there is one."""
 
     def __init_subclass__(cls, **kwargs: object) -> None:
         super().__init_subclass__(**kwargs)
@@ -73,6 +84,11 @@ class Effect(nn.Module):
         values: Tensor = getattr(self, name)
         return values.to(like)
 
+    def column(self, name: str, like: Tensor) -> Tensor:
+        """The parameter `name` so that it multiplies what is (B, time, n): () or (B, 1, 1)."""
+        values = self.value(name, like)
+        return values if values.dim() == 0 else values[:, None, None]
+
 
 class ActuationEffect(Effect):
     """Changes the command on its way to the physics."""
@@ -80,22 +96,76 @@ class ActuationEffect(Effect):
     stage = Stage.ACTUATION
 
     def memory(self, commands: Tensor, substep: float) -> Tensor:
-        """What the effect remembers at the start of an episode; `commands` (B, S, n_action) gives shape and dtype."""
+        """What the effect remembers at the start of an episode, (B, any, n_action).
+
+        `commands` (B, S, n_action) gives shape and dtype; before an episode begins the command was zero.
+        """
         return commands[:, :0]
 
     def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
-        """What acts of the commands (B, S, n_action) over the S substeps, each `substep` s long, and the new memory."""
+        """What acts of the commands (B, S, n_action) over the S substeps, each `substep` s long, and the new memory.
+
+        S may be one period's substeps or a whole episode's: the result is the same.
+        """
         raise NotImplementedError
 
 
 class DynamicsEffect(Effect):
-    """Adds a load, a generalised force per degree of freedom, to the physics."""
+    """Adds a load, a generalised force per degree of freedom, to the physics, or changes its parameters."""
 
     stage = Stage.DYNAMICS
 
-    def load(self, time: Tensor, state: Tensor) -> Tensor:
-        """Load (B, n_load) at the time (B,) since the start of the episode, in a state (B, n_state)."""
+    def alter(self, system: System) -> System:
+        """The system with the parameters that this effect gives it; its fields may then be tensors, () or (B,)."""
+        return system
+
+    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+        """Load (B, n_load) at the time (B,) since the start of the episode, in a state (B, n_state).
+
+        `system` is the one that all effects have altered.
+        """
+        return torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)
+
+
+class SensingEffect(Effect):
+    """Changes what is measured of the state, row by row."""
+
+    stage = Stage.SENSING
+
+    def memory(self, state: Tensor, period: float) -> Tensor:
+        """What the effect remembers before the first row of an episode that begins in `state` (B, n_state).
+
+        (B, any, any); before an episode begins, its first state was measured.
+        """
+        return state[:, None, :0]
+
+    def apply_to(
+        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        """What is read of one row (B, n_state), the rows being `period` s apart, and the new memory.
+
+        `generator` is needed by random effects alone.
+        """
         raise NotImplementedError
+
+
+def expect(system: System, kind: type[SystemKind], effect: Effect) -> SystemKind:
+    """The system as one of the `kind` that an effect acts on.
+
+    Raises:
+        TypeError: it is another.
+    """
+    if not isinstance(system, kind):
+        raise TypeError(f"{effect.name} acts on a {kind.name}, not on a {system.name}")
+    return system
+
+
+def inside(place: Tensor, start: Tensor, end: Tensor, width: float) -> Tensor:
+    """1 between start and end and 0 outside, with logistic edges: from 10 % to 90 % in 4.4 `width`.
+
+    Its integral is end - start whatever the width; it is 0 where end <= start.
+    """
+    return (((place - start) / width).sigmoid() - ((place - end) / width).sigmoid()).clamp_min(0)
 
 
 EFFECTS: dict[str, type[Effect]] = {}

@@ -1,24 +1,26 @@
-"""Forces on the cart of a cart-pole. Positive pushes towards +x."""
+"""Forces on a cart-pole that do not come from rubbing. Positive pushes towards +x."""
 
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from visadapt.effects.base import DynamicsEffect, Parameter
+from visadapt.effects.base import DynamicsEffect, Parameter, expect, inside
+from visadapt.systems import CartPole, System
 
 
 class CartForce(DynamicsEffect):
     """A force on the cart alone; subclasses give its size."""
 
-    def push(self, time: Tensor, state: Tensor) -> Tensor:
+    def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         """Force in N, (B,)."""
         raise NotImplementedError
 
-    def load(self, time: Tensor, state: Tensor) -> Tensor:
-        push = self.push(time, state)
+    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+        push = self.push(time, state, system)
         return torch.stack((push, torch.zeros_like(push)), -1)
 
 
@@ -28,10 +30,10 @@ class ConstantForce(CartForce):
     name = "constant_force"
     equation = "F = force"
     source = "Newton's second law; the paper, section 3.2.1"
-    table = (Parameter("force", "N", -30.0, 30.0, 0.0),)
-    indistinguishable_from = ("actuator_bias", "track_tilt")
+    table = (Parameter("force", "N", -10.0, 10.0, 0.0, linear=True),)
+    indistinguishable_from = ("actuator_bias",)
 
-    def push(self, time: Tensor, state: Tensor) -> Tensor:
+    def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         return self.value("force", state).expand_as(time)
 
 
@@ -42,24 +44,77 @@ class PeriodicForce(CartForce):
     equation = "F = amplitude cos(2 pi frequency t + phase) + offset"
     source = "the paper, section 3.2.2"
     table = (
-        Parameter("amplitude", "N", 0.0, 30.0, 0.0),
+        Parameter("amplitude", "N", 0.0, 10.0, 0.0, linear=True),
         Parameter("frequency", "Hz", 0.02, 5.0, None),
         Parameter("phase", "rad", -math.pi, math.pi, None),
-        Parameter("offset", "N", -30.0, 30.0, 0.0),
+        Parameter("offset", "N", -10.0, 10.0, 0.0, linear=True),
     )
 
-    def push(self, time: Tensor, state: Tensor) -> Tensor:
+    def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         angle = 2 * math.pi * self.value("frequency", state) * time + self.value("phase", state)
         return self.value("amplitude", state) * angle.cos() + self.value("offset", state)
 
 
-class ViscousFriction(CartForce):
-    """Friction in proportion to the cart's speed."""
+class Gust(CartForce):
+    """A push between two times since the start of the episode.
 
-    name = "viscous_friction"
-    equation = "F = -coefficient x_dot"
-    source = "Olsson et al. (1998), Friction models and friction compensation, section 2"
-    table = (Parameter("coefficient", "N s/m", 0.0, 50.0, 0.0),)
+    Its edges are logistic, 10 % to 90 % in 18 ms, so that an integrator's steps of 12.5 ms see where they lie; its
+    impulse, force (end - start), is that of sharp ones.
+    """
 
-    def push(self, time: Tensor, state: Tensor) -> Tensor:
-        return -self.value("coefficient", state) * state[..., 1]
+    name = "gust"
+    equation = "F = force for start <= t < end"
+    source = "Newton's second law; discrete gusts: Hoblit (1988), Gust Loads on Aircraft, chapter 2 (here on a cart)"
+    table = (
+        Parameter("start", "s", 0.0, 20.0, None),
+        Parameter("end", "s", 0.0, 20.0, None),
+        Parameter("force", "N", -15.0, 15.0, 0.0, linear=True),
+    )
+
+    EDGE: ClassVar[float] = 0.004
+    """s"""
+
+    def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+        start, end = self.value("start", state), self.value("end", state)
+        return self.value("force", state) * inside(time, start, end, self.EDGE)
+
+
+class Spring(CartForce):
+    """A cable or a rubber band that draws the cart to one place."""
+
+    name = "spring"
+    equation = "F = -stiffness (x - rest)"
+    source = "Hooke's law"
+    table = (
+        Parameter("stiffness", "N/m", 0.0, 50.0, 0.0, linear=True),
+        Parameter("rest", "m", -1.5, 1.5, None),
+    )
+
+    def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+        return -self.value("stiffness", state) * (state[:, 0] - self.value("rest", state))
+
+
+class TrackTilt(DynamicsEffect):
+    """A track that rises towards +x by `angle`; theta is still measured from the track's normal.
+
+    Gravity has a part along the track, so cart and pole roll down, and the pole stands where it is vertical, at
+    theta = angle: that separates it from a constant force.
+    """
+
+    name = "track_tilt"
+    equation = (
+        "Q_x = -(M + m) g sin(angle), "
+        "Q_theta = -m l g sin(angle) cos(theta) + m l g (cos(angle) - 1) sin(theta): gravity turned by angle"
+    )
+    source = "Lagrange's equations of the cart-pole with gravity along (-sin(angle), -cos(angle)) in the track's frame"
+    table = (Parameter("angle", "rad", -0.3, 0.3, 0.0),)
+
+    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+        cart_pole = expect(system, CartPole, self)
+        tilt, theta = self.value("angle", state), state[:, 2]
+        weight = (cart_pole.cart_mass + cart_pole.pole_mass) * cart_pole.gravity
+        moment = cart_pole.pole_mass * cart_pole.pole_half_length * cart_pole.gravity
+        along = -weight * tilt.sin()
+        # cos - 1 as a square, which keeps its digits at small angles.
+        torque = -moment * (tilt.sin() * theta.cos() + 2 * (tilt / 2).sin().square() * theta.sin())
+        return torch.stack((along.expand_as(torque), torque), -1)

@@ -30,6 +30,7 @@ from visadapt.effects import DynamicsEffect
 from visadapt.learning.poses import PoseFinder, Poses
 from visadapt.learning.smoothing import Noise, Path, Problem, likeliest, smooth
 from visadapt.recordings import Episode
+from visadapt.systems import System
 from visadapt.world import World
 
 SHOCK = 0.03
@@ -242,5 +243,5 @@ class _Load(DynamicsEffect):
         super().__init__()
         self.rows = rows
 
-    def load(self, time: Tensor, state: Tensor) -> Tensor:
+    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         return self.rows

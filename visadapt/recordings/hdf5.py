@@ -12,7 +12,8 @@ All datasets carry a checksum (Fletcher-32), so that damaged bytes are an error 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -65,27 +66,40 @@ def write_recording(
         temporary.write_bytes(content)
 
 
-def read_recording(path: str | os.PathLike[str]) -> list[Episode]:
-    """All episodes of a file that `write_recording` wrote, in order.
+def read_names(path: str | os.PathLike[str]) -> tuple[list[str] | None, list[str] | None]:
+    """The names of the columns of state and of action, None where a file has none; raises as `read_recording`."""
+    with _opened(Path(path)) as file:
+        state, action = (file.attrs.get(f"{kind}_names") for kind in ("state", "action"))
+        return None if state is None else list(state), None if action is None else list(action)
+
+
+def read_recording(path: str | os.PathLike[str], frames: bool = True) -> list[Episode]:
+    """All episodes of a file that `write_recording` wrote, in order; with `frames` False, of their states alone.
 
     Raises:
         RecordingError: the file is missing, torn, of another format or version, or its rows make no episode;
             the message is one line that says which file and episode, and what would be right.
     """
     path = Path(path)
+    with _opened(path) as file:
+        episodes = [_read_episode(path, file, number, frames) for number in range(len(file))]
+    _check_alike(path, episodes)
+    return episodes
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[h5py.File]:
     if not path.is_file():
         raise RecordingError(f"{path}: there is no such file")
     try:
         with h5py.File(path, "r") as file:
             _check_version(path, file)
-            episodes = [_read_episode(path, file, number) for number in range(len(file))]
+            yield file
     except OSError as error:
         # The message of HDF5 is for its own developers, and may be several lines.
         raise RecordingError(
             f"{path}: not a readable HDF5 file, or cut short; a recording written by visadapt was expected"
         ) from error
-    _check_alike(path, episodes)
-    return episodes
 
 
 def _group_name(number: int) -> str:
@@ -111,7 +125,7 @@ def _check_version(path: Path, file: h5py.File) -> None:
         raise RecordingError(f"{path}: version {version} of the format; this visadapt reads version {VERSION}")
 
 
-def _read_episode(path: Path, file: h5py.File, number: int) -> Episode:
+def _read_episode(path: Path, file: h5py.File, number: int, frames: bool) -> Episode:
     where = f"{path}: {_group_name(number)}"
     group = file.get(_group_name(number))
     if not isinstance(group, h5py.Group):
@@ -119,8 +133,11 @@ def _read_episode(path: Path, file: h5py.File, number: int) -> Episode:
     time, action = _read(where, group, "time"), _read(where, group, "action")
     if time is None or action is None:
         raise RecordingError(f"{where} has no dataset {'time' if time is None else 'action'!r}")
+    state = _read(where, group, "state")
+    if state is None and not frames:
+        raise RecordingError(f"{where} holds frames alone; states are needed")
     try:
-        return Episode(time, action, _read(where, group, "state"), _read(where, group, "frame"))
+        return Episode(time, action, state, _read(where, group, "frame") if frames else None)
     except ValueError as error:
         raise RecordingError(f"{where}: {error}") from error
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
@@ -22,7 +22,8 @@ class Variable:
 class System(ABC):
     """Source physics in continuous time, batched and differentiable.
 
-    Subclasses are frozen dataclasses whose fields are the physical parameters in SI units.
+    Subclasses are frozen dataclasses whose fields are the physical parameters in SI units: numbers, or tensors, () or
+    (B,), where an effect has changed them.
     """
 
     name: ClassVar[str]
@@ -34,6 +35,12 @@ class System(ABC):
     @abstractmethod
     def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:
         """Time derivative (B, n_state) of a state (B, n_state) under a command (B, n_action) and a load (B, n_load)."""
+
+    def to(self, like: Tensor) -> Self:
+        """The same system, parameters that are tensors with the device and dtype of `like`."""
+        itself: Any = self  # a dataclass, which this base is not
+        values = {field.name: getattr(self, field.name) for field in fields(itself)}
+        return replace(itself, **{k: value.to(like) for k, value in values.items() if isinstance(value, Tensor)})
 
     @classmethod
     def index(cls, name: str) -> int:

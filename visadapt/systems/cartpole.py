@@ -20,15 +20,15 @@ from visadapt.systems.base import System, Variable
 class CartPole(System):
     """A uniform pole on a cart. Defaults are the paper's CartPole (0.05 s between commands)."""
 
-    cart_mass: float = 1.0
+    cart_mass: float | Tensor = 1.0
     """kg"""
-    pole_mass: float = 0.1
+    pole_mass: float | Tensor = 0.1
     """kg"""
-    pole_half_length: float = 0.5
+    pole_half_length: float | Tensor = 0.5
     """m, from the hinge to the pole's centre of mass"""
-    max_force: float = 30.0
+    max_force: float | Tensor = 30.0
     """N on the cart at a command of 1"""
-    gravity: float = 9.8
+    gravity: float | Tensor = 9.8
     """m/s2"""
 
     name: ClassVar[str] = "cartpole"
@@ -47,7 +47,7 @@ class CartPole(System):
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if not value > 0:
+            if not bool(torch.as_tensor(value > 0).all()):
                 raise ValueError(f"cartpole: {field.name} must be positive, got {value!r}")
 
     def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from renderers import DrawnCartPole
-from visadapt.effects import ConstantForce, DynamicsEffect, Effect, PeriodicForce
+from visadapt.effects import ConstantForce, Effect, PeriodicForce
 from visadapt.systems import CartPole, System
 from visadapt.targets.base import Observation, Target, TargetError
 from visadapt.world import World, WorldState
@@ -90,10 +90,12 @@ class SyntheticTarget(Target):
         self.angle_limit = angle_limit
         self._world: World | None = None
         self._at: WorldState | None = None
+        self._generator: torch.Generator | None = None
 
     def reset(self, batch: int, generator: torch.Generator) -> Observation:
         effects = self.draw_effects(batch, generator)
         substeps = round(self.period / 0.001)
+        self._generator = generator
         self._world = World(self.system, effects, self.period, "midpoint", substeps).requires_grad_(False)
         self._at = self._world.start(self.initial.draw(batch, generator))
         return self._observe()
@@ -108,6 +110,7 @@ class SyntheticTarget(Target):
     def _observe(self) -> Observation:
         assert self._world is not None
         assert self._at is not None
+        measured, self._at = self._world.measure(self._at, self._generator)
         state = self._at.state
         alive = state.isfinite().all(1) & (state[:, 2].abs() <= self.angle_limit)
         frame = None
@@ -116,8 +119,4 @@ class SyntheticTarget(Target):
             # A fallen cart-pole may be anywhere; the camera shows it at its last sensible place.
             shown = state.nan_to_num().clamp(-10, 10).double().numpy()
             frame = torch.from_numpy(self.camera(shown[:, 0], shown[:, 2]))
-        force = torch.zeros_like(state[:, 0])
-        for effect in self._world.effects:
-            if isinstance(effect, DynamicsEffect):
-                force = force + effect.load(self._at.time, state)[:, 0]
-        return Observation(state, alive, frame, force)
+        return Observation(measured, alive, frame, self._world.load(self._at)[:, 0])

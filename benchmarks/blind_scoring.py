@@ -1,0 +1,195 @@
+"""What a diagnosis of a blind recording is worth: answers (DESIGN.md's JSON, schema 1) against the sealed key.
+
+An answer names classes. With verdict `identified` each cause is one by itself; with `ambiguous` causes that are listed
+as indistinguishable from one another form one class, of which one member is meant. A true effect is found where a
+class of at most 3 has it; several true effects need a class each.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from itertools import permutations
+from typing import Any
+
+LARGEST_CLASS = 3
+
+SIZE: dict[str, tuple[str, float]] = {
+    "actuator_gain": ("scale", 1.0),
+    "actuator_bias": ("offset", 0.0),
+    "actuator_delay": ("delay", 0.0),
+    "actuator_lag": ("time_constant", 0.0),
+    "actuator_deadzone": ("width", 0.0),
+    "actuator_saturation": ("limit", 0.0),
+    "actuator_backlash": ("width", 0.0),
+    "constant_force": ("force", 0.0),
+    "periodic_force": ("amplitude", 0.0),
+    "gust": ("force", 0.0),
+    "viscous_friction": ("coefficient", 0.0),
+    "coulomb_friction": ("force", 0.0),
+    "quadratic_drag": ("coefficient", 0.0),
+    "friction_patch": ("coefficient", 0.0),
+    "spring": ("stiffness", 0.0),
+    "pole_damping": ("coefficient", 0.0),
+    "track_tilt": ("angle", 0.0),
+    "cart_mass": ("scale", 1.0),
+    "pole_mass": ("scale", 1.0),
+    "pole_length": ("scale", 1.0),
+    "angle_offset": ("offset", 0.0),
+    "measurement_delay": ("delay", 0.0),
+    "dropout": ("rate", 0.0),
+}
+"""the parameter that says how large an effect is, and its value where the effect does nothing"""
+
+REGION = {"friction_patch": "x", "gust": "time", "frozen_zone": "theta"}
+"""effects that live in a region, and the variable of `where.regions` that shows it"""
+
+Answer = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """One recording's line in the key."""
+
+    kind: str
+    """single, pair, triple, none or foreign"""
+    effects: dict[str, dict[str, float]]
+    """parameters by effect"""
+    strengths: dict[str, float]
+    """by effect, in units of the noise"""
+
+    @classmethod
+    def of(cls, recording: dict[str, Any]) -> Truth:
+        """From the key's JSON."""
+        effects = {e["effect"]: e["parameters"] for e in recording["effects"]}
+        return cls(recording["kind"], effects, {e["effect"]: e["strength"] for e in recording["effects"]})
+
+
+@dataclass
+class Score:
+    """One answer against its truth. None: does not apply."""
+
+    kind: str
+    """of the truth"""
+    verdict: str
+    """of the answer"""
+    found: bool | None = None
+    """every true effect has a class (named kinds only)"""
+    exact: bool | None = None
+    """and there is no class besides"""
+    top3: bool | None = None
+    """the true set is among the first three of the ranking"""
+    strength: float | None = None
+    """of a single"""
+    closed: float | None = None
+    """gap.closed of an identified answer"""
+    probability: float | None = None
+    """of the ranking's first set"""
+    first_right: bool | None = None
+    """whether that set is the true one, or of its class"""
+    errors: list[float] = field(default_factory=list)
+    """|estimate - truth| / |truth| of the sizes of rightly named causes"""
+    deviations: list[float] = field(default_factory=list)
+    """the same relative to how far the truth is from doing nothing; differs for scales alone"""
+    covered: list[bool] = field(default_factory=list)
+    """whether a 90 % interval holds the truth, for every parameter of rightly named causes"""
+    overlaps: list[float] = field(default_factory=list)
+    """intersection over union of the region of a patch, gust or frozen zone with the answer's; 0 where it has none"""
+
+
+def classes(answer: Answer) -> list[set[str]]:
+    """What the answer claims to act: one of each set."""
+    if answer["verdict"] not in ("identified", "ambiguous"):
+        return []
+    merged: list[set[str]] = []
+    for cause in answer["causes"]:
+        own = {cause["effect"]}
+        if answer["verdict"] == "ambiguous":
+            own |= set(cause.get("indistinguishable_from") or ())
+        for other in [other for other in merged if other & own]:
+            merged.remove(other)
+            own |= other
+        merged.append(own)
+    return merged
+
+
+def matches(effects: set[str], groups: list[set[str]]) -> bool:
+    """Whether every effect finds a class of its own that is small enough."""
+    small = [group for group in groups if len(group) <= LARGEST_CLASS]
+    names = sorted(effects)
+    return any(
+        all(name in group for name, group in zip(names, order, strict=True))
+        for order in permutations(small, len(names))
+    )
+
+
+def score(truth: Truth, answer: Answer) -> Score:
+    """Score one answer."""
+    result = Score(truth.kind, answer["verdict"])
+    if answer["verdict"] == "identified":
+        result.closed = (answer.get("gap") or {}).get("closed")
+    groups, effects = classes(answer), set(truth.effects)
+    ranking = answer.get("ranking") or []
+    if truth.kind != "foreign" and ranking and ranking[0].get("probability") is not None:
+        result.probability = float(ranking[0]["probability"])
+        first = set(ranking[0]["effects"])
+        # One of a class that the data forces counts as the true one.
+        right = bool(effects) and len(groups) == len(effects) == len(first) and matches(effects, groups)
+        result.first_right = first == effects or (right and matches(first, groups))
+    if truth.kind in ("none", "foreign"):
+        return result
+    result.found = matches(effects, groups)
+    result.exact = result.found and len(groups) == len(effects)
+    result.top3 = any(set(entry["effects"]) == effects for entry in ranking[:3])
+    if truth.kind == "single":
+        result.strength = next(iter(truth.strengths.values()))
+    if groups:
+        for cause in answer["causes"]:
+            if cause["effect"] in effects:
+                _parameters(result, cause, truth.effects[cause["effect"]])
+    for effect in sorted(effects & REGION.keys()):
+        result.overlaps.append(_overlap(answer, REGION[effect], truth.effects[effect]))
+    return result
+
+
+def _parameters(result: Score, cause: dict[str, Any], true: dict[str, float]) -> None:
+    name, neutral = SIZE.get(cause["effect"], ("", 0.0))
+    if cause["effect"] == "sensor_scale":
+        # Of the two scales, the one that is off.
+        name, neutral = max(("position", "angle"), key=lambda n: abs(true[n] - 1.0)), 1.0
+    for parameter, estimate in cause["parameters"].items():
+        if parameter not in true or estimate.get("value") is None:
+            continue
+        value, truth = float(estimate["value"]), true[parameter]
+        if parameter == name and truth not in (0.0, neutral):
+            result.errors.append(abs(value - truth) / abs(truth))
+            result.deviations.append(abs(value - truth) / abs(truth - neutral))
+        interval = estimate.get("ci90")
+        if interval and None not in interval:
+            low, high = interval
+            if parameter == "phase":
+                # The turn that lies nearest to the interval.
+                truth += 2 * math.pi * round(((low + high) / 2 - truth) / (2 * math.pi))
+            result.covered.append(bool(low <= truth <= high))
+
+
+def _overlap(answer: Answer, variable: str, true: dict[str, float]) -> float:
+    """With the region of that variable that has the largest share of the gap."""
+    regions = (answer.get("where") or {}).get("regions") or []
+    own = [region for region in regions if region["variable"] == variable]
+    if not own:
+        return 0.0
+    best = max(own, key=lambda region: region.get("share") or 0.0)
+    common = min(best["to"], true["end"]) - max(best["from"], true["start"])
+    whole = max(best["to"], true["end"]) - min(best["from"], true["start"])
+    return max(0.0, common) / whole if whole > 0 else 0.0
+
+
+def wilson(hits: int, n: int, z: float = 1.959964) -> tuple[float, float]:
+    """95 % interval of a share (Wilson 1927)."""
+    if n == 0:
+        return math.nan, math.nan
+    p = hits / n
+    centre, scale = p + z * z / (2 * n), 1 + z * z / n
+    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)

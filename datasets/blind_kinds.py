@@ -1,0 +1,245 @@
+"""What can stand between a blind recording and the source: the catalogue's effects and foreign ones.
+
+Each kind draws its shape (direction, places, times, frequencies) once and has one size, a positive number that its
+strength grows with. Names and parameters of the named kinds are DESIGN.md's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+Shape = dict[str, float]
+Draw = Callable[[np.random.Generator, float], Shape]
+Build = Callable[[float, Shape], Shape]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of effect."""
+
+    name: str
+    """standard name, or a name of its own for a foreign one"""
+    stage: str
+    """actuation, dynamics or sensing"""
+    low: float
+    """smallest size"""
+    high: float
+    """largest size that is still sensible physically"""
+    build: Build
+    """(size, shape) -> parameters"""
+    draw: Draw = lambda rng, length: {}
+    """(random numbers, episode length in s) -> shape"""
+
+
+def _sign(rng: np.random.Generator, _: float = 0.0) -> Shape:
+    return {"sign": float(rng.choice((-1.0, 1.0)))}
+
+
+def _log(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _plain(parameter: str) -> Build:
+    return lambda size, shape: {parameter: size}
+
+
+def _signed(parameter: str) -> Build:
+    return lambda size, shape: {parameter: shape["sign"] * size}
+
+
+def _scale(size: float, shape: Shape) -> Shape:
+    return {"scale": float(np.exp(shape["sign"] * size))}
+
+
+def _shaped(parameter: str) -> Build:
+    """The size, with the shape's sign where it has one, and the shape itself."""
+    return lambda size, shape: {
+        parameter: shape.get("sign", 1.0) * size,
+        **{name: value for name, value in shape.items() if name != "sign"},
+    }
+
+
+def _span(rng: np.random.Generator, centre: float, width: float) -> Shape:
+    middle = rng.uniform(-centre, centre)
+    return {"start": float(middle - width / 2), "end": float(middle + width / 2)}
+
+
+def _periodic(rng: np.random.Generator, _: float) -> Shape:
+    offset = float(rng.uniform(-1, 1)) if rng.random() < 0.5 else 0.0
+    return {"frequency": _log(rng, 0.2, 2.5), "phase": float(rng.uniform(-np.pi, np.pi)), "ratio": offset}
+
+
+def _gust(rng: np.random.Generator, length: float) -> Shape:
+    lasts = float(rng.uniform(0.15, 0.4)) * length
+    start = float(rng.uniform(0.1 * length, 0.9 * length - lasts))
+    return _sign(rng) | {"start": round(start, 3), "end": round(start + lasts, 3)}
+
+
+def _scaled_sensor(rng: np.random.Generator, _: float) -> Shape:
+    return _sign(rng) | {"position": float(rng.random() < 0.5)}
+
+
+def _patch(rng: np.random.Generator, _: float) -> Shape:
+    return _span(rng, 0.4, float(rng.uniform(0.2, 0.6)))
+
+
+NAMED: tuple[Kind, ...] = (
+    Kind("actuator_gain", "actuation", 0.01, 0.7, _scale, _sign),
+    Kind("actuator_bias", "actuation", 0.001, 0.3, _signed("offset"), _sign),
+    Kind("actuator_delay", "actuation", 0.001, 0.15, _plain("delay")),
+    Kind("actuator_lag", "actuation", 0.001, 0.25, _plain("time_constant")),
+    Kind("actuator_deadzone", "actuation", 0.001, 0.3, _plain("width")),
+    # A size of 0 leaves commands up to 1 alone; 3.5 caps them at 0.03.
+    Kind("actuator_saturation", "actuation", 0.05, 3.5, lambda size, shape: {"limit": float(np.exp(-size))}),
+    Kind("actuator_backlash", "actuation", 0.002, 0.5, _plain("width")),
+    Kind("constant_force", "dynamics", 0.02, 8.0, _signed("force"), _sign),
+    Kind(
+        "periodic_force",
+        "dynamics",
+        0.02,
+        10.0,
+        lambda size, shape: {
+            "amplitude": size,
+            "frequency": shape["frequency"],
+            "phase": shape["phase"],
+            "offset": size * shape["ratio"],
+        },
+        _periodic,
+    ),
+    Kind("gust", "dynamics", 0.05, 15.0, _shaped("force"), _gust),
+    Kind("viscous_friction", "dynamics", 0.02, 15.0, _plain("coefficient")),
+    Kind("coulomb_friction", "dynamics", 0.02, 6.0, _plain("force")),
+    Kind("quadratic_drag", "dynamics", 0.02, 20.0, _plain("coefficient")),
+    Kind("friction_patch", "dynamics", 0.1, 40.0, _shaped("coefficient"), _patch),
+    Kind(
+        "spring", "dynamics", 0.05, 40.0, _shaped("stiffness"), lambda rng, _: {"rest": float(rng.uniform(-0.4, 0.4))}
+    ),
+    Kind("pole_damping", "dynamics", 0.0003, 0.15, _plain("coefficient")),
+    Kind("track_tilt", "dynamics", 0.001, 0.2, _signed("angle"), _sign),
+    Kind("cart_mass", "dynamics", 0.01, 1.1, _scale, _sign),
+    Kind("pole_mass", "dynamics", 0.05, 1.6, _scale, _sign),
+    Kind("pole_length", "dynamics", 0.01, 0.9, _scale, _sign),
+    Kind("angle_offset", "sensing", 0.0005, 0.2, _signed("offset"), _sign),
+    Kind("measurement_delay", "sensing", 0.001, 0.15, _plain("delay")),
+    Kind(
+        "sensor_scale",
+        "sensing",
+        0.005,
+        0.7,
+        lambda size, shape: {
+            "position": float(np.exp(shape["sign"] * size * shape["position"])),
+            "angle": float(np.exp(shape["sign"] * size * (1 - shape["position"]))),
+        },
+        _scaled_sensor,
+    ),
+    Kind(
+        "frozen_zone",
+        "sensing",
+        0.002,
+        0.25,
+        lambda size, shape: {
+            "start": shape["centre"] - size / 2,
+            "end": shape["centre"] + size / 2,
+            "holds_rate": shape["holds_rate"],
+        },
+        lambda rng, _: {"centre": float(rng.normal(0, 0.04)), "holds_rate": float(rng.random() < 0.5)},
+    ),
+    Kind("dropout", "sensing", 0.005, 0.5, _plain("rate")),
+)
+"""the catalogue (position_offset leaves no trace in a recording and is left out)"""
+
+
+def _seeded(rng: np.random.Generator, **more: float) -> Shape:
+    return {"path_seed": float(rng.integers(2**31)), **more}
+
+
+FOREIGN: tuple[Kind, ...] = (
+    Kind(
+        "cogging",
+        "dynamics",
+        0.1,
+        30.0,
+        _shaped("amplitude"),
+        lambda rng, _: {"wavelength": _log(rng, 0.06, 0.25), "phase": float(rng.uniform(-np.pi, np.pi))},
+    ),
+    Kind("hardening_spring", "dynamics", 0.5, 400.0, _shaped("stiffness"), lambda rng, _: {"rest": 0.0}),
+    Kind(
+        "stribeck_friction", "dynamics", 0.05, 10.0, _shaped("force"), lambda rng, _: {"speed": _log(rng, 0.05, 0.15)}
+    ),
+    Kind(
+        "random_force",
+        "dynamics",
+        0.05,
+        10.0,
+        _shaped("deviation"),
+        lambda rng, _: _seeded(rng, correlation=_log(rng, 0.15, 0.8)),
+    ),
+    Kind("kicks", "dynamics", 0.2, 40.0, _shaped("force"), lambda rng, _: _seeded(rng, interval=_log(rng, 0.6, 1.5))),
+    Kind(
+        "magnet",
+        "dynamics",
+        0.1,
+        20.0,
+        _shaped("force"),
+        lambda rng, _: (
+            _sign(rng) | {"position": float(rng.uniform(-0.3, 0.3)), "reach": float(rng.uniform(0.05, 0.15))}
+        ),
+    ),
+    Kind("one_way_drag", "dynamics", 0.1, 30.0, _shaped("coefficient"), lambda rng, _: {"side": _sign(rng)["sign"]}),
+    Kind("aerodynamic_coupling", "dynamics", 0.1, 80.0, _shaped("coefficient"), _sign),
+    Kind(
+        "sloshing",
+        "dynamics",
+        0.02,
+        1.5,
+        _shaped("mass"),
+        lambda rng, _: {"frequency": _log(rng, 0.8, 2.5), "damping": float(rng.uniform(0.03, 0.15))},
+    ),
+    Kind(
+        "pivot_detent",
+        "dynamics",
+        0.001,
+        0.5,
+        _shaped("torque"),
+        lambda rng, _: {"teeth": float(rng.uniform(20, 50)), "phase": float(rng.uniform(-np.pi, np.pi))},
+    ),
+    Kind("pivot_cable", "dynamics", 0.001, 0.5, _shaped("torque"), _sign),
+    Kind(
+        "sticky_bearing",
+        "dynamics",
+        0.001,
+        0.5,
+        _shaped("torque"),
+        lambda rng, _: _span(rng, 0.04, float(rng.uniform(0.04, 0.1))),
+    ),
+    Kind("directional_gain", "actuation", 0.01, 0.7, _signed("share"), _sign),
+    Kind("even_motor", "actuation", 0.02, 4.0, _signed("coefficient"), _sign),
+    Kind("fading_gain", "actuation", 0.002, 0.15, _plain("rate")),
+    # A drift of the position at a steady rate would be another inertial frame, which no data show.
+    Kind(
+        "encoder_ripple",
+        "sensing",
+        0.0003,
+        0.1,
+        _shaped("amplitude"),
+        lambda rng, _: {"wavelength": _log(rng, 0.1, 0.4), "phase": float(rng.uniform(-np.pi, np.pi))},
+    ),
+    Kind("angle_drift", "sensing", 0.0003, 0.05, _signed("rate"), _sign),
+    Kind("angle_quantisation", "sensing", 0.002, 0.15, _plain("step")),
+)
+"""what no name of the catalogue stands for"""
+
+INSEPARABLE: tuple[frozenset[str], ...] = (
+    frozenset({"actuator_bias", "constant_force"}),
+    frozenset({"actuator_delay", "measurement_delay"}),
+    frozenset({"actuator_gain", "cart_mass", "pole_mass"}),
+    frozenset({"track_tilt", "angle_offset", "constant_force"}),
+    frozenset({"track_tilt", "angle_offset", "actuator_bias"}),
+)
+"""never together in one recording: other sizes of some of them, or of fewer, make the same data"""
+
+KINDS: dict[str, Kind] = {kind.name: kind for kind in NAMED + FOREIGN}
+"""by name"""

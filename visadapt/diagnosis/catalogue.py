@@ -1,0 +1,40 @@
+"""Which effects a diagnosis looks for, and which of them are one and the same to passive data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+
+from visadapt.effects import EFFECTS, ActuationEffect, Dropout, DynamicsEffect, Effect, FrozenZone, SensingEffect
+
+HOLDING: tuple[type[Effect], ...] = (Dropout, FrozenZone)
+"""Effects that are read off repeated readings, before anything is fitted."""
+
+
+def catalogue() -> list[type[Effect]]:
+    """All named effects at the stages of a simulator without a camera."""
+    stages = (ActuationEffect, DynamicsEffect, SensingEffect)
+    return [effect for effect in EFFECTS.values() if issubclass(effect, stages)]
+
+
+def searched(effects: Iterable[type[Effect]]) -> list[type[Effect]]:
+    """Those that are fitted: the first of each group of twins, and no sensor that remembers."""
+    out: list[type[Effect]] = []
+    for effect in effects:
+        twin = any(effect.name in other.indistinguishable_from for other in out)
+        if not twin and effect not in HOLDING and not _remembers(effect):
+            out.append(effect)
+    return out
+
+
+def twins(effect: type[Effect], effects: Iterable[type[Effect]]) -> list[type[Effect]]:
+    """Effects among `effects` that passive data cannot tell from this one."""
+    return [other for other in effects if other.name in effect.indistinguishable_from]
+
+
+def _remembers(effect: type[Effect]) -> bool:
+    if not issubclass(effect, SensingEffect):
+        return False
+    nothing = effect(**{p.name: p.low if p.neutral is None else p.neutral for p in effect.table})
+    return nothing.memory(torch.zeros(1, 4), 1.0).numel() > 0

@@ -1,0 +1,79 @@
+"""The rows of a recording as tensors: one window per episode, or several where episodes are long."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+LONGEST = 120
+"""Rows of a window; a longer episode is cut, since states far apart say nothing about each other's noise."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """W windows of at most T rows, in float64; what is beyond a window's end is zero and not `used`."""
+
+    measured: Tensor
+    """(W, T, m)"""
+    used: Tensor
+    """(W, T, m) 1 where a measurement counts"""
+    inside: Tensor
+    """(W, T) 1 within the window"""
+    time: Tensor
+    """(W, T) s since the episode began"""
+    command: Tensor
+    """(E, L) of whole episodes, from their beginning"""
+    first: Tensor
+    """(W,) row of the episode at which the window begins"""
+    episode: Tensor
+    """(W,) index of the window's episode"""
+    channels: tuple[int, ...]
+    """columns of the state that were measured"""
+    period: float
+    """s"""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(W, T)"""
+        return self.inside.shape[0], self.inside.shape[1]
+
+    def of(self, windows: Tensor) -> Rows:
+        """Only these windows."""
+        return Rows(
+            self.measured[windows], self.used[windows], self.inside[windows], self.time[windows],
+            self.command, self.first[windows], self.episode[windows], self.channels, self.period,
+        )  # fmt: skip
+
+
+def cut(
+    measured: Sequence[Tensor],
+    valid: Sequence[Tensor],
+    commands: Sequence[Tensor],
+    channels: tuple[int, ...],
+    period: float,
+) -> Rows:
+    """Cut episodes into windows of equal length within each: measured (T, m), valid (T, m) and commands (T,)."""
+    pieces = []
+    for index, values in enumerate(measured):
+        count = -(-len(values) // LONGEST)
+        edges = torch.linspace(0, len(values), count + 1).round().long().tolist()
+        pieces += [(index, a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    rows = max(b - a for _, a, b in pieces)
+    shape = (len(pieces), rows)
+    out = torch.zeros(*shape, len(channels), dtype=torch.float64)
+    inside = torch.zeros(shape, dtype=torch.float64)
+    used = torch.zeros_like(out)
+    for w, (index, a, b) in enumerate(pieces):
+        out[w, : b - a] = measured[index][a:b]
+        used[w, : b - a] = valid[index][a:b]
+        inside[w, : b - a] = 1
+    command = torch.zeros(len(commands), max(len(c) for c in commands) + rows, dtype=torch.float64)
+    for index, values in enumerate(commands):
+        command[index, : len(values)] = values
+    first = torch.tensor([a for _, a, _ in pieces])
+    time = period * (first[:, None] + torch.arange(rows)).double()
+    episode = torch.tensor([index for index, _, _ in pieces])
+    return Rows(out, used, inside, time, command, first, episode, channels, period)

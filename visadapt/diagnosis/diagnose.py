@@ -1,0 +1,167 @@
+"""From a recording to a diagnosis: set aside what is no reading, search, judge, predict what was held out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from visadapt.console import Report, staged
+from visadapt.diagnosis import experiments, how_far, where
+from visadapt.diagnosis.catalogue import catalogue as all_effects
+from visadapt.diagnosis.catalogue import searched
+from visadapt.diagnosis.causes import Named, causes, classes, ranking, stage_shares
+from visadapt.diagnosis.evidence import Errors, disturbances, evidence
+from visadapt.diagnosis.held import held_causes, unaware
+from visadapt.diagnosis.readings import Readings
+from visadapt.diagnosis.result import (
+    AMBIGUOUS,
+    IDENTIFIED,
+    NO_GAP,
+    UNEXPLAINED,
+    Cause,
+    Diagnosis,
+    RecordingSummary,
+    Region,
+    Where,
+)
+from visadapt.diagnosis.verdict import Judgement, judge
+from visadapt.diagnosis.which import Search
+from visadapt.effects import Effect
+from visadapt.recordings import Recording
+from visadapt.systems import CartPole
+from visadapt.world import World
+
+ENOUGH = 0.9
+"""Share of the gap that the causes must close to be the explanation where something is left over."""
+
+RIVALS = 3
+"""Sets after the best one of which it is computed how far they close the gap."""
+
+
+def diagnose(
+    recording: Recording,
+    world: World,
+    catalogue: Sequence[type[Effect]] | None = None,
+    seed: int = 0,
+    jobs: int = 1,
+    progress: Report | None = None,
+) -> Diagnosis:
+    """Say where a recording departs from the source, which effects cause it, and how far they close the gap.
+
+    Args:
+        recording: states, or some of them, and commands.
+        world: the source; its system and its parameters are taken as known.
+        catalogue: the effects that may be named; without it, all that are registered.
+        seed: of the shifts by which the significance of regions is counted; nothing else is drawn.
+        jobs: cores that tensor operations may use.
+        progress: called with (stage, steps done, steps in all, loss).
+
+    Raises:
+        ValueError: the world has effects of its own, or is not a cart-pole.
+    """
+    if len(world.effects):
+        raise ValueError("diagnose: the world is the source and has no effects; give the bare system")
+    if not isinstance(world.system, CartPole):
+        raise ValueError(f"diagnose: cartpole is what can be diagnosed, got {world.system.name}")
+    torch.set_num_threads(jobs)
+    effects = list(all_effects() if catalogue is None else catalogue)
+    with torch.inference_mode():
+        return _diagnose(recording, world.system, effects, seed, progress)
+
+
+def _diagnose(
+    recording: Recording, system: CartPole, effects: list[type[Effect]], seed: int, progress: Report | None
+) -> Diagnosis:
+    readings = Readings.of(recording, system)
+    rows = readings.rows
+    search = Search(system, rows, searched(effects))
+    search.run(staged(progress, "search"))
+    judgement = judge(search)
+    best = judgement.best
+    places = classes(judgement, effects)
+    held = held_causes(readings, search, judgement)
+
+    # How far: the source, the best set, each cause alone, the runners-up; all on episodes held out.
+    alone = [search.single(effect) for effect in dict.fromkeys(named.canonical for place in places for named in place)]
+    rivals = [weighed.fitted for weighed in judgement.weighed[1 : 1 + RIVALS]]
+    sets = {frozenset(f.names): f for f in [search.source, best, *alone, *rivals]}
+    ahead = how_far.held_out(system, rows, [(f.effects, f.fits) for f in sets.values()])
+    predicted = dict(zip(sets, ahead, strict=True))
+    source = unaware(readings, search) if held else predicted[frozenset()]
+    corrected = predicted[frozenset(best.names)]
+    boxed = how_far.held_out(system, rows, [((), search.source.fits)], black_box=True)[0]
+    errors = Errors.of(source, corrected, boxed, (best.fits.log_noise[0] / 2).exp())
+    closing = {names: errors.closed_by(each) for names, each in predicted.items()}
+
+    verdict = _verdict(judgement, errors, bool(held))
+    told: tuple[Cause, ...] = ()
+    if verdict == IDENTIFIED:
+        told = (*(each.cause for each in held), *causes(search, judgement, places, closing))
+        if any(cause.indistinguishable_from for cause in told):
+            verdict = AMBIGUOUS
+    before, after = disturbances(search, judgement)
+    regions = _regions(told, before if told else after, seed)
+    return Diagnosis(
+        system=system.name,
+        recording=RecordingSummary(len(recording.episodes), recording.samples, float(f"{recording.period:.9g}")),
+        verdict=verdict,
+        where=Where(
+            stage_shares(search, judgement, [each.cost for each in held]),
+            errors.by_state(system, rows.channels, bool(told)),
+            regions,
+        ),
+        causes=told,
+        ranking=ranking(judgement, effects, closing, [each.cause for each in held]),
+        gap=errors.gap(),
+        next_experiment=_next(judgement, verdict, places),
+        warnings=(*recording.warnings, *readings.warnings, *_doubts(judgement, verdict)),
+        evidence=evidence(search, source, corrected, errors, before, after, regions),
+    )
+
+
+def _verdict(judgement: Judgement, errors: Errors, held: bool) -> str:
+    if judgement.unexplained:
+        # Where there are many rows anything left over is evident; what matters is how much it is.
+        closed = errors.gap().closed
+        return IDENTIFIED if judgement.best.effects and closed >= ENOUGH else UNEXPLAINED
+    return IDENTIFIED if judgement.best.effects or held else NO_GAP
+
+
+def _regions(told: Sequence[Cause], found: where.Disturbance, seed: int) -> tuple[Region, ...]:
+    """Those of the causes that act in one, as they were fitted; then those where the residual stands out."""
+    own = []
+    for cause in told:
+        if {"start", "end"} <= set(cause.parameters):
+            start, end = cause.parameters["start"], cause.parameters["end"]
+            variable = {"s": "time", "m": "x", "rad": "theta"}[start.unit]
+            own.append(
+                Region(
+                    variable,
+                    start.value,
+                    end.value,
+                    where.share(found, variable, start.value, end.value),
+                    1 - cause.probability,
+                )
+            )
+    taken = {region.variable for region in own}
+    return (*own, *(region for region in where.regions(found, seed) if region.variable not in taken))
+
+
+def _next(judgement: Judgement, verdict: str, places: Sequence[Sequence[Named]]) -> str:
+    if verdict == NO_GAP:
+        return experiments.more()
+    if verdict == UNEXPLAINED:
+        first = judgement.functions[0]
+        return experiments.explain(first.port, first.variable)
+    return experiments.separate([[named.effect for named in place] for place in places])
+
+
+def _doubts(judgement: Judgement, verdict: str) -> list[str]:
+    if verdict in (IDENTIFIED, AMBIGUOUS) and judgement.unexplained:
+        first = judgement.functions[0]
+        return [
+            f"the causes close the gap but do not explain all: something is left that enters as {first.port} and goes "
+            f"with {first.variable}"
+        ]
+    return []

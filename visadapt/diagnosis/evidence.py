@@ -1,0 +1,135 @@
+"""The figures behind a result: errors by horizon and state, and what the report draws."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from visadapt.diagnosis import how_far
+from visadapt.diagnosis.how_far import Ahead
+from visadapt.diagnosis.models import Family
+from visadapt.diagnosis.result import Evidence, Gap, Growth, Prediction, Region
+from visadapt.diagnosis.verdict import Judgement
+from visadapt.diagnosis.where import Disturbance, disturbance, profile, spectrum
+from visadapt.diagnosis.which import Search
+from visadapt.systems import System
+
+SHOWN = 3
+"""Held-out predictions that the report draws."""
+
+PROFILES = 4
+"""Variables over which it draws what is left."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Root mean square errors of held-out predictions by horizon and channel (H, m), in deviations of the noise."""
+
+    before: Tensor
+    after: Tensor
+    floor: Tensor
+    black_box: Tensor
+    deviation: Tensor
+    """(m,) of the noise"""
+
+    @classmethod
+    def of(cls, source: Ahead, corrected: Ahead, boxed: Ahead, deviation: Tensor) -> Errors:
+        """From predictions of the source, of the source with the causes, and of the source with a black box."""
+        every = (source.rms(deviation), corrected.rms(deviation), corrected.floor(deviation), boxed.rms(deviation))
+        return cls(*every, deviation)
+
+    def closed_by(self, ahead: Ahead) -> float:
+        """Share of the gap that a set closes."""
+        reached = how_far.overall(ahead.rms(self.deviation))[-1]
+        return how_far.closed(_last(self.before), float(reached), _last(self.floor))
+
+    def gap(self) -> Gap:
+        """As the result states it."""
+        before, after, floor, box = (_last(e) for e in (self.before, self.after, self.floor, self.black_box))
+        measure = (
+            f"root mean square error of predictions {how_far.AHEAD:g} s ahead on held-out episodes, "
+            "in standard deviations of the measurement noise"
+        )
+        return Gap(measure, before, after, floor, box, how_far.closed(before, after, floor))
+
+    def growth(self, period: float) -> Growth:
+        """Over the horizon."""
+        seconds = period * np.arange(1, len(self.before) + 1)
+        every = (how_far.overall(e).numpy() for e in (self.before, self.after, self.floor, self.black_box))
+        return Growth(seconds, *every)
+
+    def by_state(self, system: System, channels: Sequence[int], explained: bool) -> dict[str, float]:
+        """Share of the gap by state: of what the causes close, or else of what is there; NaN where unmeasured."""
+        least = self.after if explained else self.floor
+        excess = (self.before[-1].square() - least[-1].square()).clamp(min=0)
+        whole = float(excess.sum())
+        shares = {variable.name: math.nan for variable in system.states}
+        for k, channel in enumerate(channels):
+            shares[system.states[channel].name] = float(excess[k]) / whole if whole > 0 else 0.0
+        return shares
+
+
+def _last(errors: Tensor) -> float:
+    return float(how_far.overall(errors)[-1])
+
+
+def disturbances(search: Search, judgement: Judgement) -> tuple[Disturbance, Disturbance]:
+    """What acts beside the source, and beside the best set, smoothed alike."""
+    source, best = search.source, judgement.best
+    # The same room for a disturbance in both, or the smoother one would look cleaner for that alone.
+    room = source.fits.log_process.clamp(min=math.log(0.01**2))
+    return (
+        disturbance(Family(search.system, (), search.rows), source.fits, room),
+        disturbance(Family(search.system, best.effects, search.rows), best.fits, room),
+    )
+
+
+def evidence(
+    search: Search,
+    source: Ahead,
+    corrected: Ahead,
+    errors: Errors,
+    before: Disturbance,
+    after: Disturbance,
+    regions: Sequence[Region],
+) -> Evidence:
+    """What the report draws."""
+    units = {v.name: v.unit for v in (*search.system.states, *search.system.actions)} | {"time": "s"}
+    drawn = [region.variable for region in regions] + ["x_dot", "x", "command", "time", "theta", "theta_dot"]
+    names = [name for name in dict.fromkeys(drawn) if name in units][:PROFILES]
+    return Evidence(
+        _predictions(search, source, corrected),
+        tuple(profile(name, units[name], before, after) for name in names),
+        errors.growth(search.rows.period),
+        spectrum(before, after, search.rows.period),
+    )
+
+
+def _predictions(search: Search, source: Ahead, corrected: Ahead) -> tuple[Prediction, ...]:
+    """Stretches in which the source errs most, from windows of their own."""
+    rows = search.rows
+    horizon = source.predicted.shape[2] - 1
+    wrong = source.error[-1].square().sum(-1) * source.there[-1].prod(-1)
+    out = []
+    for window in wrong.max(1).values.argsort(descending=True)[:SHOWN].tolist():
+        end = int(wrong[window].argmax())
+        start = end - horizon
+        if start < 0 or float(wrong[window, end]) == 0:
+            continue
+        measured = np.full((horizon + 1, source.predicted.shape[-1]), np.nan)
+        measured[:, list(rows.channels)] = rows.measured[window, start : end + 1].numpy()
+        out.append(
+            Prediction(
+                int(rows.episode[window]),
+                rows.time[window, start : end + 1].numpy(),
+                measured,
+                source.predicted[window, start].numpy(),
+                corrected.predicted[window, start].numpy(),
+            )
+        )
+    return tuple(out)

@@ -1,0 +1,75 @@
+"""Readings that are no readings: rows that repeat the one before, and a sensor that stands still.
+
+A sensor with noise never gives the same number twice; where it does, the reading was held. Such readings say nothing
+of the state, so they are set aside before anything is fitted, and counted here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+DISTINCT = 0.5
+"""Share of different numbers among a channel's readings from which on it counts as continuous."""
+
+GRID = 120
+"""Places tried for either edge of a zone in which a sensor stands still."""
+
+POLE = (2, 3)
+"""Columns of the state that a worn angle sensor holds."""
+
+
+@dataclass(frozen=True)
+class Holds:
+    """What was held, by episode."""
+
+    used: list[Tensor]
+    """(T, m) 1 where a reading counts"""
+    lost: list[Tensor]
+    """(T,) the whole row was held"""
+    frozen: list[Tensor]
+    """(T,) angle and angular velocity were held, the rest was not"""
+
+
+def find_holds(measured: Sequence[Tensor], channels: tuple[int, ...]) -> Holds:
+    """Held readings in episodes (T, m) of these columns of the state."""
+    together = torch.cat(list(measured))
+    continuous = [len(together[:, k].unique()) > DISTINCT * len(together) for k in range(len(channels))]
+    used, lost, frozen = [], [], []
+    for values in measured:
+        same = torch.zeros_like(values, dtype=torch.bool)
+        same[1:] = values[1:] == values[:-1]
+        same &= torch.tensor(continuous)
+        pole = torch.tensor([c in POLE for c in channels])
+        whole = same.all(1) if all(continuous) else torch.zeros(len(values), dtype=torch.bool)
+        still = same[:, pole].all(1) & ~whole if bool(pole.any()) else torch.zeros_like(whole)
+        used.append(1.0 - (whole[:, None] | (still[:, None] & pole)).double())
+        lost.append(whole)
+        frozen.append(still)
+    return Holds(used, lost, frozen)
+
+
+def zone(held: Tensor, angle: Tensor, deviation: float) -> tuple[float, float, float]:
+    """Start and end of the angles at which a sensor stands still, and the deviation of either.
+
+    Args:
+        held: (N,) whether the reading was held.
+        angle: (N,) true angles, known to `deviation`.
+
+    Maximum likelihood with a normal error of the angles, over the edges between the angles met.
+    """
+    inside = angle[held]
+    low = torch.linspace(float(inside.min()) - 3 * deviation, float(inside.median()), GRID, dtype=angle.dtype)
+    high = torch.linspace(float(inside.median()), float(inside.max()) + 3 * deviation, GRID, dtype=angle.dtype)
+    below = torch.special.ndtr((low[:, None] - angle) / deviation)
+    above = torch.special.ndtr((angle - high[:, None]) / deviation)
+    chance = (1 - below[:, None] - above[None]).clamp(1e-6, 1 - 1e-6)
+    score = torch.where(held, chance.log(), (1 - chance).log()).sum(-1)
+    weight = (score - score.max()).exp()
+    weight = weight / weight.sum()
+    start, end = (weight.sum(1) * low).sum(), (weight.sum(0) * high).sum()
+    spread = (weight.sum(1) * (low - start).square()).sum() + (weight.sum(0) * (high - end).square()).sum()
+    return float(start), float(end), float((spread / 2).sqrt())

@@ -1,0 +1,180 @@
+"""What a fitted set leaves unexplained: a black box of smooth functions, each of its own variable, and its evidence.
+
+A function adds a force on the cart, a torque at the pivot, or an error to a reading. Each is a sum of Gaussian bumps
+of one state, the command, the command before, or the time. What it adds passes through the gains of the set's own
+filter, so that fitting it is a linear regression of whitened innovations, whose evidence is exact (MacKay 1992,
+Bayesian interpolation, Neural Computation 4(3)).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from visadapt.diagnosis.fitting import Fits
+from visadapt.diagnosis.innovations import Innovations
+from visadapt.diagnosis.models import Family, linearise
+from visadapt.effects import DynamicsEffect
+from visadapt.effects.base import Parameter
+from visadapt.systems import System
+
+BUMPS = 10
+"""Bumps of a function."""
+
+FACTORS: dict[str, tuple[str | None, ...]] = {
+    "cart_force": (None, "x_dot", "command"),
+    "pivot_torque": (None, "theta_dot"),
+}
+"""By what a function on each load is multiplied."""
+
+SIZES = (0.03, 0.3, 3.0, 30.0)
+"""Prior deviations that are tried of what the bumps together change of the innovations, in deviations of these."""
+
+
+class Push(DynamicsEffect):
+    """A load of its own on each degree of freedom, to differentiate by; not in the catalogue, as it has no name."""
+
+    table = (Parameter("cart_force", "N", -1.0, 1.0, 0.0), Parameter("pivot_torque", "N m", -1.0, 1.0, 0.0))
+
+    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+        return torch.stack((self.value("cart_force", state), self.value("pivot_torque", state)), -1)
+
+
+@dataclass(frozen=True)
+class Function:
+    """One function of the black box, fitted alone."""
+
+    port: str
+    """cart_force, pivot_torque, or the state that is read"""
+    variable: str
+    """a state, command, previous_command or time"""
+    factor: str | None
+    """a variable that multiplies it, so that it is a friction or a gain; None for a plain load"""
+    evidence: float
+    """log odds of it against nothing"""
+    centres: Tensor
+    """(BUMPS,) in the variable's unit"""
+    values: Tensor
+    """(BUMPS,) of the function at the centres, in the port's unit, over the factor's"""
+
+
+@dataclass(frozen=True)
+class BlackBox:
+    """All functions that load the system, fitted together beside a set."""
+
+    weights: Tensor
+    """(variables x loads x BUMPS,)"""
+    places: dict[str, tuple[float, float]]
+    """of every variable, the first and the last centre"""
+
+    @classmethod
+    def fit(cls, family: Family, fits: Fits, counts: Tensor) -> BlackBox:
+        """To the windows that count (W,)."""
+        places = {
+            name: _ends(place, family.rows.inside > 0) for name, place in variables_of(family, fits.state[0]).items()
+        }
+        empty = cls(torch.zeros(0), places)
+        columns = empty._columns(family, fits)
+        innovations = Innovations(family, fits)
+        reading = torch.zeros(*family.rows.used.shape, columns.shape[-1], dtype=torch.float64)
+        counted = (family.rows.used * counts[:, None, None]).flatten()
+        answers = innovations.answer(columns, reading) * counted[:, None]
+        weights, _ = _regression(answers, innovations.error * counted)
+        return cls(weights, places)
+
+    def drive(self, family: Family, fits: Fits) -> Tensor:
+        """What it adds to the states a period on, along those of `fits`, (W, T - 1, n)."""
+        return self._columns(family, fits) @ self.weights
+
+    def _columns(self, family: Family, fits: Fits) -> Tensor:
+        loads = loads_of(family, fits)
+        columns = []
+        for name, place in variables_of(family, fits.state[0]).items():
+            _, bumps = _bumps(place, self.places[name])
+            weighted = bumps[:, :-1] * family.rows.inside[:, 1:, None]
+            columns += [loads[..., k, None] * weighted[:, :, None] for k in range(loads.shape[-1])]
+        return torch.cat(columns, -1)
+
+
+def functions(family: Family, fits: Fits) -> list[Function]:
+    """Every function of the black box beside a fitted set, the most evident first."""
+    rows, system = family.rows, family.system
+    state = fits.state[0]
+    loads = loads_of(family, fits)
+    variables = variables_of(family, state)
+    kinds, drives, readings, places = [], [], [], []
+    for name, place in variables.items():
+        centres, bumps = _bumps(place, _ends(place, rows.inside > 0))
+        inner = bumps[:, :-1] * rows.inside[:, 1:, None]
+        for k, load in enumerate(system.loads):
+            for factor in FACTORS[load.name]:
+                by = 1.0 if factor is None else variables[factor][:, :-1, None]
+                kinds.append((load.name, name, factor))
+                drives.append(loads[..., k, None] * (by * inner)[:, :, None])
+                readings.append(torch.zeros(*rows.used.shape, BUMPS, dtype=torch.float64))
+                places.append(centres)
+        for k, channel in enumerate(rows.channels):
+            read = system.states[channel].name
+            if name in (read, "time"):
+                kinds.append((read, name, None))
+                drives.append(torch.zeros(*state[:, 1:].shape, BUMPS, dtype=torch.float64))
+                reading = torch.zeros(*rows.used.shape, BUMPS, dtype=torch.float64)
+                reading[:, :, k] = -bumps * rows.used[:, :, k, None]
+                readings.append(reading)
+                places.append(centres)
+    innovations = Innovations(family, fits)
+    answers = innovations.answer(torch.cat(drives, -1), torch.cat(readings, -1)).split(BUMPS, 1)
+    out = []
+    for (port, variable, factor), answer, centres in zip(kinds, answers, places, strict=True):
+        weights, evidence = _regression(answer, innovations.error)
+        _, shape = _bumps(centres, (float(centres[0]), float(centres[-1])))
+        out.append(Function(port, variable, factor, evidence, centres, shape @ weights))
+    return sorted(out, key=lambda function: -function.evidence)
+
+
+def variables_of(family: Family, state: Tensor) -> dict[str, Tensor]:
+    """(W, T) of every variable."""
+    rows = family.rows
+    index = rows.first[:, None] + torch.arange(rows.shape[1])
+    command = rows.command[rows.episode[:, None], index]
+    before = rows.command[rows.episode[:, None], (index - 1).clamp(min=0)] * (index > 0)
+    out = {variable.name: state[..., k] for k, variable in enumerate(family.system.states)}
+    return {**out, "command": command, "previous_command": before, "time": rows.time}
+
+
+def loads_of(family: Family, fits: Fits) -> Tensor:
+    """What a unit of each load, held for a period, adds to the states, (W, T - 1, n, loads)."""
+    pushed = Family(family.system, [*family.effects, Push], family.rows)
+    theta = torch.cat((fits.theta[0, : len(family.table)], torch.zeros(len(Push.table), dtype=torch.float64)))
+    return linearise(pushed, theta, fits.state[0]).by_parameter[..., -len(Push.table) :]
+
+
+def _ends(place: Tensor, inside: Tensor) -> tuple[float, float]:
+    low, high = torch.quantile(place[inside], torch.tensor([0.01, 0.99], dtype=place.dtype)).tolist()
+    return low, max(high, low + 1e-9)
+
+
+def _bumps(place: Tensor, ends: tuple[float, float]) -> tuple[Tensor, Tensor]:
+    """Centres (BUMPS,), evenly over where the data are, and the bumps (W, T, BUMPS)."""
+    centres = torch.linspace(*ends, BUMPS, dtype=place.dtype)
+    width = centres[1] - centres[0]
+    return centres, torch.exp(-0.5 * ((place[..., None] - centres) / width).square())
+
+
+def _regression(answers: Tensor, error: Tensor) -> tuple[Tensor, float]:
+    """Weights (M,) that take most from `error` (N,) for their size, and their log odds against nothing."""
+    normal = answers.T @ answers
+    pull = -(answers.T @ error)
+    scale = 1 / (normal.diagonal().mean() + 1e-300)
+    identity = torch.eye(len(pull), dtype=normal.dtype)
+    best, weights = -math.inf, torch.zeros_like(pull)
+    for size in SIZES:
+        variance = scale * size**2 * BUMPS
+        inner = torch.linalg.solve(normal + identity / variance, pull)
+        value = float(0.5 * pull @ inner - 0.5 * torch.linalg.slogdet(identity + variance * normal)[1])
+        if value > best:
+            best, weights = value, inner
+    return weights, best - math.log(len(SIZES))

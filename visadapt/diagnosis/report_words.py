@@ -1,0 +1,171 @@
+"""A diagnosis in words: the verdict in a sentence, numbers with the digits they deserve, the text for the terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, Cause, Diagnosis, Estimate, Region
+from visadapt.systems import SYSTEMS
+
+UNKNOWN = "unknown"
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number with so many significant digits, without an exponent where it reads well without."""
+    if not math.isfinite(value):
+        return UNKNOWN
+    if value == 0:
+        return "0"
+    if not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}"
+    return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
+
+
+def percent(share: float) -> str:
+    """A share as a percentage; "unknown" where it is."""
+    return f"{100 * share:.0f} %" if math.isfinite(share) else UNKNOWN
+
+
+def with_unit(text: str, unit: str) -> str:
+    """A number and its unit, which is "1" where there is none."""
+    return text if unit in ("1", "") else f"{text} {unit}"
+
+
+def estimate(one: Estimate) -> str:
+    """A parameter's value, with two digits of what its interval leaves open."""
+    return with_unit(_rounded(one.value, one), one.unit)
+
+
+def interval(one: Estimate) -> str:
+    """A parameter's 90 % interval."""
+    low, high = (_rounded(edge, one) if math.isfinite(edge) else "open" for edge in one.ci90)
+    return with_unit(f"{low} to {high}", one.unit)
+
+
+def _rounded(value: float, one: Estimate) -> str:
+    width = one.ci90[1] - one.ci90[0]
+    if not math.isfinite(width) or width <= 0 or not math.isfinite(value) or width < 1e-6 * abs(value):
+        return number(value)
+    decimals = 1 - math.floor(math.log10(width))
+    if decimals > 6:
+        return f"{value:.2e}"
+    return f"{value:.{decimals}f}" if decimals > 0 else f"{round(value, decimals):.0f}"
+
+
+def plain(name: str) -> str:
+    """A standard name in words."""
+    return name.replace("_", " ")
+
+
+def unit_of(variable: str, system: str) -> str:
+    """The unit of a variable that a region or a profile is over."""
+    known = {one.name: one.unit for one in (*SYSTEMS[system].states, *SYSTEMS[system].actions)}
+    return {"time": "s", "episode": "1"}.get(variable) or known.get(variable, "1")
+
+
+def region(one: Region, system: str) -> str:
+    """Where a region lies: "x from 0.10 to 0.40 m"."""
+    if one.variable == "episode":
+        return f"episodes {one.start:.0f} to {one.end:.0f}" if one.end > one.start else f"episode {one.start:.0f}"
+    span = with_unit(f"{number(one.start, 2)} to {number(one.end, 2)}", unit_of(one.variable, system))
+    return f"{one.variable} from {span}"
+
+
+def listed(words: Sequence[str], last: str = "and") -> str:
+    """ "a", "a and b", "a, b and c"."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
+
+
+def effects(names: Sequence[str]) -> str:
+    """A set of effects in words; the empty set is the source."""
+    return " + ".join(plain(name) for name in names) or "nothing: the simulator as it stands"
+
+
+def sentence(diagnosis: Diagnosis) -> str:
+    """The verdict in one plain sentence, with physical units."""
+    gap = diagnosis.gap
+    if diagnosis.verdict == NO_GAP:
+        return (
+            f"No gap: the simulator predicts this recording as well as its noise allows "
+            f"(error {number(gap.before)}, noise {number(gap.floor)})."
+        )
+    if diagnosis.verdict == IDENTIFIED:
+        return f"{_first(listed([_named(cause) for cause in diagnosis.causes]))} {_closes(diagnosis)}."
+    if diagnosis.verdict == AMBIGUOUS:
+        # A cause that nothing else could stand in for acts whatever the open ones are.
+        sure = [_named(cause) for cause in diagnosis.causes if not cause.indistinguishable_from]
+        still_open = [_named(cause) for cause in diagnosis.causes if cause.indistinguishable_from] or sure
+        either = f"{'either ' if len(still_open) == 2 else ''}{listed(still_open, 'or')}"
+        if sure and still_open is not sure:
+            either = f"{listed(sure)}, and {either},"
+        return f"{_first(either)} {_closes(diagnosis)}; this recording cannot tell which."
+    named = [ranked.gap_closed for ranked in diagnosis.ranking if ranked.effects and math.isfinite(ranked.gap_closed)]
+    best = f"the best of them closes {percent(max(named))} of the gap" if named else "none of them helps"
+    black_box = (gap.before - gap.black_box) / (gap.before - gap.floor) if gap.before != gap.floor else math.nan
+    place = ""
+    if diagnosis.where.regions:
+        place = f"; it shows most at {region(diagnosis.where.regions[0], diagnosis.system)}"
+    return f"Something acts that no known effect explains: {best}, a black box {percent(min(1.0, black_box))}{place}."
+
+
+def _named(cause: Cause) -> str:
+    values = ", ".join(f"{plain(name)} {estimate(one)}" for name, one in cause.parameters.items())
+    return f"{plain(cause.effect)} ({values})" if values else plain(cause.effect)
+
+
+def _closes(diagnosis: Diagnosis) -> str:
+    many = diagnosis.verdict == IDENTIFIED and len(diagnosis.causes) > 1
+    return f"{'close' if many else 'closes'} {percent(diagnosis.gap.closed)} of the gap to the simulator"
+
+
+def _first(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def as_text(diagnosis: Diagnosis) -> str:
+    """The diagnosis for the terminal."""
+    gap, recording = diagnosis.gap, diagnosis.recording
+    lines = [
+        f"{diagnosis.verdict}: {sentence(diagnosis)}",
+        "",
+        f"Recording  {recording.episodes} episodes, {recording.samples} samples, {recording.period:.4g} s apart",
+        f"Gap        {gap.measure}",
+        f"           before {number(gap.before)}, after {number(gap.after)}, noise floor {number(gap.floor)}, "
+        f"black box {number(gap.black_box)}; closed {percent(gap.closed)}",
+    ]
+    for cause in diagnosis.causes:
+        lines += [
+            "",
+            f"Cause      {cause.effect}: probability {cause.probability:.2f}, closes {percent(cause.gap_closed)} alone",
+            *(f"           {name} = {estimate(one)} (90 %: {interval(one)})" for name, one in cause.parameters.items()),
+        ]
+        if cause.indistinguishable_from:
+            lines.append(f"           cannot be told from {listed(cause.indistinguishable_from, 'or')}")
+    lines += ["", *_where(diagnosis)]
+    if diagnosis.ranking:
+        lines += ["", "Ranking    probability, gap closed, effects"]
+        lines += [
+            f"           {ranked.probability:.3f}  {percent(ranked.gap_closed):>7}  {effects(ranked.effects)}"
+            for ranked in diagnosis.ranking[:5]
+        ]
+    if diagnosis.next_experiment:
+        lines += ["", f"Next       {diagnosis.next_experiment}"]
+    lines += [f"Warning    {warning}" for warning in diagnosis.warnings]
+    return "\n".join(lines)
+
+
+def _where(diagnosis: Diagnosis) -> list[str]:
+    where = diagnosis.where
+    shares = [
+        ", ".join(f"{name} {percent(share)}" for name, share in table.items() if share > 0) or "none"
+        for table in (where.stages, where.states)
+    ]
+    return [
+        f"Where      by stage: {shares[0]}",
+        f"           by state: {shares[1]}",
+        *(
+            f"           {region(one, diagnosis.system)}: {percent(one.share)} of the gap (p = {one.p_value:.2g})"
+            for one in where.regions
+        ),
+    ]

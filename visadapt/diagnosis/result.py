@@ -1,0 +1,294 @@
+"""What a diagnosis says, as numbers: the JSON of the command, and the evidence that the report draws.
+
+The JSON's schema is `schema.json` beside this file, version 1. Shares and probabilities are numbers from 0 to 1;
+parameters are in the units that their effects state; whatever could not be determined is NaN here, null in the JSON.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+SCHEMA_VERSION = 1
+
+IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP = "identified", "ambiguous", "unexplained", "no_gap"
+VERDICTS = (IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP)
+
+
+@dataclass(frozen=True)
+class Region:
+    """A stretch of one variable (a state, an action, `time` in s since the episode began, or `episode`)."""
+
+    variable: str
+    start: float
+    """the JSON's "from", in the variable's unit"""
+    end: float
+    """the JSON's "to", in the variable's unit"""
+    share: float
+    """of the gap that lies here"""
+    p_value: float
+    """of a gap like this by chance somewhere, all places looked at included"""
+
+
+@dataclass(frozen=True)
+class Where:
+    """Shares of the gap by stage and by state, and the regions that stand out."""
+
+    stages: Mapping[str, float]
+    """of the explained gap: actuation, dynamics, sensing, camera"""
+    states: Mapping[str, float]
+    """every state of the system; NaN where it was not measured"""
+    regions: tuple[Region, ...] = ()
+    """the most certain first"""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter of an effect."""
+
+    value: float
+    unit: str
+    ci90: tuple[float, float]
+    """90 % interval; NaN on a side on which it is open"""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One effect that acts, as far as the data says."""
+
+    effect: str
+    parameters: Mapping[str, Estimate]
+    probability: float
+    gap_closed: float
+    """by this cause alone, on held-out episodes"""
+    indistinguishable_from: tuple[str, ...] = ()
+    """effects that fit this recording as well"""
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """One set of effects that was weighed; the empty set is the source as it stands."""
+
+    effects: tuple[str, ...]
+    probability: float
+    gap_closed: float
+    """by the set, on held-out episodes"""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """The error of predictions several steps ahead on held-out episodes."""
+
+    measure: str
+    """what the other numbers are, in words and with the unit"""
+    before: float
+    """of the source"""
+    after: float
+    """of the source with the causes"""
+    floor: float
+    """what the measurement noise alone leaves"""
+    black_box: float
+    """of the source with a residual network"""
+    closed: float
+    """(before - after) / (before - floor)"""
+
+
+@dataclass(frozen=True)
+class RecordingSummary:
+    """How much was recorded."""
+
+    episodes: int
+    samples: int
+    """executed actions"""
+    period: float
+    """s between rows"""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """One held-out window, predicted from its start with the actions that were commanded."""
+
+    episode: int
+    time: NDArray[np.floating]
+    """(K,) s since the episode began"""
+    measured: NDArray[np.floating]
+    """(K, n_state); NaN in the columns of states that were not measured"""
+    source: NDArray[np.floating]
+    """(K, n_state), as the source predicts it"""
+    corrected: NDArray[np.floating]
+    """(K, n_state), as the source with the causes predicts it (without a cause: as `source`)"""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The mean residual over one variable, in bins."""
+
+    variable: str
+    """a state, an action, `time` or `episode`"""
+    variable_unit: str
+    quantity: str
+    """what is left over, say "force on the cart" """
+    quantity_unit: str
+    centres: NDArray[np.floating]
+    """(N,) of the bins"""
+    before: NDArray[np.floating]
+    """(N,) mean under the source; NaN in empty bins"""
+    before_error: NDArray[np.floating]
+    """(N,) its standard error"""
+    after: NDArray[np.floating]
+    """(N,) mean with the causes"""
+    after_error: NDArray[np.floating]
+    """(N,) its standard error"""
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How the error grows with the horizon of prediction, all (K,); the same measure as `Gap`, but at one instant."""
+
+    seconds: NDArray[np.floating]
+    before: NDArray[np.floating]
+    after: NDArray[np.floating]
+    floor: NDArray[np.floating]
+    black_box: NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Power spectral density of the residual, all (F,)."""
+
+    quantity: str
+    """what is left over, say "force on the cart" """
+    unit: str
+    """of the density, say "N2/Hz" """
+    frequency: NDArray[np.floating]
+    """Hz"""
+    before: NDArray[np.floating]
+    after: NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class PolicyTerms:
+    """The terms of the paper's Theorem 1 for a given policy: a pair (before, after) each."""
+
+    delta: tuple[float, float]
+    """error of the model's one-step prediction"""
+    lipschitz: tuple[float, float]
+    """L, by which a step of the model under the policy multiplies a difference of states at most"""
+    zeta: tuple[float, float]
+    """the bound on the difference of the two trajectories' cost"""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the report draws and the JSON leaves out. Whatever is empty or None is not drawn."""
+
+    predictions: tuple[Prediction, ...] = ()
+    """a few held-out windows, the most telling first"""
+    profiles: tuple[Profile, ...] = ()
+    """the variables of `Where.regions` first"""
+    growth: Growth | None = None
+    spectrum: Spectrum | None = None
+    policy: PolicyTerms | None = None
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The whole result.
+
+    Raises:
+        ValueError: an unknown verdict, or causes where the verdict says that there are none.
+    """
+
+    system: str
+    recording: RecordingSummary
+    verdict: str
+    """one of VERDICTS"""
+    where: Where
+    causes: tuple[Cause, ...]
+    """the likeliest first; empty for no_gap and unexplained. For ambiguous: those that fit equally well"""
+    ranking: tuple[Ranked, ...]
+    """the likeliest first, the runners-up too"""
+    gap: Gap
+    next_experiment: str
+    """what to record to settle what is open; empty where nothing is"""
+    warnings: tuple[str, ...] = ()
+    """the recording's, and the diagnosis's own"""
+    evidence: Evidence = Evidence()
+
+    def __post_init__(self) -> None:
+        if self.verdict not in VERDICTS:
+            raise ValueError(f"the verdict is {self.verdict!r}; there are {', '.join(VERDICTS)}")
+        if bool(self.causes) != (self.verdict in (IDENTIFIED, AMBIGUOUS)):
+            raise ValueError(f"the verdict {self.verdict!r} does not go with {len(self.causes)} causes")
+
+    def to_json(self) -> dict[str, Any]:
+        """What json.dumps takes, strictly (null for what is not finite); keys and their order are the schema's."""
+        return {
+            "schema": SCHEMA_VERSION,
+            "system": self.system,
+            "recording": {
+                "episodes": int(self.recording.episodes),
+                "samples": int(self.recording.samples),
+                "period": _number(self.recording.period),
+            },
+            "verdict": self.verdict,
+            "where": {
+                "stages": {name: _number(share) for name, share in self.where.stages.items()},
+                "states": {name: _number(share) for name, share in self.where.states.items()},
+                "regions": [_region(region) for region in self.where.regions],
+                "pixels": None,
+            },
+            "causes": [_cause(cause) for cause in self.causes],
+            "ranking": [
+                {
+                    "effects": list(ranked.effects),
+                    "probability": _number(ranked.probability),
+                    "gap_closed": _number(ranked.gap_closed),
+                }
+                for ranked in self.ranking
+            ],
+            "gap": {
+                "measure": self.gap.measure,
+                "before": _number(self.gap.before),
+                "after": _number(self.gap.after),
+                "floor": _number(self.gap.floor),
+                "black_box": _number(self.gap.black_box),
+                "closed": _number(self.gap.closed),
+            },
+            "next_experiment": self.next_experiment,
+            "warnings": list(self.warnings),
+        }
+
+
+def _region(region: Region) -> dict[str, Any]:
+    return {
+        "variable": region.variable,
+        "from": _number(region.start),
+        "to": _number(region.end),
+        "share": _number(region.share),
+        "p_value": _number(region.p_value),
+    }
+
+
+def _cause(cause: Cause) -> dict[str, Any]:
+    return {
+        "effect": cause.effect,
+        "parameters": {
+            name: {"value": _number(one.value), "unit": one.unit, "ci90": [_number(edge) for edge in one.ci90]}
+            for name, one in cause.parameters.items()
+        },
+        "probability": _number(cause.probability),
+        "gap_closed": _number(cause.gap_closed),
+        "indistinguishable_from": list(cause.indistinguishable_from),
+    }
+
+
+def _number(value: float) -> float | None:
+    """A plain float, whatever numpy or torch made it; None where JSON has no number for it."""
+    plain = float(value)
+    return plain if math.isfinite(plain) else None

@@ -1,0 +1,103 @@
+"""The verdict: which sets of effects the recording speaks for, whether they explain it all, and what else would do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from visadapt.diagnosis.leftover import Function, functions
+from visadapt.diagnosis.models import Family
+from visadapt.diagnosis.which import Effects, Fitted, Search
+from visadapt.effects import Effect
+
+WEIGHED = 8
+"""Sets, the most probable ones, of which it is asked what they leave unexplained."""
+
+NOISE = 5.0
+"""Log likelihood that process noise must add to a set to count as something unexplained, and what a set pays for it."""
+
+FUNCTION = 4.0
+"""Log odds of a function of the black box beside a set from which on it counts as something unexplained."""
+
+MASS = 0.93
+"""Posterior probability that the members of a class hold between them."""
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """A set of effects and its posterior probability."""
+
+    fitted: Fitted
+    score: float
+    """log posterior odds, what it leaves unexplained counted against it"""
+    probability: float
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What the search says."""
+
+    weighed: list[Weighed]
+    """the most probable first"""
+    leftover: float
+    """log likelihood that process noise adds to the best"""
+    functions: list[Function]
+    """of a black box beside the best"""
+    classes: dict[type[Effect], list[Weighed]]
+    """for each effect of the best set: the sets with another effect in its place that fit as well"""
+
+    @property
+    def best(self) -> Fitted:
+        """The most probable set."""
+        return self.weighed[0].fitted
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether something is left that no set explains."""
+        return self.leftover > NOISE or self.functions[0].evidence > FUNCTION
+
+
+def judge(search: Search) -> Judgement:
+    """Weigh what a search has fitted."""
+    close = [f for f in search.ranked if f.evidence > -math.inf][:WEIGHED]
+    if all(f is not search.source for f in close):
+        close.append(search.source)
+    left = search.leftover(close)
+    scores = [f.evidence - min(rest, NOISE) for f, rest in zip(close, left, strict=True)]
+    mass = torch.tensor(scores, dtype=torch.float64).softmax(0).tolist()
+    order = sorted(range(len(close)), key=lambda k: -scores[k])
+    weighed = [Weighed(close[k], scores[k], mass[k]) for k in order]
+    best = weighed[0].fitted
+    family = Family(search.system, best.effects, search.rows)
+    classes = {effect: _class(weighed, effect) for effect in best.effects}
+    return Judgement(weighed, left[order[0]], functions(family, best.fits), classes)
+
+
+def _class(weighed: Sequence[Weighed], effect: type[Effect]) -> list[Weighed]:
+    """Sets that differ from the first by having another effect in the place of `effect`, and fit as well."""
+    first = weighed[0]
+    rest = {e for e in first.fitted.effects if e is not effect}
+    rivals = []
+    for other in weighed[1:]:
+        if len(other.fitted.effects) == len(first.fitted.effects) and rest < set(other.fitted.effects):
+            # More parameters that buy nothing only make the same thing with another name.
+            more = other.fitted.fits.theta.shape[1] - first.fitted.fits.theta.shape[1]
+            gained = float(other.fitted.fits.likelihood[0] - first.fitted.fits.likelihood[0])
+            if more <= 0 or gained > more:
+                rivals.append(other)
+    whole = first.probability + sum(r.probability for r in rivals)
+    held, members = first.probability, []
+    for rival in rivals:
+        if held >= MASS * whole:
+            break
+        members.append(rival)
+        held += rival.probability
+    return members
+
+
+def exchanged(first: Effects, other: Effects) -> type[Effect]:
+    """The one effect of `other` that `first` has not."""
+    return next(e for e in other if e not in first)

@@ -1,0 +1,263 @@
+"""Which effects: a search over sets of them, forwards, backwards and sideways, judged by their evidence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from visadapt.console import Progress
+from visadapt.diagnosis.data import Rows
+from visadapt.diagnosis.fitting import Fits, fit, rough
+from visadapt.diagnosis.models import Family
+from visadapt.diagnosis.screening import screen
+from visadapt.effects import Effect
+from visadapt.systems import System
+
+Effects = tuple[type[Effect], ...]
+
+MOST = 4
+"""Effects in a set."""
+
+BEAM = 3
+LEADS = 8
+"""Sets that are taken further at each size, and effects that are tried beside each."""
+
+QUICK, CAREFUL = 8, 20
+"""Iterations of a fit that only has to show promise, and of one whose figures are reported."""
+
+UNLEARNT = 0.1
+"""Share of its prior variance that a parameter may keep."""
+
+DECADES = 3
+"""Decades over which the prior of a strength is spread."""
+
+PRIOR = 0.0
+"""Log prior odds that one effect more is there, whichever of the catalogue."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """One set of effects, fitted to a recording."""
+
+    effects: Effects
+    fits: Fits
+    """of this set alone, in the order of its effects' parameters"""
+    evidence: float
+    """log posterior odds, up to a constant"""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Standard names."""
+        return tuple(effect.name for effect in self.effects)
+
+
+def first_fits(system: System, rows: Rows) -> Fits:
+    """A start for the source as it stands."""
+    n = len(system.states)
+    state = rough(rows, n)[None]
+    return Fits(
+        torch.zeros(1, 0, dtype=torch.float64),
+        state,
+        torch.full((1, 2), math.log(0.2**2), dtype=torch.float64),
+        torch.full((1, len(rows.channels)), math.log(0.01**2), dtype=torch.float64),
+        torch.full((1,), -math.inf, dtype=torch.float64),
+        torch.zeros(1, 0, 0, dtype=torch.float64),
+    )
+
+
+class Search:
+    """The sets fitted so far to one recording, and how to fit more."""
+
+    def __init__(self, system: System, rows: Rows, catalogue: Sequence[type[Effect]]) -> None:
+        self.system = system
+        self.rows = rows
+        self.catalogue = tuple(catalogue)
+        self.fitted: dict[frozenset[str], Fitted] = {}
+        self.fit([((), first_fits(system, rows))], CAREFUL)
+
+    def run(self, progress: Progress | None = None) -> None:
+        """Grow sets while that makes them more probable; then try their neighbours."""
+        beam = [self.source]
+        for size in range(MOST):
+            if progress is not None:
+                progress(size, MOST, -self.best.evidence)
+            before = self.best
+            children = self.extend(beam)
+            if not children:
+                break
+            beam = sorted(children, key=lambda f: -f.evidence)[:BEAM]
+            if beam[0].evidence < before.evidence:
+                break
+        for _ in range(3):
+            before = self.best
+            self.neighbours(before)
+            self.polish()
+            if self.best.names == before.names:
+                break
+        if progress is not None:
+            progress(MOST, MOST, -self.best.evidence)
+
+    @property
+    def source(self) -> Fitted:
+        """The empty set."""
+        return self.fitted[frozenset()]
+
+    @property
+    def ranked(self) -> list[Fitted]:
+        """The most probable first."""
+        return sorted(self.fitted.values(), key=lambda f: -f.evidence)
+
+    @property
+    def best(self) -> Fitted:
+        """The most probable."""
+        return self.ranked[0]
+
+    def extend(self, bases: Sequence[Fitted], leads: int = LEADS) -> list[Fitted]:
+        """Every base with one effect more, its most promising ones."""
+        starts = []
+        seen = set()
+        for base in bases:
+            rest = [e for e in self.catalogue if e not in base.effects]
+            for lead in screen(self.system, base.effects, base.fits, self.rows, rest)[:leads]:
+                effects = (*base.effects, lead.effect)
+                key = frozenset(e.name for e in effects)
+                if key not in self.fitted and key not in seen:
+                    seen.add(key)
+                    starts.append((effects, _grown(base.fits, lead.values)))
+        return self.fit(starts, QUICK)
+
+    def neighbours(self, centre: Fitted) -> None:
+        """Sets with one effect less, and with one exchanged for another."""
+        smaller = []
+        starts = []
+        for gone in centre.effects:
+            effects = tuple(e for e in centre.effects if e is not gone)
+            key = frozenset(e.name for e in effects)
+            if key in self.fitted:
+                smaller.append(self.fitted[key])
+            else:
+                starts.append((effects, _shrunk(centre, gone)))
+        smaller += self.fit(starts, QUICK)
+        self.extend(smaller, leads=5)
+
+    def polish(self, within: float = 8.0, most: int = 8) -> None:
+        """Fit those carefully that may be the answer."""
+        best = self.best.evidence
+        close = [f for f in self.ranked if f.evidence > best - within][:most]
+        self.fit([(f.effects, f.fits) for f in close], CAREFUL)
+
+    def single(self, effect: type[Effect]) -> Fitted:
+        """One effect alone."""
+        key = frozenset({effect.name})
+        if key not in self.fitted:
+            self.fit([((effect,), self._lead(self.source, effect))], QUICK)
+        return self.fitted[key]
+
+    def exchange(self, whole: Fitted, gone: type[Effect], new: type[Effect]) -> Fitted:
+        """A set with one of its effects exchanged for another."""
+        kept = tuple(e for e in whole.effects if e is not gone)
+        base = self.fitted.get(frozenset(e.name for e in kept)) or self.fit([(kept, _shrunk(whole, gone))], QUICK)[0]
+        return self.fit([((*base.effects, new), self._lead(base, new))], CAREFUL)[0]
+
+    def _lead(self, base: Fitted, effect: type[Effect]) -> Fits:
+        leads = screen(self.system, base.effects, base.fits, self.rows, [effect])
+        nothing = tuple(p.neutral if p.neutral is not None else 0.5 * (p.low + p.high) for p in effect.table)
+        return _grown(base.fits, leads[0].values if leads else nothing)
+
+    def leftover(self, sets: Sequence[Fitted]) -> list[float]:
+        """Log likelihood that process noise adds to each set: how much it leaves unexplained."""
+        families = [Family(self.system, f.effects, self.rows) for f in sets]
+        quiet = fit(families, joined([f.fits for f in sets]), self._counts(len(sets)), CAREFUL, still=True)
+        return [max(0.0, float(f.fits.likelihood[0] - q)) for f, q in zip(sets, quiet.likelihood, strict=True)]
+
+    def fit(self, starts: Sequence[tuple[Effects, Fits]], iterations: int) -> list[Fitted]:
+        """Fit sets of effects, each from a start; what is better than before is kept."""
+        if not starts:
+            return []
+        families = [Family(self.system, effects, self.rows) for effects, _ in starts]
+        out = fit(families, joined([fits for _, fits in starts]), self._counts(len(starts)), iterations)
+        results = []
+        for k, (effects, _) in enumerate(starts):
+            own = _apart(out.of(torch.tensor([k])), len(families[k].table))
+            fitted = Fitted(effects, own, evidence(effects, own, len(self.catalogue)))
+            key = frozenset(fitted.names)
+            if key not in self.fitted or self.fitted[key].evidence < fitted.evidence:
+                self.fitted[key] = fitted
+            results.append(self.fitted[key])
+        return results
+
+    def _counts(self, models: int) -> Tensor:
+        return torch.ones(models, self.rows.shape[0], dtype=torch.float64)
+
+
+def evidence(effects: Effects, fits: Fits, catalogue: int) -> float:
+    """Log posterior odds of a set, by Laplace's approximation; -inf where the data say nothing of an effect.
+
+    A strength is as likely in any decade (Jeffreys' prior, over DECADES below its range), to either side; a shape is
+    as likely anywhere in its range. MacKay (2003), Information Theory, Inference and Learning Algorithms, chapter 28.
+    """
+    table = [p for e in effects for p in e.table]
+    if not table:
+        return float(fits.likelihood[0])
+    width = torch.tensor([p.high - p.low for p in table], dtype=torch.float64)
+    precision = 12 / width.square()
+    whole = fits.information[0] + torch.diag(precision)
+    sure = torch.linalg.inv(whole).diagonal()
+    if _vague(effects, sure * precision > UNLEARNT):
+        return -math.inf
+    density = -width.log()
+    for k, parameter in enumerate(table):
+        if parameter.neutral is not None:
+            size = max(abs(float(fits.theta[0, k]) - parameter.neutral), math.sqrt(float(sure[k])))
+            sides = 1 + (parameter.low < parameter.neutral < parameter.high)
+            density[k] = -math.log(sides * DECADES * math.log(10) * size)
+    occam = (
+        float(density.sum()) + 0.5 * len(table) * math.log(2 * math.pi) - 0.5 * float(torch.linalg.slogdet(whole)[1])
+    )
+    return float(fits.likelihood[0]) + min(0.0, occam) + len(effects) * (PRIOR - math.log(max(1, catalogue)))
+
+
+def _vague(effects: Effects, unlearnt: Tensor) -> bool:
+    """Whether an effect's strengths, or its shapes, are all unlearnt: it is then another one, a gust that never ends."""
+    first = 0
+    for effect in effects:
+        own = unlearnt[first : first + len(effect.table)].tolist()
+        first += len(effect.table)
+        strengths = [u for u, p in zip(own, effect.table, strict=True) if p.neutral is not None]
+        shapes = [u for u, p in zip(own, effect.table, strict=True) if p.neutral is None]
+        if (strengths and all(strengths)) or (shapes and all(shapes)):
+            return True
+    return False
+
+
+def joined(fits: Sequence[Fits]) -> Fits:
+    """Fits of one set each as fits of many."""
+    widest = max(f.theta.shape[1] for f in fits)
+    theta = torch.zeros(len(fits), widest, dtype=torch.float64)
+    for k, each in enumerate(fits):
+        theta[k, : each.theta.shape[1]] = each.theta[0]
+    rest = [torch.cat([getattr(f, name) for f in fits]) for name in ("state", "log_process", "log_noise")]
+    unknown = torch.full((len(fits),), -math.inf, dtype=torch.float64)
+    return Fits(theta, *rest, unknown, torch.zeros(len(fits), widest, widest, dtype=torch.float64))
+
+
+def _apart(fits: Fits, count: int) -> Fits:
+    return replace(fits, theta=fits.theta[:, :count], information=fits.information[:, :count, :count])
+
+
+def _grown(base: Fits, values: tuple[float, ...]) -> Fits:
+    theta = torch.cat((base.theta, torch.tensor([values], dtype=torch.float64)), 1)
+    return replace(base, theta=theta)
+
+
+def _shrunk(whole: Fitted, gone: type[Effect]) -> Fits:
+    kept = [e is not gone for e in whole.effects for _ in e.table]
+    base = whole.fits
+    theta = base.theta[:, torch.tensor(kept, dtype=torch.bool)]
+    # What is missing then is disturbance, which has to be there from the start to be found.
+    process = base.log_process.clamp(min=math.log(0.02**2))
+    return replace(base, theta=theta, log_process=process)

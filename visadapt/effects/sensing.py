@@ -1,0 +1,182 @@
+"""Effects on what is measured of a cart-pole's state (x, x_dot, theta, theta_dot)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from visadapt.effects.base import Parameter, SensingEffect, inside
+from visadapt.systems import CartPole
+
+
+class MeasurementDelay(SensingEffect):
+    """Measurements that arrive late, by any length.
+
+    Between two rows the trajectory is the cubic through their positions with their velocities (Hermite), and the
+    velocity is that cubic's slope. Before the episode its first state was measured.
+    """
+
+    name = "measurement_delay"
+    equation = "measured(t) = state(max(t - delay, 0))"
+    source = (
+        "Franklin, Powell and Workman (1998), section 4.3.3; de Boor (1978), A Practical Guide to Splines, chapter IV"
+    )
+    table = (Parameter("delay", "s", 0.0, 0.2, 0.0),)
+    indistinguishable_from = ("actuator_delay",)
+
+    def memory(self, state: Tensor, period: float) -> Tensor:
+        shift = self._shift(state, period).detach()
+        if not bool((shift >= 0).all()):
+            raise ValueError(f"measurement_delay: delay must not be negative, got {float(shift.min()) * period:g} s")
+        # Behind each row its number, so that none from before the episode is interpolated.
+        row = torch.cat((state, torch.full_like(state[:, :1], -1)), 1)
+        return row[:, None].expand(-1, int(shift.max().floor()) + 1, -1)
+
+    def apply_to(
+        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        number = memory[:, -1, -1] + 1
+        rows = torch.cat((memory, torch.cat((measured, number[:, None]), 1)[:, None]), 1)
+        shift = self._shift(measured, period)
+        # Not torch.minimum, which halves the gradient where both are equal: in every first row without a delay.
+        shift = torch.where(shift < number, shift, number)
+        whole = shift.detach().floor()
+        index = torch.arange(len(rows), device=rows.device), rows.shape[1] - 1 - whole.long()
+        later, earlier = rows[index], rows[index[0], index[1] - 1]
+        back = (shift - whole)[:, None]  # periods before the later row
+        end, start = later[:, _POSITIONS], earlier[:, _POSITIONS]
+        end_slope, start_slope = period * later[:, _VELOCITIES], period * earlier[:, _VELOCITIES]
+        # The cubic in `back`, which runs from the later row (0) to the earlier one (1).
+        bend = 3 * (start - end) + 2 * end_slope + start_slope
+        twist = 2 * (end - start) - end_slope - start_slope
+        position = end - back * (end_slope - back * (bend + back * twist))
+        velocity = (end_slope - back * (2 * bend + 3 * back * twist)) / period
+        out = measured.clone()
+        out[:, _POSITIONS], out[:, _VELOCITIES] = position, velocity
+        return out, rows[:, 1:]
+
+    def _shift(self, state: Tensor, period: float) -> Tensor:
+        """The delay in rows, (B,), in the precision of the state."""
+        return (self.value("delay", state) / period).expand(len(state))
+
+
+class FrozenZone(SensingEffect):
+    """A worn potentiometer: while the angle is between start and end, the reading holds its last value from outside.
+
+    Angle and angular velocity both hold. The edges are logistic, 10 % to 90 % in 4.4 mrad, where the reading is a
+    mixture; an empty zone does nothing.
+    """
+
+    name = "frozen_zone"
+    equation = "measured_k = measured_(k-1) for start < theta_k < end, of theta and theta_dot"
+    source = "Balaban et al. (2009), Modeling, detection, and disambiguation of sensor faults, section II"
+    table = (Parameter("start", "rad", -0.5, 0.5, 0.0), Parameter("end", "rad", -0.5, 0.5, 0.0))
+
+    EDGE: ClassVar[float] = 0.001
+    """rad"""
+
+    def memory(self, state: Tensor, period: float) -> Tensor:
+        return state[:, None, _POLE]
+
+    def apply_to(
+        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        pole = measured[:, _POLE]
+        start, end = self.value("start", measured), self.value("end", measured)
+        frozen = inside(pole[:, 0], start, end, self.EDGE)[:, None]
+        seen = pole + frozen * (memory[:, 0] - pole)
+        out = measured.clone()
+        out[:, _POLE] = seen
+        return out, seen[:, None]
+
+
+class SensorScale(SensingEffect):
+    """Encoders with other counts per metre or turn than assumed; a velocity scales with its position."""
+
+    name = "sensor_scale"
+    equation = "(x, x_dot) measured = position (x, x_dot), (theta, theta_dot) measured = angle (theta, theta_dot)"
+    source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (multiplicative sensor fault)"
+    table = (
+        Parameter("position", "1", 0.5, 2.0, 1.0, linear=True),
+        Parameter("angle", "1", 0.5, 2.0, 1.0, linear=True),
+    )
+
+    def apply_to(
+        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        position = self.value("position", measured).expand(len(measured))
+        angle = self.value("angle", measured).expand(len(measured))
+        return measured * torch.stack((position, position, angle, angle), 1), memory
+
+
+class AngleOffset(SensingEffect):
+    """A pole that reads `offset` when it is upright."""
+
+    name = "angle_offset"
+    equation = "theta measured = theta + offset"
+    source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (additive sensor fault)"
+    table = (Parameter("offset", "rad", -0.2, 0.2, 0.0, linear=True),)
+
+    def apply_to(
+        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        return _shifted(measured, CartPole.index("theta"), self.value("offset", measured)), memory
+
+
+class PositionOffset(SensingEffect):
+    """A track whose zero lies elsewhere.
+
+    A cart-pole's physics do not know where the cart is: no data show this offset, unless another effect (a spring,
+    a patch) is tied to a known place.
+    """
+
+    name = "position_offset"
+    equation = "x measured = x + offset"
+    source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (additive sensor fault)"
+    table = (Parameter("offset", "m", -0.5, 0.5, 0.0, linear=True),)
+
+    def apply_to(
+        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        return _shifted(measured, CartPole.index("x"), self.value("offset", measured)), memory
+
+
+class Dropout(SensingEffect):
+    """Rows that are lost: with probability `rate`, all of a row repeats the row measured last.
+
+    The first row of an episode is never lost: there is none before it.
+    """
+
+    name = "dropout"
+    equation = "measured_k = measured_(k-1) with probability rate"
+    source = "Schenato et al. (2007), Foundations of control and estimation over lossy networks, section II"
+    table = (Parameter("rate", "1", 0.0, 0.5, 0.0),)
+    no_gradient = "whether a row is lost is drawn, yes or no"
+
+    def memory(self, state: Tensor, period: float) -> Tensor:
+        # Behind the row measured last, whether there is one.
+        return torch.cat((state, torch.zeros_like(state[:, :1])), 1)[:, None]
+
+    def apply_to(
+        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        if generator is None:
+            raise ValueError("dropout is random: it needs a torch.Generator")
+        drawn = torch.rand(len(measured), generator=generator, device=generator.device).to(measured)
+        lost = (drawn < self.value("rate", measured)) & (memory[:, 0, -1] > 0)
+        out = torch.where(lost[:, None], memory[:, 0, :-1], measured)
+        return out, torch.cat((out, torch.ones_like(out[:, :1])), 1)[:, None]
+
+
+_POSITIONS = [CartPole.index("x"), CartPole.index("theta")]
+_VELOCITIES = [CartPole.index("x_dot"), CartPole.index("theta_dot")]
+_POLE = [CartPole.index("theta"), CartPole.index("theta_dot")]
+
+
+def _shifted(measured: Tensor, column: int, offset: Tensor) -> Tensor:
+    """`measured` (B, n) with an offset, () or (B,), on one column."""
+    out = measured.clone()
+    out[:, column] = out[:, column] + offset
+    return out

@@ -1,0 +1,28 @@
+"""A recording that is ready to be diagnosed: episodes in the system's names and units, and what was wrong with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from visadapt.recordings.episode import Episode
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Episodes of states and actions. Every episode's clock is steady: its rows are one period apart."""
+
+    episodes: tuple[Episode, ...]
+    """`state` holds the columns `measured`, no others; `action` all of the system's, in its order"""
+    measured: tuple[str, ...]
+    """the states that were measured, in the system's order"""
+    period: float
+    """s between rows: the median of the episodes'"""
+    sources: tuple[str, ...]
+    """for each episode, where it comes from, for messages: "run3.csv, episode 2" """
+    warnings: tuple[str, ...] = ()
+    """what was changed or left out, a line each"""
+
+    @property
+    def samples(self) -> int:
+        """Executed actions."""
+        return sum(episode.samples for episode in self.episodes)

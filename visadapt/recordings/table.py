@@ -1,0 +1,132 @@
+"""Tables of numbers as text, with a line of names: separated by commas or semicolons, as spreadsheets write them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visadapt.recordings.episode import RecordingError
+
+
+@dataclass(frozen=True)
+class Table:
+    """One file's text, split into its names and its rows, which are not yet numbers.
+
+    Rows are counted from 1 without the line of names, comments (lines that begin with #) and blank lines; lines are
+    counted from 1 as an editor does.
+    """
+
+    path: Path
+    header: tuple[str, ...]
+    separator: str
+    body: str
+    first_line: int
+    """of the body"""
+
+    @classmethod
+    def open(cls, path: Path) -> Table:
+        """Read a file as far as its line of names.
+
+        Raises:
+            RecordingError: the file is missing, unreadable, no text, empty, or has no line of names.
+        """
+        try:
+            text = path.read_text(encoding="utf-8-sig")  # line ends of any kind become \n
+        except UnicodeDecodeError as error:
+            raise RecordingError(f"{path}: not text in UTF-8 (byte {error.start}); a CSV file is right") from error
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+        start, line = 0, 0
+        while start < len(text):
+            end = text.find("\n", start) + 1 or len(text)
+            first, line = text[start:end].strip(), line + 1
+            start = end
+            if first and not first.startswith("#"):
+                break
+        else:
+            raise RecordingError(f"{path}: is empty; a line of names and rows of numbers below it are right")
+        separator = ";" if first.count(";") > first.count(",") else ","
+        header = tuple(name.strip().strip('"') for name in first.split(separator))
+        if all(_is_number(name) for name in header):
+            raise RecordingError(
+                f"{path}: line {line} holds numbers where the columns' names belong (say episode,time,x,theta,command)"
+            )
+        return cls(path, header, separator, text[start:], line + 1)
+
+    def numbers(self, columns: Sequence[int]) -> NDArray[np.float64]:
+        """The rows of some columns (rows, len(columns)); other columns may hold anything.
+
+        Raises:
+            RecordingError: no rows, a row of another length than the names', or a cell that is no number;
+                says which row, line and column.
+        """
+        if next(self._lines(), None) is None:
+            raise RecordingError(f"{self.path}: has no rows below its line of names")
+        try:
+            values = np.loadtxt(
+                io.StringIO(self.body), delimiter=self.separator, comments="#", usecols=columns, ndmin=2
+            )
+        except ValueError:
+            return self._numbers_one_by_one(columns)
+        if self.body.count(self.separator) != len(values) * (len(self.header) - 1):
+            return self._numbers_one_by_one(columns)
+        return values
+
+    def place(self, row: int) -> str:
+        """How a row, counted from 0, is called in messages."""
+        for index, (line, _) in enumerate(self._lines()):
+            if index == row:
+                return f"row {row + 1} (line {line})"
+        return f"row {row + 1}"
+
+    def _lines(self) -> Iterator[tuple[int, str]]:
+        """The rows' lines, each with its number."""
+        start, number = 0, self.first_line
+        while start < len(self.body):
+            end = self.body.find("\n", start) + 1 or len(self.body)
+            line = self.body[start:end].strip()
+            if line and not line.startswith("#"):
+                yield number, line
+            start, number = end, number + 1
+
+    def _numbers_one_by_one(self, columns: Sequence[int]) -> NDArray[np.float64]:
+        """Slower, but it knows about quotes, and which cell is wrong."""
+        rows = []
+        for row, (number, line) in enumerate(self._lines()):
+            cells = next(csv.reader([line], delimiter=self.separator))
+            where = f"{self.path}: row {row + 1} (line {number})"
+            if len(cells) < len(self.header):
+                raise RecordingError(
+                    f"{where} is cut short: {len(cells)} of {len(self.header)} cells; is the file torn?"
+                )
+            if len(cells) > len(self.header):
+                raise RecordingError(f"{where} has {len(cells)} cells, the line of names {len(self.header)}")
+            for column in columns:
+                if not _is_number(cells[column]):
+                    raise RecordingError(f"{where}, column {self.header[column]!r} {_complaint(cells[column])}")
+            rows.append([float(cells[column]) for column in columns])
+        return np.array(rows)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _complaint(cell: str) -> str:
+    cell = cell.strip()
+    if not cell:
+        return "is empty; a number is right (a row without a measurement is better left out)"
+    if _is_number(cell.replace(",", ".", 1)) and math.isfinite(float(cell.replace(",", ".", 1))):
+        return f"is {cell!r}; a decimal point is right"
+    return f"is {cell[:40]!r}; a number is right"
