@@ -177,19 +177,6 @@ class TestOnStates:
             costs.append(losses[0])
         assert costs[1] > 3 * costs[0]
 
-    @pytest.mark.parametrize("rate", [0.0, 1e-2])
-    def test_what_passes_the_correction_straight_on_has_a_rate_of_its_own(self, rate):
-        torch.manual_seed(0)
-        policy = StatePolicy(4)
-        policy.residual = Residual(stir(state_residual_network(with_history=False)), torch.full((4,), 0.01))
-        before = policy.first.weight.detach().clone()
-        settings = TuneSettings(PAPER_CARTPOLE, 3, 4, learning_rate=1e-3, feedforward_rate=rate)
-        world = World(CartPole(), [policy.residual], integrator="euler")
-        tune(policy, world, identity, settings, torch.Generator().manual_seed(0))
-        moved = float(policy.feedforward.weight.detach().abs().max())
-        assert moved == pytest.approx(2.3 * rate, rel=0.5)
-        assert not torch.equal(policy.first.weight, before)
-
     def test_a_loss_that_is_not_a_number_is_an_error_that_says_when(self):
         settings = TuneSettings(PAPER_CARTPOLE, 5, 4)
         policy = StatePolicy(4)

@@ -68,9 +68,9 @@ LEARN = TuneSettings(
 )
 ADAPT = TuneSettings(
     COST,
-    iterations=100,
+    iterations=50,
     batch=32,
-    learning_rate=5e-4,
+    learning_rate=2e-4,
     start_spread=(0.3, 0.1, 0.08, 0.1),
     kick=(0.0,) * 4,
     diverged=INSIDE,

@@ -40,9 +40,9 @@ class PixelSettings:
     adapted: TuneSettings = field(
         default_factory=lambda: TuneSettings(
             CENTRED_CARTPOLE,
-            iterations=100,
+            iterations=50,
             batch=32,
-            learning_rate=5e-4,
+            learning_rate=2e-4,
             start_spread=(0.3, 0.1, 0.1, 0.1),
             # A kick would look like a force to the residual, which would go on pushing.
             kick=(0.0, 0.0, 0.0, 0.0),

@@ -41,7 +41,6 @@ class StateSettings:
             PAPER_CARTPOLE,
             iterations=400,
             learning_rate=2e-3,
-            feedforward_rate=2e-3,
             start_spread=(0.3, 0.2, 0.1, 0.2),
             kick=(0.0, 0.0, 0.0, 0.0),
             diverged=(1e9, 2.0, 0.25, 3.0),

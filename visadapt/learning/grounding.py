@@ -53,6 +53,11 @@ def gap(world: World, windows: Windows) -> Tensor:
         return windows.next_state - world.step(world.start(windows.state), windows.action).state
 
 
+def rescale(residual: Residual, source: World, windows: Windows) -> None:
+    """Make the root mean square of the gap, state by state, the unit of the residual's corrections."""
+    residual.scale.copy_(gap(source, windows).square().mean(0).sqrt().clamp(min=1e-9))
+
+
 def ground(
     residual: Residual,
     source: World,
@@ -61,10 +66,8 @@ def ground(
     generator: torch.Generator,
     progress: Progress | None = None,
 ) -> list[GroundLoss]:
-    """Fit `residual` to all windows so far, in place."""
-    target = gap(source, windows)
-    residual.scale.copy_(target.square().mean(0).sqrt().clamp(min=1e-9))
-    target = target / residual.scale
+    """Fit the network of `residual` to all windows so far, in place, in units of its scale."""
+    target = gap(source, windows) / residual.scale
     network = residual.network
     if not isinstance(network, ResidualNetwork):
         raise TypeError(f"grounding fits the head of a ResidualNetwork, not a {type(network).__name__}")

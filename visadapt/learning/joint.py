@@ -18,9 +18,9 @@ import torch
 from visadapt.checkpoints import load_tree, load_weights, save_tree
 from visadapt.console import Progress, Report, staged
 from visadapt.effects import Residual
-from visadapt.learning.grounding import GroundLoss, GroundSettings, ground
+from visadapt.learning.grounding import GroundLoss, GroundSettings, ground, rescale
 from visadapt.learning.ledger import Ledger
-from visadapt.learning.policy import TuneSettings, tune
+from visadapt.learning.policy import TuneSettings, oppose, tune
 from visadapt.learning.windows import Observe, Windows
 from visadapt.policies import Policy
 from visadapt.recordings import Episode, read_recording, write_recording
@@ -126,7 +126,7 @@ def adapt(
     grounded = World(source.system, [residual], source.period, source.integrator, source.substeps)
     policy.residual = residual
     # Every round fits it anew: a head that has seen what is now held out would look best left alone.
-    untaught = copy.deepcopy(residual.state_dict())
+    untaught = copy.deepcopy(residual.network.state_dict())
     ledger = Ledger(settings.budget)
     episodes: list[Episode] = []
     rounds: list[Round] = []
@@ -139,7 +139,9 @@ def adapt(
             ledger.count(f"{name}: data", episode.samples)
         episodes += new if label is None else label(new)
         windows = Windows.cut(episodes, settings.observations, observe)
-        residual.load_state_dict(untaught)
+        residual.network.load_state_dict(untaught)
+        if number == 0:
+            rescale(residual, source, windows)
         grounding = _grounded(
             here / "residual.safetensors",
             lambda progress, w=windows, n=number: ground(  # type: ignore[misc]
@@ -148,6 +150,8 @@ def adapt(
             residual,
             staged(report, f"{name}: ground"),
         )
+        if number == 0:
+            oppose(policy, source, residual.scale)
         losses = _tuned(here, policy, grounded, observe, settings, windows, number, staged(report, f"{name}: tune"))
         rounds.append(Round(ledger.used, grounding, losses))
     return Adapted(ledger, rounds, episodes, folder)

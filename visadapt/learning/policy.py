@@ -20,7 +20,7 @@ from visadapt.history import History
 from visadapt.learning.cost import Cost
 from visadapt.learning.resume import EVERY, Training
 from visadapt.learning.windows import Observe, Windows
-from visadapt.policies import Policy
+from visadapt.policies import HORIZON, Policy
 from visadapt.world import World, WorldState
 
 
@@ -36,8 +36,6 @@ class TuneSettings:
     iterations: int
     batch: int = 64
     learning_rate: float = 1e-3
-    feedforward_rate: float = 5e-3
-    """learning rate of the weights that pass the residual's correction straight into the plan: they begin at zero"""
     start_spread: tuple[float, ...] = (0.5, 0.3, 0.15, 0.3)
     """half-widths of the uniform distribution of states that streams start from"""
     kick: tuple[float, ...] = (0.0, 0.3, 0.0, 0.5)
@@ -129,6 +127,18 @@ class Streams:
         return self.world.start(state), history
 
 
+def oppose(policy: Policy, source: World, scale: Tensor) -> None:
+    """Let the feed-forward undo what the residual expects, as far as commands can: least squares about rest.
+
+    `scale` (n_state,) is the residual's, in whose units the policy hears corrections.
+    """
+    rest = source.start(torch.zeros(1, policy.n_state).to(scale))
+    still = torch.zeros(1, policy.n_action).to(scale)
+    push = torch.autograd.functional.jacobian(lambda action: source.step(rest, action).state[0], still)[:, 0]
+    with torch.no_grad():
+        policy.feedforward.weight.copy_(-torch.linalg.pinv(push / scale[:, None]).repeat(HORIZON, 1))
+
+
 def tune(
     policy: Policy,
     world: World,
@@ -150,12 +160,10 @@ def tune(
         DivergedError: the loss is not finite.
     """
     world.requires_grad_(False)
-    groups: list[dict[str, list[nn.Parameter]]] = [{"params": []}, {"params": []}]
-    for name, weight in policy.named_parameters():
-        groups[name.startswith("feedforward")]["params"].append(weight)
-    optimiser = torch.optim.Adam(groups)
-    rates = [settings.learning_rate, settings.feedforward_rate]
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rates, total_steps=settings.iterations, pct_start=0.1)
+    optimiser = torch.optim.Adam(policy.parameters())
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, settings.learning_rate, total_steps=settings.iterations, pct_start=0.1
+    )
     training = Training(policy, optimiser, schedule, generator)
     streams = Streams(world, observe, windows, settings)
     losses: list[float] = []
