@@ -4,7 +4,7 @@ import torch
 
 from tests.scenes import image_residual_network, observing, small_renderer, state_residual_network
 from visadapt.effects import ConstantForce, Residual
-from visadapt.learning.grounding import GroundSettings, gap, ground, split
+from visadapt.learning.grounding import GroundSettings, gap, ground, rescale, split
 from visadapt.learning.windows import Windows
 from visadapt.networks import StateResidualNetwork
 from visadapt.recordings import Episode
@@ -31,6 +31,12 @@ def recorded(seed, count=16, rows=11):
 SOURCE = World(CartPole())
 
 
+def fit(residual, source, windows, settings, generator):
+    """The first round's grounding."""
+    rescale(residual, source, windows)
+    return ground(residual, source, windows, settings, generator)
+
+
 def gap_left(windows, residual):
     world = World(CartPole(), [residual])
     index = torch.arange(len(windows))
@@ -46,7 +52,7 @@ class TestOnStates:
         residual = Residual(state_residual_network(with_history), torch.ones(4))
         windows, unseen = Windows.cut(recorded(1), "state"), Windows.cut(recorded(2), "state")
         settings = GroundSettings(steps=500)
-        losses = ground(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
+        losses = fit(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
         before, after = gap(SOURCE, unseen), gap_left(unseen, residual)
         closed = 1 - after.square().mean(0).sqrt() / before.square().mean(0).sqrt()
         assert (closed > 0.9).all(), closed
@@ -68,7 +74,7 @@ class TestOnStates:
     def test_the_scale_is_the_root_mean_square_of_the_gap(self):
         residual = Residual(StateResidualNetwork(4), torch.ones(4))
         windows = Windows.cut(recorded(1), "state")
-        ground(residual, SOURCE, windows, GroundSettings(steps=0), torch.Generator().manual_seed(0))
+        rescale(residual, SOURCE, windows)
         with torch.no_grad():
             stepped = SOURCE.step(SOURCE.start(windows.state), windows.action).state
         wanted = np.sqrt(np.mean((windows.next_state - stepped).numpy() ** 2, 0))
@@ -78,7 +84,7 @@ class TestOnStates:
         residual = Residual(StateResidualNetwork(4), torch.ones(4))
         right = World(CartPole(), [ConstantForce(force=NEWTONS)]).requires_grad_(False)
         windows = Windows.cut(recorded(1), "state")
-        losses = ground(residual, right, windows, GroundSettings(steps=25), torch.Generator().manual_seed(0))
+        losses = fit(residual, right, windows, GroundSettings(steps=25), torch.Generator().manual_seed(0))
         assert all(np.isfinite((loss.train, loss.held_out)).all() for loss in losses)
         with torch.no_grad():
             assert residual.delta(windows.history(torch.arange(len(windows)))).abs().max() < 1e-6
@@ -90,7 +96,7 @@ class TestOnStates:
             torch.manual_seed(0)
             residual = Residual(StateResidualNetwork(4), torch.ones(4))
             settings = GroundSettings(steps=60, every=10, patience=30, learning_rate=rate)
-            losses = ground(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
+            losses = fit(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
             _, held = split(len(windows), settings.held_out, torch.Generator().manual_seed(0))
             error = gap_left(windows, residual)[held] / residual.scale
             best = min(loss.held_out for loss in losses)
@@ -105,12 +111,12 @@ class TestOnStates:
         for _ in range(2):
             torch.manual_seed(0)
             residual = Residual(StateResidualNetwork(4), torch.ones(4))
-            first = ground(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
+            first = fit(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
             found.append((residual.state_dict(), first))
         for key, value in found[0][0].items():
             assert torch.equal(value, found[1][0][key]), key
         assert found[0][1] == found[1][1]
-        second = ground(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
+        second = fit(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
         assert second[0].held_out == pytest.approx(min(loss.held_out for loss in first), rel=1e-3)
 
 
@@ -126,7 +132,7 @@ class TestOnFrames:
     def test_the_head_is_fitted_and_what_sees_stays_as_it_is(self, seen):
         residual, windows = seen
         before = {key: value.clone() for key, value in residual.state_dict().items()}
-        losses = ground(residual, SOURCE, windows, GroundSettings(), torch.Generator().manual_seed(0))
+        losses = fit(residual, SOURCE, windows, GroundSettings(), torch.Generator().manual_seed(0))
         for key, value in residual.state_dict().items():
             if key.startswith("network.encoder"):
                 assert torch.equal(value, before[key]), key
@@ -135,7 +141,7 @@ class TestOnFrames:
     def test_a_linear_head_solves_the_ridge_equations_on_all_samples(self, seen):
         residual, windows = seen
         ridge = 3.0
-        ground(residual, SOURCE, windows, GroundSettings(ridge=ridge), torch.Generator().manual_seed(0))
+        fit(residual, SOURCE, windows, GroundSettings(ridge=ridge), torch.Generator().manual_seed(0))
         head = residual.network.head
         with torch.no_grad():
             history = windows.history(torch.arange(len(windows))).acting(windows.action)
@@ -148,7 +154,7 @@ class TestOnFrames:
     def test_what_it_says_of_held_out_samples_comes_from_the_others_alone(self, seen):
         residual, windows = seen
         settings = GroundSettings()
-        losses = ground(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
+        losses = fit(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
         _, held = split(len(windows), settings.held_out, torch.Generator().manual_seed(0))
         assert [loss.step for loss in losses] == [0, 1]
         error = (gap_left(windows, residual)[held] / residual.scale).square().mean()

@@ -7,15 +7,15 @@ from tests.scenes import (
     image_residual_network,
     observing,
     small_renderer,
-    state_residual_network,
     stir,
 )
 from visadapt.effects import ActuatorDelay, ConstantForce, Residual
 from visadapt.evaluation import evaluate
 from visadapt.history import History
 from visadapt.learning.cost import PAPER_CARTPOLE, Cost
-from visadapt.learning.policy import DivergedError, TuneSettings, imagine, tune
+from visadapt.learning.policy import DivergedError, TuneSettings, imagine, oppose, tune
 from visadapt.learning.windows import Windows
+from visadapt.networks import StateResidualNetwork
 from visadapt.policies import ImagePolicy, StatePolicy
 from visadapt.recordings import Episode
 from visadapt.rollout import see_states
@@ -186,6 +186,37 @@ class TestOnStates:
             tune(policy, world, identity, settings, torch.Generator().manual_seed(0))
         for key, value in before.items():
             assert torch.equal(value, policy.state_dict()[key]), key
+
+
+class TestOpposing:
+    """A residual that expects what a force does is answered by the opposite force, without any training."""
+
+    def answered(self, newtons, scale, reads):
+        network = StateResidualNetwork(4)
+        policy = StatePolicy(4)
+        policy.residual = Residual(network, scale)
+        source = World(CartPole(), integrator="euler")
+        state = torch.tensor([[0.3, 0.1, 0.05, -0.2]])
+        seen = History.start(state, 1)
+        quiet = policy(seen)
+        pushed = World(CartPole(), [ConstantForce(force=newtons)], integrator="euler").requires_grad_(False)
+        rest, still = torch.zeros(1, 4), torch.zeros(1, 1)
+        gap = (pushed.step(pushed.start(rest), still).state - source.step(source.start(rest), still).state)[0]
+        with torch.no_grad():
+            network.head[-1].bias.copy_(gap / scale * reads)
+        oppose(policy, source, scale)
+        return (policy(seen).atanh() - quiet.atanh())[0, :, 0] * CartPole().max_force
+
+    @pytest.mark.parametrize("newtons", [2.0, -1.0])
+    @pytest.mark.parametrize("scale", [torch.ones(4), torch.tensor([0.003, 0.1, 0.004, 0.15])])
+    def test_a_force_is_undone_over_the_whole_plan_whatever_the_scale(self, newtons, scale):
+        found = self.answered(newtons, scale, torch.ones(4))
+        torch.testing.assert_close(found, torch.full((10,), -newtons), rtol=1e-3, atol=1e-3)
+
+    def test_what_no_command_can_do_is_met_by_the_nearest_that_one_can(self):
+        scale = torch.tensor([0.003, 0.1, 0.004, 0.15])
+        found = self.answered(2.0, scale, torch.tensor([1.0, 1.0, 1.0, 0.0]))
+        assert ((found > -2.0) & (found < 0.0)).all()
 
 
 def learn(checkpoint, stop=None, iterations=120):
