@@ -22,7 +22,8 @@ class Policy(nn.Module):
     """Base of policies; subclasses give features, and the layers that turn them into a plan.
 
     The correction enters in two ways, both of no weight at first: among the features, and straight into the plan as
-    a feed-forward, since what is known to push can be pushed against.
+    a feed-forward, since what is known to push can be pushed against. `learning.policy.oppose` gives the feed-forward
+    its weights once there is a residual; tuning changes all of them.
     """
 
     def __init__(self, n_state: int, n_action: int) -> None:
