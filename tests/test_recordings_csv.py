@@ -397,7 +397,22 @@ class TestUnits:
     def test_columns_that_changed_places(self, file, one, other):
         table = a_table(rows=200)
         table[one], table[other] = table[other], table[one]
-        refuses(f"the columns '{one}' and '{other}' have evidently changed places", write(file, table))
+        refuses(f"column '{one}' and column '{other}' have evidently changed places", write(file, table))
+
+    @pytest.mark.parametrize("start", [0.03, 0.2])
+    @pytest.mark.parametrize("rates", [False, True])
+    def test_columns_that_changed_places_together(self, file, start, rates):
+        table = a_run(start=start, noise=1e-3)
+        table["x"], table["theta"] = table["theta"], table["x"]
+        table["x_dot"], table["theta_dot"] = table["theta_dot"], table["x_dot"]
+        if not rates:
+            del table["x_dot"], table["theta_dot"]
+        refuses("column 'x' answers the command as theta should, and column 'theta' as x", write(file, table))
+
+    def test_a_column_is_called_what_the_file_calls_it(self, file):
+        table = a_run(start=0.1, noise=1e-3)
+        table["pole_angle"] = np.degrees(table.pop("theta"))
+        refuses(r"column 'pole_angle' \(theta\) .* radians are right", write(file, table))
 
     def test_metres_that_wrap(self, file):
         table = a_table(rows=200)
