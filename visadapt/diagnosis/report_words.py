@@ -100,13 +100,24 @@ def sentence(diagnosis: Diagnosis) -> str:
         if sure and still_open is not sure:
             either = f"{listed(sure)}, and {either},"
         return f"{_first(either)} {_closes(diagnosis)}; this recording cannot tell which."
-    named = [ranked.gap_closed for ranked in diagnosis.ranking if ranked.effects and math.isfinite(ranked.gap_closed)]
-    best = f"the best of them closes {percent(max(named))} of the gap" if named else "none of them helps"
+    return _unexplained(diagnosis)
+
+
+def _unexplained(diagnosis: Diagnosis) -> str:
+    gap = diagnosis.gap
+    closed = [ranked.gap_closed for ranked in diagnosis.ranking if ranked.effects and math.isfinite(ranked.gap_closed)]
+    best = max(closed, default=0.0)
     black_box = (gap.before - gap.black_box) / (gap.before - gap.floor) if gap.before != gap.floor else math.nan
-    place = ""
+    text = "Something acts that no known effect explains: "
+    if best <= 0:
+        text += "none of them closes any of the gap"
+    elif black_box > best:
+        text += f"the best of them close {percent(best)} of the gap, a black box {percent(min(1.0, black_box))}"
+    else:
+        text += f"the best of them close {percent(best)} of the gap, and what is left is not noise"
     if diagnosis.where.regions:
-        place = f"; it shows most at {region(diagnosis.where.regions[0], diagnosis.system)}"
-    return f"Something acts that no known effect explains: {best}, a black box {percent(min(1.0, black_box))}{place}."
+        text += f"; it shows most at {region(diagnosis.where.regions[0], diagnosis.system)}"
+    return f"{text}."
 
 
 def _named(cause: Cause) -> str:
