@@ -385,8 +385,15 @@ class TestUnits:
         table["theta_dot"] = 1.5 * np.pi * np.cos(1.5 * table["time"])
         state = load(write(file, table)).episodes[0].state[:, 2]
         assert np.abs(np.diff(state)).max() < 1
-        assert abs(np.median(state)) <= np.pi
         np.testing.assert_allclose(np.cos(state), np.cos(angle), atol=1e-12)
+
+    def test_a_pole_that_was_swung_up_is_upright_at_0(self, file):
+        table = a_table(rows=200)
+        angle = -np.pi * (1.5 + 0.5 * np.tanh(table["time"] - 8))  # hangs for most of the time
+        table["theta"] = (angle + np.pi) % (2 * np.pi) - np.pi
+        del table["theta_dot"]
+        state = load(write(file, table)).episodes[0].state[:, 2]
+        assert abs(state[-1]) < 0.1
 
     def test_an_angle_that_goes_round_several_times(self, file):
         table = a_table(rows=200)
