@@ -98,12 +98,7 @@ def ahead(family: Family, fits: Fits, black_box: BlackBox | None = None) -> Ahea
     horizon = max(1, round(AHEAD / rows.period))
     extra = torch.zeros_like(fits.state[0, :, 1:]) if black_box is None else black_box.drive(family, fits)
     problem = linear_problem([family], fits, rough(rows, fits.state.shape[-1])[:, 0])
-    problem = replace(
-        problem,
-        drive=problem.drive[..., :1] + extra[..., None],
-        reading=problem.reading[..., :1],
-        start=problem.start[..., :1],
-    )
+    problem = replace(problem.data(), drive=problem.drive[..., :1] + extra[..., None])
     smoothed, _ = backward(problem, forward(problem, *variances(fits.log_process, fits.log_noise, windows)))
     predicted = _run_on(family, fits.theta[0], fits.state[0] + smoothed[..., 0], horizon, extra)
     shape = (horizon + 1, windows, length, len(rows.channels))

@@ -26,6 +26,9 @@ BEAM = 3
 LEADS = 8
 """Sets that are taken further at each size, and effects that are tried beside each."""
 
+PROMISING = 1.0
+"""Log likelihood that a lead must promise to be fitted; an effect costs more."""
+
 QUICK, CAREFUL = 8, 20
 """Iterations of a fit that only has to show promise, and of one whose figures are reported."""
 
@@ -123,6 +126,8 @@ class Search:
         for base in bases:
             rest = [e for e in self.catalogue if e not in base.effects]
             for lead in screen(self.system, base.effects, base.fits, self.rows, rest)[:leads]:
+                if lead.gain < PROMISING:
+                    continue
                 effects = (*base.effects, lead.effect)
                 key = frozenset(e.name for e in effects)
                 if key not in self.fitted and key not in seen:
@@ -242,7 +247,7 @@ def joined(fits: Sequence[Fits]) -> Fits:
         theta[k, : each.theta.shape[1]] = each.theta[0]
     rest = [torch.cat([getattr(f, name) for f in fits]) for name in ("state", "log_process", "log_noise")]
     unknown = torch.full((len(fits),), -math.inf, dtype=torch.float64)
-    return Fits(theta, *rest, unknown, torch.zeros(len(fits), widest, widest, dtype=torch.float64))
+    return Fits(theta, rest[0], rest[1], rest[2], unknown, torch.zeros(len(fits), widest, widest).double())
 
 
 def _apart(fits: Fits, count: int) -> Fits:
