@@ -20,7 +20,7 @@ from visadapt.diagnosis.data import Rows
 from visadapt.diagnosis.filtering import backward, forward
 from visadapt.diagnosis.fitting import Fits, fit, linear_problem, rough, variances
 from visadapt.diagnosis.leftover import BlackBox
-from visadapt.diagnosis.models import Family
+from visadapt.diagnosis.models import COARSE, Family
 from visadapt.diagnosis.which import Effects, joined
 from visadapt.systems import System
 
@@ -29,7 +29,7 @@ AHEAD = 0.5
 
 FOLDS = 4
 
-REFIT = 8
+REFIT = 5
 """Iterations of a fit that starts from the fit to all episodes."""
 
 FAR = 1e3
@@ -79,7 +79,7 @@ def held_out(system: System, rows: Rows, sets: Sequence[tuple[Effects, Fits]], b
     """Each set, fitted without each fold and predicting it; with a black box beside it, if one is asked for."""
     out = folds(rows)
     count = len(out)
-    families = [Family(system, effects, rows) for effects, _ in sets for _ in range(count)]
+    families = [Family(system, effects, rows, COARSE) for effects, _ in sets for _ in range(count)]
     starts = joined([fits for _, fits in sets for _ in range(count)])
     counts = (1 - out).repeat(len(sets), 1) if count > 1 else torch.ones(len(sets), rows.shape[0], dtype=out.dtype)
     fitted = fit(families, starts, counts, REFIT)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from visadapt.diagnosis.data import Rows, cut
+from visadapt.diagnosis.fitting import Fits
 from visadapt.diagnosis.holds import POLE, Holds, find_holds
 from visadapt.diagnosis.models import Family
 from visadapt.diagnosis.where import disturbance
@@ -67,7 +68,8 @@ class Readings:
             warnings.append(
                 f"of {windows} windows of up to {length} rows, {most}, spread evenly over the recording, were used"
             )
-        defect = _contradicted(system, rows)
+        source = Search(system, rows, ()).source.fits
+        defect = _contradicted(system, rows, source)
         if defect is not None:
             low, high, count = defect
             rows = _without(rows, low, high)
@@ -75,7 +77,7 @@ class Readings:
                 f"{count} readings of theta between {low:.2f} and {high:.2f} rad contradict those around them and the "
                 "physics: the sensor is defective there; they were set aside"
             )
-        turned = _turned(system, rows)
+        turned = _turned(system, rows, source)
         if turned is not None:
             rows, raw = turned.of(rows), turned.of(raw)
             warnings.append(f"{turned.what} has the other sign than the source's: it was turned round")
@@ -89,9 +91,8 @@ class Readings:
         return cls(rows, raw, holds, tuple(warnings))
 
 
-def _contradicted(system: System, rows: Rows) -> tuple[float, float, int] | None:
+def _contradicted(system: System, rows: Rows, fits: Fits) -> tuple[float, float, int] | None:
     """Angles, a small part of all, at which it would take far greater torques than elsewhere to follow the readings."""
-    fits = Search(system, rows, ()).source.fits
     if float(fits.log_process[0, 1]) < WRONG:
         return None
     found = disturbance(Family(system, (), rows), fits, fits.log_process)
@@ -135,11 +136,11 @@ CONVENTIONS = (Turned("the angle", -1, 1), Turned("the command", 1, -1), Turned(
 """The position's sign is that of angle and command together, by the symmetry of the cart-pole."""
 
 
-def _turned(system: System, rows: Rows) -> Turned | None:
+def _turned(system: System, rows: Rows, source: Fits) -> Turned | None:
     """The convention that the recording is in, if it is not the source's: one in which it is far likelier."""
-    own = Search(system, rows, ()).source.fits
-    if float(own.log_process.max()) < WRONG:
+    if float(source.log_process.max()) < WRONG:
         return None
+    own = Search(system, rows, ()).source.fits
     likelihoods = [float(Search(system, other.of(rows), ()).source.fits.likelihood[0]) for other in CONVENTIONS]
     best = max(range(len(CONVENTIONS)), key=likelihoods.__getitem__)
     gained = likelihoods[best] - float(own.likelihood[0])
