@@ -45,10 +45,10 @@ def record(
             at = world.step(at, action)
     clean = torch.stack(states, 1)[..., columns]
     state = clean + torch.tensor(noise)[columns] * torch.randn(clean.shape, generator=generator, dtype=torch.float64)
-    action = torch.stack(actions, 1).numpy()
+    commands = torch.stack(actions, 1).numpy()
     time = 0.05 * np.arange(rows)
     return Recording(
-        tuple(Episode(time, action[k], state[k].numpy()) for k in range(episodes)),
+        tuple(Episode(time, commands[k], state[k].numpy()) for k in range(episodes)),
         tuple(measured),
         0.05,
         tuple(f"episode {k}" for k in range(episodes)),
