@@ -16,10 +16,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from visadapt.diagnosis import leftover
 from visadapt.diagnosis.data import Rows
 from visadapt.diagnosis.filtering import backward, forward
 from visadapt.diagnosis.fitting import Fits, fit, linear_problem, rough, variances
-from visadapt.diagnosis.leftover import BlackBox
 from visadapt.diagnosis.models import COARSE, Family
 from visadapt.diagnosis.which import Effects, joined
 from visadapt.systems import System
@@ -87,16 +87,17 @@ def held_out(system: System, rows: Rows, sets: Sequence[tuple[Effects, Fits]], b
     for k, family in enumerate(families):
         own = fitted.of(torch.tensor([k]))
         own = replace(own, theta=own.theta[:, : len(family.table)])
-        parts.append(ahead(family, own, BlackBox.fit(family, own, counts[k]) if black_box else None))
+        extra = leftover.black_box(family, own, counts[k]) if black_box else None
+        parts.append(ahead(family, own, extra))
     return [_merged(parts[k * count : (k + 1) * count], out.argmax(0)) for k in range(len(sets))]
 
 
-def ahead(family: Family, fits: Fits, black_box: BlackBox | None = None) -> Ahead:
-    """What one fitted set, and perhaps a black box beside it, predicts from every row of every window."""
+def ahead(family: Family, fits: Fits, extra: Tensor | None = None) -> Ahead:
+    """What one fitted set, with what a black box may add to its states (W, T - 1, n), predicts from every row."""
     rows = family.rows
     windows, length = rows.shape
     horizon = max(1, round(AHEAD / rows.period))
-    extra = torch.zeros_like(fits.state[0, :, 1:]) if black_box is None else black_box.drive(family, fits)
+    extra = torch.zeros_like(fits.state[0, :, 1:]) if extra is None else extra
     problem = linear_problem([family], fits, rough(rows, fits.state.shape[-1])[:, 0])
     problem = replace(problem.data(), drive=problem.drive[..., :1] + extra[..., None])
     smoothed, _ = backward(problem, forward(problem, *variances(fits.log_process, fits.log_noise, windows)))

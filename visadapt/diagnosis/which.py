@@ -38,7 +38,7 @@ UNLEARNT = 0.1
 DECADES = 3
 """Decades over which the prior of a strength is spread."""
 
-PRIOR = -2.0
+PRIOR = -1.0
 """Log prior odds that one effect more is there, whichever of the catalogue."""
 
 
