@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -40,6 +40,8 @@ class Settings:
     """how many recordings"""
     seed: int = 0
     """of everything that is drawn"""
+    strengths: tuple[float, float] | None = None
+    """weakest and strongest effect, in units of the noise; by default 2 to 30 (easy) or 0.7 to 6 (hard)"""
     key: Path | None = None
     """file for the answers; by default beside the folder, <out>.key.json"""
 
@@ -118,6 +120,11 @@ def make(settings: Settings) -> list[Draft]:
     if settings.count < 1:
         raise ValueError(f"count is {settings.count}, must be at least 1")
     difficulty = DIFFICULTIES[settings.kind]
+    if settings.strengths is not None:
+        weakest, strongest = settings.strengths
+        if not 0 < weakest < strongest:
+            raise ValueError(f"strengths are {weakest:g} and {strongest:g}, must be positive and rise")
+        difficulty = replace(difficulty, strengths=settings.strengths)
     seeds = np.random.SeedSequence([settings.seed, list(DIFFICULTIES).index(settings.kind)]).spawn(settings.count + 1)
     # Shares as even as the count allows, in an order that says nothing.
     edges = np.cumsum(list(difficulty.mix.values()))
@@ -259,7 +266,7 @@ def key_text(settings: Settings, drafts: list[Draft]) -> str:
         answers.append(
             {"file": name, "kind": draft.mixture, "effects": effects, "driver": draft.case.driver.description}
         )
-    head = {"kind": settings.kind, "seed": settings.seed, "noise": asdict(DIFFICULTIES[settings.kind])["noise"]}
+    head = {"kind": settings.kind, "seed": settings.seed, "noise": DIFFICULTIES[settings.kind].noise}
     return json.dumps({**head, "recordings": answers}, indent=1) + "\n"
 
 

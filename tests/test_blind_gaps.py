@@ -239,6 +239,11 @@ def test_the_key_is_sealed_and_everything_repeats(tmp_path, capsys, drafts):
     assert first.startswith("0,0.00,")
 
 
+def test_strengths_must_rise():
+    with pytest.raises(ValueError, match="strengths are 6 and 2, must be positive and rise"):
+        make(Settings(Path("unused"), "hard", 1, strengths=(6.0, 2.0)))
+
+
 def test_the_key_may_not_lie_among_the_recordings(tmp_path):
     with pytest.raises(ValueError, match="must not lie in the folder"):
         main(Settings(tmp_path, "hard", 1, key=tmp_path / "key.json"))

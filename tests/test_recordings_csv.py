@@ -385,8 +385,15 @@ class TestUnits:
         table["theta_dot"] = 1.5 * np.pi * np.cos(1.5 * table["time"])
         state = load(write(file, table)).episodes[0].state[:, 2]
         assert np.abs(np.diff(state)).max() < 1
-        assert abs(np.median(state)) <= np.pi
         np.testing.assert_allclose(np.cos(state), np.cos(angle), atol=1e-12)
+
+    def test_a_pole_that_was_swung_up_is_upright_at_0(self, file):
+        table = a_table(rows=200)
+        angle = -np.pi * (1.5 + 0.5 * np.tanh(table["time"] - 8))  # hangs for most of the time
+        table["theta"] = (angle + np.pi) % (2 * np.pi) - np.pi
+        del table["theta_dot"]
+        state = load(write(file, table)).episodes[0].state[:, 2]
+        assert abs(state[-1]) < 0.1
 
     def test_an_angle_that_goes_round_several_times(self, file):
         table = a_table(rows=200)
@@ -397,7 +404,22 @@ class TestUnits:
     def test_columns_that_changed_places(self, file, one, other):
         table = a_table(rows=200)
         table[one], table[other] = table[other], table[one]
-        refuses(f"the columns '{one}' and '{other}' have evidently changed places", write(file, table))
+        refuses(f"column '{one}' and column '{other}' have evidently changed places", write(file, table))
+
+    @pytest.mark.parametrize("start", [0.03, 0.2])
+    @pytest.mark.parametrize("rates", [False, True])
+    def test_columns_that_changed_places_together(self, file, start, rates):
+        table = a_run(start=start, noise=1e-3)
+        table["x"], table["theta"] = table["theta"], table["x"]
+        table["x_dot"], table["theta_dot"] = table["theta_dot"], table["x_dot"]
+        if not rates:
+            del table["x_dot"], table["theta_dot"]
+        refuses("column 'x' answers the command as theta should, and column 'theta' as x", write(file, table))
+
+    def test_a_column_is_called_what_the_file_calls_it(self, file):
+        table = a_run(start=0.1, noise=1e-3)
+        table["pole_angle"] = np.degrees(table.pop("theta"))
+        refuses(r"column 'pole_angle' \(theta\) .* radians are right", write(file, table))
 
     def test_metres_that_wrap(self, file):
         table = a_table(rows=200)

@@ -170,6 +170,10 @@ class TestResult:
         recording = RecordingSummary(*np.array([3, 100, 1]))
         json.dumps(a_diagnosis("identified", gap=gap, recording=recording).to_json(), allow_nan=False)
 
+    def test_shares_may_pass_one_by_a_rounding_error(self):
+        diagnosis = a_diagnosis("identified", causes=(replace(DELAY, probability=1.0000000000000002),))
+        assert diagnosis.to_json()["causes"][0]["probability"] == 1
+
     def test_the_schema_refuses_causes_where_there_are_none(self):
         content = a_diagnosis("identified").to_json() | {"verdict": "no_gap"}
         with pytest.raises(jsonschema.ValidationError):
@@ -200,7 +204,7 @@ class TestWords:
             ),
             (
                 "unexplained",
-                "Something acts that no known effect explains: the best of them closes 38 % of the gap, a black box "
+                "Something acts that no known effect explains: the best of them close 38 % of the gap, a black box "
                 "91 %; it shows most at x from 0.10 to 0.40 m.",
             ),
             (
@@ -212,10 +216,20 @@ class TestWords:
     def test_the_verdict_in_a_sentence(self, verdict, text):
         assert sentence(a_diagnosis(verdict)) == text
 
+    @pytest.mark.parametrize(
+        ("ranking", "text"),
+        [
+            ((Ranked((), 0.9, 0.0),), "explains: none of them closes any of the gap; it shows"),
+            ((Ranked(("gust",), 0.9, 0.95),), "the best of them close 95 % of the gap, and what is left is not noise;"),
+        ],
+    )
+    def test_what_is_unexplained(self, ranking, text):
+        assert text in sentence(a_diagnosis("unexplained", ranking=ranking))
+
     def test_one_cause_is_sure_and_two_are_open(self):
         text = sentence(a_diagnosis("ambiguous", causes=(PATCH, GAIN, MASS)))
         assert re.match(
-            r"Friction patch \(.*\), and either actuator gain \(.*\) or cart mass \(.*\), closes 96 %", text
+            r"Friction patch \(.*\) and either actuator gain \(.*\) or cart mass \(.*\) close 96 %", text
         )
 
     @pytest.mark.parametrize(

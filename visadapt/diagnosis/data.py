@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 
 LONGEST = 120
 """Rows of a window; a longer episode is cut, since states far apart say nothing about each other's noise."""
+
+
+ROUNDING = 1e-6
+"""Differences that arithmetic makes of equal readings (turning an angle round, say), not the sensor."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +39,8 @@ class Rows:
     """columns of the state that were measured"""
     period: float
     """s"""
+    step: tuple[float, ...]
+    """of each channel, the least difference between two readings that differ"""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -42,10 +49,18 @@ class Rows:
 
     def of(self, windows: Tensor) -> Rows:
         """Only these windows."""
-        return Rows(
-            self.measured[windows], self.used[windows], self.inside[windows], self.time[windows],
-            self.command, self.first[windows], self.episode[windows], self.channels, self.period,
-        )  # fmt: skip
+        every = ("measured", "used", "inside", "time", "first", "episode")
+        return replace(self, **{name: getattr(self, name)[windows] for name in every})
+
+    def reading(self, kept: Sequence[int]) -> Rows:
+        """Only these of the measured channels."""
+        return replace(
+            self,
+            measured=self.measured[..., kept],
+            used=self.used[..., kept],
+            channels=tuple(self.channels[k] for k in kept),
+            step=tuple(self.step[k] for k in kept),
+        )
 
 
 def cut(
@@ -60,7 +75,7 @@ def cut(
     for index, values in enumerate(measured):
         count = -(-len(values) // LONGEST)
         edges = torch.linspace(0, len(values), count + 1).round().long().tolist()
-        pieces += [(index, a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        pieces += [(index, a, b) for a, b in pairwise(edges)]
     rows = max(b - a for _, a, b in pieces)
     shape = (len(pieces), rows)
     out = torch.zeros(*shape, len(channels), dtype=torch.float64)
@@ -76,4 +91,12 @@ def cut(
     first = torch.tensor([a for _, a, _ in pieces])
     time = period * (first[:, None] + torch.arange(rows)).double()
     episode = torch.tensor([index for index, _, _ in pieces])
-    return Rows(out, used, inside, time, command, first, episode, channels, period)
+    step = tuple(smallest_step(torch.cat([values[:, k] for values in measured])) for k in range(len(channels)))
+    return Rows(out, used, inside, time, command, first, episode, channels, period, step)
+
+
+def smallest_step(readings: Tensor) -> float:
+    """Of a sensor: the least difference between two readings (N,) that differ."""
+    steps = readings.unique().diff()
+    steps = steps[steps > ROUNDING]
+    return float(steps.min()) if len(steps) else 0.0

@@ -8,8 +8,8 @@ from visadapt.effects import Effect, Stage
 
 SETTLES: dict[frozenset[str], str] = {
     frozenset({"constant_force", "actuator_bias"}): (
-        "switch the motor off, let the cart stand on its own with the pole hanging or removed, and measure the force on "
-        "it with a spring balance: a constant force is still there, an actuator bias is gone"
+        "switch the motor off, let the cart stand with the pole hanging or removed, and measure the force on it with a "
+        "spring balance: a constant force is still there, an actuator bias is gone"
     ),
     frozenset({"actuator_delay", "measurement_delay"}): (
         "time command and sensor against one clock: film the cart beside a lamp that lights with the command; a late "
@@ -20,8 +20,8 @@ SETTLES: dict[frozenset[str], str] = {
         "after a delay the acceleration jumps, after a lag it creeps up"
     ),
     frozenset({"actuator_gain", "cart_mass"}): (
-        "push the cart by hand with the motor off, or weigh it: a heavier cart accelerates less under any force, a weaker "
-        "motor only under its own"
+        "push the cart by hand with the motor off, or weigh it: a heavier cart accelerates less under any force, a "
+        "weaker motor only under its own"
     ),
     frozenset({"viscous_friction", "quadratic_drag"}): "record faster motions: drag grows with the square of the speed",
     frozenset({"viscous_friction", "coulomb_friction"}): (

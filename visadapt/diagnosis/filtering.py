@@ -11,7 +11,7 @@ the first is the data, the others are sensitivities, which pass through the same
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -33,6 +33,10 @@ class Linear:
     """(N, n, M) the mean of x_0"""
     spread: Tensor
     """(n,) p"""
+
+    def data(self) -> Linear:
+        """Without the sensitivities."""
+        return replace(self, drive=self.drive[..., :1], reading=self.reading[..., :1], start=self.start[..., :1])
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,7 @@ def respond(problem: Linear, filtered: Filtered, drive: Tensor, reading: Tensor)
 
 
 def backward(problem: Linear, filtered: Filtered) -> tuple[Tensor, Tensor]:
-    """Smoothed states (N, T, n, M), and the adjoints (N, T, n, M): minus q times them is the smoothed w before row t."""
+    """Smoothed states (N, T, n, M), and adjoints (N, T, n, M): minus q times them is the smoothed w before row t."""
     rows, channels = problem.reading.shape[1:3]
     adjoint = torch.zeros_like(problem.start)
     states, adjoints = [], []

@@ -14,14 +14,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from visadapt.diagnosis.data import Rows
-from visadapt.diagnosis.filtering import Filtered, Linear, backward, forward, log_likelihood
+from visadapt.diagnosis.filtering import Linear, backward, forward, log_likelihood
 from visadapt.diagnosis.models import Family, linearise
 
 SMOOTH = 1e-6
@@ -36,6 +36,12 @@ SPREAD = (0.3**2, 2.0**2, 0.3**2, 3.0**2)
 
 ENOUGH = 0.02
 """Log likelihood that is not worth an iteration."""
+
+TINY = 1e-12
+"""Least variance of a measurement, in its unit squared."""
+
+STUCK = 100.0
+"""Damping from which on a step is too short to lead anywhere."""
 
 LOG_STEP = 1e-3
 GREATEST = 1.5
@@ -61,7 +67,7 @@ class Fits:
 
     def of(self, chosen: Tensor) -> Fits:
         """Only these."""
-        return Fits(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+        return Fits(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
 
 
 def rough(rows: Rows, n: int) -> Tensor:
@@ -143,69 +149,52 @@ def slope(families: Sequence[Family], fits: Fits, origin: Tensor, counts: Tensor
     """Likelihood, gradient and Fisher information at `fits`."""
     models, windows = counts.shape
     logs = torch.cat((fits.log_process, fits.log_noise), 1)
-    replicas = 1 + logs.shape[1]
-    varied = logs[None].repeat(replicas, 1, 1)
-    varied[1:] += LOG_STEP * torch.eye(replicas - 1, dtype=logs.dtype)[:, None]
-    varied = varied.flatten(0, 1)
     problem = linear_problem(families, fits, origin)
     used = families[0].rows.used.repeat(models, 1, 1) * counts.reshape(-1, 1, 1)
-    process, noise = variances(varied[:, :2], varied[:, 2:], windows)
-    filtered = forward(_repeated(problem, replicas), process, noise)
-    own = models * windows
-    likelihoods = log_likelihood(filtered, used.repeat(replicas, 1, 1)).reshape(replicas, models, windows).sum(-1)
-    here = _first(filtered, own)
+    here = forward(problem, *variances(fits.log_process, fits.log_noise, windows))
+    likelihood = log_likelihood(here, used).reshape(models, windows).sum(-1)
     white = (here.white * used[..., None]).reshape(models, -1, here.innovation.shape[-1])
     error, columns = white[..., :1], white[..., 1:]
+    # The noise's turn: the data's column alone, filtered with each variance a little larger.
+    varied = (logs + LOG_STEP * torch.eye(logs.shape[1], dtype=logs.dtype)[:, None]).flatten(0, 1)
+    swayed = forward(_repeated(problem.data(), logs.shape[1]), *variances(varied[:, :2], varied[:, 2:], windows))
+    gains = log_likelihood(swayed, used.repeat(logs.shape[1], 1, 1)).reshape(-1, models, windows).sum(-1) - likelihood
 
-    def by_noise(values: Tensor) -> Tensor:
-        values = values.reshape(replicas, own, *values.shape[1:])
-        change = (values[1:] - values[:1]) / LOG_STEP * used
-        return change.reshape(replicas - 1, models, -1).permute(1, 2, 0)
+    def by_noise(there: Tensor, now: Tensor) -> Tensor:
+        change = (there.reshape(-1, *now.shape) - now) / LOG_STEP * used
+        return change.reshape(logs.shape[1], models, -1).permute(1, 2, 0)
 
-    sways = by_noise(filtered.variance.log())
-    shifts = by_noise(filtered.innovation[..., 0]) / here.variance.sqrt().reshape(models, -1, 1)
+    sways = by_noise(swayed.variance.log(), here.variance.log())
+    shifts = by_noise(swayed.innovation[..., 0], here.innovation[..., 0]) / here.variance.sqrt().reshape(models, -1, 1)
     smoothed, _ = backward(problem, here)
     return Slope(
-        likelihoods[0],
+        likelihood,
         columns.mT @ columns,
         -(columns.mT @ error)[..., 0],
         0.5 * sways.mT @ sways + shifts.mT @ shifts,
-        ((likelihoods[1:] - likelihoods[0]) / LOG_STEP).T,
+        (gains / LOG_STEP).T,
         smoothed.reshape(*fits.state.shape, -1),
     )
 
 
 def _repeated(problem: Linear, count: int) -> Linear:
+    """The same systems so many times."""
+
     def repeat(x: Tensor) -> Tensor:
         return x.repeat(count, *(1,) * (x.dim() - 1))
 
-    return Linear(
-        repeat(problem.transition),
-        repeat(problem.drive),
-        repeat(problem.sensing),
-        repeat(problem.reading),
-        repeat(problem.start),
-        problem.spread,
-    )
-
-
-def _first(filtered: Filtered, count: int) -> Filtered:
-    """The first so many systems."""
-    return Filtered(
-        [x[:count] for x in filtered.predicted],
-        [x[:count] for x in filtered.covariance],
-        [[g[:count] for g in row] for row in filtered.gain],
-        filtered.innovation[:count],
-        filtered.variance[:count],
-    )
+    every = {field.name: repeat(getattr(problem, field.name)) for field in fields(problem) if field.name != "spread"}
+    return replace(problem, **every)
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Ranges of parameters (C, K), both 0 for those that a set does not have."""
+    """Of parameters (C, K), both 0 for those that a set does not have; and of the noise."""
 
     low: Tensor
     high: Tensor
+    noise: Tensor
+    """(m,) least log variances: rounding to steps is noise too, of a step over the root of 12"""
 
 
 def fit(families: Sequence[Family], start: Fits, counts: Tensor, iterations: int, still: bool = False) -> Fits:
@@ -216,23 +205,30 @@ def fit(families: Sequence[Family], start: Fits, counts: Tensor, iterations: int
     low, high = torch.zeros_like(start.theta), torch.zeros_like(start.theta)
     for c, family in enumerate(families):
         low[c, : len(family.table)], high[c, : len(family.table)] = family.low, family.high
-    bounds = Bounds(low, high)
+    steps = torch.tensor(families[0].rows.step, dtype=torch.float64)
+    bounds = Bounds(low, high, (steps.square() / 12 + TINY).log())
     damping = torch.full((len(families),), 1e-3, dtype=torch.float64)
-    here, best, best_slope, quiet = start, start, None, 0
+    stale = torch.zeros(len(families), dtype=torch.long)
+    live = torch.arange(len(families))
+    here = best = start
+    at: Slope | None = None
     for _ in range(iterations):
-        now = slope(families, here, origin, counts)
-        here = replace(here, likelihood=now.likelihood, information=now.information)
-        if best_slope is None:
-            best, best_slope = here, now
+        now = slope([families[k] for k in live.tolist()], here.of(live), origin, counts[live])
+        tried = replace(here.of(live), likelihood=now.likelihood, information=now.information)
+        if at is None:
+            best, at = tried, now
         else:
-            gain = here.likelihood - best.likelihood
+            gain = tried.likelihood - best.likelihood[live]
             better = gain > 0
-            quiet = quiet + 1 if bool((gain < ENOUGH).all()) else 0
-            damping = torch.where(better, damping / 4, damping * 8).clamp(1e-9, 1e9)
-            best, best_slope = _where(better, here, best), _where(better, now, best_slope)
-            if quiet >= 2:
+            damping[live] = torch.where(better, damping[live] / 4, (8 * damping[live]).clamp(min=0.1))
+            stale[live] = torch.where(better & (gain < ENOUGH), stale[live] + 1, 0)
+            best = _put(best, live[better], tried, better)
+            at = _put(at, live[better], now, better)
+            # Those that have settled leave the batch.
+            live = live[(stale[live] < 2) & (damping[live] < STUCK)]
+            if not len(live):
                 break
-        here = _step(best, best_slope, damping, bounds)
+        here = _step(best, at, damping, bounds)
         if still:
             here = replace(here, log_process=start.log_process)
     return best
@@ -256,12 +252,15 @@ def _step(fits: Fits, at: Slope, damping: Tensor, bounds: Bounds) -> Fits:
         theta=theta,
         state=fits.state + (at.smoothed * moves[:, None, None, None]).sum(-1),
         log_process=(fits.log_process + sway[:, :2]).clamp(QUIET, LOUD),
-        log_noise=fits.log_noise + sway[:, 2:],
+        log_noise=torch.maximum(fits.log_noise + sway[:, 2:], bounds.noise),
     )
 
 
-def _where(keep: Tensor, a: Chosen, b: Chosen) -> Chosen:
-    def pick(x: Tensor, y: Tensor) -> Tensor:
-        return torch.where(keep.reshape(-1, *(1,) * (x.dim() - 1)), x, y)
-
-    return type(a)(*(pick(getattr(a, name), getattr(b, name)) for name in a.__dataclass_fields__))
+def _put(into: Chosen, places: Tensor, values: Chosen, which: Tensor) -> Chosen:
+    """`into` with the models at `places` replaced by those of `values` that `which` marks."""
+    out = {}
+    for field in fields(into):
+        tensor = getattr(into, field.name).clone()
+        tensor[places] = getattr(values, field.name)[which]
+        out[field.name] = tensor
+    return replace(into, **out)

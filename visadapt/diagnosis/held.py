@@ -92,4 +92,5 @@ def _zone(readings: Readings, search: Search, judgement: Judgement) -> tuple[flo
     inside = rows.inside > 0
     channel = rows.channels.index(search.system.index("theta"))
     deviation = ROUGH * float((fits.log_noise[0, channel] / 2).exp())
-    return zone(_marks(readings, whole=False)[inside], fits.state[0, ..., 2][inside], deviation)
+    angle = fits.state[0, ..., 2][inside]
+    return zone(_marks(readings, whole=False)[inside], torch.atan2(angle.sin(), angle.cos()), deviation)

@@ -1,6 +1,6 @@
 """Readings that are no readings: rows that repeat the one before, and a sensor that stands still.
 
-A sensor with noise never gives the same number twice; where it does, the reading was held. Such readings say nothing
+A sensor in motion never gives the same number twice; where it does, the reading was held. Such readings say nothing
 of the state, so they are set aside before anything is fitted, and counted here.
 """
 
@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-DISTINCT = 0.5
-"""Share of different numbers among a channel's readings from which on it counts as continuous."""
+from visadapt.diagnosis.data import smallest_step
+
+MOVING = 8
+"""Smallest steps of a sensor that it must jump by, before or after a repeated reading, for that to be a held one."""
 
 GRID = 120
 """Places tried for either edge of a zone in which a sensor stands still."""
@@ -37,19 +39,31 @@ class Holds:
 def find_holds(measured: Sequence[Tensor], channels: tuple[int, ...]) -> Holds:
     """Held readings in episodes (T, m) of these columns of the state."""
     together = torch.cat(list(measured))
-    continuous = [len(together[:, k].unique()) > DISTINCT * len(together) for k in range(len(channels))]
+    steps = [smallest_step(together[:, k]) for k in range(len(channels))]
+    pole = torch.tensor([c in POLE for c in channels])
     used, lost, frozen = [], [], []
     for values in measured:
-        same = torch.zeros_like(values, dtype=torch.bool)
-        same[1:] = values[1:] == values[:-1]
-        same &= torch.tensor(continuous)
-        pole = torch.tensor([c in POLE for c in channels])
-        whole = same.all(1) if all(continuous) else torch.zeros(len(values), dtype=torch.bool)
+        same = torch.stack([_held(values[:, k], MOVING * steps[k]) for k in range(len(channels))], 1)
+        whole = same.all(1)
         still = same[:, pole].all(1) & ~whole if bool(pole.any()) else torch.zeros_like(whole)
-        used.append(1.0 - (whole[:, None] | (still[:, None] & pole)).double())
+        # What a sensor gives first when it wakes may still be half of what it held.
+        waking = torch.zeros_like(still)
+        waking[1:] = still[:-1] & ~still[1:]
+        used.append(1.0 - (whole[:, None] | ((still | waking)[:, None] & pole)).double())
         lost.append(whole)
         frozen.append(still)
     return Holds(used, lost, frozen)
+
+
+def _held(readings: Tensor, moving: float) -> Tensor:
+    """(T,) rows that repeat the one before, in runs that a jump leads into or out of."""
+    change = readings.diff(prepend=readings[:1])
+    same = change == 0
+    same[0] = False
+    # Rows of a run share a number; the jump into it is that of its first row, the jump out that of the next run's.
+    run = (~same).cumsum(0) - 1
+    jumps = torch.cat((change[~same].abs(), torch.zeros(1, dtype=readings.dtype)))
+    return same & ((jumps[run] > moving) | (jumps[run + 1] > moving))
 
 
 def zone(held: Tensor, angle: Tensor, deviation: float) -> tuple[float, float, float]:

@@ -16,11 +16,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from visadapt.diagnosis import leftover
 from visadapt.diagnosis.data import Rows
 from visadapt.diagnosis.filtering import backward, forward
 from visadapt.diagnosis.fitting import Fits, fit, linear_problem, rough, variances
-from visadapt.diagnosis.leftover import BlackBox
-from visadapt.diagnosis.models import Family
+from visadapt.diagnosis.models import COARSE, Family
 from visadapt.diagnosis.which import Effects, joined
 from visadapt.systems import System
 
@@ -29,7 +29,7 @@ AHEAD = 0.5
 
 FOLDS = 4
 
-REFIT = 8
+REFIT = 5
 """Iterations of a fit that starts from the fit to all episodes."""
 
 FAR = 1e3
@@ -79,7 +79,7 @@ def held_out(system: System, rows: Rows, sets: Sequence[tuple[Effects, Fits]], b
     """Each set, fitted without each fold and predicting it; with a black box beside it, if one is asked for."""
     out = folds(rows)
     count = len(out)
-    families = [Family(system, effects, rows) for effects, _ in sets for _ in range(count)]
+    families = [Family(system, effects, rows, COARSE) for effects, _ in sets for _ in range(count)]
     starts = joined([fits for _, fits in sets for _ in range(count)])
     counts = (1 - out).repeat(len(sets), 1) if count > 1 else torch.ones(len(sets), rows.shape[0], dtype=out.dtype)
     fitted = fit(families, starts, counts, REFIT)
@@ -87,23 +87,19 @@ def held_out(system: System, rows: Rows, sets: Sequence[tuple[Effects, Fits]], b
     for k, family in enumerate(families):
         own = fitted.of(torch.tensor([k]))
         own = replace(own, theta=own.theta[:, : len(family.table)])
-        parts.append(ahead(family, own, BlackBox.fit(family, own, counts[k]) if black_box else None))
+        extra = leftover.black_box(family, own, counts[k]) if black_box else None
+        parts.append(ahead(family, own, extra))
     return [_merged(parts[k * count : (k + 1) * count], out.argmax(0)) for k in range(len(sets))]
 
 
-def ahead(family: Family, fits: Fits, black_box: BlackBox | None = None) -> Ahead:
-    """What one fitted set, and perhaps a black box beside it, predicts from every row of every window."""
+def ahead(family: Family, fits: Fits, extra: Tensor | None = None) -> Ahead:
+    """What one fitted set, with what a black box may add to its states (W, T - 1, n), predicts from every row."""
     rows = family.rows
     windows, length = rows.shape
     horizon = max(1, round(AHEAD / rows.period))
-    extra = torch.zeros_like(fits.state[0, :, 1:]) if black_box is None else black_box.drive(family, fits)
+    extra = torch.zeros_like(fits.state[0, :, 1:]) if extra is None else extra
     problem = linear_problem([family], fits, rough(rows, fits.state.shape[-1])[:, 0])
-    problem = replace(
-        problem,
-        drive=problem.drive[..., :1] + extra[..., None],
-        reading=problem.reading[..., :1],
-        start=problem.start[..., :1],
-    )
+    problem = replace(problem.data(), drive=problem.drive[..., :1] + extra[..., None])
     smoothed, _ = backward(problem, forward(problem, *variances(fits.log_process, fits.log_noise, windows)))
     predicted = _run_on(family, fits.theta[0], fits.state[0] + smoothed[..., 0], horizon, extra)
     shape = (horizon + 1, windows, length, len(rows.channels))

@@ -9,6 +9,7 @@ Bayesian interpolation, Neural Computation 4(3)).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -23,6 +24,9 @@ from visadapt.systems import System
 
 BUMPS = 10
 """Bumps of a function."""
+
+MOST = 8
+"""Functions of a black box."""
 
 FACTORS: dict[str, tuple[str | None, ...]] = {
     "cart_force": (None, "x_dot", "command"),
@@ -62,77 +66,81 @@ class Function:
 
 
 @dataclass(frozen=True)
-class BlackBox:
-    """All functions that load the system, fitted together beside a set."""
+class Block:
+    """The bumps of one function, as inputs to the filter."""
 
-    weights: Tensor
-    """(variables x loads x BUMPS,)"""
-    places: dict[str, tuple[float, float]]
-    """of every variable, the first and the last centre"""
-
-    @classmethod
-    def fit(cls, family: Family, fits: Fits, counts: Tensor) -> BlackBox:
-        """To the windows that count (W,)."""
-        places = {
-            name: _ends(place, family.rows.inside > 0) for name, place in variables_of(family, fits.state[0]).items()
-        }
-        empty = cls(torch.zeros(0), places)
-        columns = empty._columns(family, fits)
-        innovations = Innovations(family, fits)
-        reading = torch.zeros(*family.rows.used.shape, columns.shape[-1], dtype=torch.float64)
-        counted = (family.rows.used * counts[:, None, None]).flatten()
-        answers = innovations.answer(columns, reading) * counted[:, None]
-        weights, _ = _regression(answers, innovations.error * counted)
-        return cls(weights, places)
-
-    def drive(self, family: Family, fits: Fits) -> Tensor:
-        """What it adds to the states a period on, along those of `fits`, (W, T - 1, n)."""
-        return self._columns(family, fits) @ self.weights
-
-    def _columns(self, family: Family, fits: Fits) -> Tensor:
-        loads = loads_of(family, fits)
-        columns = []
-        for name, place in variables_of(family, fits.state[0]).items():
-            _, bumps = _bumps(place, self.places[name])
-            weighted = bumps[:, :-1] * family.rows.inside[:, 1:, None]
-            columns += [loads[..., k, None] * weighted[:, :, None] for k in range(loads.shape[-1])]
-        return torch.cat(columns, -1)
+    port: str
+    variable: str
+    factor: str | None
+    centres: Tensor
+    drive: Tensor
+    """(W, T - 1, n, BUMPS)"""
+    reading: Tensor
+    """(W, T, m, BUMPS)"""
 
 
 def functions(family: Family, fits: Fits) -> list[Function]:
     """Every function of the black box beside a fitted set, the most evident first."""
+    blocks = _blocks(family, fits)
+    innovations = Innovations(family, fits)
+    out = []
+    for block, answer in zip(blocks, _answers(innovations, blocks), strict=True):
+        weights, evidence = _regression(answer, innovations.error)
+        _, shape = _bumps(block.centres, (float(block.centres[0]), float(block.centres[-1])))
+        out.append(Function(block.port, block.variable, block.factor, evidence, block.centres, shape @ weights))
+    return sorted(out, key=lambda function: -function.evidence)
+
+
+def black_box(family: Family, fits: Fits, counts: Tensor) -> Tensor:
+    """What loads learnt from the windows that count (W,) add to the states a period on, in all (W, T - 1, n).
+
+    One function after the other, the most evident first, each fitted to what those before it leave.
+    """
+    blocks = [block for block in _blocks(family, fits) if not bool(block.reading.any())]
+    innovations = Innovations(family, fits)
+    counted = (family.rows.used * counts[:, None, None]).flatten()
+    answers = [answer * counted[:, None] for answer in _answers(innovations, blocks)]
+    left = innovations.error * counted
+    drive = torch.zeros_like(blocks[0].drive[..., 0])
+    for _ in range(MOST):
+        fitted = [_regression(answer, left) for answer in answers]
+        best = max(range(len(fitted)), key=lambda k: fitted[k][1])
+        weights, evidence = fitted[best]
+        if evidence <= 0:
+            break
+        left = left + answers[best] @ weights
+        drive = drive + blocks[best].drive @ weights
+    return drive
+
+
+def _answers(innovations: Innovations, blocks: Sequence[Block]) -> tuple[Tensor, ...]:
+    drive, reading = (torch.cat([getattr(block, name) for block in blocks], -1) for name in ("drive", "reading"))
+    return innovations.answer(drive, reading).split(BUMPS, 1)
+
+
+def _blocks(family: Family, fits: Fits) -> list[Block]:
     rows, system = family.rows, family.system
     state = fits.state[0]
     loads = loads_of(family, fits)
     variables = variables_of(family, state)
-    kinds, drives, readings, places = [], [], [], []
+    still = torch.zeros(*state[:, 1:].shape, BUMPS, dtype=torch.float64)
+    silent = torch.zeros(*rows.used.shape, BUMPS, dtype=torch.float64)
+    out = []
     for name, place in variables.items():
         centres, bumps = _bumps(place, _ends(place, rows.inside > 0))
         inner = bumps[:, :-1] * rows.inside[:, 1:, None]
         for k, load in enumerate(system.loads):
             for factor in FACTORS[load.name]:
                 by = 1.0 if factor is None else variables[factor][:, :-1, None]
-                kinds.append((load.name, name, factor))
-                drives.append(loads[..., k, None] * (by * inner)[:, :, None])
-                readings.append(torch.zeros(*rows.used.shape, BUMPS, dtype=torch.float64))
-                places.append(centres)
+                drive = loads[..., k, None] * (by * inner)[:, :, None]
+                out.append(Block(load.name, name, factor, centres, drive, silent))
         for k, channel in enumerate(rows.channels):
             read = system.states[channel].name
             if name in (read, "time"):
-                kinds.append((read, name, None))
-                drives.append(torch.zeros(*state[:, 1:].shape, BUMPS, dtype=torch.float64))
-                reading = torch.zeros(*rows.used.shape, BUMPS, dtype=torch.float64)
+                reading = silent.clone()
                 reading[:, :, k] = -bumps * rows.used[:, :, k, None]
-                readings.append(reading)
-                places.append(centres)
-    innovations = Innovations(family, fits)
-    answers = innovations.answer(torch.cat(drives, -1), torch.cat(readings, -1)).split(BUMPS, 1)
-    out = []
-    for (port, variable, factor), answer, centres in zip(kinds, answers, places, strict=True):
-        weights, evidence = _regression(answer, innovations.error)
-        _, shape = _bumps(centres, (float(centres[0]), float(centres[-1])))
-        out.append(Function(port, variable, factor, evidence, centres, shape @ weights))
-    return sorted(out, key=lambda function: -function.evidence)
+                out.append(Block(read, name, None, centres, still, reading))
+    return out
 
 
 def variables_of(family: Family, state: Tensor) -> dict[str, Tensor]:

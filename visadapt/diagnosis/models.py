@@ -32,21 +32,20 @@ PARAMETER_STEP = 1e-6
 
 TURNS = 4 * math.pi
 
-FINE = 4
-"""Substeps in a period where an effect changes within one; smooth physics needs one step of Runge-Kutta."""
+COARSE, FINE = 4, 10
+"""Substeps in a period where an effect changes within one: to see whether it is worth a look, and for figures that are
+reported. Smooth physics needs one step of Runge-Kutta."""
 
 
 class Family:
     """All simulators that a set of effects, with any parameters, makes of a source; K parameters in all."""
 
-    def __init__(
-        self, system: System, effects: Sequence[type[Effect]], rows: Rows, substeps: int | None = None
-    ) -> None:
+    def __init__(self, system: System, effects: Sequence[type[Effect]], rows: Rows, substeps: int = FINE) -> None:
         self.system = system
         self.effects = tuple(effects)
         self.rows = rows
         abrupt = any(issubclass(e, ActuationEffect | CoulombFriction | FrictionPatch | Gust) for e in effects)
-        self.substeps = substeps or (FINE if abrupt else 1)
+        self.substeps = substeps if abrupt else 1
         self.table = [parameter for effect in effects for parameter in effect.table]
         # A phase may go round on its way to where it fits.
         turns = torch.tensor([TURNS * (p.name == "phase") for p in self.table], dtype=torch.float64)

@@ -1,19 +1,42 @@
-"""A recording made ready to be fitted: tensors, with held readings set aside, and not more rows than can be searched."""
+"""A recording made ready to be fitted: what is no reading of its own set aside, and not more rows than need be."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from visadapt.diagnosis.data import Rows, cut
-from visadapt.diagnosis.holds import Holds, find_holds
+from visadapt.diagnosis.fitting import Fits
+from visadapt.diagnosis.holds import POLE, Holds, find_holds
+from visadapt.diagnosis.models import Family
+from visadapt.diagnosis.where import disturbance
+from visadapt.diagnosis.which import Search
 from visadapt.recordings import Recording
 from visadapt.systems import System
 
 MOST_ROWS = 1600
 """Rows that a search uses; of more, windows spread evenly over the recording are taken."""
+
+
+WRONG = math.log(0.02**2)
+"""Log variance of a change of velocity in a period, from which on it is asked whether a sign is wrong."""
+
+FAR_LIKELIER = 0.1
+"""Log likelihood per reading that another sign must bring to be taken for the right one."""
+
+BAND = 0.1
+"""rad, the width of the bands of angle in which defects of the sensor are looked for."""
+
+LOUDER = 25.0
+FEWEST = 5
+PART = 0.15
+"""A band is defective where the torque's power is so many times its median, on so many rows, a part of all at most."""
+
+LATE = 0.2
+"""Share of a period by which a velocity may lag the slope of its position and still be a measurement of its own."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +61,109 @@ class Readings:
         raw = cut(measured, [torch.ones_like(m) for m in measured], commands, channels, recording.period)
         windows, length = rows.shape
         most = max(4, MOST_ROWS // length)
-        if windows <= most:
-            return cls(rows, raw, holds, ())
-        chosen = torch.linspace(0, windows - 1, most).round().long()
-        note = f"of {windows} windows of up to {length} rows, {most}, spread evenly over the recording, were used"
-        return cls(rows.of(chosen), raw.of(chosen), holds, (note,))
+        warnings = []
+        if windows > most:
+            chosen = torch.linspace(0, windows - 1, most).round().long()
+            rows, raw = rows.of(chosen), raw.of(chosen)
+            warnings.append(
+                f"of {windows} windows of up to {length} rows, {most}, spread evenly over the recording, were used"
+            )
+        source = Search(system, rows, ()).source.fits
+        defect = _contradicted(system, rows, source)
+        if defect is not None:
+            low, high, count = defect
+            rows = _without(rows, low, high)
+            warnings.append(
+                f"{count} readings of theta between {low:.2f} and {high:.2f} rad contradict those around them and the "
+                "physics: the sensor is defective there; they were set aside"
+            )
+        turned = _turned(system, rows, source)
+        if turned is not None:
+            rows, raw = turned.of(rows), turned.of(raw)
+            warnings.append(f"{turned.what} has the other sign than the source's: it was turned round")
+        derived = _derived(system, rows)
+        kept = [k for k, channel in enumerate(channels) if system.states[channel].name not in derived]
+        warnings += [
+            f"{name} is {late:.3g} s late against the slope of its position: derived on the rig, not measured; left out"
+            for name, late in derived.items()
+        ]
+        rows, raw = rows.reading(kept), raw.reading(kept)
+        return cls(rows, raw, holds, tuple(warnings))
+
+
+def _contradicted(system: System, rows: Rows, fits: Fits) -> tuple[float, float, int] | None:
+    """Angles, a small part of all, at which it would take far greater torques than elsewhere to follow the readings."""
+    if float(fits.log_process[0, 1]) < WRONG:
+        return None
+    found = disturbance(Family(system, (), rows), fits, fits.log_process)
+    here = found.there > 0
+    theta = found.variables["theta"][here]
+    place = ((torch.atan2(theta.sin(), theta.cos()) + math.pi) / BAND).long()
+    power = found.load[..., 1][here].square()
+    count = torch.zeros(int(2 * math.pi / BAND) + 1, dtype=power.dtype).index_add_(0, place, torch.ones_like(power))
+    mean = torch.zeros_like(count).index_add_(0, place, power) / count.clamp(min=1)
+    loud = (mean > LOUDER * mean[count > 0].median()) & (count >= FEWEST)
+    if not bool(loud.any()) or float(count[loud].sum()) > PART * float(count.sum()):
+        return None
+    bands = loud.nonzero()[:, 0]
+    low, high = (BAND * (float(k) + extra) - math.pi for k, extra in ((bands.min(), 0), (bands.max(), 1)))
+    return low, high, int(count[int(bands.min()) : int(bands.max()) + 1].sum())
+
+
+def _without(rows: Rows, low: float, high: float) -> Rows:
+    """The pole's readings at these angles not used."""
+    theta = rows.measured[..., rows.channels.index(POLE[0])]
+    wrapped = torch.atan2(theta.sin(), theta.cos())
+    bad = ((wrapped >= low) & (wrapped <= high))[..., None] & torch.tensor([c in POLE for c in rows.channels])
+    return replace(rows, used=rows.used * (~bad))
+
+
+@dataclass(frozen=True)
+class Turned:
+    """Another sign convention than the source's."""
+
+    what: str
+    angle: float
+    command: float
+
+    def of(self, rows: Rows) -> Rows:
+        """In the source's convention."""
+        sign = torch.tensor([self.angle if channel in POLE else 1.0 for channel in rows.channels], dtype=torch.float64)
+        return replace(rows, measured=rows.measured * sign, command=rows.command * self.command)
+
+
+CONVENTIONS = (Turned("the angle", -1, 1), Turned("the command", 1, -1), Turned("the position", -1, -1))
+"""The position's sign is that of angle and command together, by the symmetry of the cart-pole."""
+
+
+def _turned(system: System, rows: Rows, source: Fits) -> Turned | None:
+    """The convention that the recording is in, if it is not the source's: one in which it is far likelier."""
+    if float(source.log_process.max()) < WRONG:
+        return None
+    own = Search(system, rows, ()).source.fits
+    likelihoods = [float(Search(system, other.of(rows), ()).source.fits.likelihood[0]) for other in CONVENTIONS]
+    best = max(range(len(CONVENTIONS)), key=likelihoods.__getitem__)
+    gained = likelihoods[best] - float(own.likelihood[0])
+    return CONVENTIONS[best] if gained > FAR_LIKELIER * float(rows.used.sum()) else None
+
+
+def _derived(system: System, rows: Rows) -> dict[str, float]:
+    """Velocities that lag their position by a good part of a period, and by how much: differences, or filtered ones."""
+    positions = [k for k, channel in enumerate(rows.channels) if channel % 2 == 0]
+    velocities = [k for k, channel in enumerate(rows.channels) if channel % 2 == 1]
+    velocities = [k for k in velocities if rows.channels[k] - 1 in [rows.channels[p] for p in positions]]
+    if not velocities:
+        return {}
+    state = Search(system, rows.reading(positions), ()).source.fits.state[0]
+    both = rows.inside[:, 2:] * rows.inside[:, :-2]
+    out = {}
+    for k in velocities:
+        true = state[..., rows.channels[k]]
+        slope = (true[:, 2:] - true[:, :-2]) / (2 * rows.period)
+        used = both * rows.used[:, 1:-1, k]
+        late = float(
+            -((rows.measured[:, 1:-1, k] - true[:, 1:-1]) * slope * used).sum() / (slope.square() * used).sum()
+        )
+        if late > LATE * rows.period:
+            out[system.states[rows.channels[k]].name] = late
+    return out

@@ -19,7 +19,7 @@ from visadapt.systems import SYSTEMS
 
 __all__ = ["as_html", "as_text", "write_report"]
 
-MOST_WINDOWS, MOST_PROFILES = 3, 4
+MOST_WINDOWS, MOST_PROFILES = 3, 3
 """More figures would hide the telling ones."""
 
 
@@ -74,8 +74,8 @@ def _gaps(diagnosis: Diagnosis) -> list[tuple[str, float, str]]:
     """What the bars show: name, error, CSS class."""
     gap = diagnosis.gap
     rows = [("simulator", gap.before, "before")]
-    if diagnosis.causes:
-        rows.append(("with the causes", gap.after, "after"))
+    if gap.after != gap.before:
+        rows.append(("with the causes" if diagnosis.causes else "with the best known effects", gap.after, "after"))
     return [*rows, ("with a black box", gap.black_box, "black-box"), ("measurement noise", gap.floor, "floor")]
 
 

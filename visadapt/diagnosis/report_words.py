@@ -93,20 +93,35 @@ def sentence(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == IDENTIFIED:
         return f"{_first(listed([_named(cause) for cause in diagnosis.causes]))} {_closes(diagnosis)}."
     if diagnosis.verdict == AMBIGUOUS:
-        # A cause that nothing else could stand in for acts whatever the open ones are.
-        sure = [_named(cause) for cause in diagnosis.causes if not cause.indistinguishable_from]
-        still_open = [_named(cause) for cause in diagnosis.causes if cause.indistinguishable_from] or sure
-        either = f"{'either ' if len(still_open) == 2 else ''}{listed(still_open, 'or')}"
-        if sure and still_open is not sure:
-            either = f"{listed(sure)}, and {either},"
-        return f"{_first(either)} {_closes(diagnosis)}; this recording cannot tell which."
-    named = [ranked.gap_closed for ranked in diagnosis.ranking if ranked.effects and math.isfinite(ranked.gap_closed)]
-    best = f"the best of them closes {percent(max(named))} of the gap" if named else "none of them helps"
+        places = [listed([_named(cause) for cause in place], "or") for place in _places(diagnosis.causes)]
+        whole = listed([f"either {place}" if " or " in place else place for place in places])
+        return f"{_first(whole)} {_closes(diagnosis)}; this recording cannot tell which."
+    return _unexplained(diagnosis)
+
+
+def _places(causes: Sequence[Cause]) -> list[list[Cause]]:
+    """Causes that stand in for each other together; those that nothing else could stand in for first."""
+    places: dict[frozenset[str], list[Cause]] = {}
+    for cause in causes:
+        places.setdefault(frozenset((cause.effect, *cause.indistinguishable_from)), []).append(cause)
+    return sorted(places.values(), key=len)
+
+
+def _unexplained(diagnosis: Diagnosis) -> str:
+    gap = diagnosis.gap
+    closed = [ranked.gap_closed for ranked in diagnosis.ranking if ranked.effects and math.isfinite(ranked.gap_closed)]
+    best = max(closed, default=0.0)
     black_box = (gap.before - gap.black_box) / (gap.before - gap.floor) if gap.before != gap.floor else math.nan
-    place = ""
+    text = "Something acts that no known effect explains: "
+    if best <= 0:
+        text += "none of them closes any of the gap"
+    elif black_box > best:
+        text += f"the best of them close {percent(best)} of the gap, a black box {percent(min(1.0, black_box))}"
+    else:
+        text += f"the best of them close {percent(best)} of the gap, and what is left is not noise"
     if diagnosis.where.regions:
-        place = f"; it shows most at {region(diagnosis.where.regions[0], diagnosis.system)}"
-    return f"Something acts that no known effect explains: {best}, a black box {percent(min(1.0, black_box))}{place}."
+        text += f"; it shows most at {region(diagnosis.where.regions[0], diagnosis.system)}"
+    return f"{text}."
 
 
 def _named(cause: Cause) -> str:
@@ -115,7 +130,7 @@ def _named(cause: Cause) -> str:
 
 
 def _closes(diagnosis: Diagnosis) -> str:
-    many = diagnosis.verdict == IDENTIFIED and len(diagnosis.causes) > 1
+    many = len(_places(diagnosis.causes)) > 1
     return f"{'close' if many else 'closes'} {percent(diagnosis.gap.closed)} of the gap to the simulator"
 
 

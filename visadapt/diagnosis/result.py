@@ -238,8 +238,8 @@ class Diagnosis:
             },
             "verdict": self.verdict,
             "where": {
-                "stages": {name: _number(share) for name, share in self.where.stages.items()},
-                "states": {name: _number(share) for name, share in self.where.states.items()},
+                "stages": {name: _share(share) for name, share in self.where.stages.items()},
+                "states": {name: _share(share) for name, share in self.where.states.items()},
                 "regions": [_region(region) for region in self.where.regions],
                 "pixels": None,
             },
@@ -247,7 +247,7 @@ class Diagnosis:
             "ranking": [
                 {
                     "effects": list(ranked.effects),
-                    "probability": _number(ranked.probability),
+                    "probability": _share(ranked.probability),
                     "gap_closed": _number(ranked.gap_closed),
                 }
                 for ranked in self.ranking
@@ -270,8 +270,8 @@ def _region(region: Region) -> dict[str, Any]:
         "variable": region.variable,
         "from": _number(region.start),
         "to": _number(region.end),
-        "share": _number(region.share),
-        "p_value": _number(region.p_value),
+        "share": _share(region.share),
+        "p_value": _share(region.p_value),
     }
 
 
@@ -282,7 +282,7 @@ def _cause(cause: Cause) -> dict[str, Any]:
             name: {"value": _number(one.value), "unit": one.unit, "ci90": [_number(edge) for edge in one.ci90]}
             for name, one in cause.parameters.items()
         },
-        "probability": _number(cause.probability),
+        "probability": _share(cause.probability),
         "gap_closed": _number(cause.gap_closed),
         "indistinguishable_from": list(cause.indistinguishable_from),
     }
@@ -292,3 +292,9 @@ def _number(value: float) -> float | None:
     """A plain float, whatever numpy or torch made it; None where JSON has no number for it."""
     plain = float(value)
     return plain if math.isfinite(plain) else None
+
+
+def _share(value: float) -> float | None:
+    """As `_number`, without the rounding errors by which sums of shares pass 1."""
+    plain = _number(value)
+    return None if plain is None else round(plain, 12)

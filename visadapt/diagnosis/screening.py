@@ -114,10 +114,10 @@ def _columns(
     unit = torch.ones(max(1, len(linear)), dtype=torch.float64)
     for j, column in enumerate(linear):
         parameter = effects[-1].table[column]
-        neutral = float(parameter.neutral or 0.0)
-        end = parameter.high if parameter.high > neutral else parameter.low
-        unit[j] = PROBE * (end - neutral)
-        tried[:, j, column] = neutral + unit[j]
+        nothing = float(parameter.neutral or 0.0)
+        end = parameter.high if parameter.high > nothing else parameter.low
+        unit[j] = PROBE * (end - nothing)
+        tried[:, j, column] = nothing + unit[j]
     tried = tried.reshape(-1, own)
     neutral = torch.tensor([0.0 if p.neutral is None else p.neutral for p in effects[-1].table], dtype=torch.float64)
     tried = torch.cat((neutral[None], tried))

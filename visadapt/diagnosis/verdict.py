@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,6 +14,9 @@ from visadapt.effects import Effect
 
 WEIGHED = 8
 """Sets, the most probable ones, of which it is asked what they leave unexplained."""
+
+WITHIN = 10.0
+"""Log posterior odds that such a set may be behind the best."""
 
 NOISE = 5.0
 """Log likelihood that process noise must add to a set to count as something unexplained, and what a set pays for it."""
@@ -62,7 +64,7 @@ class Judgement:
 
 def judge(search: Search) -> Judgement:
     """Weigh what a search has fitted."""
-    close = [f for f in search.ranked if f.evidence > -math.inf][:WEIGHED]
+    close = [f for f in search.ranked if f.evidence > search.best.evidence - WITHIN][:WEIGHED]
     if all(f is not search.source for f in close):
         close.append(search.source)
     left = search.leftover(close)

@@ -66,8 +66,9 @@ def regions(found: Disturbance, seed: int) -> list[Region]:
     all the looking.
     """
     here = found.there.flatten() > 0
-    size = found.load[..., 0].flatten()[here]
-    power = (size / size.square().mean().sqrt().clamp(min=1e-300)).square()
+    square = found.load.flatten(0, 1)[here].square()
+    # Force and torque weigh alike.
+    power = (square / square.mean(0).clamp(min=1e-300)).mean(1)
     generator = torch.Generator().manual_seed(seed)
     shifts = torch.randint(1, len(power), (SHIFTS,), generator=generator)
     shifted = torch.stack([power, *(power.roll(int(k)) for k in shifts)])
@@ -99,7 +100,8 @@ def regions(found: Disturbance, seed: int) -> list[Region]:
 def share(found: Disturbance, variable: str, start: float, end: float) -> float:
     """Share of the disturbance's power between two values of a variable."""
     place = found.variables[variable]
-    power = found.load[..., 0].square() * found.there
+    square = found.load.square() * found.there[..., None]
+    power = (square / square.mean((0, 1)).clamp(min=1e-300)).mean(-1)
     return float((power * (place >= start) * (place <= end)).sum() / power.sum().clamp(min=1e-300))
 
 

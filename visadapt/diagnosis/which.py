@@ -12,7 +12,7 @@ from torch import Tensor
 from visadapt.console import Progress
 from visadapt.diagnosis.data import Rows
 from visadapt.diagnosis.fitting import Fits, fit, rough
-from visadapt.diagnosis.models import Family
+from visadapt.diagnosis.models import COARSE, FINE, Family
 from visadapt.diagnosis.screening import screen
 from visadapt.effects import Effect
 from visadapt.systems import System
@@ -26,6 +26,9 @@ BEAM = 3
 LEADS = 8
 """Sets that are taken further at each size, and effects that are tried beside each."""
 
+PROMISING = 1.0
+"""Log likelihood that a lead must promise to be fitted; an effect costs more."""
+
 QUICK, CAREFUL = 8, 20
 """Iterations of a fit that only has to show promise, and of one whose figures are reported."""
 
@@ -35,7 +38,7 @@ UNLEARNT = 0.1
 DECADES = 3
 """Decades over which the prior of a strength is spread."""
 
-PRIOR = 0.0
+PRIOR = -1.0
 """Log prior odds that one effect more is there, whichever of the catalogue."""
 
 
@@ -123,6 +126,8 @@ class Search:
         for base in bases:
             rest = [e for e in self.catalogue if e not in base.effects]
             for lead in screen(self.system, base.effects, base.fits, self.rows, rest)[:leads]:
+                if lead.gain < PROMISING:
+                    continue
                 effects = (*base.effects, lead.effect)
                 key = frozenset(e.name for e in effects)
                 if key not in self.fitted and key not in seen:
@@ -145,9 +150,11 @@ class Search:
         self.extend(smaller, leads=5)
 
     def polish(self, within: float = 8.0, most: int = 8) -> None:
-        """Fit those carefully that may be the answer."""
-        best = self.best.evidence
-        close = [f for f in self.ranked if f.evidence > best - within][:most]
+        """Fit those carefully that may be the answer, and the best set's subsets, against which its effects count."""
+        best = self.best
+        close = [f for f in self.ranked if f.evidence > best.evidence - within][:most]
+        smaller = [self.fitted.get(frozenset(best.names) - {name}) for name in best.names]
+        close += [f for f in smaller if f is not None and all(f is not other for other in close)]
         self.fit([(f.effects, f.fits) for f in close], CAREFUL)
 
     def single(self, effect: type[Effect]) -> Fitted:
@@ -171,14 +178,15 @@ class Search:
     def leftover(self, sets: Sequence[Fitted]) -> list[float]:
         """Log likelihood that process noise adds to each set: how much it leaves unexplained."""
         families = [Family(self.system, f.effects, self.rows) for f in sets]
-        quiet = fit(families, joined([f.fits for f in sets]), self._counts(len(sets)), CAREFUL, still=True)
+        quiet = fit(families, joined([f.fits for f in sets]), self._counts(len(sets)), QUICK, still=True)
         return [max(0.0, float(f.fits.likelihood[0] - q)) for f, q in zip(sets, quiet.likelihood, strict=True)]
 
     def fit(self, starts: Sequence[tuple[Effects, Fits]], iterations: int) -> list[Fitted]:
         """Fit sets of effects, each from a start; what is better than before is kept."""
         if not starts:
             return []
-        families = [Family(self.system, effects, self.rows) for effects, _ in starts]
+        substeps = COARSE if iterations == QUICK else FINE
+        families = [Family(self.system, effects, self.rows, substeps) for effects, _ in starts]
         out = fit(families, joined([fits for _, fits in starts]), self._counts(len(starts)), iterations)
         results = []
         for k, (effects, _) in enumerate(starts):
@@ -207,7 +215,7 @@ def evidence(effects: Effects, fits: Fits, catalogue: int) -> float:
     precision = 12 / width.square()
     whole = fits.information[0] + torch.diag(precision)
     sure = torch.linalg.inv(whole).diagonal()
-    if _vague(effects, sure * precision > UNLEARNT):
+    if _vague(effects, fits, sure, precision):
         return -math.inf
     density = -width.log()
     for k, parameter in enumerate(table):
@@ -221,15 +229,21 @@ def evidence(effects: Effects, fits: Fits, catalogue: int) -> float:
     return float(fits.likelihood[0]) + min(0.0, occam) + len(effects) * (PRIOR - math.log(max(1, catalogue)))
 
 
-def _vague(effects: Effects, unlearnt: Tensor) -> bool:
-    """Whether an effect's strengths, or its shapes, are all unlearnt: it is then another one, a gust that never ends."""
+def _vague(effects: Effects, fits: Fits, sure: Tensor, precision: Tensor) -> bool:
+    """Whether all strengths of an effect may be nothing, or all its shapes are unlearnt: a gust that never ends."""
     first = 0
     for effect in effects:
-        own = unlearnt[first : first + len(effect.table)].tolist()
+        strengths, shapes = [], []
+        for k, parameter in enumerate(effect.table, first):
+            unlearnt = float(sure[k] * precision[k]) > UNLEARNT
+            if parameter.neutral is None:
+                shapes.append(unlearnt)
+            else:
+                away = abs(float(fits.theta[0, k]) - parameter.neutral)
+                strengths.append(unlearnt and away < 2 * math.sqrt(float(sure[k])))
         first += len(effect.table)
-        strengths = [u for u, p in zip(own, effect.table, strict=True) if p.neutral is not None]
-        shapes = [u for u, p in zip(own, effect.table, strict=True) if p.neutral is None]
-        if (strengths and all(strengths)) or (shapes and all(shapes)):
+        # One shape alone may trade places with another effect's strength: a spring's rest with a force.
+        if (strengths and all(strengths)) or (len(shapes) > 1 and all(shapes)):
             return True
     return False
 
@@ -242,7 +256,7 @@ def joined(fits: Sequence[Fits]) -> Fits:
         theta[k, : each.theta.shape[1]] = each.theta[0]
     rest = [torch.cat([getattr(f, name) for f in fits]) for name in ("state", "log_process", "log_noise")]
     unknown = torch.full((len(fits),), -math.inf, dtype=torch.float64)
-    return Fits(theta, *rest, unknown, torch.zeros(len(fits), widest, widest, dtype=torch.float64))
+    return Fits(theta, rest[0], rest[1], rest[2], unknown, torch.zeros(len(fits), widest, widest).double())
 
 
 def _apart(fits: Fits, count: int) -> Fits:

@@ -113,7 +113,7 @@ class ActuatorGain(ActuationEffect):
     name = "actuator_gain"
     equation = "u = scale command"
     source = "Franklin, Powell and Emami-Naeini (2015), Feedback Control of Dynamic Systems, section 2.3"
-    table = (Parameter("scale", "1", 0.4, 2.0, 1.0, linear=True),)
+    table = (Parameter("scale", "1", 0.2, 8.0, 1.0, linear=True),)
 
     def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
         return self.column("scale", commands) * commands, memory

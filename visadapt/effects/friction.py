@@ -18,7 +18,7 @@ class ViscousFriction(CartForce):
     name = "viscous_friction"
     equation = "F = -coefficient x_dot"
     source = "Olsson et al. (1998), Friction models and friction compensation, section 2"
-    table = (Parameter("coefficient", "N s/m", 0.0, 15.0, 0.0, linear=True),)
+    table = (Parameter("coefficient", "N s/m", 0.0, 30.0, 0.0, linear=True),)
 
     def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         return -self.value("coefficient", state) * state[:, 1]

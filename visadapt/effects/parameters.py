@@ -22,7 +22,7 @@ class CartMass(ParameterScale):
     name = "cart_mass"
     equation = "M = scale M_source"
     source = "Barto, Sutton and Anderson (1983), appendix, the cart's mass"
-    table = (Parameter("scale", "1", 0.4, 3.0, 1.0),)
+    table = (Parameter("scale", "1", 0.3, 8.0, 1.0),)
 
     def alter(self, system: System) -> System:
         cart_pole = expect(system, CartPole, self)

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from visadapt.recordings.clock import Note, Rows
-from visadapt.recordings.degrees import DEGREE, are_degrees
 from visadapt.recordings.episode import RecordingError
+from visadapt.recordings.physics import DEGREE, are_degrees, changed_places
 from visadapt.systems import System, Variable
 
 TURN = 2 * math.pi
@@ -36,8 +36,8 @@ def check_finite(rows: Rows, states: Sequence[str], actions: Sequence[str]) -> N
         row, column = np.argwhere(bad)[0]
         name = ("time", *states, *actions)[column]
         raise RecordingError(
-            f"{rows.source}: {rows.place(int(row))}, column {name!r} is {table[row, column]}; a finite number is right "
-            "(a row without a measurement is better left out)"
+            f"{rows.source}: {rows.place(int(row))}, {rows.column(name)} is {table[row, column]}; a finite number is "
+            "right (a row without a measurement is better left out)"
         )
 
 
@@ -65,7 +65,7 @@ def check_commands(rows: Sequence[Rows], actions: Sequence[Variable], note: Note
         right = f"within [{variable.low:g}, {variable.high:g}] is right"
         if share > 0.5 or abs(largest) > 2 * scale:
             raise RecordingError(
-                f"{one.source}: {one.place(row)}, column {variable.name!r} is {largest:g}, and {share:.0%} of the "
+                f"{one.source}: {one.place(row)}, {one.column(variable.name)} is {largest:g}, and {share:.0%} of the "
                 f"column lie outside; {right} (name a column in N 'force')"
             )
         note(f"{share:.1%} of {variable.name} lie outside, up to {largest:g}; {right}", "the recording")
@@ -85,12 +85,20 @@ def check_units(rows: Rows, measured: Sequence[str], system: System) -> None:
         rate_name = f"{name}_dot"
         if rate_name in variables:
             _check_rate(rows, variables[name], values, variables[rate_name], columns.get(rate_name))
+    angles = [name for name in columns if variables[name].unit == "rad"]
     if are_degrees(rows, measured, system):
-        name, values = next((name, values) for name, values in columns.items() if variables[name].unit == "rad")
+        name, values = angles[0], columns[angles[0]]
         raise RecordingError(
-            f"{rows.source}: column {name!r} goes from {values.min():.3g} to {values.max():.3g} and answers the "
+            f"{rows.source}: {rows.column(name)} goes from {values.min():.3g} to {values.max():.3g} and answers the "
             f"command as if in degrees; radians are right"
         )
+    for name, other in product((name for name in columns if variables[name].unit == "m"), angles):
+        if changed_places(rows, measured, system, name, other):
+            raise RecordingError(
+                f"{rows.source}: {rows.column(name)} answers the command as {other} should, and "
+                f"{rows.column(other)} as {name}: they have changed places "
+                f"(or the command's sign is wrong: positive pushes towards +x)"
+            )
 
 
 def rates(time: NDArray[np.float64], values: NDArray[np.float64], angle: bool) -> NDArray[np.float64]:
@@ -106,7 +114,7 @@ def _check_jumps(rows: Rows, name: str, values: NDArray[np.float64]) -> None:
     if steps.max() > 1.25 * TURN:
         row = int(steps.argmax()) + 1
         raise RecordingError(
-            f"{rows.source}: {rows.place(row)}, column {name!r} jumps from {values[row - 1]:g} to {values[row]:g}; "
+            f"{rows.source}: {rows.place(row)}, {rows.column(name)} jumps from {values[row - 1]:g} to {values[row]:g}; "
             "radians are right (these look like degrees)"
         )
 
@@ -131,15 +139,15 @@ def _check_rate(
     if fast > (rate.high if beyond else limit):
         row = int(np.abs(values).argmax())
         raise RecordingError(
-            f"{rows.source}: {rows.place(row)}, column {variable.name!r} is {values[row]:g} {variable.unit}, and it "
-            f"changes by up to {np.abs(coarse).max():.3g} {rate.unit}; {right} (these look like {looks})"
+            f"{rows.source}: {rows.place(row)}, {rows.column(variable.name)} is {values[row]:g} {variable.unit}, and "
+            f"it changes by up to {np.abs(coarse).max():.3g} {rate.unit}; {right} (these look like {looks})"
         )
     if given is None:
         return
     if float(np.quantile(np.abs(given), 0.9)) > limit:
         row = int(np.abs(given).argmax())
         raise RecordingError(
-            f"{rows.source}: {rows.place(row)}, column {rate.name!r} is {given[row]:g} {rate.unit}; "
+            f"{rows.source}: {rows.place(row)}, {rows.column(rate.name)} is {given[row]:g} {rate.unit}; "
             f"{right} (these look like {looks})"
         )
     between = 0.5 * (given[1:] + given[:-1])
@@ -148,7 +156,7 @@ def _check_rate(
         for wrong, factor in ((variable, ratio), (rate, DEGREE**2 / ratio)):
             if 0.5 < factor < 2:
                 raise RecordingError(
-                    f"{rows.source}: column {wrong.name!r} is {1 / DEGREE:.0f} times what the other says "
+                    f"{rows.source}: {rows.column(wrong.name)} is {1 / DEGREE:.0f} times what the other says "
                     f"({variable.name} changes by {change.std():.3g} {rate.unit}, {rate.name} is {between.std():.3g} "
                     f"{rate.unit}, root mean square); {right} (these look like {looks})"
                 )
@@ -163,15 +171,15 @@ def _check_places(rows: Rows, columns: dict[str, NDArray[np.float64]], variables
         crossed = _correlation(rates(rows.time, rate, False), columns[name][1:])
         if crossed > ALONG and _correlation(changes[name], rate[1:]) < NOT_ALONG:
             raise RecordingError(
-                f"{rows.source}: the columns {name!r} and '{name}_dot' have evidently changed places: "
-                f"{name} is the rate of change of {name}_dot"
+                f"{rows.source}: {rows.column(name)} and {rows.column(f'{name}_dot')} have evidently changed places: "
+                "the first is the second's rate of change"
             )
     for name, other in combinations(given, 2):
         crossed = min(_correlation(changes[name], given[other][1:]), _correlation(changes[other], given[name][1:]))
         own = max(_correlation(changes[one], given[one][1:]) for one in (name, other))
         if crossed > ALONG and own < NOT_ALONG:
             raise RecordingError(
-                f"{rows.source}: the columns {name!r} and {other!r} have evidently changed places: "
+                f"{rows.source}: {rows.column(name)} and {rows.column(other)} have evidently changed places: "
                 f"{name} changes as {other}_dot says, and {other} as {name}_dot says"
             )
     for name in bases:
@@ -180,8 +188,8 @@ def _check_places(rows: Rows, columns: dict[str, NDArray[np.float64]], variables
         wraps = abs(steps[row] - TURN) < 0.5 and np.abs(columns[name]).max() < 0.55 * TURN
         if variables[name].unit == "m" and wraps:
             raise RecordingError(
-                f"{rows.source}: {rows.place(row + 1)}, column {name!r} jumps by {steps[row]:.3g} m, as an angle does "
-                "that wraps; metres are right (did two columns change places?)"
+                f"{rows.source}: {rows.place(row + 1)}, {rows.column(name)} jumps by {steps[row]:.3g} m, as an angle "
+                "does that wraps; metres are right (did two columns change places?)"
             )
 
 

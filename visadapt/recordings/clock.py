@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -40,6 +40,12 @@ class Rows:
     """(T, n_measured)"""
     place: Callable[[int], str]
     """how a row, counted from 0, is called in messages"""
+    names: Mapping[str, str] = field(default_factory=dict)
+    """what the file calls our variables, where it calls them something else"""
+
+    def column(self, name: str) -> str:
+        """How the column of one of our variables is called in messages."""
+        return f"column {self.names[name]!r} ({name})" if name in self.names else f"column {name!r}"
 
     def part(self, start: int, end: int) -> Rows:
         """The rows from `start` up to `end`, not included."""
@@ -65,7 +71,7 @@ def check_forward(rows: Rows) -> None:
         before, after = rows.time[row], rows.time[row + 1]
         problem = "repeats itself" if before == after else "runs backward"
         raise RecordingError(
-            f"{rows.source}: {rows.place(row + 1)}, column 'time': the clock {problem} (from {before:.9g} s to "
+            f"{rows.source}: {rows.place(row + 1)}, {rows.column('time')}: the clock {problem} (from {before:.9g} s to "
             f"{after:.9g} s); a rising one is right, and a column 'episode' where several episodes follow each other"
         )
 

@@ -37,7 +37,8 @@ def read_rows(path: Path, system: System, given: Mapping[str, str]) -> tuple[lis
     actions = [variable.name for variable in system.actions]
     state = np.column_stack([values[name] for name in measured])
     action = np.column_stack([values[name] for name in actions])
-    whole = Rows(str(path), values["time"], action, state, table.place)
+    names = {name: table.header[found[name]] for name in found if table.header[found[name]].lower() != name}
+    whole = Rows(str(path), values["time"], action, state, table.place, names)
     force = any(table.header[found[name]].lower() == FORCE for name in actions)
     if "episode" not in found:
         return [whole], measured, force

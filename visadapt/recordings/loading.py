@@ -23,6 +23,8 @@ HORIZON = 0.5
 ROWS_IN_HORIZON = 3
 """A horizon is at least this many rows long."""
 HDF5_MAGIC = b"\x89HDF"
+UPRIGHT = 1.0
+"""rad from 0 up to which an angle counts as upright."""
 SUFFIXES = (".csv", ".h5", ".hdf5")
 """Files of a folder that are read."""
 
@@ -50,8 +52,9 @@ def load_recording(
     """Read states and actions from CSV and HDF5 files.
 
     Names are matched as `columns.match` says, and clocks as `clock.py` says. Angles are unwrapped within an episode,
-    which as a whole is put where its median lies in [-pi, pi]. A command in N (a column `force` that exceeds 1) is
-    divided by the system's `max_force`. What was changed or left out is in the recording's warnings.
+    so that upright is 0 there (where a pole turns over, the turn in which it is upright most). A command in N (a
+    column `force` that exceeds 1) is divided by the system's `max_force`. What was changed or left out is in the
+    recording's warnings.
 
     Args:
         paths: files, or folders whose CSV and HDF5 files are taken in the order of their names.
@@ -181,7 +184,9 @@ def _unwrapped(rows: Rows, measured: Sequence[str], system: System) -> Rows:
     for column, name in enumerate(measured):
         if system.states[system.index(name)].unit == "rad":
             angle = np.unwrap(state[:, column])
-            state[:, column] = angle - 2 * np.pi * np.round(np.median(angle) / (2 * np.pi))
+            turns = np.round(angle / (2 * np.pi))
+            upright = np.abs(angle - 2 * np.pi * turns) < UPRIGHT
+            state[:, column] = angle - 2 * np.pi * np.round(np.median(turns[upright] if upright.any() else turns))
     return replace(rows, state=state)
 
 

@@ -32,10 +32,10 @@ from visadapt.recordings import Recording
 from visadapt.systems import CartPole
 from visadapt.world import World
 
-ENOUGH = 0.9
+ENOUGH = 0.97
 """Share of the gap that the causes must close to be the explanation where something is left over."""
 
-RIVALS = 3
+RIVALS = 2
 """Sets after the best one of which it is computed how far they close the gap."""
 
 
