@@ -228,9 +228,7 @@ class TestWords:
 
     def test_one_cause_is_sure_and_two_are_open(self):
         text = sentence(a_diagnosis("ambiguous", causes=(PATCH, GAIN, MASS)))
-        assert re.match(
-            r"Friction patch \(.*\) and either actuator gain \(.*\) or cart mass \(.*\) close 96 %", text
-        )
+        assert re.match(r"Friction patch \(.*\) and either actuator gain \(.*\) or cart mass \(.*\) close 96 %", text)
 
     @pytest.mark.parametrize(
         ("value", "text"),

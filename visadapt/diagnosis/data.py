@@ -69,12 +69,16 @@ def cut(
     commands: Sequence[Tensor],
     channels: tuple[int, ...],
     period: float,
+    stretches: Sequence[tuple[int, int, int]] | None = None,
 ) -> Rows:
-    """Cut episodes into windows of equal length within each: measured (T, m), valid (T, m) and commands (T,)."""
+    """Cut episodes into windows of equal length within each: measured (T, m), valid (T, m) and commands (T,).
+
+    `stretches`, where given, are what is used: an episode's index, and the rows from which and up to which.
+    """
     pieces = []
-    for index, values in enumerate(measured):
-        count = -(-len(values) // LONGEST)
-        edges = torch.linspace(0, len(values), count + 1).round().long().tolist()
+    for index, begin, end in stretches or [(k, 0, len(values)) for k, values in enumerate(measured)]:
+        count = -(-(end - begin) // LONGEST)
+        edges = torch.linspace(begin, end, count + 1).round().long().tolist()
         pieces += [(index, a, b) for a, b in pairwise(edges)]
     rows = max(b - a for _, a, b in pieces)
     shape = (len(pieces), rows)

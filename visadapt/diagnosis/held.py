@@ -13,7 +13,7 @@ from visadapt.diagnosis.causes import NINETY
 from visadapt.diagnosis.holds import zone
 from visadapt.diagnosis.how_far import Ahead
 from visadapt.diagnosis.models import Family
-from visadapt.diagnosis.readings import Readings
+from visadapt.diagnosis.readings import BAND, Readings
 from visadapt.diagnosis.result import Cause, Estimate
 from visadapt.diagnosis.verdict import Judgement
 from visadapt.diagnosis.which import Search
@@ -46,7 +46,7 @@ def held_causes(readings: Readings, search: Search, judgement: Judgement) -> lis
         parameters = {"rate": Estimate(rate, Dropout.table[0].unit, (middle - half, middle + half))}
         out.append(Held(Cause(Dropout.name, parameters, 1.0, math.nan), _cost(readings, search, judgement, whole=True)))
     frozen = sum(int(x.sum()) for x in readings.holds.frozen)
-    if frozen >= FEWEST:
+    if frozen >= FEWEST and (readings.defect is not None or int(_marks(readings, whole=False).sum()) >= FEWEST):
         start, end, deviation = _zone(readings, search, judgement)
         unit = FrozenZone.table[0].unit
         parameters = {
@@ -90,6 +90,8 @@ def _zone(readings: Readings, search: Search, judgement: Judgement) -> tuple[flo
     rows = readings.rows
     fits = judgement.best.fits
     inside = rows.inside > 0
+    if readings.defect is not None:
+        return *readings.defect, BAND
     channel = rows.channels.index(search.system.index("theta"))
     deviation = ROUGH * float((fits.log_noise[0, channel] / 2).exp())
     angle = fits.state[0, ..., 2][inside]

@@ -33,7 +33,7 @@ class Holds:
     lost: list[Tensor]
     """(T,) the whole row was held"""
     frozen: list[Tensor]
-    """(T,) angle and angular velocity were held, the rest was not"""
+    """(T,) the angle was held, the rest of the row was not"""
 
 
 def find_holds(measured: Sequence[Tensor], channels: tuple[int, ...]) -> Holds:
@@ -41,15 +41,18 @@ def find_holds(measured: Sequence[Tensor], channels: tuple[int, ...]) -> Holds:
     together = torch.cat(list(measured))
     steps = [smallest_step(together[:, k]) for k in range(len(channels))]
     pole = torch.tensor([c in POLE for c in channels])
+    angle = channels.index(POLE[0]) if POLE[0] in channels else None
     used, lost, frozen = [], [], []
     for values in measured:
         same = torch.stack([_held(values[:, k], MOVING * steps[k]) for k in range(len(channels))], 1)
         whole = same.all(1)
-        still = same[:, pole].all(1) & ~whole if bool(pole.any()) else torch.zeros_like(whole)
+        # An angular velocity of its own sensor may go on while the angle stands still.
+        own = same & pole & ~whole[:, None]
+        still = own[:, angle] if angle is not None else torch.zeros_like(whole)
         # What a sensor gives first when it wakes may still be half of what it held.
-        waking = torch.zeros_like(still)
-        waking[1:] = still[:-1] & ~still[1:]
-        used.append(1.0 - (whole[:, None] | ((still | waking)[:, None] & pole)).double())
+        waking = torch.zeros_like(own)
+        waking[1:] = own[:-1] & ~own[1:]
+        used.append(1.0 - (whole[:, None] | (still[:, None] & own) | waking).double())
         lost.append(whole)
         frozen.append(still)
     return Holds(used, lost, frozen)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from visadapt.diagnosis.data import Rows, cut
 from visadapt.diagnosis.fitting import Fits
@@ -35,6 +37,12 @@ FEWEST = 5
 PART = 0.15
 """A band is defective where the torque's power is so many times its median, on so many rows, a part of all at most."""
 
+ROUND = 0.8
+"""Share of the circle in which a pole is met that turns all the way round."""
+
+SHORTEST = 15
+"""Rows between two passes of a defective band that are worth a window."""
+
 LATE = 0.2
 """Share of a period by which a velocity may lag the slope of its position and still be a measurement of its own."""
 
@@ -48,6 +56,8 @@ class Readings:
     raw: Rows
     """the same windows with held readings as they were read"""
     holds: Holds
+    defect: tuple[float, float] | None
+    """rad, between which the angle sensor is defective, in the source's convention"""
     warnings: tuple[str, ...]
 
     @classmethod
@@ -57,30 +67,45 @@ class Readings:
         measured = [torch.tensor(np.asarray(e.state, dtype=np.float64)) for e in recording.episodes]
         commands = [torch.tensor(np.asarray(e.action, dtype=np.float64))[:, 0] for e in recording.episodes]
         holds = find_holds(measured, channels)
-        rows = cut(measured, holds.used, commands, channels, recording.period)
-        raw = cut(measured, [torch.ones_like(m) for m in measured], commands, channels, recording.period)
-        windows, length = rows.shape
-        most = max(4, MOST_ROWS // length)
-        warnings = []
-        if windows > most:
-            chosen = torch.linspace(0, windows - 1, most).round().long()
-            rows, raw = rows.of(chosen), raw.of(chosen)
-            warnings.append(
-                f"of {windows} windows of up to {length} rows, {most}, spread evenly over the recording, were used"
-            )
+        warnings: list[str] = []
+
+        def windows(stretches: list[tuple[int, int, int]] | None, notes: list[str]) -> tuple[Rows, Rows]:
+            every = [torch.ones_like(m) for m in measured]
+            rows = cut(measured, holds.used, commands, channels, recording.period, stretches)
+            raw = cut(measured, every, commands, channels, recording.period, stretches)
+            count, length = rows.shape
+            most = max(4, int(MOST_ROWS / float(rows.inside.sum(1).mean())))
+            if count > most:
+                chosen = torch.linspace(0, count - 1, most).round().long()
+                rows, raw = rows.of(chosen), raw.of(chosen)
+                notes.append(
+                    f"of {count} windows of up to {length} rows, {most}, spread evenly over the recording, were used"
+                )
+            return rows, raw
+
+        thinned: list[str] = []
+        rows, raw = windows(None, thinned)
         source = Search(system, rows, ()).source.fits
         defect = _contradicted(system, rows, source)
+        band = None
         if defect is not None:
-            low, high, count = defect
-            rows = _without(rows, low, high)
+            low, high, beyond = defect
+            band = (low, high)
+            angle = channels.index(POLE[0])
+            bad = [_within(m[:, angle], low, high) for m in measured]
+            if beyond:
+                # A gap in a potentiometer's turn: of unknown width, so nothing is carried across it, and the turn
+                # runs from one of its edges to the other, so that a scale acts alike on either side of upright.
+                measured = [_on_one_turn(m, angle, 0.5 * (low + high)) for m in measured]
+                thinned = []
+                rows, raw = windows(_apart(bad), thinned)
+            else:
+                rows = _without(rows, low, high)
             warnings.append(
-                f"{count} readings of theta between {low:.2f} and {high:.2f} rad contradict those around them and the "
-                "physics: the sensor is defective there; they were set aside"
+                f"{sum(int(b.sum()) for b in bad)} readings of theta between {low:.2f} and {high:.2f} rad contradict "
+                "those around them and the physics: the sensor is defective there; they were set aside"
             )
-        turned = _turned(system, rows, source)
-        if turned is not None:
-            rows, raw = turned.of(rows), turned.of(raw)
-            warnings.append(f"{turned.what} has the other sign than the source's: it was turned round")
+        warnings += thinned
         derived = _derived(system, rows)
         kept = [k for k, channel in enumerate(channels) if system.states[channel].name not in derived]
         warnings += [
@@ -88,11 +113,21 @@ class Readings:
             for name, late in derived.items()
         ]
         rows, raw = rows.reading(kept), raw.reading(kept)
-        return cls(rows, raw, holds, tuple(warnings))
+        # Velocities that lag would speak for the wrong sign.
+        turned = _turned(system, rows, source)
+        if turned is not None:
+            rows, raw = turned.of(rows), turned.of(raw)
+            if band is not None and turned.angle < 0:
+                band = (-band[1], -band[0])
+            warnings.append(f"{turned.what} has the other sign than the source's: it was turned round")
+        return cls(rows, raw, holds, band, tuple(warnings))
 
 
-def _contradicted(system: System, rows: Rows, fits: Fits) -> tuple[float, float, int] | None:
-    """Angles, a small part of all, at which it would take far greater torques than elsewhere to follow the readings."""
+def _contradicted(system: System, rows: Rows, fits: Fits) -> tuple[float, float, bool] | None:
+    """Angles, a small part of all, at which it would take far greater torques than elsewhere to follow the readings.
+
+    And whether the pole turns all the way round.
+    """
     if float(fits.log_process[0, 1]) < WRONG:
         return None
     found = disturbance(Family(system, (), rows), fits, fits.log_process)
@@ -107,15 +142,37 @@ def _contradicted(system: System, rows: Rows, fits: Fits) -> tuple[float, float,
         return None
     bands = loud.nonzero()[:, 0]
     low, high = (BAND * (float(k) + extra) - math.pi for k, extra in ((bands.min(), 0), (bands.max(), 1)))
-    return low, high, int(count[int(bands.min()) : int(bands.max()) + 1].sum())
+    return low, high, float((count > 0).double().mean()) > ROUND
+
+
+def _within(theta: Tensor, low: float, high: float) -> Tensor:
+    """Whether angles, of any turn, lie between two of the first."""
+    wrapped = torch.atan2(theta.sin(), theta.cos())
+    return (wrapped >= low) & (wrapped <= high)
+
+
+def _on_one_turn(measured: Tensor, angle: int, edge: float) -> Tensor:
+    """The angle on the turn that begins, or ends, at `edge` and in which upright is 0."""
+    start = edge if edge < 0 else edge - 2 * math.pi
+    out = measured.clone()
+    out[:, angle] = (measured[:, angle] - start).remainder(2 * math.pi) + start
+    return out
+
+
+def _apart(bad: list[Tensor]) -> list[tuple[int, int, int]]:
+    """Stretches without bad rows that are long enough: an episode's index, the first row, and the row past the last."""
+    out = []
+    for index, rows in enumerate(bad):
+        edges = [-1, *rows.nonzero()[:, 0].tolist(), len(rows)]
+        out += [(index, a + 1, b) for a, b in pairwise(edges) if b - a - 1 >= SHORTEST]
+    return out
 
 
 def _without(rows: Rows, low: float, high: float) -> Rows:
     """The pole's readings at these angles not used."""
-    theta = rows.measured[..., rows.channels.index(POLE[0])]
-    wrapped = torch.atan2(theta.sin(), theta.cos())
-    bad = ((wrapped >= low) & (wrapped <= high))[..., None] & torch.tensor([c in POLE for c in rows.channels])
-    return replace(rows, used=rows.used * (~bad))
+    bad = _within(rows.measured[..., rows.channels.index(POLE[0])], low, high)
+    pole = torch.tensor([channel in POLE for channel in rows.channels])
+    return replace(rows, used=rows.used * ~(bad[..., None] & pole))
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from visadapt.systems import System
 
 Effects = tuple[type[Effect], ...]
 
-MOST = 4
+MOST = 6
 """Effects in a set."""
 
 BEAM = 3

@@ -35,7 +35,7 @@ class PoleMass(ParameterScale):
     name = "pole_mass"
     equation = "m = scale m_source"
     source = "Barto, Sutton and Anderson (1983), appendix, the pole's mass"
-    table = (Parameter("scale", "1", 0.2, 5.0, 1.0),)
+    table = (Parameter("scale", "1", 0.05, 5.0, 1.0),)
 
     def alter(self, system: System) -> System:
         cart_pole = expect(system, CartPole, self)
