@@ -203,7 +203,8 @@ class TestOpposing:
         rest, still = torch.zeros(1, 4), torch.zeros(1, 1)
         gap = (pushed.step(pushed.start(rest), still).state - source.step(source.start(rest), still).state)[0]
         with torch.no_grad():
-            network.head[-1].bias.copy_(gap / scale * reads)
+            last = list(network.head.parameters())[-1]
+            last.copy_(gap / scale * reads)
         oppose(policy, source, scale)
         return (policy(seen).atanh() - quiet.atanh())[0, :, 0] * CartPole().max_force
 
