@@ -1,7 +1,7 @@
 """Grounding: the residual learns what the source leaves out (equation 10).
 
 What the residual's network has learnt to see beforehand stays as it is; its head is fitted to all samples so far: a
-linear one by ridge regression, an MLP by descent.
+linear one by ridge regression, an MLP by descent from where the last round left it.
 """
 
 from __future__ import annotations

@@ -7,7 +7,6 @@ under its final name only once it is whole; an interrupted run goes on after the
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -125,8 +124,6 @@ def adapt(
     """
     grounded = World(source.system, [residual], source.period, source.integrator, source.substeps)
     policy.residual = residual
-    # Every round fits it anew: a head that has seen what is now held out would look best left alone.
-    untaught = copy.deepcopy(residual.network.state_dict())
     ledger = Ledger(settings.budget)
     episodes: list[Episode] = []
     rounds: list[Round] = []
@@ -139,7 +136,6 @@ def adapt(
             ledger.count(f"{name}: data", episode.samples)
         episodes += new if label is None else label(new)
         windows = Windows.cut(episodes, settings.observations, observe)
-        residual.network.load_state_dict(untaught)
         if number == 0:
             rescale(residual, source, windows)
         grounding = _grounded(
