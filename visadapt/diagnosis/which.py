@@ -26,6 +26,10 @@ BEAM = 3
 LEADS = 8
 """Sets that are taken further at each size, and effects that are tried beside each."""
 
+SUSPICIOUS = 5.0
+WIDE = 6
+"""Log likelihood that process noise adds to the best set from which on the search is widened, to so many sets."""
+
 PROMISING = 1.0
 """Log likelihood that a lead must promise to be fitted; an effect costs more."""
 
@@ -95,14 +99,28 @@ class Search:
             beam = sorted(children, key=lambda f: -f.evidence)[:BEAM]
             if beam[0].evidence < before.evidence:
                 break
+        self._settle()
+        if self.leftover([self.best])[0] > SUSPICIOUS:
+            # Something is left: perhaps two effects that show only together, behind singles that seem to do.
+            self._widen()
+            self._settle()
+        if progress is not None:
+            progress(MOST, MOST, -self.best.evidence)
+
+    def _settle(self) -> None:
+        """Exchange, take away and fit carefully until the best set stays the best."""
         for _ in range(3):
             before = self.best
             self.neighbours(before)
             self.polish()
             if self.best.names == before.names:
-                break
-        if progress is not None:
-            progress(MOST, MOST, -self.best.evidence)
+                return
+
+    def _widen(self) -> None:
+        """Pairs from many singles, and triples from many pairs."""
+        for size in (1, 2):
+            bases = [f for f in self.ranked if len(f.effects) == size and f.evidence > -math.inf][:WIDE]
+            self.extend(bases)
 
     @property
     def source(self) -> Fitted:
