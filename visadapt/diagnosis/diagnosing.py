@@ -35,6 +35,9 @@ from visadapt.world import World
 ENOUGH = 0.97
 """Share of the gap that the causes must close to be the explanation where something is left over."""
 
+CLEAR = 3.0
+"""Times the noise that predictions must still err by for the noise to be no measure of what is left."""
+
 RIVALS = 2
 """Sets after the best one of which it is computed how far they close the gap."""
 
@@ -122,9 +125,11 @@ def _diagnose(
 
 def _verdict(judgement: Judgement, errors: Errors, held: bool) -> str:
     if judgement.unexplained:
-        # Where there are many rows anything left over is evident; what matters is how much it is.
-        closed = errors.gap().closed
-        return IDENTIFIED if judgement.best.effects and closed >= ENOUGH else UNEXPLAINED
+        gap = errors.gap()
+        # Where the noise is so low that any real machine departs from any model, what counts is how much of the gap
+        # is closed; elsewhere, whether what is left is evident.
+        enough = gap.closed >= ENOUGH if gap.after > CLEAR * gap.floor else judgement.slight
+        return IDENTIFIED if judgement.best.effects and enough else UNEXPLAINED
     return IDENTIFIED if judgement.best.effects or held else NO_GAP
 
 

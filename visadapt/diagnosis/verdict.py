@@ -24,6 +24,9 @@ NOISE = 5.0
 FUNCTION = 4.0
 """Log odds of a function of the black box beside a set from which on it counts as something unexplained."""
 
+SLIGHT = 0.05
+"""Log likelihood left over, beside that which the best set brings, that is not worth the word unexplained."""
+
 MASS = 0.93
 """Posterior probability that the members of a class hold between them."""
 
@@ -56,10 +59,18 @@ class Judgement:
         """The most probable set."""
         return self.weighed[0].fitted
 
+    gained: float
+    """log likelihood of the best beyond the source's"""
+
     @property
     def unexplained(self) -> bool:
         """Whether something is left that no set explains."""
         return self.leftover > NOISE or self.functions[0].evidence > FUNCTION
+
+    @property
+    def slight(self) -> bool:
+        """Whether what is left is little beside what the best set explains: a friction's rounded corner, say."""
+        return max(self.leftover, self.functions[0].evidence) < SLIGHT * self.gained
 
 
 def judge(search: Search) -> Judgement:
@@ -75,7 +86,8 @@ def judge(search: Search) -> Judgement:
     best = weighed[0].fitted
     family = Family(search.system, best.effects, search.rows)
     classes = {effect: _class(weighed, effect) for effect in best.effects}
-    return Judgement(weighed, left[order[0]], functions(family, best.fits), classes)
+    gained = float(best.fits.likelihood[0] - search.source.fits.likelihood[0])
+    return Judgement(weighed, left[order[0]], functions(family, best.fits), classes, gained)
 
 
 def _class(weighed: Sequence[Weighed], effect: type[Effect]) -> list[Weighed]:
