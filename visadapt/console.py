@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -40,7 +41,7 @@ def reporting() -> Iterator[Report]:
                 stages[stage] = bars.add_task(stage, total=total, loss=loss)
             bars.update(stages[stage], completed=done, total=total, loss=loss)
             if done == total and not console.is_terminal:
-                console.print(f"{stage}: {done} steps, loss {loss:.4g}")
+                console.print(f"{stage}: {done} steps" + ("" if math.isnan(loss) else f", loss {loss:.4g}"))
 
         yield report
 
