@@ -32,7 +32,7 @@ from visadapt.recordings import Recording
 from visadapt.systems import CartPole
 from visadapt.world import World
 
-ENOUGH = 0.97
+ENOUGH = 0.95
 """Share of the gap that the causes must close to be the explanation where something is left over."""
 
 CLEAR = 3.0
