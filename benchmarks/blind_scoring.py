@@ -183,13 +183,3 @@ def _overlap(answer: Answer, variable: str, true: dict[str, float]) -> float:
     common = min(best["to"], true["end"]) - max(best["from"], true["start"])
     whole = max(best["to"], true["end"]) - min(best["from"], true["start"])
     return max(0.0, common) / whole if whole > 0 else 0.0
-
-
-def wilson(hits: int, n: int, z: float = 1.959964) -> tuple[float, float]:
-    """95 % interval of a share (Wilson 1927)."""
-    if n == 0:
-        return math.nan, math.nan
-    p = hits / n
-    centre, scale = p + z * z / (2 * n), 1 + z * z / n
-    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)

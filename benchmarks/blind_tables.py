@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.blind_scoring import Answer, Score, Truth, classes, wilson
+from benchmarks.blind_scoring import Answer, Score, Truth, classes
 from visadapt.files import replacing
+from visadapt.intervals import wilson
 
 STRENGTHS = (0.0, 1.0, 1.5, 2.5, 4.0, 8.0, 15.0, np.inf)
 """edges of the bins of strength"""

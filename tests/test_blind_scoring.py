@@ -9,9 +9,10 @@ import pytest
 from benchmarks import blind_diagnosis
 from benchmarks.blind_baselines import afternoon, chance
 from benchmarks.blind_diagnosis import Settings, diagnose_one, read_log, run_one, write
-from benchmarks.blind_scoring import REGION, SIZE, Truth, classes, matches, score, wilson
+from benchmarks.blind_scoring import REGION, SIZE, Truth, classes, matches, score
 from benchmarks.blind_tables import Row, confusion, label, read_table, tabulate
 from datasets.blind_kinds import NAMED
+from visadapt.intervals import wilson
 
 
 def cause(effect, alike=(), **parameters):

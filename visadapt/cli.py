@@ -12,8 +12,6 @@ import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-
 from visadapt import diagnosis
 from visadapt.console import reporting
 from visadapt.diagnosis.report import as_text, write_report
@@ -97,7 +95,6 @@ def _diagnose(options: argparse.Namespace) -> None:
     if options.effects:
         _run(Path(options.effects))
     recording = load_recording(options.recording, system, options.columns)
-    torch.set_num_threads(options.jobs)
     # Only the verdict belongs on stdout.
     with contextlib.redirect_stdout(sys.stderr), reporting() as report:
         result = diagnosis.diagnose(

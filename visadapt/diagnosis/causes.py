@@ -13,7 +13,7 @@ from visadapt.diagnosis.data import Rows
 from visadapt.diagnosis.result import Cause, Estimate, Ranked
 from visadapt.diagnosis.screening import spans
 from visadapt.diagnosis.verdict import Judgement, Weighed, exchanged
-from visadapt.diagnosis.which import Fitted, Search
+from visadapt.diagnosis.which import Fitted, Search, posterior
 from visadapt.effects import Effect
 from visadapt.effects.base import Parameter
 
@@ -81,9 +81,7 @@ def _twin(search: Search, member: Named, own: Mapping[str, Estimate]) -> Mapping
 
 def estimates(fitted: Fitted, effect: type[Effect], rows: Rows) -> dict[str, Estimate]:
     """Maximum likelihood estimates of one effect's parameters, with 90 % intervals from Fisher's information."""
-    table = [p for e in fitted.effects for p in e.table]
-    width = torch.tensor([p.high - p.low for p in table], dtype=torch.float64)
-    whole = fitted.fits.information[0] + torch.diag(12 / width.square())
+    _, whole = posterior(fitted.effects, fitted.fits)
     deviation = torch.linalg.inv(whole).diagonal().sqrt()
     first = sum(len(e.table) for e in fitted.effects[: fitted.effects.index(effect)])
     seen = spans(rows, fitted.fits.state[0])

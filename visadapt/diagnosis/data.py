@@ -12,7 +12,6 @@ from torch import Tensor
 LONGEST = 120
 """Rows of a window; a longer episode is cut, since states far apart say nothing about each other's noise."""
 
-
 ROUNDING = 1e-6
 """Differences that arithmetic makes of equal readings (turning an angle round, say), not the sensor."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
+from visadapt.diagnosis.report_words import listed
 from visadapt.effects import Effect, Stage
 
 SETTLES: dict[frozenset[str], str] = {
@@ -48,7 +49,7 @@ def separate(classes: Sequence[Collection[type[Effect]]]) -> str:
         known = [text for pair, text in SETTLES.items() if pair <= names]
         if len(names) > 1:
             told = known or [_general(members)]
-            parts.append(f"To tell {_listed(sorted(names))} apart: " + "; ".join(told) + ".")
+            parts.append(f"To tell {listed(sorted(names))} apart: " + "; ".join(told) + ".")
     return " ".join(parts)
 
 
@@ -72,7 +73,3 @@ def more() -> str:
 def _general(members: Collection[type[Effect]]) -> str:
     stages = sorted({effect.stage for effect in members})
     return "record " + ", then ".join(BY_STAGE[stage] for stage in stages if stage in BY_STAGE)
-
-
-def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]

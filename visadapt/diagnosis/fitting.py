@@ -85,9 +85,10 @@ def rough(rows: Rows, n: int) -> Tensor:
     return out * rows.inside[..., None]
 
 
-def linear_problem(families: Sequence[Family], fits: Fits, origin: Tensor) -> Linear:
-    """The models, one after the other, along the states of `fits`; `origin` (W, n) is the rough first state."""
+def linear_problem(families: Sequence[Family], fits: Fits) -> Linear:
+    """The models, one after the other, along the states of `fits`."""
     rows = families[0].rows
+    origin = rough(rows, fits.state.shape[-1])[:, 0]
     used = rows.used[..., None]
     inside = rows.inside[:, 1:, None, None]
     windows, length, n = fits.state.shape[1:]
@@ -145,11 +146,11 @@ class Slope:
     """(C, W, T, n, 1 + K) change of the states, and with each parameter"""
 
 
-def slope(families: Sequence[Family], fits: Fits, origin: Tensor, counts: Tensor) -> Slope:
+def slope(families: Sequence[Family], fits: Fits, counts: Tensor) -> Slope:
     """Likelihood, gradient and Fisher information at `fits`."""
     models, windows = counts.shape
     logs = torch.cat((fits.log_process, fits.log_noise), 1)
-    problem = linear_problem(families, fits, origin)
+    problem = linear_problem(families, fits)
     used = families[0].rows.used.repeat(models, 1, 1) * counts.reshape(-1, 1, 1)
     here = forward(problem, *variances(fits.log_process, fits.log_noise, windows))
     likelihood = log_likelihood(here, used).reshape(models, windows).sum(-1)
@@ -201,7 +202,6 @@ def fit(families: Sequence[Family], start: Fits, counts: Tensor, iterations: int
     """Fit from `start`; `counts` (C, W) is 1 for the windows that count; `still` allows no process noise."""
     if still:
         start = replace(start, log_process=torch.full_like(start.log_process, QUIET))
-    origin = rough(families[0].rows, start.state.shape[-1])[:, 0]
     low, high = torch.zeros_like(start.theta), torch.zeros_like(start.theta)
     for c, family in enumerate(families):
         low[c, : len(family.table)], high[c, : len(family.table)] = family.low, family.high
@@ -213,7 +213,7 @@ def fit(families: Sequence[Family], start: Fits, counts: Tensor, iterations: int
     here = best = start
     at: Slope | None = None
     for _ in range(iterations):
-        now = slope([families[k] for k in live.tolist()], here.of(live), origin, counts[live])
+        now = slope([families[k] for k in live.tolist()], here.of(live), counts[live])
         tried = replace(here.of(live), likelihood=now.likelihood, information=now.information)
         if at is None:
             best, at = tried, now

@@ -18,6 +18,7 @@ from visadapt.diagnosis.result import Cause, Estimate
 from visadapt.diagnosis.verdict import Judgement
 from visadapt.diagnosis.which import Search
 from visadapt.effects import Dropout, FrozenZone
+from visadapt.intervals import wilson
 
 FEWEST = 2
 """Repeated readings from which on they are a cause."""
@@ -39,11 +40,7 @@ def held_causes(readings: Readings, search: Search, judgement: Judgement) -> lis
     out = []
     lost, rows = sum(int(x.sum()) for x in readings.holds.lost), sum(len(x) - 1 for x in readings.holds.lost)
     if lost >= FEWEST:
-        rate = lost / rows
-        # Wilson (1927): of a share.
-        half = NINETY * math.sqrt(rate * (1 - rate) / rows + NINETY**2 / (4 * rows**2)) / (1 + NINETY**2 / rows)
-        middle = (rate + NINETY**2 / (2 * rows)) / (1 + NINETY**2 / rows)
-        parameters = {"rate": Estimate(rate, Dropout.table[0].unit, (middle - half, middle + half))}
+        parameters = {"rate": Estimate(lost / rows, Dropout.table[0].unit, wilson(lost, rows, NINETY))}
         out.append(Held(Cause(Dropout.name, parameters, 1.0, math.nan), _cost(readings, search, judgement, whole=True)))
     frozen = sum(int(x.sum()) for x in readings.holds.frozen)
     if frozen >= FEWEST and (readings.defect is not None or int(_marks(readings, whole=False).sum()) >= FEWEST):

@@ -19,7 +19,7 @@ from torch import Tensor
 from visadapt.diagnosis import leftover
 from visadapt.diagnosis.data import Rows
 from visadapt.diagnosis.filtering import backward, forward
-from visadapt.diagnosis.fitting import Fits, fit, linear_problem, rough, variances
+from visadapt.diagnosis.fitting import Fits, fit, linear_problem, variances
 from visadapt.diagnosis.models import COARSE, Family
 from visadapt.diagnosis.which import Effects, joined
 from visadapt.systems import System
@@ -98,7 +98,7 @@ def ahead(family: Family, fits: Fits, extra: Tensor | None = None) -> Ahead:
     windows, length = rows.shape
     horizon = max(1, round(AHEAD / rows.period))
     extra = torch.zeros_like(fits.state[0, :, 1:]) if extra is None else extra
-    problem = linear_problem([family], fits, rough(rows, fits.state.shape[-1])[:, 0])
+    problem = linear_problem([family], fits)
     problem = replace(problem.data(), drive=problem.drive[..., :1] + extra[..., None])
     smoothed, _ = backward(problem, forward(problem, *variances(fits.log_process, fits.log_noise, windows)))
     predicted = _run_on(family, fits.theta[0], fits.state[0] + smoothed[..., 0], horizon, extra)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from visadapt.diagnosis.filtering import forward, respond
-from visadapt.diagnosis.fitting import Fits, linear_problem, rough, variances
+from visadapt.diagnosis.fitting import Fits, linear_problem, variances
 from visadapt.diagnosis.models import Family
 
 
@@ -21,7 +21,7 @@ class Innovations:
     def __init__(self, family: Family, fits: Fits) -> None:
         rows = family.rows
         self.rows = rows
-        self._problem = linear_problem([family], fits, rough(rows, fits.state.shape[-1])[:, 0])
+        self._problem = linear_problem([family], fits)
         self._filtered = forward(self._problem, *variances(fits.log_process, fits.log_noise, rows.shape[0]))
         white = self._white(self._filtered.innovation)
         self._known, _ = torch.linalg.qr(white[:, 1:])

@@ -31,6 +31,7 @@ PARAMETER_STEP = 1e-6
 """Finite differences: of a state, and as a share of the range of a parameter. All is in float64."""
 
 TURNS = 4 * math.pi
+"""rad that a phase may go beyond its range on its way to where it fits."""
 
 COARSE, FINE = 4, 10
 """Substeps in a period where an effect changes within one: to see whether it is worth a look, and for figures that are
@@ -47,7 +48,6 @@ class Family:
         abrupt = any(issubclass(e, ActuationEffect | CoulombFriction | FrictionPatch | Gust) for e in effects)
         self.substeps = substeps if abrupt else 1
         self.table = [parameter for effect in effects for parameter in effect.table]
-        # A phase may go round on its way to where it fits.
         turns = torch.tensor([TURNS * (p.name == "phase") for p in self.table], dtype=torch.float64)
         self.low = torch.tensor([p.low for p in self.table], dtype=torch.float64) - turns
         self.high = torch.tensor([p.high for p in self.table], dtype=torch.float64) + turns

@@ -53,14 +53,13 @@ class Judgement:
     """of a black box beside the best"""
     classes: dict[type[Effect], list[Weighed]]
     """for each effect of the best set: the sets with another effect in its place that fit as well"""
+    gained: float
+    """log likelihood of the best beyond the source's"""
 
     @property
     def best(self) -> Fitted:
         """The most probable set."""
         return self.weighed[0].fitted
-
-    gained: float
-    """log likelihood of the best beyond the source's"""
 
     @property
     def unexplained(self) -> bool:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from visadapt.diagnosis.filtering import backward, forward
-from visadapt.diagnosis.fitting import Fits, linear_problem, rough, variances
+from visadapt.diagnosis.fitting import Fits, linear_problem, variances
 from visadapt.diagnosis.leftover import loads_of, variables_of
 from visadapt.diagnosis.models import Family
 from visadapt.diagnosis.result import Profile, Region, Spectrum
@@ -39,12 +39,19 @@ class Disturbance:
     variables: Mapping[str, Tensor]
     """(W, T - 1) by name"""
 
+    @property
+    def power(self) -> Tensor:
+        """(W, T - 1) of force and torque, which weigh alike; 1 in the mean over the rows that are there."""
+        square = self.load.square() * self.there[..., None]
+        mean = square.sum((0, 1)) / self.there.sum()
+        return (square / mean.clamp(min=1e-300)).mean(-1)
+
 
 def disturbance(family: Family, fits: Fits, log_process: Tensor) -> Disturbance:
     """The loads that bring the set of `fits` to follow the recording, with process noise (1, 2) allowed to them."""
     fits = replace(fits, log_process=log_process)
     rows = family.rows
-    problem = linear_problem([family], fits, rough(rows, fits.state.shape[-1])[:, 0])
+    problem = linear_problem([family], fits)
     process, noise = variances(fits.log_process, fits.log_noise, rows.shape[0])
     _, adjoint = backward(problem, forward(problem, process, noise))
     added = -(process[:, None] * adjoint[..., 0])[:, 1:, 1::2]
@@ -66,19 +73,16 @@ def regions(found: Disturbance, seed: int) -> list[Region]:
     all the looking.
     """
     here = found.there.flatten() > 0
-    square = found.load.flatten(0, 1)[here].square()
-    # Force and torque weigh alike.
-    power = (square / square.mean(0).clamp(min=1e-300)).mean(1)
+    power = found.power.flatten()[here]
     generator = torch.Generator().manual_seed(seed)
     shifts = torch.randint(1, len(power), (SHIFTS,), generator=generator)
     shifted = torch.stack([power, *(power.roll(int(k)) for k in shifts)])
     out = []
     for name, values in found.variables.items():
         place = values.flatten()[here]
-        edges = torch.quantile(place, torch.linspace(0, 1, BINS + 1, dtype=place.dtype)).unique()
+        edges, bins = _binned(place)
         if len(edges) < 4 or name == "previous_command":
             continue
-        bins = torch.bucketize(place, edges[1:-1])
         count = torch.zeros(len(edges) - 1, dtype=power.dtype).index_add_(0, bins, torch.ones_like(power))
         total = torch.zeros(len(shifted), len(edges) - 1, dtype=power.dtype).index_add_(1, bins, shifted)
         first, last = torch.triu_indices(len(edges), len(edges), 1)
@@ -100,9 +104,14 @@ def regions(found: Disturbance, seed: int) -> list[Region]:
 def share(found: Disturbance, variable: str, start: float, end: float) -> float:
     """Share of the disturbance's power between two values of a variable."""
     place = found.variables[variable]
-    square = found.load.square() * found.there[..., None]
-    power = (square / square.mean((0, 1)).clamp(min=1e-300)).mean(-1)
+    power = found.power
     return float((power * (place >= start) * (place <= end)).sum() / power.sum().clamp(min=1e-300))
+
+
+def _binned(place: Tensor) -> tuple[Tensor, Tensor]:
+    """Edges of BINS quantiles of values (N,), fewer where values repeat, and the bin of each."""
+    edges = torch.quantile(place, torch.linspace(0, 1, BINS + 1, dtype=place.dtype)).unique()
+    return edges, torch.bucketize(place, edges[1:-1])
 
 
 def _between(values: Tensor, first: Tensor, last: Tensor) -> Tensor:
@@ -114,8 +123,7 @@ def profile(name: str, unit: str, before: Disturbance, after: Disturbance) -> Pr
     """The mean residual force over one variable, with and without the causes."""
     here = before.there.flatten() > 0
     place = before.variables[name].flatten()[here]
-    edges = torch.quantile(place, torch.linspace(0, 1, BINS + 1, dtype=place.dtype)).unique()
-    bins = torch.bucketize(place, edges[1:-1])
+    edges, bins = _binned(place)
     count = len(edges) - 1
     means = []
     for found in (before, after):

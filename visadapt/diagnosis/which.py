@@ -33,8 +33,12 @@ WIDE = 6
 PROMISING = 1.0
 """Log likelihood that a lead must promise to be fitted; an effect costs more."""
 
-QUICK, CAREFUL = 8, 20
-"""Iterations of a fit that only has to show promise, and of one whose figures are reported."""
+QUICK, CAREFUL = (8, COARSE), (20, FINE)
+"""Iterations and substeps of a fit that only has to show promise, and of one whose figures are reported."""
+
+CLOSE = 8.0
+POLISHED = 8
+"""Log posterior odds that a set may be behind the best to be fitted carefully, and how many are at most."""
 
 UNLEARNT = 0.1
 """Share of its prior variance that a parameter may keep."""
@@ -167,10 +171,10 @@ class Search:
         smaller += self.fit(starts, QUICK)
         self.extend(smaller, leads=5)
 
-    def polish(self, within: float = 8.0, most: int = 8) -> None:
+    def polish(self) -> None:
         """Fit those carefully that may be the answer, and the best set's subsets, against which its effects count."""
         best = self.best
-        close = [f for f in self.ranked if f.evidence > best.evidence - within][:most]
+        close = [f for f in self.ranked if f.evidence > best.evidence - CLOSE][:POLISHED]
         smaller = [self.fitted.get(frozenset(best.names) - {name}) for name in best.names]
         close += [f for f in smaller if f is not None and all(f is not other for other in close)]
         self.fit([(f.effects, f.fits) for f in close], CAREFUL)
@@ -196,14 +200,14 @@ class Search:
     def leftover(self, sets: Sequence[Fitted]) -> list[float]:
         """Log likelihood that process noise adds to each set: how much it leaves unexplained."""
         families = [Family(self.system, f.effects, self.rows) for f in sets]
-        quiet = fit(families, joined([f.fits for f in sets]), self._counts(len(sets)), QUICK, still=True)
+        quiet = fit(families, joined([f.fits for f in sets]), self._counts(len(sets)), QUICK[0], still=True)
         return [max(0.0, float(f.fits.likelihood[0] - q)) for f, q in zip(sets, quiet.likelihood, strict=True)]
 
-    def fit(self, starts: Sequence[tuple[Effects, Fits]], iterations: int) -> list[Fitted]:
-        """Fit sets of effects, each from a start; what is better than before is kept."""
+    def fit(self, starts: Sequence[tuple[Effects, Fits]], effort: tuple[int, int]) -> list[Fitted]:
+        """Fit sets of effects, each from a start, QUICK or CAREFUL; what is better than before is kept."""
         if not starts:
             return []
-        substeps = COARSE if iterations == QUICK else FINE
+        iterations, substeps = effort
         families = [Family(self.system, effects, self.rows, substeps) for effects, _ in starts]
         out = fit(families, joined([fits for _, fits in starts]), self._counts(len(starts)), iterations)
         results = []
@@ -220,6 +224,17 @@ class Search:
         return torch.ones(models, self.rows.shape[0], dtype=torch.float64)
 
 
+def widths(effects: Effects) -> Tensor:
+    """(K,) of the ranges in which the parameters of a set are searched."""
+    return torch.tensor([p.high - p.low for e in effects for p in e.table], dtype=torch.float64)
+
+
+def posterior(effects: Effects, fits: Fits) -> tuple[Tensor, Tensor]:
+    """Precision of a set's parameters: (K,) before the data, that of their ranges, and (K, K) with them."""
+    precision = 12 / widths(effects).square()
+    return precision, fits.information[0] + torch.diag(precision)
+
+
 def evidence(effects: Effects, fits: Fits, catalogue: int) -> float:
     """Log posterior odds of a set, by Laplace's approximation; -inf where the data say nothing of an effect.
 
@@ -229,9 +244,8 @@ def evidence(effects: Effects, fits: Fits, catalogue: int) -> float:
     table = [p for e in effects for p in e.table]
     if not table:
         return float(fits.likelihood[0])
-    width = torch.tensor([p.high - p.low for p in table], dtype=torch.float64)
-    precision = 12 / width.square()
-    whole = fits.information[0] + torch.diag(precision)
+    width = widths(effects)
+    precision, whole = posterior(effects, fits)
     sure = torch.linalg.inv(whole).diagonal()
     if _vague(effects, fits, sure, precision):
         return -math.inf

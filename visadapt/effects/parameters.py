@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -13,7 +14,13 @@ from visadapt.systems import CartPole, System
 class ParameterScale(DynamicsEffect):
     """A factor on one parameter of a cart-pole; adds no load."""
 
+    field: ClassVar[str]
+    """the parameter's name in the system"""
     scale: Tensor
+
+    def alter(self, system: System) -> System:
+        cart_pole = expect(system, CartPole, self)
+        return replace(cart_pole, **{self.field: self.scale * getattr(cart_pole, self.field)})
 
 
 class CartMass(ParameterScale):
@@ -23,10 +30,7 @@ class CartMass(ParameterScale):
     equation = "M = scale M_source"
     source = "Barto, Sutton and Anderson (1983), appendix, the cart's mass"
     table = (Parameter("scale", "1", 0.3, 8.0, 1.0),)
-
-    def alter(self, system: System) -> System:
-        cart_pole = expect(system, CartPole, self)
-        return replace(cart_pole, cart_mass=self.scale * cart_pole.cart_mass)
+    field = "cart_mass"
 
 
 class PoleMass(ParameterScale):
@@ -36,10 +40,7 @@ class PoleMass(ParameterScale):
     equation = "m = scale m_source"
     source = "Barto, Sutton and Anderson (1983), appendix, the pole's mass"
     table = (Parameter("scale", "1", 0.05, 5.0, 1.0),)
-
-    def alter(self, system: System) -> System:
-        cart_pole = expect(system, CartPole, self)
-        return replace(cart_pole, pole_mass=self.scale * cart_pole.pole_mass)
+    field = "pole_mass"
 
 
 class PoleLength(ParameterScale):
@@ -49,7 +50,4 @@ class PoleLength(ParameterScale):
     equation = "l = scale l_source"
     source = "Barto, Sutton and Anderson (1983), appendix, the pole's half-length"
     table = (Parameter("scale", "1", 0.4, 2.5, 1.0),)
-
-    def alter(self, system: System) -> System:
-        cart_pole = expect(system, CartPole, self)
-        return replace(cart_pole, pole_half_length=self.scale * cart_pole.pole_half_length)
+    field = "pole_half_length"

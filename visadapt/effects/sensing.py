@@ -111,21 +111,32 @@ class SensorScale(SensingEffect):
         return measured * torch.stack((position, position, angle, angle), 1), memory
 
 
-class AngleOffset(SensingEffect):
+class SensorOffset(SensingEffect):
+    """An offset, () or (B,), on the reading of one state."""
+
+    state: ClassVar[str]
+    """its name in the system"""
+
+    def apply_to(
+        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        out = measured.clone()
+        column = CartPole.index(self.state)
+        out[:, column] = out[:, column] + self.value("offset", measured)
+        return out, memory
+
+
+class AngleOffset(SensorOffset):
     """A pole that reads `offset` when it is upright."""
 
     name = "angle_offset"
     equation = "theta measured = theta + offset"
     source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (additive sensor fault)"
     table = (Parameter("offset", "rad", -0.2, 0.2, 0.0, linear=True),)
-
-    def apply_to(
-        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
-    ) -> tuple[Tensor, Tensor]:
-        return _shifted(measured, CartPole.index("theta"), self.value("offset", measured)), memory
+    state = "theta"
 
 
-class PositionOffset(SensingEffect):
+class PositionOffset(SensorOffset):
     """A track whose zero lies elsewhere.
 
     A cart-pole's physics do not know where the cart is: no data show this offset, unless another effect (a spring,
@@ -136,11 +147,7 @@ class PositionOffset(SensingEffect):
     equation = "x measured = x + offset"
     source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (additive sensor fault)"
     table = (Parameter("offset", "m", -0.5, 0.5, 0.0, linear=True),)
-
-    def apply_to(
-        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
-    ) -> tuple[Tensor, Tensor]:
-        return _shifted(measured, CartPole.index("x"), self.value("offset", measured)), memory
+    state = "x"
 
 
 class Dropout(SensingEffect):
@@ -173,10 +180,3 @@ class Dropout(SensingEffect):
 _POSITIONS = [CartPole.index("x"), CartPole.index("theta")]
 _VELOCITIES = [CartPole.index("x_dot"), CartPole.index("theta_dot")]
 _POLE = [CartPole.index("theta"), CartPole.index("theta_dot")]
-
-
-def _shifted(measured: Tensor, column: int, offset: Tensor) -> Tensor:
-    """`measured` (B, n) with an offset, () or (B,), on one column."""
-    out = measured.clone()
-    out[:, column] = out[:, column] + offset
-    return out

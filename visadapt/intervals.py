@@ -1,0 +1,15 @@
+"""Intervals of what was counted."""
+
+from __future__ import annotations
+
+import math
+
+
+def wilson(hits: int, n: int, z: float = 1.959964) -> tuple[float, float]:
+    """Interval of a share, 95 % unless told, `z` deviations to either side (Wilson 1927); NaN where nothing counts."""
+    if n == 0:
+        return math.nan, math.nan
+    p = hits / n
+    centre, scale = p + z * z / (2 * n), 1 + z * z / n
+    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)
