@@ -2,7 +2,9 @@
 
 from visadapt.systems.base import System, Variable
 from visadapt.systems.cartpole import CartPole
+from visadapt.systems.quadrotor import Quadrotor
+from visadapt.systems.rigid_body import RigidBody
 
-SYSTEMS: dict[str, type[System]] = {system.name: system for system in (CartPole,)}
+SYSTEMS: dict[str, type[System]] = {system.name: system for system in (CartPole, Quadrotor)}
 
-__all__ = ["SYSTEMS", "CartPole", "System", "Variable"]
+__all__ = ["SYSTEMS", "CartPole", "Quadrotor", "RigidBody", "System", "Variable"]

@@ -1,0 +1,149 @@
+"""A rigid body that flies: what the quadrotor and the fixed wing share.
+
+Frames follow ROS's REP 103: the world's z axis points up; the body's x axis points forward, y left, z up. Attitude
+is a quaternion (w, x, y, z) that turns body into world axes, so no attitude is singular. Only its direction counts:
+physics normalises it wherever it is used.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from visadapt.systems.base import System, Variable
+
+POSITION, VELOCITY, ATTITUDE, RATES = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13)
+"""Columns of the state."""
+
+
+def _bilinear(entries: dict[tuple[int, int], dict[int, float]], shape: tuple[int, int, int]) -> Tensor:
+    """A matrix that gives the third index from the products of the first two, flattened: few large operations
+    instead of many small ones, since a derivative is taken thousands of times a second."""
+    out = torch.zeros(shape)
+    for (i, j), results in entries.items():
+        for k, value in results.items():
+            out[i, j, k] = value
+    return out.flatten(0, 1)
+
+
+_ROTATION = _bilinear(
+    {
+        # R = (w^2 - |v|^2) I + 2 v v^T + 2 w [v]x for q = (w, v); results count the entries of R by rows.
+        (0, 0): {0: 1, 4: 1, 8: 1},
+        (1, 1): {0: 1, 4: -1, 8: -1},
+        (2, 2): {0: -1, 4: 1, 8: -1},
+        (3, 3): {0: -1, 4: -1, 8: 1},
+        (1, 2): {1: 2, 3: 2},
+        (1, 3): {2: 2, 6: 2},
+        (2, 3): {5: 2, 7: 2},
+        (0, 3): {1: -2, 3: 2},
+        (0, 2): {2: 2, 6: -2},
+        (0, 1): {5: -2, 7: 2},
+    },
+    (4, 4, 9),
+)
+_TURNING = _bilinear(
+    {
+        # q' = q (0, rates) / 2, the quaternion product; results count w, x, y, z.
+        (0, 0): {1: 0.5},
+        (0, 1): {2: 0.5},
+        (0, 2): {3: 0.5},
+        (1, 0): {0: -0.5},
+        (1, 1): {3: 0.5},
+        (1, 2): {2: -0.5},
+        (2, 0): {3: -0.5},
+        (2, 1): {0: -0.5},
+        (2, 2): {1: 0.5},
+        (3, 0): {2: 0.5},
+        (3, 1): {1: -0.5},
+        (3, 2): {0: -0.5},
+    },
+    (4, 3, 4),
+)
+
+
+class RigidBody(System):
+    """Newton's and Euler's equations; a subclass says which force and torque act on the body.
+
+    Stevens, Lewis and Johnson (2016), Aircraft Control and Simulation, section 1.7 (flat earth).
+    """
+
+    states: ClassVar[tuple[Variable, ...]] = (
+        *(Variable(name, "m", -100.0, 100.0) for name in ("x", "y", "z")),
+        *(Variable(name, "m/s", -30.0, 30.0) for name in ("x_dot", "y_dot", "z_dot")),
+        *(Variable(name, "1", -1.0, 1.0) for name in ("q_w", "q_x", "q_y", "q_z")),
+        *(Variable(name, "rad/s", -20.0, 20.0) for name in ("omega_x", "omega_y", "omega_z")),
+    )
+    loads: ClassVar[tuple[Variable, ...]] = (
+        *(Variable(name, "N", -100.0, 100.0) for name in ("force_x", "force_y", "force_z")),
+        *(Variable(name, "N m", -10.0, 10.0) for name in ("torque_x", "torque_y", "torque_z")),
+    )
+    """A force in world axes and a torque in body axes."""
+
+    mass: float | Tensor
+    """kg"""
+    gravity: float | Tensor
+    """m/s2"""
+
+    @abstractmethod
+    def wrench(self, velocity: Tensor, rates: Tensor, command: Tensor) -> tuple[Tensor, Tensor]:
+        """Force (B, 3) in N and torque (B, 3) in N m on the body, in its axes, weight left out.
+
+        `velocity` (B, 3) and `rates` (B, 3) are in body axes, in m/s and rad/s.
+        """
+
+    @abstractmethod
+    def inertia(self, like: Tensor) -> Tensor:
+        """Moments of inertia in body axes, kg m2: (3, 3), or (B, 3, 3)."""
+
+    def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:
+        velocity, attitude, rates = state[:, VELOCITY], state[:, ATTITUDE], state[:, RATES]
+        turned = rotation(attitude)
+        force, torque = self.wrench(times(turned.mT, velocity), rates, command)
+        inertia = self.inertia(state)
+        whole = torque + load[:, 3:] - torch.linalg.cross(rates, times(inertia, rates))
+        weight = torch.as_tensor(self.gravity).to(state)[..., None] * state.new_tensor((0.0, 0.0, 1.0))
+        acceleration = (times(turned, force) + load[:, :3]) / columns(self.mass) - weight
+        return torch.cat((velocity, acceleration, turning(attitude, rates), times(inertia.inverse(), whole)), 1)
+
+
+def columns(value: float | Tensor) -> float | Tensor:
+    """A parameter, () or (B,), as a factor on what is (B, n)."""
+    return value[:, None] if isinstance(value, Tensor) and value.dim() else value
+
+
+def times(matrix: Tensor, vector: Tensor) -> Tensor:
+    """A matrix (3, 3), or one for each row (B, 3, 3), times vectors (B, 3)."""
+    return (matrix @ vector[..., None])[..., 0] if matrix.dim() > 2 else vector @ matrix.mT
+
+
+def rotation(attitude: Tensor) -> Tensor:
+    """Matrices (B, 3, 3) that turn vectors from body to world axes, of attitudes (B, 4)."""
+    products = (attitude[:, :, None] * attitude[:, None]).flatten(1)
+    unit = products / attitude.square().sum(-1, keepdim=True)
+    return (unit @ _ROTATION.to(attitude)).unflatten(-1, (3, 3))
+
+
+def turning(attitude: Tensor, rates: Tensor) -> Tensor:
+    """Time derivative (B, 4) of attitudes (B, 4) under body rates (B, 3)."""
+    return (attitude[:, :, None] * rates[:, None]).flatten(1) @ _TURNING.to(attitude)
+
+
+def from_angles(angles: Tensor) -> Tensor:
+    """Attitudes (B, 4) of roll, pitch and yaw (B, 3) in rad, turned about z, then y, then x.
+
+    With z up, a positive pitch points the nose down.
+    """
+    (cr, cp, cy), (sr, sp, sy) = (angles / 2).cos().unbind(-1), (angles / 2).sin().unbind(-1)
+    return torch.stack(
+        (
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ),
+        -1,
+    )
