@@ -11,6 +11,7 @@ from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.joint import AdaptSettings, adapt
 from visadapt.learning.ledger import BudgetExceeded, Ledger
 from visadapt.learning.policy import TuneSettings
+from visadapt.learning.tasks import Balance
 from visadapt.networks import StateResidualNetwork
 from visadapt.policies import StatePolicy
 from visadapt.recordings import read_recording
@@ -20,7 +21,9 @@ from visadapt.targets import SyntheticTarget, TargetError
 from visadapt.targets.synthetic import constant_force
 from visadapt.world import World
 
-TUNE = TuneSettings(PAPER_CARTPOLE, iterations=105, batch=4, learning_rate=3e-3, observation_noise=0.0, recorded=0.5)
+TUNE = TuneSettings(
+    Balance(PAPER_CARTPOLE), iterations=105, batch=4, learning_rate=3e-3, observation_noise=0.0, recorded=0.5
+)
 GROUND = GroundSettings(steps=60, every=20)
 SMALL = AdaptSettings(TUNE, GROUND, budget=50, round_samples=30, observations="state", longest_episode=12, seed=1)
 QUICK = dataclasses.replace(SMALL, tune=dataclasses.replace(TUNE, iterations=3))

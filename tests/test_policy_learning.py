@@ -14,6 +14,7 @@ from visadapt.evaluation import evaluate
 from visadapt.history import History
 from visadapt.learning.cost import PAPER_CARTPOLE, Cost
 from visadapt.learning.policy import DivergedError, TuneSettings, imagine, oppose, tune
+from visadapt.learning.tasks import Balance
 from visadapt.learning.windows import Windows
 from visadapt.networks import StateResidualNetwork
 from visadapt.policies import ImagePolicy, StatePolicy
@@ -141,9 +142,8 @@ class TestOnStates:
         policy = StatePolicy(4)
         target = SyntheticTarget()
         before, _ = evaluate(target, policy, see_states, 0, 20, 100)
-        settings = TuneSettings(
-            PAPER_CARTPOLE, 200, 16, learning_rate=1e-2, observation_noise=0.0, diverged=ANYWHERE, longest=100
-        )
+        task = Balance(PAPER_CARTPOLE, diverged=ANYWHERE)
+        settings = TuneSettings(task, 200, 16, learning_rate=1e-2, observation_noise=0.0, longest=100)
         world = World(CartPole(), integrator="euler")
         losses = tune(policy, world, identity, settings, torch.Generator().manual_seed(0))
         after, _ = evaluate(target, policy, see_states, 0, 20, 100)
@@ -163,12 +163,9 @@ class TestOnStates:
             torch.manual_seed(0)
             wide = (9.0, 9.0, 9.0, 9.0)
             settings = TuneSettings(
-                weighs_angle,
+                Balance(weighs_angle, start_spread=(0.0, 0.0, 0.0, 0.0), diverged=wide, first_divergence=1.0),
                 iterations=1,
                 batch=4,
-                start_spread=(0.0, 0.0, 0.0, 0.0),
-                diverged=wide,
-                first_divergence=1.0,
                 recorded=share,
                 observation_noise=0.0,
             )
@@ -178,7 +175,7 @@ class TestOnStates:
         assert costs[1] > 3 * costs[0]
 
     def test_a_loss_that_is_not_a_number_is_an_error_that_says_when(self):
-        settings = TuneSettings(PAPER_CARTPOLE, 5, 4)
+        settings = TuneSettings(Balance(PAPER_CARTPOLE), 5, 4)
         policy = StatePolicy(4)
         world = World(CartPole(), [ConstantForce(force=float("nan"))])
         before = {key: value.clone() for key, value in policy.state_dict().items()}
@@ -230,7 +227,7 @@ def learn(checkpoint, stop=None, iterations=120):
     torch.manual_seed(0)
     policy = StatePolicy(4, with_history=True)
     world = World(CartPole(), [ActuatorDelay(delay=0.05)], integrator="euler")
-    settings = TuneSettings(PAPER_CARTPOLE, iterations, 8, longest=30)
+    settings = TuneSettings(Balance(PAPER_CARTPOLE), iterations, 8, longest=30)
     generator = torch.Generator().manual_seed(1)
     losses = tune(policy, world, identity, settings, generator, progress=progress, checkpoint=checkpoint)
     return policy.state_dict(), losses

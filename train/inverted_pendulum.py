@@ -39,6 +39,7 @@ from visadapt.learning.cost import Cost
 from visadapt.learning.grounding import gap
 from visadapt.learning.perception import Paths, PerceptionSettings
 from visadapt.learning.policy import TuneSettings
+from visadapt.learning.tasks import Balance
 from visadapt.learning.windows import Windows
 from visadapt.panels import Panel
 from visadapt.pixels import PixelSettings, PixelTask
@@ -63,18 +64,12 @@ COST = Cost(state=(50.0, 3.0, 100.0, 0.3))
 that swings at 1 rad/s moves the cart by 0.12 m/s."""
 SEE = PerceptionSettings(iterations=2000, cart=Paths(0.8, 0.3, 3.0), pole=Paths(0.15, 0.4, 6.0))
 INSIDE = (REACH - 0.05, 1.0, ANGLE_LIMIT - 0.01, 1.5)
-LEARN = TuneSettings(
-    COST, 1500, start_spread=(0.4, 0.2, 0.12, 0.2), kick=(0.0, 0.1, 0.0, 0.2), diverged=INSIDE, first_divergence=0.3
-)
+LEARN = TuneSettings(Balance(COST, (0.4, 0.2, 0.12, 0.2), (0.0, 0.1, 0.0, 0.2), INSIDE, first_divergence=0.3), 1500)
 ADAPT = TuneSettings(
-    COST,
+    Balance(COST, (0.3, 0.1, 0.08, 0.1), (0.0,) * 4, INSIDE, first_divergence=0.4),
     iterations=50,
     batch=32,
     learning_rate=2e-4,
-    start_spread=(0.3, 0.1, 0.08, 0.1),
-    kick=(0.0,) * 4,
-    diverged=INSIDE,
-    first_divergence=0.4,
     longest=25,
     recorded=0.8,
 )

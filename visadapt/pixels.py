@@ -18,6 +18,7 @@ from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.joint import Adapted, AdaptSettings, adapt
 from visadapt.learning.perception import PerceptionSettings, learn_to_see, scale
 from visadapt.learning.policy import TuneSettings, tune
+from visadapt.learning.tasks import Balance
 from visadapt.learning.tracking import Tracker
 from visadapt.networks import FrameEncoder, ImageResidualNetwork
 from visadapt.policies import ImagePolicy
@@ -35,19 +36,21 @@ class PixelSettings:
     """How a task from pixels is trained; defaults are the CartPole's."""
 
     perception: PerceptionSettings = field(default_factory=PerceptionSettings)
-    source: TuneSettings = field(default_factory=lambda: TuneSettings(CENTRED_CARTPOLE, iterations=2500))
+    source: TuneSettings = field(default_factory=lambda: TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500))
     """the policy in the source"""
     adapted: TuneSettings = field(
         default_factory=lambda: TuneSettings(
-            CENTRED_CARTPOLE,
+            Balance(
+                CENTRED_CARTPOLE,
+                start_spread=(0.3, 0.1, 0.1, 0.1),
+                # A kick would look like a force to the residual, which would go on pushing.
+                kick=(0.0, 0.0, 0.0, 0.0),
+                diverged=(1.2, 2.0, 0.25, 3.0),
+                first_divergence=0.4,
+            ),
             iterations=50,
             batch=32,
             learning_rate=2e-4,
-            start_spread=(0.3, 0.1, 0.1, 0.1),
-            # A kick would look like a force to the residual, which would go on pushing.
-            kick=(0.0, 0.0, 0.0, 0.0),
-            diverged=(1.2, 2.0, 0.25, 3.0),
-            first_divergence=0.4,
             longest=25,
             recorded=0.8,
         )

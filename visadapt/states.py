@@ -15,6 +15,7 @@ from visadapt.learning.cost import PAPER_CARTPOLE
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.joint import Adapted, AdaptSettings, adapt
 from visadapt.learning.policy import TuneSettings, tune
+from visadapt.learning.tasks import Balance
 from visadapt.networks import StateResidualNetwork
 from visadapt.policies import StatePolicy
 from visadapt.rollout import see_states
@@ -33,18 +34,20 @@ class StateSettings:
     """whether policy and residual see 5 states and actions, or the last alone"""
     source: TuneSettings = field(
         default_factory=lambda: TuneSettings(
-            PAPER_CARTPOLE, iterations=3000, learning_rate=3e-3, observation_noise=0.0, diverged=ANYWHERE
+            Balance(PAPER_CARTPOLE, diverged=ANYWHERE), iterations=3000, learning_rate=3e-3, observation_noise=0.0
         )
     )
     adapted: TuneSettings = field(
         default_factory=lambda: TuneSettings(
-            PAPER_CARTPOLE,
+            Balance(
+                PAPER_CARTPOLE,
+                start_spread=(0.3, 0.2, 0.1, 0.2),
+                kick=(0.0, 0.0, 0.0, 0.0),
+                diverged=(1e9, 2.0, 0.25, 3.0),
+                first_divergence=0.4,
+            ),
             iterations=400,
             learning_rate=2e-3,
-            start_spread=(0.3, 0.2, 0.1, 0.2),
-            kick=(0.0, 0.0, 0.0, 0.0),
-            diverged=(1e9, 2.0, 0.25, 3.0),
-            first_divergence=0.4,
             longest=25,
             recorded=0.8,
             observation_noise=0.0,

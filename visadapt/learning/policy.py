@@ -17,8 +17,8 @@ from torch import Tensor, nn
 
 from visadapt.console import Progress
 from visadapt.history import History
-from visadapt.learning.cost import Cost
 from visadapt.learning.resume import EVERY, Training
+from visadapt.learning.tasks import Task
 from visadapt.learning.windows import Observe, Windows
 from visadapt.policies import HORIZON, Policy
 from visadapt.world import World, WorldState
@@ -32,18 +32,10 @@ class DivergedError(RuntimeError):
 class TuneSettings:
     """How a policy is trained in a world."""
 
-    cost: Cost
+    task: Task
     iterations: int
     batch: int = 64
     learning_rate: float = 1e-3
-    start_spread: tuple[float, ...] = (0.5, 0.3, 0.15, 0.3)
-    """half-widths of the uniform distribution of states that streams start from"""
-    kick: tuple[float, ...] = (0.0, 0.3, 0.0, 0.5)
-    """standard deviation of a random change of the state, met once in 20 steps: it widens what the policy meets"""
-    diverged: tuple[float, ...] = (1.5, 4.0, 0.5, 10.0)
-    """delta_div at the end of the curriculum: a stream starts anew where a state is beyond it"""
-    first_divergence: float = 0.1
-    """share of `diverged` that the curriculum begins with; it reaches 1 at half of the iterations"""
     longest: int = 150
     """steps after which a stream starts anew"""
     recorded: float = 0.0
@@ -60,33 +52,36 @@ class Streams:
         self.observe = observe
         self.windows = windows
         self.settings = settings
+        self.task = settings.task
         self.at: WorldState
         self.history: History
+        self.place: Tensor
         self.age: Tensor
+
+    def show(self, state: Tensor) -> Tensor:
+        """What the policy is shown of states (B, n_state) where the streams are now."""
+        return self.task.show(self.observe(state), self.place)
 
     @torch.no_grad()
     def start(self, generator: torch.Generator) -> None:
         """Start all streams, at random ages, so that they do not end together."""
-        self.at, self.history = self._fresh(self._limit(0.0), generator)
+        self.at, self.history, self.place = self._fresh(0.0, generator)
         self.age = torch.randint(self.settings.longest, (self.settings.batch,), generator=generator)
 
     @torch.no_grad()
     def advance(self, at: WorldState, action: Tensor, progress: float, generator: torch.Generator) -> None:
         """Take the step to `at` under `action`; restart what strayed. `progress` in [0, 1] drives the curriculum."""
-        settings = self.settings
-        state = at.state
-        kicked = torch.rand(len(state), 1, generator=generator) < 0.05
-        kick = torch.tensor(settings.kick) * torch.randn(state.shape, generator=generator)
-        state = state + (kicked * kick).to(state)
+        state = self.task.disturb(at.state, generator)
         self.at = WorldState(at.time, state, at.memory).detach()
-        self.history = self.history.acting(action).observing(self.observe(state)).detach()
+        self.place = self.task.onward(self.place)
+        self.history = self.history.acting(action).observing(self.show(state)).detach()
         self.age += 1
-        limit = self._limit(progress)
-        keep = (self.age < settings.longest) & (state.abs() <= limit).all(1)
+        keep = (self.age < self.settings.longest) & ~self.task.astray(state, self.place, progress)
         if not bool(keep.all()):
-            at, history = self._fresh(limit, generator)
+            at, history, place = self._fresh(progress, generator)
             self.at = self.at.where(keep, at)
             self.history = self.history.where(keep, history)
+            self.place = torch.where(keep.reshape(-1, *[1] * (place.dim() - 1)), self.place, place)
             self.age = torch.where(keep, self.age, 0)
 
     def kept(self) -> dict[str, Any]:
@@ -97,6 +92,7 @@ class Streams:
             "memory": list(self.at.memory),
             "observations": self.history.observations,
             "actions": self.history.actions,
+            "place": self.place,
             "age": self.age,
         }
 
@@ -104,27 +100,23 @@ class Streams:
         """Go on from what `kept` gave."""
         self.at = WorldState(kept["time"], kept["state"], tuple(kept["memory"]))
         self.history = History(kept["observations"], kept["actions"])
+        self.place = kept["place"]
         self.age = kept["age"]
 
-    def _limit(self, progress: float) -> Tensor:
-        """delta_div now, (n_state,)."""
-        first = self.settings.first_divergence
-        return (first + (1 - first) * min(1.0, 2 * progress)) * torch.tensor(self.settings.diverged)
-
-    def _fresh(self, limit: Tensor, generator: torch.Generator) -> tuple[WorldState, History]:
+    def _fresh(self, progress: float, generator: torch.Generator) -> tuple[WorldState, History, Tensor]:
         settings = self.settings
-        spread = torch.minimum(torch.tensor(settings.start_spread), limit)
-        state = spread * (2 * torch.rand(settings.batch, len(spread), generator=generator) - 1)
-        history = History.start(self.observe(state), len(self.world.system.actions))
-        # A fall on record is beyond delta_div; starting from it would drown what can be learnt.
+        state, place = self.task.begin(settings.batch, progress, generator)
+        history = History.start(self.task.show(self.observe(state), place), len(self.world.system.actions))
         windows = self.windows
-        near = () if windows is None else (windows.state.abs() <= limit).all(1).nonzero()[:, 0]
-        if windows is not None and len(near):
-            from_record = torch.rand(settings.batch, generator=generator) < settings.recorded
-            rows = near[torch.randint(len(near), (settings.batch,), generator=generator)]
-            state = torch.where(from_record[:, None], windows.state[rows], state)
-            history = windows.history(rows).where(from_record, history)
-        return self.world.start(state), history
+        if windows is not None and settings.recorded > 0:
+            # A fall on record is beyond delta_div; starting from it would drown what can be learnt.
+            near = (~self.task.astray(windows.state, place, progress)).nonzero()[:, 0]
+            if len(near):
+                from_record = torch.rand(settings.batch, generator=generator) < settings.recorded
+                rows = near[torch.randint(len(near), (settings.batch,), generator=generator)]
+                state = torch.where(from_record[:, None], windows.state[rows], state)
+                history = windows.history(rows).where(from_record, history)
+        return self.world.start(state), history, place
 
 
 def oppose(policy: Policy, source: World, scale: Tensor) -> None:
@@ -177,8 +169,8 @@ def tune(
         noise = settings.observation_noise * torch.randn(streams.history.observations.shape, generator=generator)
         seen = History(streams.history.observations + noise.to(streams.history.observations), streams.history.actions)
         plan = policy(seen)
-        states, first = imagine(world, observe, streams.at, streams.history, plan)
-        loss = settings.cost(states, plan, streams.at.state).mean()
+        states, first = imagine(world, streams.show, streams.at, streams.history, plan)
+        loss = settings.task.cost(states, plan, streams.at.state, streams.place).mean()
         if not bool(loss.isfinite()):
             raise DivergedError(f"the policy's loss is {float(loss.detach())} at iteration {iteration}")
         optimiser.zero_grad()
