@@ -140,5 +140,6 @@ def test_every_system_says_what_its_variables_are(system):
         assert variable.unit
         assert variable.low < variable.high
     assert [system.index(variable.name) for variable in system.states] == list(range(len(system.states)))
-    with pytest.raises(KeyError, match="no state 'speed'; its states are x, x_dot"):
+    first, second = (variable.name for variable in system.states[:2])
+    with pytest.raises(KeyError, match=f"{system.name} has no state 'speed'; its states are {first}, {second}"):
         system.index("speed")

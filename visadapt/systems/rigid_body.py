@@ -105,7 +105,7 @@ class RigidBody(System):
         force, torque = self.wrench(times(turned.mT, velocity), rates, command)
         inertia = self.inertia(state)
         whole = torque + load[:, 3:] - torch.linalg.cross(rates, times(inertia, rates))
-        weight = torch.as_tensor(self.gravity).to(state)[..., None] * state.new_tensor((0.0, 0.0, 1.0))
+        weight = columns(self.gravity) * state.new_tensor((0.0, 0.0, 1.0))
         acceleration = (times(turned, force) + load[:, :3]) / columns(self.mass) - weight
         return torch.cat((velocity, acceleration, turning(attitude, rates), times(inertia.inverse(), whole)), 1)
 

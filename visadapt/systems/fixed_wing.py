@@ -1,0 +1,260 @@
+"""A small aeroplane with a propeller in front, an elevator, ailerons and a rudder.
+
+Equations: Beard and McLain (2012), Small Unmanned Aircraft, chapters 3 and 4. Lift, drag, side force and moments are
+linear (section 4.2); rates count as c q / (2 V), b p / (2 V) and b r / (2 V); moments are force times chord (pitch) or
+span (roll, yaw). Coefficients have the book's signs and axes, x forward, y right, z down; state, force and torque are
+in the body's, y left, z up.
+
+Two things differ from the book. Thrust is a force along the body's x axis that follows the command at once, as in the
+paper. And coefficients, which are those of attached flow, are held where angle of attack or sideslip leave
+`linear_range`: past the stall lift stays near its maximum instead of growing without bound, and drag stays positive.
+Separated flow itself is not modelled (the book's flat plate, equation 4.9, needs numbers that the source lacks), so
+that drag is too small in a deep stall or a spin.
+
+Numbers: the perching aircraft of Waldock, Greatwood, Salama and Richardson (2018), "Learning to perform a perched
+landing on the ground using deep reinforcement learning", J. Intell. Robot. Syst. 92, as the paper's authors list them
+(github.com/lis-epfl/apg_trajectory_tracking, neural_control/dynamics/config_fixed_wing.json); Waldock's own table was
+not at hand to compare. All inertias, sizes and coefficients are from that file, none scaled or guessed; the 10 degrees
+of `linear_range` are the bound in the code beside it, ranges of commands are the paper's. Left out: a thrust line
+tilted down by 0.165 rad.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from visadapt.systems.base import Variable
+from visadapt.systems.rigid_body import RigidBody, from_angles, times
+
+_EFFECTS = ("drag", "side", "lift", "roll", "pitch", "yaw")
+_CAUSES = ("zero", "sideslip", "attack", "elevator", "aileron", "rudder", "roll_rate", "pitch_rate", "yaw_rate")
+_DEGREE = math.pi / 180
+_FLOOR = 1e-6
+"""m/s; slower than this, air has no direction"""
+
+
+@dataclass(frozen=True)
+class FixedWing(RigidBody):
+    """Defaults are Waldock's aircraft and the paper's ranges of commands (0.05 s between commands; starts at 11.5 m/s).
+
+    A thrust command of -1 is none and 1 is `max_thrust`. A positive elevator (trailing edge down) pushes the nose
+    down, a positive aileron the left wing down, a positive rudder (trailing edge left) the nose to the left.
+    Coefficients are dimensionless, or 1/rad. Those called `<force or moment>_<cause>` say how much of the first the
+    second brings; `zero` is what is there without a cause, and 0 sideways for an aircraft that is its own mirror image.
+
+    Roll rate decays at 1.95 V a second, which RK4 bears in steps of 0.05 s up to 28 m/s: a dive needs shorter ones.
+    """
+
+    mass: float | Tensor = 1.01
+    """kg"""
+    inertia_x: float | Tensor = 0.04766
+    """kg m2, J_x, roll"""
+    inertia_y: float | Tensor = 0.05005
+    """kg m2, J_y, pitch"""
+    inertia_z: float | Tensor = 0.09558
+    """kg m2, J_z, yaw"""
+    inertia_xz: float | Tensor = -0.00105
+    """kg m2, J_xz, the integral of x z dm with z down, as in the book"""
+    wing_area: float | Tensor = 0.276
+    """m2, S"""
+    span: float | Tensor = 1.54
+    """m, b"""
+    chord: float | Tensor = 0.185
+    """m, c, mean"""
+    air_density: float | Tensor = 1.225
+    """kg/m3"""
+    gravity: float | Tensor = 9.81
+    """m/s2"""
+    max_thrust: float | Tensor = 7.0
+    """N at a command of 1"""
+    max_elevator: float | Tensor = 20 * _DEGREE
+    """rad at a command of 1"""
+    max_aileron: float | Tensor = 2.5 * _DEGREE
+    """rad at a command of 1"""
+    max_rudder: float | Tensor = 20 * _DEGREE
+    """rad at a command of 1"""
+    linear_range: float | Tensor = 10 * _DEGREE
+    """rad; angle of attack and sideslip beyond which coefficients stay as they are there"""
+
+    lift_zero: float | Tensor = 0.39
+    """C_L0"""
+    lift_attack: float | Tensor = 4.5321
+    """C_Lalpha, the lift slope"""
+    lift_pitch_rate: float | Tensor = 0.318
+    """C_Lq"""
+    lift_elevator: float | Tensor = 0.527
+    """C_Ldelta_e"""
+    drag_zero: float | Tensor = 0.0765
+    """C_D0"""
+    drag_attack: float | Tensor = 0.3346
+    """C_Dalpha"""
+    drag_pitch_rate: float | Tensor = 0.354
+    """C_Dq"""
+    drag_elevator: float | Tensor = 0.004
+    """C_Ddelta_e"""
+    side_zero: float | Tensor = 0.0
+    """C_Y0"""
+    side_sideslip: float | Tensor = -0.033
+    """C_Ybeta"""
+    side_roll_rate: float | Tensor = -0.1
+    """C_Yp"""
+    side_yaw_rate: float | Tensor = 0.039
+    """C_Yr"""
+    side_aileron: float | Tensor = 0.0
+    """C_Ydelta_a"""
+    side_rudder: float | Tensor = 0.225
+    """C_Ydelta_r"""
+    roll_zero: float | Tensor = 0.0
+    """C_l0"""
+    roll_sideslip: float | Tensor = -0.081
+    """C_lbeta"""
+    roll_roll_rate: float | Tensor = -0.529
+    """C_lp"""
+    roll_yaw_rate: float | Tensor = 0.159
+    """C_lr"""
+    roll_aileron: float | Tensor = -0.453
+    """C_ldelta_a"""
+    roll_rudder: float | Tensor = 0.005
+    """C_ldelta_r"""
+    pitch_zero: float | Tensor = 0.02
+    """C_m0"""
+    pitch_attack: float | Tensor = -1.4037
+    """C_malpha"""
+    pitch_pitch_rate: float | Tensor = -0.1324
+    """C_mq"""
+    pitch_elevator: float | Tensor = -0.4236
+    """C_mdelta_e"""
+    yaw_zero: float | Tensor = 0.0
+    """C_n0"""
+    yaw_sideslip: float | Tensor = 0.189
+    """C_nbeta"""
+    yaw_roll_rate: float | Tensor = -0.083
+    """C_np"""
+    yaw_yaw_rate: float | Tensor = -0.948
+    """C_nr"""
+    yaw_aileron: float | Tensor = -0.041
+    """C_ndelta_a"""
+    yaw_rudder: float | Tensor = -0.077
+    """C_ndelta_r"""
+
+    name: ClassVar[str] = "fixed_wing"
+    actions: ClassVar[tuple[Variable, ...]] = tuple(
+        Variable(name, "1", -1.0, 1.0) for name in ("thrust", "elevator", "aileron", "rudder")
+    )
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name == "inertia_xz" or field.name.startswith(_EFFECTS):
+                if not _holds(abs(value) < math.inf):
+                    raise ValueError(f"fixed_wing: {field.name} must be finite, got {value!r}")
+            elif not _holds(value > 0):
+                raise ValueError(f"fixed_wing: {field.name} must be positive, got {value!r}")
+        if not _holds(self.inertia_xz**2 < self.inertia_x * self.inertia_z):
+            raise ValueError(
+                "fixed_wing: inertia_xz must be smaller than the geometric mean of inertia_x and inertia_z, "
+                f"got {self.inertia_xz!r}"
+            )
+
+    def inertia(self, like: Tensor) -> Tensor:
+        # With z up, the product of inertia has the other sign than in the book.
+        x, y, z, xz = self.inertia_x, self.inertia_y, self.inertia_z, self.inertia_xz
+        return _gather((x, 0.0, xz, 0.0, y, 0.0, xz, 0.0, z), like).unflatten(-1, (3, 3))
+
+    def wrench(self, velocity: Tensor, rates: Tensor, command: Tensor) -> tuple[Tensor, Tensor]:
+        """Beard and McLain's section 4.2, and thrust; force and torque (B, 3) each."""
+        table, limit = self._table(velocity)
+        plane, speed = velocity[:, ::2], velocity.norm(dim=-1, keepdim=True)
+        in_plane = plane.norm(dim=-1, keepdim=True).clamp_min(_FLOOR)
+        ahead = torch.where(in_plane > _FLOOR, velocity[:, :1], 1.0)  # atan2 has no gradient at (0, 0)
+        # Minus sideslip and minus angle of attack, since y is left and z is up: the table has the sign.
+        angles = torch.atan2(velocity[:, 1:], torch.cat((in_plane, ahead), -1)).clamp(-limit, limit)
+        # V^2 times a coefficient is V times this: rates, which count as c q / (2 V), then need no division by V.
+        causes = torch.cat((speed, speed * torch.cat((angles, command[:, 1:]), -1), rates), -1)
+        effects = speed * times(table, causes)
+        drag, side, lift = effects[:, :3].unbind(-1)
+        forward, upward = (plane / in_plane).unbind(-1)
+        thrust = self.max_thrust * (command[:, 0] + 1) / 2
+        force = torch.stack((thrust - drag * forward - lift * upward, side, lift * forward - drag * upward), -1)
+        return force, effects[:, 3:]
+
+    def trim(self, speed: Tensor) -> tuple[Tensor, Tensor]:
+        """States (B, 13) and commands (B, 4) of steady level flight along +x at airspeeds (B,) in m/s.
+
+        Solves acceleration = 0 and angular acceleration = 0 for roll, pitch, and the four commands by Newton's method,
+        in float64. Not differentiable.
+
+        Raises:
+            ValueError: there is no such flight, because it stalls or needs a command beyond [-1, 1].
+        """
+        speeds = speed.detach().double()
+        system = self.to(speeds)
+        still = torch.zeros(len(speeds), 12, dtype=torch.float64, device=speeds.device)
+
+        def flight(unknown: Tensor) -> tuple[Tensor, Tensor]:
+            attitude = from_angles(torch.cat((unknown[:, :2], still[:, :1]), 1))
+            return torch.cat((still[:, :3], speeds[:, None], still[:, :2], attitude, still[:, :3]), 1), unknown[:, 2:]
+
+        def imbalance(unknown: Tensor) -> Tensor:
+            change = system.derivative(*flight(unknown), still[:, :6])
+            return torch.cat((change[:, 3:6], change[:, 10:]), 1)
+
+        unknown = still[:, :6].clone()
+        for _ in range(20):
+            left = imbalance(unknown).detach()
+            if left.abs().max() < 1e-10:
+                break
+            # Rows do not touch each other, so the gradient of their sum holds the gradient of each.
+            jacobian = torch.autograd.functional.jacobian(lambda at: imbalance(at).sum(0), unknown)
+            unknown = unknown - torch.linalg.solve_ex(jacobian.movedim(1, 0), left)[0]
+        state, command = (part.detach() for part in flight(unknown))
+        found = (imbalance(unknown).detach().abs() < 1e-8).all(1) & (command.abs() <= 1).all(1)
+        if not bool(found.all()):
+            raise ValueError(f"fixed_wing: no level flight within the commands at {float(speeds[~found][0]):g} m/s")
+        return state.to(speed), command.to(speed)
+
+    def _table(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """What one unit of each cause adds to each effect, in the body's axes, and the limit of the angles.
+
+        (6, 9) and (1,), or (B, 6, 9) and (B, 1) where a parameter is (B,). Entries become N and N m when they are
+        multiplied by the airspeed and by the cause, which is the airspeed times an angle, or a rate.
+        """
+        unit = self.air_density * self.wing_area / 2
+        effects = (unit, -unit, unit, unit * self.span, -unit * self.chord, -unit * self.span)
+        surfaces = (self.max_elevator, self.max_aileron, self.max_rudder)
+        causes = (1.0, -1.0, -1.0, *surfaces, self.span / 2, -self.chord / 2, -self.span / 2)
+        values = [
+            getattr(self, name) * effects[row] * causes[column] if name else 0.0
+            for row, names in enumerate(_TABLE)
+            for column, name in enumerate(names)
+        ]
+        gathered = _gather([*values, self.linear_range], like)
+        return gathered[..., :-1].unflatten(-1, (len(_EFFECTS), len(_CAUSES))), gathered[..., -1:]
+
+
+_TABLE = tuple(
+    tuple(name if (name := f"{effect}_{cause}") in FixedWing.__dataclass_fields__ else "" for cause in _CAUSES)
+    for effect in _EFFECTS
+)
+"""Names of the coefficients, a row for each effect; empty where a cause has no such effect."""
+
+
+def _gather(values: Sequence[float | Tensor], like: Tensor) -> Tensor:
+    """Parameters side by side, (n,), or (B, n) where one of them is (B,)."""
+    tensors = {i: value for i, value in enumerate(values) if isinstance(value, Tensor)}
+    gathered = like.new_tensor([0.0 if isinstance(value, Tensor) else value for value in values])
+    if tensors:
+        gathered = gathered.repeat(*torch.broadcast_shapes(*(value.shape for value in tensors.values())), 1)
+        for i, value in tensors.items():
+            gathered[..., i] = value
+    return gathered
+
+
+def _holds(condition: bool | Tensor) -> bool:
+    return bool(condition.all()) if isinstance(condition, Tensor) else condition
