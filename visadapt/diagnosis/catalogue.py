@@ -7,15 +7,16 @@ from collections.abc import Iterable
 import torch
 
 from visadapt.effects import EFFECTS, ActuationEffect, Dropout, DynamicsEffect, Effect, FrozenZone, SensingEffect
+from visadapt.systems import System
 
 HOLDING: tuple[type[Effect], ...] = (Dropout, FrozenZone)
 """Effects that are read off repeated readings, before anything is fitted."""
 
 
-def catalogue() -> list[type[Effect]]:
-    """All named effects at the stages of a simulator without a camera."""
+def catalogue(system: System) -> list[type[Effect]]:
+    """All named effects that act on the system, at the stages of a simulator without a camera."""
     stages = (ActuationEffect, DynamicsEffect, SensingEffect)
-    return [effect for effect in EFFECTS.values() if issubclass(effect, stages)]
+    return [e for e in EFFECTS.values() if issubclass(e, stages) and isinstance(system, e.systems)]
 
 
 def searched(effects: Iterable[type[Effect]]) -> list[type[Effect]]:

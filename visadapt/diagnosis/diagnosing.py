@@ -68,7 +68,7 @@ def diagnose(
     if not isinstance(world.system, CartPole):
         raise ValueError(f"diagnose: cartpole is what can be diagnosed, got {world.system.name}")
     torch.set_num_threads(jobs)
-    effects = list(all_effects() if catalogue is None else catalogue)
+    effects = list(all_effects(world.system) if catalogue is None else catalogue)
     with torch.inference_mode():
         return _diagnose(recording, world.system, effects, seed, progress)
 

@@ -9,6 +9,7 @@ from visadapt.effects.actuation import (
     ActuatorLag,
     ActuatorSaturation,
 )
+from visadapt.effects.aerial import LinearDrag
 from visadapt.effects.base import (
     EFFECTS,
     ActuationEffect,
@@ -51,6 +52,7 @@ __all__ = [
     "FrictionPatch",
     "FrozenZone",
     "Gust",
+    "LinearDrag",
     "MeasurementDelay",
     "Parameter",
     "PeriodicForce",

@@ -51,6 +51,8 @@ class Effect(nn.Module):
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
+    systems: ClassVar[tuple[type[System], ...]] = (System,)
+    """What it acts on; any system, unless it says which."""
     equation: ClassVar[str]
     source: ClassVar[str]
     table: ClassVar[tuple[Parameter, ...]] = ()

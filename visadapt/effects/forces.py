@@ -1,4 +1,4 @@
-"""Forces on a cart-pole that do not come from rubbing. Positive pushes towards +x."""
+"""Forces that do not come from rubbing: along x on any system, the rest on a cart-pole. Positive pushes towards +x."""
 
 from __future__ import annotations
 
@@ -7,25 +7,37 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from visadapt.effects.base import DynamicsEffect, Parameter, expect, inside
-from visadapt.systems import CartPole, System
+from visadapt.systems import CartPole, RigidBody, System
 
 
-class CartForce(DynamicsEffect):
-    """A force on the cart alone; subclasses give its size."""
+class ForceAlongX(DynamicsEffect):
+    """A force along x and nothing else: on the cart, or on a vehicle along the world's x; subclasses give its size."""
+
+    systems: ClassVar[tuple[type[System], ...]] = (CartPole, RigidBody)
 
     def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         """Force in N, (B,)."""
         raise NotImplementedError
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        push = self.push(time, state, system)
-        return torch.stack((push, torch.zeros_like(push)), -1)
+        # Of all these systems the first load is the force along x.
+        return pad(self.push(time, state, system)[:, None], (0, len(system.loads) - 1))
 
 
-class ConstantForce(CartForce):
-    """A push that never lets up: a cable's weight, say."""
+class CartForce(ForceAlongX):
+    """A force on the cart alone; subclasses give its size."""
+
+    systems = (CartPole,)
+
+
+class ConstantForce(ForceAlongX):
+    """A push along x that never lets up: a cable's weight, say.
+
+    On a cart-pole it cannot be told from actuator_bias; on a vehicle, whose commands push elsewhere, it can.
+    """
 
     name = "constant_force"
     equation = "F = force"
@@ -37,8 +49,12 @@ class ConstantForce(CartForce):
         return self.value("force", state).expand_as(time)
 
 
-class PeriodicForce(CartForce):
-    """Phases count from the start of the episode; 2 (sin t + 1) N is amplitude 2, offset 2, phase -pi/2."""
+class PeriodicForce(ForceAlongX):
+    """A push along x that comes and goes.
+
+    Phases count from the start of the episode; 2 (sin t + 1) N is amplitude 2, offset 2, phase -pi/2;
+    2 cos t N is amplitude 2, offset 0, phase 0; both have frequency 1/(2 pi).
+    """
 
     name = "periodic_force"
     equation = "F = amplitude cos(2 pi frequency t + phase) + offset"
@@ -108,6 +124,7 @@ class TrackTilt(DynamicsEffect):
     )
     source = "Lagrange's equations of the cart-pole with gravity along (-sin(angle), -cos(angle)) in the track's frame"
     table = (Parameter("angle", "rad", -0.3, 0.3, 0.0),)
+    systems = (CartPole,)
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         cart_pole = expect(system, CartPole, self)

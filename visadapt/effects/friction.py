@@ -98,6 +98,7 @@ class PoleDamping(DynamicsEffect):
     equation = "Q_theta = -coefficient theta_dot"
     source = "Barto, Sutton and Anderson (1983), appendix, the term mu_p"
     table = (Parameter("coefficient", "N m s/rad", 0.0, 0.2, 0.0, linear=True),)
+    systems = (CartPole,)
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         torque = -self.value("coefficient", state) * state[:, 3]

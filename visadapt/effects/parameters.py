@@ -14,6 +14,7 @@ from visadapt.systems import CartPole, System
 class ParameterScale(DynamicsEffect):
     """A factor on one parameter of a cart-pole; adds no load."""
 
+    systems = (CartPole,)
     field: ClassVar[str]
     """the parameter's name in the system"""
     scale: Tensor

@@ -1,4 +1,4 @@
-"""Effects on what is measured of a cart-pole's state (x, x_dot, theta, theta_dot)."""
+"""Effects on what is measured of a state: all but dropout on that of a cart-pole (x, x_dot, theta, theta_dot)."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ class MeasurementDelay(SensingEffect):
     """
 
     name = "measurement_delay"
+    systems = (CartPole,)
     equation = "measured(t) = state(max(t - delay, 0))"
     source = (
         "Franklin, Powell and Workman (1998), section 4.3.3; de Boor (1978), A Practical Guide to Splines, chapter IV"
@@ -70,6 +71,7 @@ class FrozenZone(SensingEffect):
     """
 
     name = "frozen_zone"
+    systems = (CartPole,)
     equation = "measured_k = measured_(k-1) for start < theta_k < end, of theta and theta_dot"
     source = "Balaban et al. (2009), Modeling, detection, and disambiguation of sensor faults, section II"
     table = (Parameter("start", "rad", -0.5, 0.5, 0.0), Parameter("end", "rad", -0.5, 0.5, 0.0))
@@ -96,6 +98,7 @@ class SensorScale(SensingEffect):
     """Encoders with other counts per metre or turn than assumed; a velocity scales with its position."""
 
     name = "sensor_scale"
+    systems = (CartPole,)
     equation = "(x, x_dot) measured = position (x, x_dot), (theta, theta_dot) measured = angle (theta, theta_dot)"
     source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (multiplicative sensor fault)"
     table = (
@@ -114,6 +117,7 @@ class SensorScale(SensingEffect):
 class SensorOffset(SensingEffect):
     """An offset, () or (B,), on the reading of one state."""
 
+    systems = (CartPole,)
     state: ClassVar[str]
     """its name in the system"""
 
