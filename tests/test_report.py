@@ -60,7 +60,7 @@ def some_evidence(velocities=True):
         ),
         growth=Growth(seconds, 1 + 8 * seconds**2, 1 + 0.3 * seconds, np.ones(10), 1 + 0.5 * seconds),
         spectrum=Spectrum("force on the cart", "N2/Hz", frequency, 1 / frequency, 0.05 + 0 * frequency),
-        policy=PolicyTerms((0.12, 0.01), (1.02, 1.02), (3.4, 0.3)),
+        policy=PolicyTerms((0.12, 0.01), (2.5, 2.0), (0.04, 0.03), (0.3, 0.2)),
     )
 
 
@@ -253,6 +253,8 @@ class TestWords:
             assert all(f"{name} = " in text for name in cause.parameters)
         for line in (diagnosis.next_experiment, *diagnosis.warnings):
             assert line in text
+        for value in ("2.50", "0.0400", "0.520", "0.270"):  # L, the distance of commands, the bounds
+            assert value in text
         assert "nan" not in text
 
 

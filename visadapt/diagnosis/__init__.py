@@ -1,6 +1,6 @@
 """Diagnosis: where a recording departs from the source, which effects cause it, and how far they close the gap."""
 
-from visadapt.diagnosis.diagnosing import diagnose
+from visadapt.diagnosis.diagnosing import DIAGNOSABLE, diagnose
 from visadapt.diagnosis.result import Diagnosis
 
-__all__ = ["Diagnosis", "diagnose"]
+__all__ = ["DIAGNOSABLE", "Diagnosis", "diagnose"]

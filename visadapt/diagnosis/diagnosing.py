@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from visadapt.console import Report, staged
-from visadapt.diagnosis import experiments, how_far, where
+from visadapt.diagnosis import experiments, how_far, theorem, where
 from visadapt.diagnosis.catalogue import catalogue as all_effects
 from visadapt.diagnosis.catalogue import searched
 from visadapt.diagnosis.causes import Named, causes, classes, ranking, stage_shares
@@ -29,8 +29,11 @@ from visadapt.diagnosis.verdict import Judgement, judge
 from visadapt.diagnosis.which import Search
 from visadapt.effects import Effect
 from visadapt.recordings import Recording
-from visadapt.systems import CartPole
+from visadapt.systems import CartPole, System
 from visadapt.world import World
+
+DIAGNOSABLE: dict[str, type[System]] = {CartPole.name: CartPole}
+"""The systems that can be diagnosed, by name."""
 
 ENOUGH = 0.95
 """Share of the gap that the causes must close to be the explanation where something is left over."""
@@ -49,6 +52,7 @@ def diagnose(
     seed: int = 0,
     jobs: int = 1,
     progress: Report | None = None,
+    policy: theorem.StatesToActions | None = None,
 ) -> Diagnosis:
     """Say where a recording departs from the source, which effects cause it, and how far they close the gap.
 
@@ -59,22 +63,31 @@ def diagnose(
         seed: of the shifts by which the significance of regions is counted; nothing else is drawn.
         jobs: cores that tensor operations may use.
         progress: called with (stage, steps done, steps in all, loss).
+        policy: on states, with the units and signs of the source and the rate of the recording; for it, Theorem 1's
+            terms are told (`Diagnosis.evidence.policy`).
 
     Raises:
-        ValueError: the world has effects of its own, or is not a cart-pole.
+        ValueError: the world has effects of its own, or a system that cannot be diagnosed; or no policy on its states.
     """
     if len(world.effects):
         raise ValueError("diagnose: the world is the source and has no effects; give the bare system")
-    if not isinstance(world.system, CartPole):
-        raise ValueError(f"diagnose: cartpole is what can be diagnosed, got {world.system.name}")
+    if not isinstance(world.system, tuple(DIAGNOSABLE.values())):
+        raise ValueError(f"diagnose: {', '.join(DIAGNOSABLE)} is what can be diagnosed, got {world.system.name}")
     torch.set_num_threads(jobs)
-    effects = list(all_effects(world.system) if catalogue is None else catalogue)
+    effects = list(all_effects() if catalogue is None else catalogue)
     with torch.inference_mode():
-        return _diagnose(recording, world.system, effects, seed, progress)
+        if policy is not None:
+            theorem.check(policy, world.system)
+        return _diagnose(recording, world.system, effects, seed, progress, policy)
 
 
 def _diagnose(
-    recording: Recording, system: CartPole, effects: list[type[Effect]], seed: int, progress: Report | None
+    recording: Recording,
+    system: System,
+    effects: list[type[Effect]],
+    seed: int,
+    progress: Report | None,
+    policy: theorem.StatesToActions | None,
 ) -> Diagnosis:
     readings = Readings.of(recording, system)
     rows = readings.rows
@@ -103,6 +116,7 @@ def _diagnose(
         told = (*(each.cause for each in held), *causes(search, judgement, places, closing))
         if any(cause.indistinguishable_from for cause in told):
             verdict = AMBIGUOUS
+    terms = None if policy is None else theorem.policy_terms(policy, system, rows, best)
     before, after = disturbances(search, judgement)
     regions = _regions(told, before if told else after, seed)
     return Diagnosis(
@@ -119,7 +133,7 @@ def _diagnose(
         gap=errors.gap(),
         next_experiment=_next(judgement, verdict, places),
         warnings=(*recording.warnings, *readings.warnings, *_doubts(judgement, verdict)),
-        evidence=evidence(search, source, corrected, errors, before, after, regions),
+        evidence=evidence(search, source, corrected, errors, before, after, regions, terms),
     )
 
 

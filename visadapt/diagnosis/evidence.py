@@ -12,7 +12,7 @@ from torch import Tensor
 from visadapt.diagnosis import how_far
 from visadapt.diagnosis.how_far import Ahead
 from visadapt.diagnosis.models import Family
-from visadapt.diagnosis.result import Evidence, Gap, Growth, Prediction, Region
+from visadapt.diagnosis.result import Evidence, Gap, Growth, PolicyTerms, Prediction, Region
 from visadapt.diagnosis.verdict import Judgement
 from visadapt.diagnosis.where import Disturbance, disturbance, profile, spectrum
 from visadapt.diagnosis.which import Search
@@ -96,6 +96,7 @@ def evidence(
     before: Disturbance,
     after: Disturbance,
     regions: Sequence[Region],
+    policy: PolicyTerms | None,
 ) -> Evidence:
     """What the report draws."""
     units = {v.name: v.unit for v in (*search.system.states, *search.system.actions)} | {"time": "s"}
@@ -106,6 +107,7 @@ def evidence(
         tuple(profile(name, units[name], before, after) for name in names),
         errors.growth(search.rows.period),
         spectrum(before, after, search.rows.period),
+        policy,
     )
 
 

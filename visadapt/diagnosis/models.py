@@ -56,14 +56,14 @@ class Family:
         self._order = [*chain, *(e for e in effects if issubclass(e, DynamicsEffect)), *sensors]
 
     def _made(self, kind: type[Made], theta: Tensor) -> list[Made]:
-        """The effects of a kind in the order in which they act, with one value of each parameter per row of theta."""
+        """The effects of a kind in the order in which they act, with the parameters (P,), or (N, P) for N rows."""
         out = []
         for effect in self._order:
             if issubclass(effect, kind):
                 first = sum(len(e.table) for e in self.effects[: self.effects.index(effect)])
                 made = effect(**{parameter.name: 0.0 for parameter in effect.table})
                 for column, parameter in enumerate(effect.table, first):
-                    setattr(made, parameter.name, nn.Parameter(theta[:, column], requires_grad=False))
+                    setattr(made, parameter.name, nn.Parameter(theta[..., column], requires_grad=False))
                 out.append(made)
         return out
 
@@ -80,8 +80,35 @@ class Family:
         index = rows.first[:, None] + torch.arange(rows.shape[1])
         return commands[:, rows.episode[:, None], index]
 
+    def instead(self, theta: Tensor, actions: Tensor) -> Tensor:
+        """(W, T, K, S) what acts over a row's substeps if its command alone were another, for parameters (P,).
+
+        `actions` (W, T, K) are the other commands; those before the row stay as they were given, since the chain
+        remembers them.
+        """
+        rows = self.rows
+        h = rows.period / self.substeps
+        chain = self._made(ActuationEffect, theta)
+        out = actions[..., None].expand(-1, -1, -1, self.substeps).clone()
+        if not chain:
+            return out
+        given = rows.command[..., None, None].expand(-1, -1, self.substeps, -1)
+        memory = [effect.memory(given[:, 0], h) for effect in chain]
+        length, count = actions.shape[1:]
+        for row in range(int(rows.first.max()) + length):
+            place = row - rows.first
+            windows = ((place >= 0) & (place < length)).nonzero()[:, 0]
+            tried = out[windows, place[windows]].flatten(0, 1)[..., None]
+            past = rows.episode[windows].repeat_interleave(count)
+            was = given[:, row]
+            for k, effect in enumerate(chain):
+                tried, _ = effect.apply_to(tried, memory[k][past], h)
+                was, memory[k] = effect.apply_to(was, memory[k], h)
+            out[windows, place[windows]] = tried.reshape(len(windows), count, self.substeps)
+        return out
+
     def step(self, theta: Tensor, commands: Tensor, time: Tensor, state: Tensor) -> Tensor:
-        """One period on from states (N, n) under commands (N, S), each row with its parameters (N, P)."""
+        """One period on from states (N, n) under commands (N, S), with parameters (P,), or (N, P), a row's own."""
         loads = self._made(DynamicsEffect, theta)
         system = self.system
         for effect in loads:
@@ -101,11 +128,15 @@ class Family:
             time = time + h
         return state
 
-    def measure(self, theta: Tensor, state: Tensor) -> Tensor:
-        """What is measured (N, m) of states (N, n), each row with its parameters (N, P)."""
+    def sense(self, theta: Tensor, state: Tensor) -> Tensor:
+        """What sensors, had every state one, would read (N, n) of states (N, n), with parameters as in `step`."""
         for effect in self._made(SensingEffect, theta):
             state, _ = effect.apply_to(state, effect.memory(state, self.rows.period), self.rows.period, None)
-        return state[:, list(self.rows.channels)]
+        return state
+
+    def measure(self, theta: Tensor, state: Tensor) -> Tensor:
+        """What is measured (N, m) of states (N, n), with parameters as in `step`."""
+        return self.sense(theta, state)[:, list(self.rows.channels)]
 
 
 @dataclass(frozen=True)

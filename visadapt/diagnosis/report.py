@@ -65,7 +65,8 @@ def as_html(diagnosis: Diagnosis, settings: Mapping[str, str]) -> str:
         largest=max((value for _, value, _ in gaps if math.isfinite(value)), default=0.0),
         equations={name: effect.equation for name, effect in EFFECTS.items()},
         figures=_figures(diagnosis),
-        policy=_policy(diagnosis),
+        corrected=words.corrected(diagnosis),
+        policy=words.policy_terms(diagnosis),
         settings=settings,
     )
 
@@ -75,7 +76,7 @@ def _gaps(diagnosis: Diagnosis) -> list[tuple[str, float, str]]:
     gap = diagnosis.gap
     rows = [("simulator", gap.before, "before")]
     if gap.after != gap.before:
-        rows.append(("with the causes" if diagnosis.causes else "with the best known effects", gap.after, "after"))
+        rows.append((words.corrected(diagnosis), gap.after, "after"))
     return [*rows, ("with a black box", gap.black_box, "black-box"), ("measurement noise", gap.floor, "floor")]
 
 
@@ -90,14 +91,3 @@ def _figures(diagnosis: Diagnosis) -> dict[str, Any]:
         "growth": figures.growth(evidence.growth, corrected) if evidence.growth else "",
         "spectrum": figures.spectrum(evidence.spectrum, corrected) if evidence.spectrum else "",
     }
-
-
-def _policy(diagnosis: Diagnosis) -> list[tuple[str, tuple[float, float]]]:
-    terms = diagnosis.evidence.policy
-    if terms is None:
-        return []
-    return [
-        ("error of a step of the model, delta", terms.delta),
-        ("growth of a difference in a step, L", terms.lipschitz),
-        ("bound on the difference of cost, zeta", terms.zeta),
-    ]

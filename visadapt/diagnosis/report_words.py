@@ -138,6 +138,25 @@ def _first(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+def corrected(diagnosis: Diagnosis) -> str:
+    """What the simulator is called with what was found."""
+    return "with the causes" if diagnosis.causes else "with the best known effects"
+
+
+def policy_terms(diagnosis: Diagnosis) -> list[tuple[str, tuple[float, float]]]:
+    """Theorem 1's terms, each with what it is; none where no policy was given."""
+    terms = diagnosis.evidence.policy
+    if terms is None:
+        return []
+    return [
+        ("delta, error of the model's step under the policy", terms.delta),
+        ("L, change of that step with the command at most", terms.lipschitz),
+        ("E|pi - pi_hat|, distance of the policy's command from the model's best", terms.action_gap),
+        ("E[zeta], distance from the reference that the best command leaves", terms.zeta),
+        ("delta + L E|pi - pi_hat| + E[zeta], bound on the policy's distance from the reference", terms.bound),
+    ]
+
+
 def as_text(diagnosis: Diagnosis) -> str:
     """The diagnosis for the terminal."""
     gap, recording = diagnosis.gap, diagnosis.recording
@@ -164,6 +183,10 @@ def as_text(diagnosis: Diagnosis) -> str:
             f"           {ranked.probability:.3f}  {percent(ranked.gap_closed):>7}  {effects(ranked.effects)}"
             for ranked in diagnosis.ranking[:5]
         ]
+    terms = policy_terms(diagnosis)
+    if terms:
+        lines += ["", f"Policy     Theorem 1, a step of the policy in SI units: simulator, {corrected(diagnosis)}"]
+        lines += [f"           {number(pair[0]):>7}  {number(pair[1]):>7}  {name}" for name, pair in terms]
     if diagnosis.next_experiment:
         lines += ["", f"Next       {diagnosis.next_experiment}"]
     lines += [f"Warning    {warning}" for warning in diagnosis.warnings]

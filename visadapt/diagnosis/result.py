@@ -173,14 +173,27 @@ class Spectrum:
 
 @dataclass(frozen=True)
 class PolicyTerms:
-    """The terms of the paper's Theorem 1 for a given policy: a pair (before, after) each."""
+    """The terms of the paper's Theorem 1 for a given policy, a pair (before, after) each.
+
+    Before, the model f_hat is the source; after, it is the source with the causes. Means are over the states of the
+    recording, norms are Euclidean over one step's state in SI units (`theorem.py` says how they are found).
+    """
 
     delta: tuple[float, float]
-    """error of the model's one-step prediction"""
+    """error of the model's step under the policy, E|f_hat(s, pi(s)) - f*(s, pi(s))| (equation 6)"""
     lipschitz: tuple[float, float]
-    """L, by which a step of the model under the policy multiplies a difference of states at most"""
+    """L, by which the model's step follows a change of the action at most (equation 7), per unit of command"""
+    action_gap: tuple[float, float]
+    """distance of the policy's action from the one that is best in the model, E|pi(s) - pi_hat(s)|, in commands"""
     zeta: tuple[float, float]
-    """the bound on the difference of the two trajectories' cost"""
+    """distance from the reference that this best action leaves, E[zeta] (equation 5)"""
+
+    @property
+    def bound(self) -> tuple[float, float]:
+        """On the policy's distance from the reference after a step of the machine (equation 8)."""
+        terms = zip(self.delta, self.lipschitz, self.action_gap, self.zeta, strict=True)
+        before, after = (delta + lipschitz * gap + zeta for delta, lipschitz, gap, zeta in terms)
+        return before, after
 
 
 @dataclass(frozen=True)
