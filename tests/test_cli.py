@@ -10,7 +10,9 @@ import torch
 
 from tests.test_report import SCHEMA, a_diagnosis
 from visadapt import cli, diagnosis
+from visadapt.checkpoints import save_network
 from visadapt.effects import EFFECTS
+from visadapt.policies import ImagePolicy, StatePolicy
 from visadapt.systems import CartPole
 
 RIG = Path(__file__).parents[2] / "shared" / "recordings" / "physical-cartpole"
@@ -52,8 +54,8 @@ def stub(monkeypatch):
     """A diagnosis that is there at once, and what it was asked."""
     asked: dict = {}
 
-    def diagnose(recording, world, catalogue=None, seed=0, jobs=1, progress=None):
-        asked.update(recording=recording, world=world, seed=seed, jobs=jobs)
+    def diagnose(recording, world, catalogue=None, seed=0, jobs=1, progress=None, policy=None):
+        asked.update(recording=recording, world=world, seed=seed, jobs=jobs, policy=policy)
         progress("fitting", 1, 1, 0.5)
         print("chatter")
         return a_diagnosis("identified", warnings=recording.warnings)
@@ -109,6 +111,14 @@ class TestCommand:
             assert EFFECTS["test_cli_mine"].__module__ in sys.modules
         finally:
             EFFECTS.pop("test_cli_mine", None)
+
+    @pytest.mark.parametrize("with_history", [False, True])
+    def test_a_policy(self, recording, stub, tmp_path, with_history):
+        policy, path = StatePolicy(4, with_history=with_history), tmp_path / "policy.safetensors"
+        save_network(path, policy, {"seed": 0})
+        assert run(recording, "--policy", path) == 0
+        assert stub["policy"].with_history == with_history
+        assert all(torch.equal(a, b) for a, b in zip(stub["policy"].parameters(), policy.parameters(), strict=True))
 
     def test_as_a_program(self, tmp_path):
         command = [sys.executable, "-c", "import sys; from visadapt.cli import main; sys.exit(main())"]
@@ -166,6 +176,16 @@ class TestBadInput:
         self.refuses(capsys, "none.py: there is no such file", recording, "--effects", tmp_path / "none.py")
         self.refuses(capsys, "a name that ends in .py is right", recording, "--effects", recording)
 
+    def test_policies(self, recording, stub, capsys, tmp_path):
+        path = tmp_path / "policy.safetensors"
+        self.refuses(capsys, "policy.safetensors: there is no such checkpoint", recording, "--policy", path)
+        path.write_bytes(b"torn")
+        self.refuses(capsys, "policy.safetensors: not a whole safetensors file", recording, "--policy", path)
+        save_network(path, ImagePolicy(torch.zeros(100, 120), 1.0), {})
+        self.refuses(capsys, "holds a ImagePolicy, a StatePolicy is needed", recording, "--policy", path)
+        save_network(path, StatePolicy(7), {})
+        self.refuses(capsys, "made for another architecture: feedforward.weight", recording, "--policy", path)
+
     def test_where_nothing_can_be_written(self, recording, stub, tmp_path, capsys):
         blocked = tmp_path / "file"
         blocked.write_text("")
@@ -182,6 +202,7 @@ class TestBadInput:
             ["--jobs", "many"],
             ["--seed", "a"],
             ["--system", "unicycle"],
+            ["--system", "quadrotor"],
         ],
     )
     def test_arguments(self, recording, stub, capsys, arguments):

@@ -13,13 +13,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from visadapt import diagnosis
+from visadapt.checkpoints import CheckpointError, load_network
 from visadapt.console import reporting
+from visadapt.diagnosis import DIAGNOSABLE
 from visadapt.diagnosis.report import as_text, write_report
 from visadapt.files import replacing
+from visadapt.policies import StatePolicy
 from visadapt.recordings import RecordingError, load_recording
 from visadapt.rig import RigError, load_rig
 from visadapt.runs import versions
-from visadapt.systems import SYSTEMS, System
+from visadapt.systems import System
 from visadapt.world import World
 
 BAD_INPUT = 2
@@ -35,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         _diagnose(options)
-    except (InputError, RecordingError, RigError, OSError) as error:
+    except (InputError, RecordingError, RigError, CheckpointError, OSError) as error:
         print(f"visadapt: {error}", file=sys.stderr)
         return BAD_INPUT
     return 0
@@ -53,7 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     diagnose.add_argument(
         "recording", nargs="+", metavar="RECORDING", help="a CSV or HDF5 file, several, or a folder of them"
     )
-    diagnose.add_argument("--system", required=True, choices=sorted(SYSTEMS), help="the source physics")
+    diagnose.add_argument("--system", required=True, choices=sorted(DIAGNOSABLE), help="the source physics")
     diagnose.add_argument("--params", metavar="RIG.toml", help="the rig's own parameters, in a table [parameters]")
     diagnose.add_argument(
         "--columns",
@@ -63,6 +66,12 @@ def _parser() -> argparse.ArgumentParser:
         help="our name=the file's, as in x=position,theta=phi",
     )
     diagnose.add_argument("--effects", metavar="FILE.py", help="a file that defines effects of your own")
+    diagnose.add_argument(
+        "--policy",
+        metavar="P.safetensors",
+        help="a policy on states, as visadapt.states.pretrain saves it, for which the terms of the paper's Theorem 1 "
+        "are told, on the terminal and in the report",
+    )
     diagnose.add_argument("--json", metavar="F", help="write the result here, as visadapt/diagnosis/schema.json says")
     diagnose.add_argument("--report", metavar="F.html", help="write a page with figures here")
     diagnose.add_argument("--seed", metavar="N", type=int, default=0, help="of all that is drawn (default: 0)")
@@ -90,10 +99,11 @@ def _positive(text: str) -> int:
 
 def _diagnose(options: argparse.Namespace) -> None:
     began = time.perf_counter()
-    system_class = SYSTEMS[options.system]
+    system_class = DIAGNOSABLE[options.system]
     system = load_rig(options.params, system_class) if options.params else system_class()
     if options.effects:
         _run(Path(options.effects))
+    policy = _state_policy(Path(options.policy), system) if options.policy else None
     recording = load_recording(options.recording, system, options.columns)
     # Only the verdict belongs on stdout.
     with contextlib.redirect_stdout(sys.stderr), reporting() as report:
@@ -103,6 +113,7 @@ def _diagnose(options: argparse.Namespace) -> None:
             seed=options.seed,
             jobs=options.jobs,
             progress=report,
+            policy=policy,
         )
     print(as_text(result))
     if options.json:
@@ -121,11 +132,26 @@ def _settings(options: argparse.Namespace, system: System, seconds: float) -> di
         "parameters from": options.params or "the system's defaults",
         "columns": ", ".join(f"{ours}={theirs}" for ours, theirs in options.columns.items()),
         "effects from": options.effects or "",
+        "policy from": options.policy or "",
         "seed": str(options.seed),
         "time": f"{seconds:.1f} s on {options.jobs} core{'s' if options.jobs > 1 else ''}",
         "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
     }
     return {name: value for name, value in settings.items() if value}
+
+
+def _state_policy(path: Path, system: System) -> StatePolicy:
+    """A policy on the last state, or on 5 states and actions: the file does not say which."""
+    alone, with_history = (StatePolicy(len(system.states), len(system.actions), history) for history in (False, True))
+    try:
+        load_network(path, alone)
+    except CheckpointError as misfit:
+        try:
+            load_network(path, with_history)
+        except CheckpointError:
+            raise misfit from None
+        return with_history
+    return alone
 
 
 def _run(path: Path) -> None:
