@@ -74,7 +74,7 @@ def diagnose(
     if not isinstance(world.system, tuple(DIAGNOSABLE.values())):
         raise ValueError(f"diagnose: {', '.join(DIAGNOSABLE)} is what can be diagnosed, got {world.system.name}")
     torch.set_num_threads(jobs)
-    effects = list(all_effects() if catalogue is None else catalogue)
+    effects = list(all_effects(world.system) if catalogue is None else catalogue)
     with torch.inference_mode():
         if policy is not None:
             theorem.check(policy, world.system)
