@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import torch
@@ -10,12 +11,15 @@ from torch import Tensor, nn
 
 from visadapt.history import LENGTH, History
 from visadapt.systems import System
+from visadapt.systems.rigid_body import ATTITUDE, RATES, VELOCITY, RigidBody, rotation
 
 CHANNELS = (8, 16, 32, 32)
 FEATURES = 128
 CHANGE_GAIN = 2.0
 EXPECTED = 2.0
 """m/s2 and rad/s2: unexplained accelerations are given to a residual's head in units of this"""
+Predict = Callable[[Tensor, Tensor], Tensor]
+"""States and actions to the states a period later."""
 KINEMATICS = 2 * LENGTH
 """The latest position and its LENGTH - 1 changes, for each of the two things that move: cart and pole."""
 
@@ -192,3 +196,43 @@ class StateResidualNetwork(ResidualNetwork):
         ends = [system.derivative(part, actions[:, :-1], load) for part in (states[:, :-1], states[:, 1:])]
         measured = states.diff(dim=1) / self.period
         return (measured - (ends[0] + ends[1]) / 2)[..., 1::2]
+
+
+class FlightResidualNetwork(ResidualNetwork):
+    """Linear in what moves a rigid body: velocity, rotation, rates and action now; no position, no network to overfit.
+
+    Drag, wind, weight and weak motors are linear in these to first order, and a few hundred samples fit them. With a
+    history it also reads the changes of velocity and rates that the source left unexplained over the last periods: a
+    force that changes shows there and nowhere else.
+
+    Args:
+        system: the vehicle.
+        period: s between actions.
+        predict: the source's step, (B, 13) and (B, n_action) to (B, 13); without it, there is no history.
+    """
+
+    def __init__(self, system: RigidBody, period: float, predict: Predict | None = None) -> None:
+        inputs = 15 + len(system.actions) + (0 if predict is None else 6 * (LENGTH - 1))
+        super().__init__(nn.Linear(inputs, len(system.states)))
+        self.n_state = len(system.states)
+        self.period = period
+        self.predict = predict
+
+    def embed(self, history: History) -> Tensor:
+        states = history.observations[..., : self.n_state]
+        last = states[:, -1]
+        turned = rotation(last[:, ATTITUDE]).flatten(1)
+        own = torch.cat((last[:, VELOCITY], turned, last[:, RATES], history.actions[:, -1]), 1)
+        if self.predict is None:
+            return own
+        return torch.cat((own, self.unexplained(self.predict, states, history.actions)), 1)
+
+    def unexplained(self, predict: Predict, states: Tensor, actions: Tensor) -> Tensor:
+        """Changes of velocity and rates beyond the source's over the periods between states, (B, 6 (LENGTH - 1)).
+
+        In units of EXPECTED times a period.
+        """
+        before, after = states[:, :-1].flatten(0, 1), states[:, 1:].flatten(0, 1)
+        left = after - predict(before, actions[:, :-1].flatten(0, 1))
+        moving = torch.cat((left[:, VELOCITY], left[:, RATES]), 1) / (EXPECTED * self.period)
+        return moving.unflatten(0, (len(states), LENGTH - 1)).flatten(1)

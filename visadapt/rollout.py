@@ -30,6 +30,13 @@ def see_states(observation: Observation) -> Tensor:
     return observation.state
 
 
+def see_goals(observation: Observation) -> Tensor:
+    """States and, after them, goals (B, n_state + n_goal)."""
+    if observation.goal is None:
+        raise TargetError("the policy is told its goal, but the target has none: give it a course")
+    return torch.cat((observation.state, observation.goal), 1)
+
+
 @dataclass(frozen=True)
 class Run:
     """One episode that was run: its rows up to its end, and how it ended."""

@@ -47,6 +47,8 @@ class AdaptSettings:
     """steps"""
     exploration: float = 0.05
     """standard deviation of white noise on the commands while data are collected"""
+    feedforward: bool = True
+    """begin with a policy that opposes what the residual expects; False where one command cannot undo it in a period"""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -146,7 +148,7 @@ def adapt(
             residual,
             staged(report, f"{name}: ground"),
         )
-        if number == 0:
+        if number == 0 and settings.feedforward:
             oppose(policy, source, residual.scale)
         losses = _tuned(here, policy, grounded, observe, settings, windows, number, staged(report, f"{name}: tune"))
         rounds.append(Round(ledger.used, grounding, losses))

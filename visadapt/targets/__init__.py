@@ -1,9 +1,11 @@
 """Targets: anything that can be run."""
 
 from visadapt.targets.base import Observation, Target, TargetError
+from visadapt.targets.flight import FlightTarget
 from visadapt.targets.synthetic import Start, SyntheticTarget, constant_force, no_effects, sine_force
 
 __all__ = [
+    "FlightTarget",
     "Observation",
     "Start",
     "SyntheticTarget",

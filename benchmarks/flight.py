@@ -1,0 +1,177 @@
+"""The paper's vehicles under disturbances: drag (its Tables 1 and 3) and a force that changes (its section 3.2.2).
+
+    python -m benchmarks.flight
+
+The quadrotor follows random references, the fixed wing flies through a point 50 m ahead. Each has one source policy
+(assets/, from train.flight_policies), and each seed adapts it: to a drag of 0.3 1/s with a residual that sees one
+state, to 2 cos(t + phase) N along x, a phase for each flight, with a residual that sees five. Scored on 100 flights
+that were not trained on, as it stands after every round.
+
+Writes results/flight.csv. Interrupt it anywhere; started again, it goes on.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import multiprocessing
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+
+from datasets import quadrotor_references
+from visadapt.courses import AlongReferences
+from visadapt.effects import Effect, LinearDrag, PeriodicForce
+from visadapt.flights import Flight, FlightScore, fixed_wing, quadrotor, score
+from visadapt.policies import FlightPolicy
+from visadapt.results import Row, write_rows
+from visadapt.runs import once, open_run
+from visadapt.systems import FixedWing, Quadrotor, RigidBody
+from visadapt.targets.synthetic import DrawEffects, no_effects
+
+DRAG = 0.3
+"""1/s, r in v' = ... - r v"""
+SCORE_SEED = 2026
+OURS = "ours, states"
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A vehicle, what is hidden in its target, and the samples it is given."""
+
+    vehicle: type[RigidBody]
+    hidden: str
+    """drag, or force"""
+    budget: int
+    round_samples: int
+
+
+EXPERIMENTS = {
+    "quadrotor, drag": Experiment(Quadrotor, "drag", 1000, 200),
+    "fixed wing, drag": Experiment(FixedWing, "drag", 2000, 400),
+    "quadrotor, 2 cos t": Experiment(Quadrotor, "force", 1000, 200),
+    "fixed wing, 2 cos t": Experiment(FixedWing, "force", 2000, 400),
+}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is run, and where."""
+
+    seeds: int = 3
+    experiments: tuple[str, ...] = tuple(EXPERIMENTS)
+    """which of EXPERIMENTS are run and tabled"""
+    flights: int = 100
+    """that each policy is scored on"""
+    jobs: int = 2
+    """seeds at once, one core each"""
+    references: Path = Path("data/quadrotor_references.npz")
+    """made where it is not there"""
+    assets: Path = Path("assets")
+    work: Path = Path("runs/flight")
+    out: Path = Path("results/flight.csv")
+
+
+def main(settings: Settings) -> None:
+    """Run what is missing, then write the table."""
+    if not settings.references.exists():
+        quadrotor_references.main(quadrotor_references.Settings(out=settings.references))
+    jobs = [(name, seed) for name in settings.experiments for seed in range(settings.seeds)]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(settings.jobs, mp_context=context) as pool:
+        found = dict(zip(jobs, pool.map(_scores, [settings] * len(jobs), *zip(*jobs, strict=True)), strict=True))
+    rows = []
+    for name in settings.experiments:
+        scores = [found[name, seed] for seed in range(settings.seeds)]
+        rows += [_row(name, samples, [each[samples] for each in scores]) for samples in scores[0]]
+    write_rows(settings.out, rows)
+    for row in rows:
+        print(f"{row.experiment:20} {row.domain:8} {row.samples:5} samples  {row.mean:.4f} +- {row.std:.4f} m")
+
+
+def vehicle(experiment: Experiment, references: Path) -> Flight:
+    """The vehicle of an experiment, and its courses."""
+    if experiment.vehicle is FixedWing:
+        return fixed_wing()
+    train, test = quadrotor_references.read(references)
+    return quadrotor(AlongReferences(train), AlongReferences(test))
+
+
+def hidden(experiment: Experiment, mass: float) -> DrawEffects:
+    """What is hidden in the target."""
+
+    def drag(batch: int, generator: torch.Generator) -> Sequence[Effect]:
+        return (LinearDrag(coefficient=DRAG * mass),)
+
+    def force(batch: int, generator: torch.Generator) -> Sequence[Effect]:
+        phase = math.pi * (2 * torch.rand(batch, generator=generator) - 1)
+        return (PeriodicForce(amplitude=2.0, frequency=1 / (2 * math.pi), phase=phase, offset=0.0),)
+
+    return drag if experiment.hidden == "drag" else force
+
+
+def _scores(settings: Settings, name: str, seed: int) -> dict[str, FlightScore]:
+    """Scores of one seed of an experiment, by samples; before adaptation by domain."""
+    torch.set_num_threads(1)
+    experiment = EXPERIMENTS[name]
+    flight = vehicle(experiment, settings.references)
+    folder = settings.work / name.replace(", ", "-").replace(" ", "-") / f"seed-{seed}"
+    open_run(folder, {"seed": seed, "flights": settings.flights, **_plain(experiment), **asdict(flight.settings)})
+    draw = hidden(experiment, float(flight.system.mass))
+    policy = flight.pretrain(settings.assets / f"{flight.system.name}.safetensors", 0)
+    adapting = copy.deepcopy(policy)
+    adapted = flight.adapt(
+        adapting,
+        flight.target(draw, test=False),
+        folder,
+        experiment.budget,
+        experiment.round_samples,
+        seed,
+        with_history=experiment.hidden == "force",
+    )
+
+    def scored(key: str, draws: DrawEffects, which: FlightPolicy) -> FlightScore:
+        def fresh() -> dict[str, object]:
+            return asdict(score(flight.target(draws), which, SCORE_SEED, settings.flights))
+
+        return FlightScore(**once(folder / f"{key}.json", fresh))
+
+    found = {"source": scored("source", no_effects, policy), "target": scored("target", draw, policy)}
+    for samples in [each.samples for each in adapted.rounds]:
+        adapted.restore(adapting, samples)
+        found[str(samples)] = scored(str(samples), draw, adapting)
+    return found
+
+
+def _plain(experiment: Experiment) -> dict[str, object]:
+    return {**asdict(experiment), "vehicle": experiment.vehicle.name}
+
+
+def _row(name: str, key: str, scores: Sequence[FlightScore]) -> Row:
+    """Over all flights of all seeds; a flight that failed is in the mean with all it missed by, and counted apart."""
+    means = np.array([score.mean for score in scores])
+    spread = np.sqrt(np.mean([score.std**2 for score in scores]) + means.var())
+    experiment = EXPERIMENTS[name]
+    return Row(
+        experiment=name,
+        system=experiment.vehicle.name,
+        method="unadapted" if key in ("source", "target") else OURS,
+        domain=key if key in ("source", "target") else "adapted",
+        samples=0 if key in ("source", "target") else int(key),
+        measure="mean tracking error" if experiment.vehicle is Quadrotor else "miss of the target",
+        unit="m",
+        mean=round(float(means.mean()), 5),
+        std=round(float(spread), 5),
+        episodes=sum(score.flights for score in scores),
+        failed=sum(score.failed for score in scores),
+        seeds=len(scores),
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings, description=__doc__))

@@ -1,0 +1,199 @@
+"""Control of vehicles from states: the paper's quadrotor and fixed wing (section 3.2.1, A.1.1 and A.1.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from visadapt.checkpoints import load_network, save_network
+from visadapt.console import Report, staged
+from visadapt.courses import AlongReferences, Course, ToTarget
+from visadapt.effects import Residual
+from visadapt.learning.following import Follow, Reach
+from visadapt.learning.grounding import GroundSettings
+from visadapt.learning.joint import Adapted, AdaptSettings, adapt
+from visadapt.learning.policy import TuneSettings, tune
+from visadapt.learning.tasks import Task
+from visadapt.networks import FlightResidualNetwork
+from visadapt.policies import FlightPolicy, FollowPolicy, ReachPolicy
+from visadapt.rollout import run, see_goals
+from visadapt.systems import FixedWing, Quadrotor, RigidBody
+from visadapt.targets import FlightTarget
+from visadapt.targets.synthetic import DrawEffects, no_effects
+from visadapt.world import World
+
+
+@dataclass(frozen=True)
+class FlightSettings:
+    """How a vehicle's policy is trained in the source, and tuned in each round."""
+
+    source_iterations: int
+    source_rate: float
+    iterations: int
+    rate: float
+    batch: int = 256
+    longest: int = 100
+    """steps of a stream"""
+    ground: GroundSettings = field(default_factory=lambda: GroundSettings(ridge=0.1))
+
+
+class Flight:
+    """One vehicle and what it is to do.
+
+    Args:
+        system: the vehicle.
+        period: s between commands.
+        substeps: of the source's integrator.
+        train, test: courses to train on, and to be scored on.
+        task: what streams do.
+        policy: makes a new policy.
+    """
+
+    def __init__(
+        self,
+        system: RigidBody,
+        period: float,
+        substeps: int,
+        train: Course,
+        test: Course,
+        task: Task,
+        policy: Callable[[], FlightPolicy],
+        settings: FlightSettings,
+    ) -> None:
+        self.system = system
+        self.source = World(system, period=period, substeps=substeps)
+        self.train = train
+        self.test = test
+        self.task = task
+        self.policy = policy
+        self.settings = settings
+
+    def target(self, draw_effects: DrawEffects = no_effects, test: bool = True) -> FlightTarget:
+        """The vehicle with hidden effects, on the courses to be scored on, or else on those to train on."""
+        return FlightTarget(self.test if test else self.train, self.system, self.source.period, draw_effects)
+
+    def pretrain(self, path: Path, seed: int, report: Report | None = None) -> FlightPolicy:
+        """The policy of the source, trained there or read from `path`."""
+        torch.manual_seed(seed)
+        policy = self.policy()
+        if path.exists():
+            load_network(path, policy)
+            return policy
+        own = self.settings
+        settings = TuneSettings(
+            self.task, own.source_iterations, own.batch, own.source_rate, own.longest, observation_noise=0.0
+        )
+        partial_path = path.with_suffix(".partial.safetensors")
+        tune(
+            policy,
+            self.source,
+            _states,
+            settings,
+            torch.Generator().manual_seed(seed),
+            progress=staged(report, f"{self.system.name}: source policy"),
+            checkpoint=partial_path,
+        )
+        save_network(path, policy, {"seed": seed, **asdict(own)})
+        partial_path.unlink(missing_ok=True)
+        return policy
+
+    def adapt(
+        self,
+        policy: FlightPolicy,
+        target: FlightTarget,
+        folder: Path,
+        budget: int,
+        round_samples: int,
+        seed: int,
+        with_history: bool = False,
+        report: Report | None = None,
+    ) -> Adapted:
+        """Adapt `policy`, in place, to `target` with at most `budget` counted samples: Algorithm 1 in `folder`.
+
+        Args:
+            with_history: whether the residual also reads what was left unexplained over the last periods, in which
+                a force that changes shows.
+        """
+        torch.manual_seed(seed)
+        own = self.settings
+        predict = partial(_step, self.source) if with_history else None
+        network = FlightResidualNetwork(self.system, self.source.period, predict)
+        residual = Residual(network, torch.ones(len(self.system.states)))
+        settings = AdaptSettings(
+            TuneSettings(self.task, own.iterations, own.batch, own.rate, own.longest, observation_noise=0.0),
+            own.ground,
+            budget,
+            round_samples,
+            "state",
+            longest_episode=target.course.steps,
+            feedforward=False,
+            seed=seed,
+        )
+        return adapt(policy, residual, self.source, target, _states, see_goals, settings, folder, report=report)
+
+
+def quadrotor(train: AlongReferences, test: AlongReferences) -> Flight:
+    """The quadrotor that follows references 0.1 s a row."""
+    period = train.references.period
+    settings = FlightSettings(source_iterations=4000, source_rate=4e-3, iterations=200, rate=1e-3)
+    return Flight(Quadrotor(), period, 2, train, test, Follow(train), lambda: FollowPolicy(period), settings)
+
+
+def fixed_wing(period: float = 0.05) -> Flight:
+    """The fixed wing that flies through points 50 m ahead."""
+    course = ToTarget(period)
+    settings = FlightSettings(source_iterations=4000, source_rate=3e-3, iterations=200, rate=1e-3)
+    return Flight(FixedWing(), period, 1, course, course, Reach(course), ReachPolicy, settings)
+
+
+@dataclass(frozen=True)
+class FlightScore:
+    """How far flights miss. A flight that fails is in the mean with all it missed by."""
+
+    flights: int
+    failed: int
+    """flights that were more than FAR off somewhere, or not finite"""
+    mean: float
+    """m, over flights, of the mean over each"""
+    std: float
+    """m, over flights"""
+    worst: float
+    """m, the greatest distance of all"""
+
+    def __str__(self) -> str:
+        return f"{self.mean:.4f} +- {self.std:.4f} m, {self.flights - self.failed} of {self.flights} stayed near"
+
+
+FAR = 1.0
+"""m off the course: the flight has failed."""
+
+
+def score(target: FlightTarget, policy: FlightPolicy, seed: int, flights: int = 100) -> FlightScore:
+    """Fly `flights` courses drawn with `seed`; the steps are free and not counted."""
+    policy.eval()
+    runs = run(target, policy, see_goals, flights, target.course.steps, torch.Generator().manual_seed(seed))
+    misses = []
+    for k, flown in enumerate(runs):
+        if flown.survived:
+            assert flown.episode.state is not None
+            states = torch.as_tensor(flown.episode.state)[None]
+            misses.append(target.course.misses(states, target.first[k : k + 1])[0].numpy())
+        else:
+            misses.append(np.array([np.inf]))
+    means = np.array([miss.mean() for miss in misses])
+    worst = np.array([miss.max() for miss in misses])
+    return FlightScore(flights, int((worst > FAR).sum()), float(means.mean()), float(means.std()), float(worst.max()))
+
+
+def _states(state: Tensor) -> Tensor:
+    return state
+
+
+def _step(source: World, state: Tensor, action: Tensor) -> Tensor:
+    return source.step(source.start(state), action).state

@@ -1,0 +1,133 @@
+"""The tasks of flying: along a reference, or through a point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from visadapt.courses import AlongReferences, ToTarget
+from visadapt.learning.tasks import Task, curriculum
+from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
+
+
+@dataclass(frozen=True)
+class FollowCost:
+    """Weights of squared distances from the reference and of effort, A.1.1 of the paper.
+
+    C = sum_k position |x - x_nu|^2 + velocity |v - v_nu|^2 + rates |omega|^2 + action |a|^2
+
+    The paper holds thrust and rates near the middle of their range with weights of 5 and 0.1 on commands in [0, 1];
+    what pulls the thrust towards hovering also pulls the vehicle off its reference, so `action` is small.
+    """
+
+    position: float = 10.0
+    velocity: float = 1.0
+    rates: float = 0.1
+    action: float = 0.01
+
+    def __call__(self, states: Tensor, plan: Tensor, reference: Tensor) -> Tensor:
+        """Cost (B,) of states (B, K, 13) and actions (B, K, n_action); `reference` (B, K, 6): positions, velocities."""
+        away = states[..., : VELOCITY.stop] - reference
+        return (
+            self.position * away[..., POSITION].square().sum((1, 2))
+            + self.velocity * away[..., VELOCITY].square().sum((1, 2))
+            + self.rates * states[..., RATES].square().sum((1, 2))
+            + self.action * plan.square().sum((1, 2))
+        )
+
+
+@dataclass(frozen=True)
+class Follow(Task):
+    """Fly along one of many references. A place is the course's."""
+
+    course: AlongReferences
+    cost_of: FollowCost = FollowCost()
+    start_spread: tuple[float, float] = (0.1, 0.2)
+    """standard deviation in m and m/s of the start around the reference"""
+    diverged: float = 2.0
+    """m, delta_div at the end of the curriculum: a stream further from its reference starts anew"""
+    first_divergence: float = 0.05
+    """share of `diverged` that the curriculum begins with; it reaches 1 at half of the iterations"""
+
+    def begin(self, batch: int, progress: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Somewhere on a reference, and a little off it."""
+        which = torch.randint(len(self.course.references.positions), (batch,), generator=generator)
+        row = torch.randint(self.course.last, (batch,), generator=generator)
+        state = self.course.on(which, row)
+        metres, speed = self.start_spread
+        spread = torch.tensor([metres] * 3 + [speed] * 3)
+        share = curriculum(self.first_divergence, progress)
+        state[:, : len(spread)] += share * spread * torch.randn(batch, len(spread), generator=generator)
+        return state, torch.stack((which, row), 1)
+
+    def cost(self, states: Tensor, plan: Tensor, now: Tensor, place: Tensor) -> Tensor:
+        return self.cost_of(states, plan, self.course.ahead(place))
+
+    def astray(self, state: Tensor, place: Tensor, progress: float) -> Tensor:
+        which, row = place.unbind(1)
+        there = self.course.references.positions[which, row.clamp(max=self.course.last)]
+        limit = self.diverged * curriculum(self.first_divergence, progress)
+        away = (state[:, POSITION] - there).norm(dim=1)
+        return ~(away <= limit) | (row >= self.course.last)
+
+    def show(self, seen: Tensor, place: Tensor) -> Tensor:
+        return torch.cat((seen, self.course.goal(place)), 1)
+
+    def onward(self, place: Tensor) -> Tensor:
+        return self.course.onward(place)
+
+
+@dataclass(frozen=True)
+class Reach(Task):
+    """Fly a fixed wing through a point. A place is the point, (B, 3).
+
+    The reference is the straight line from where the vehicle is to the point, flown at the course's speed (A.1.2):
+    C = sum_k along |e_k|^2 + (across - along) |e_k off the line|^2 + rates |omega|^2 + action |a|^2
+
+    with e_k = x_{t+k} - nu_{t+k}. The paper weighs both by 10; but what decides is to be on the line, not when.
+    """
+
+    course: ToTarget
+    along: float = 1.0
+    across: float = 30.0
+    rates: float = 0.1
+    action: float = 0.01
+    start_spread: tuple[float, float, float] = (0.5, 0.5, 0.1)
+    """standard deviation in m, m/s and rad/s of the start around the straight line"""
+    diverged: float = 8.0
+    """m from the straight line at which a stream starts anew"""
+
+    def begin(self, batch: int, progress: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """In level flight somewhere on the way, half of the streams at its beginning."""
+        state, place = self.course.start(batch, generator)
+        share = (2 * torch.rand(batch, 1, generator=generator) - 1).clamp(min=0)
+        state[:, POSITION] += share * place
+        for part, deviation in zip((POSITION, VELOCITY, RATES), self.start_spread, strict=True):
+            state[:, part] += (share > 0) * deviation * torch.randn(batch, 3, generator=generator)
+        return state, place
+
+    def cost(self, states: Tensor, plan: Tensor, now: Tensor, place: Tensor) -> Tensor:
+        to = place - now[:, POSITION]
+        way = to / to.norm(dim=1, keepdim=True).clamp_min(1e-3)
+        steps = self.course.speed * self.course.period * torch.arange(1, states.shape[1] + 1).to(states)
+        reference = now[:, None, POSITION] + steps[:, None] * way[:, None]
+        away = states[..., POSITION] - reference
+        behind = (away * way[:, None]).sum(-1).square()
+        return (
+            (self.along - self.across) * behind.sum(1)
+            + self.across * away.square().sum((1, 2))
+            + self.rates * states[..., RATES].square().sum((1, 2))
+            + self.action * plan.square().sum((1, 2))
+        )
+
+    def astray(self, state: Tensor, place: Tensor, progress: float) -> Tensor:
+        """Too far off, or past the point."""
+        line = place / place.norm(dim=1, keepdim=True)
+        along = (state[:, POSITION] * line).sum(1, keepdim=True)
+        off = (state[:, POSITION] - along * line).norm(dim=1)
+        return ~(off <= self.diverged) | (state[:, 0] >= place[:, 0])
+
+    def show(self, seen: Tensor, place: Tensor) -> Tensor:
+        return torch.cat((seen, self.course.goal(place)), 1)
