@@ -6,27 +6,33 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import nn
-from torch.func import functional_call
 
 from visadapt.effects import EFFECTS, ConstantForce, Effect, Stage
-from visadapt.systems import CartPole
+from visadapt.systems import SYSTEMS, CartPole
 from visadapt.world import World
 
 NAMED = sorted(EFFECTS.keys() - {"residual"})
 """The effects with parameters; the residual, a network, has tests of its own in test_world.py."""
 
-ON_CART = [name for name in NAMED if issubclass(CartPole, EFFECTS[name].systems)]
+PAIRS = [
+    (name, system)
+    for name in NAMED
+    for system in (kind() for kind in SYSTEMS.values())
+    if isinstance(system, EFFECTS[name].systems)
+]
+"""Every effect with every system that it acts on."""
 
-SMOOTH = [name for name in ON_CART if not EFFECTS[name].no_gradient]
+SMOOTH = [(name, system) for name, system in PAIRS if not EFFECTS[name].no_gradient]
 
 PERIOD, STEPS = 0.05, 3
+CART_POLE = CartPole()
 
 STRONG = {
     "actuator_saturation": {"limit": 0.3},
     "gust": {"start": 0.02, "end": 0.1, "force": 5.0},
     "friction_patch": {"start": -1.0, "end": 1.0, "coefficient": 10.0},
     "frozen_zone": {"start": -0.3, "end": 0.4},
+    "ground_effect": {"radius": 0.5, "ground": 0.0},
 }
 """Parameters that show in a few steps, where 80 % of every range do not."""
 
@@ -46,20 +52,36 @@ def build(name, values):
     return EFFECTS[name](**{key: torch.tensor(value) for key, value in values.items()}).double()
 
 
-def world_of(*effects, system=None):
-    return World(system or CartPole(), effects, PERIOD, "rk4", substeps=3)
+def drawn(name, system, test, examples=10, batch=None):
+    """Runs `test` on parameters of the effect; on the vehicles, whose steps cost more, on fewer."""
+
+    @settings(max_examples=examples if isinstance(system, CartPole) else 2)
+    @given(from_table(name, batch))
+    def run(values):
+        test(values)
+
+    run()
 
 
-def inputs(batch, seed=0):
-    """States (batch, 4) and actions (STEPS, batch, 1), away from the limits of the command."""
+def world_of(*effects, system=CART_POLE):
+    return World(system, effects, PERIOD, "rk4", substeps=3 if isinstance(system, CartPole) else 1)
+
+
+def inputs(batch, system=CART_POLE, seed=0):
+    """States (batch, n_state) and actions (STEPS, batch, n_action), away from the limits of the command."""
     generator = torch.Generator().manual_seed(seed)
-    state = 0.5 * torch.randn(batch, 4, generator=generator, dtype=torch.float64)
-    actions = 1.8 * torch.rand(STEPS, batch, 1, generator=generator, dtype=torch.float64) - 0.9
-    return state, actions
+    state = torch.randn(batch, len(system.states), generator=generator, dtype=torch.float64)
+    actions = torch.rand(STEPS, batch, len(system.actions), generator=generator, dtype=torch.float64)
+    if isinstance(system, CartPole):
+        state *= 0.5
+    else:
+        # Upright, just above the ground, and so slow that the strongest drag is not stiff.
+        state = 0.1 * state + torch.tensor([0.0, 0.0, 0.5, 2.0, 0.0, 0.0, 1.0, *[0.0] * 6], dtype=torch.float64)
+    return state, 1.8 * actions - 0.9
 
 
 def readings(world, state, actions):
-    """What is measured (STEPS + 1, B, 4) of a run."""
+    """What is measured (STEPS + 1, B, n_state) of a run."""
     generator = torch.Generator().manual_seed(1)
     measured, at = world.measure(world.start(state), generator)
     seen = [measured]
@@ -69,45 +91,32 @@ def readings(world, state, actions):
     return torch.stack(seen)
 
 
-class Steps(nn.Module):
-    """A few steps of a world as one function of its parameters, the state and the actions."""
-
-    def __init__(self, world):
-        super().__init__()
-        self.world = world
-
-    def forward(self, state, actions):
-        return readings(self.world, state, actions)
-
-
-def assert_gradients_agree(function, values, limits):
+def assert_gradients_agree(function, point, limits):
     """Gradients against finite differences, at kinks too: there they lie between the slopes on both sides.
 
-    `limits` holds (low, high) for each input, which no difference steps over, or None.
+    `function` maps (N, D) to (N,), each row for itself; `limits` (2, D) are values which no difference steps over.
     """
-    leaves = [value.detach().clone().requires_grad_() for value in values]
-    grads = torch.autograd.grad(function(*leaves), leaves)
-    h = 1e-6
-    values = [value.detach() for value in values]
-    centre = float(function(*values))
-    for position, (value, grad, limit) in enumerate(zip(values, grads, limits, strict=True)):
-        for place in range(value.numel()):
-            slopes = []
-            for step in (-h, h):
-                moved = value.clone()
-                moved.view(-1)[place] += step
-                at = float(moved.view(-1)[place])
-                if limit is None or limit[0] <= at <= limit[1]:
-                    other = [moved if k == position else v for k, v in enumerate(values)]
-                    slopes.append((float(function(*other)) - centre) / step)
-            tolerance = 1e-4 * (1 + max(abs(slope) for slope in slopes))
-            found = float(grad.reshape(-1)[place])
-            assert min(slopes) - tolerance <= found <= max(slopes) + tolerance, (position, place, found, slopes)
+    point = point.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(function(point).sum(), point)
+    point, h = point.detach(), 1e-6
+    count, size = point.shape
+    steps = torch.cat((-h * torch.eye(size), torch.zeros(1, size), h * torch.eye(size))).to(point)
+    values = function((point[:, None] + steps).clamp(*limits).flatten(0, 1)).unflatten(0, (count, -1))
+    below, centre, above = values[:, :size], values[:, size, None], values[:, size + 1 :]
+    slopes = torch.stack(((centre - below) / h, (above - centre) / h))
+    outside = torch.stack((point - h < limits[0], point + h > limits[1]))
+    slopes = torch.where(outside, slopes.flip(0), slopes)
+    tolerance = 1e-4 * (1 + slopes.abs().amax(0))
+    wrong = (gradient < slopes.amin(0) - tolerance) | (gradient > slopes.amax(0) + tolerance)
+    assert not wrong.any(), (wrong.nonzero().tolist(), gradient[wrong], slopes[:, wrong])
 
 
-@pytest.mark.parametrize("name", ON_CART)
-class TestContract:
-    """What every effect promises, whoever writes it."""
+@pytest.mark.parametrize("name", NAMED)
+class TestStatements:
+    """What every effect says of itself, whoever writes it."""
+
+    def test_it_says_which_systems_it_acts_on(self, name):
+        assert any(issubclass(system, EFFECTS[name].systems) for system in SYSTEMS.values())
 
     def test_it_is_at_a_stage_and_those_it_is_mistaken_for_are_mistaken_for_it(self, name):
         assert EFFECTS[name].stage in Stage
@@ -132,53 +141,59 @@ class TestContract:
         with pytest.raises(ValueError, match=f"{name} takes the parameters .*; got none"):
             EFFECTS[name]()
 
-    @given(data=st.data())
-    @settings(max_examples=10)
-    def test_neutral_parameters_change_nothing(self, name, data):
-        values = data.draw(from_table(name))
-        values |= {p.name: p.neutral for p in EFFECTS[name].table if p.neutral is not None}
-        state, actions = inputs(4)
-        torch.testing.assert_close(
-            readings(world_of(build(name, values)), state, actions),
-            readings(world_of(), state, actions),
-            rtol=0,
-            atol=1e-12,
-        )
 
-    def test_it_does_something(self, name):
+@pytest.mark.parametrize(("name", "system"), PAIRS, ids=lambda part: getattr(part, "name", part))
+class TestContract:
+    """What every effect promises on every system that it acts on."""
+
+    def test_neutral_parameters_change_nothing(self, name, system):
+        state, actions = inputs(4, system)
+        without = readings(world_of(system=system), state, actions)
+
+        def test(values):
+            values = values | {p.name: p.neutral for p in EFFECTS[name].table if p.neutral is not None}
+            with_it = readings(world_of(build(name, values), system=system), state, actions)
+            torch.testing.assert_close(with_it, without, rtol=0, atol=1e-12)
+
+        drawn(name, system, test)
+
+    def test_it_does_something(self, name, system):
         values = STRONG.get(name, {p.name: p.low + 0.8 * (p.high - p.low) for p in EFFECTS[name].table})
-        state, actions = inputs(4)
-        moved = readings(world_of(build(name, values)), state, actions) - readings(world_of(), state, actions)
-        assert moved.abs().max() > 1e-4
+        state, actions = inputs(4, system)
+        with_it = readings(world_of(build(name, values), system=system), state, actions)
+        assert (with_it - readings(world_of(system=system), state, actions)).abs().max() > 1e-4
 
-    @given(data=st.data())
-    @settings(max_examples=5)
-    def test_it_pickles(self, name, data):
-        effect = build(name, data.draw(from_table(name)))
-        copy = pickle.loads(pickle.dumps(effect))
-        state, actions = inputs(2)
-        assert type(copy) is type(effect)
-        assert torch.equal(readings(world_of(copy), state, actions), readings(world_of(effect), state, actions))
+    def test_it_pickles(self, name, system):
+        state, actions = inputs(2, system)
 
-    def test_device_and_dtype_come_from_the_tensors(self, name):
+        def test(values):
+            effect = build(name, values)
+            copy = pickle.loads(pickle.dumps(effect))
+            assert type(copy) is type(effect)
+            own, other = (readings(world_of(e, system=system), state, actions) for e in (effect, copy))
+            assert torch.equal(own, other)
+
+        drawn(name, system, test, 5)
+
+    def test_device_and_dtype_come_from_the_tensors(self, name, system):
         values = {p.name: 0.5 * (p.low + p.high) for p in EFFECTS[name].table}
-        world = world_of(EFFECTS[name](**values))
-        state, actions = inputs(2)
+        world = world_of(EFFECTS[name](**values), system=system)
+        state, actions = inputs(2, system)
         assert readings(world, state, actions).dtype == torch.float64
         assert readings(world, state.float(), actions.float()).dtype == torch.float32
 
-    def test_what_its_linear_parameters_add_is_proportional_to_them(self, name):
+    def test_what_its_linear_parameters_add_is_proportional_to_them(self, name, system):
         table = EFFECTS[name].table
         linear = [p for p in table if p.linear]
         values = STRONG.get(name, {p.name: p.low + 0.7 * (p.high - p.low) for p in table})
-        (state, actions), h = inputs(4), PERIOD
+        (state, actions), h = inputs(4, system), PERIOD
 
         def added(share):
             """What the effect adds when its linear parameters have gone a share of the way from neutral."""
             own = values | {p.name: p.neutral + share * (values[p.name] - p.neutral) for p in linear}
             effect = build(name, own)
             if effect.stage is Stage.DYNAMICS:
-                return effect.load(torch.linspace(0.03, 0.09, 4, dtype=torch.float64), state, CartPole())
+                return effect.load(torch.linspace(0.03, 0.09, 4, dtype=torch.float64), state, system)
             if effect.stage is Stage.ACTUATION:
                 commands = actions.transpose(0, 1)
                 return effect.apply_to(commands, effect.memory(commands, h), h)[0] - commands
@@ -190,50 +205,57 @@ class TestContract:
             torch.testing.assert_close(added(0.3), 0.3 * added(1.0), rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", SMOOTH)
+@pytest.mark.parametrize(("name", "system"), SMOOTH, ids=lambda part: getattr(part, "name", part))
 class TestSmoothContract:
     """What every effect promises but those that say why they have no gradient."""
 
-    @given(data=st.data())
-    @settings(max_examples=10)
-    def test_gradients_agree_with_finite_differences(self, name, data):
-        world = Steps(world_of(build(name, data.draw(from_table(name)))))
-        parameters = dict(world.named_parameters())
-        # Beyond the value that switches an effect off there may be none at all: a negative delay.
-        limits = {
-            p.name: (p.low if p.neutral == p.low else -math.inf, p.high if p.neutral == p.high else math.inf)
-            for p in EFFECTS[name].table
-        }
-        state, actions = inputs(2)
+    def test_gradients_agree_with_finite_differences(self, name, system):
+        """In the state, the commands and its parameters, one of each for every row."""
+        table = EFFECTS[name].table
+        n, m = len(system.states), len(system.actions)
         # Every reading counts, each with its own weight.
-        weights = torch.linspace(-1, 1, 8 * (STEPS + 1), dtype=torch.float64).reshape(STEPS + 1, 2, 4)
+        weights = torch.linspace(-1, 1, n * (STEPS + 1), dtype=torch.float64).reshape(STEPS + 1, 1, n)
 
-        def total(state, actions, *values):
-            out = functional_call(world, dict(zip(parameters, values, strict=True)), (state, actions))
-            return (out * weights).sum()
+        def total(point):
+            state, actions, values = point.split((n, STEPS * m, len(table)), 1)
+            effect = EFFECTS[name](**{p.name: 0.0 for p in table})
+            for p, value in zip(table, values.unbind(1), strict=True):
+                delattr(effect, p.name)
+                setattr(effect, p.name, value)
+            actions = actions.unflatten(1, (STEPS, m)).movedim(1, 0)
+            return (readings(world_of(effect, system=system), state, actions) * weights).sum((0, 2))
 
-        assert_gradients_agree(
-            total,
-            [state, actions, *parameters.values()],
-            [None, None, *(limits[key.rsplit(".", 1)[1]] for key in parameters)],
-        )
+        # Beyond the value that switches an effect off there may be none at all: a negative delay.
+        free = torch.full((n + STEPS * m,), math.inf, dtype=torch.float64)
+        low = [p.low if p.neutral == p.low else -math.inf for p in table]
+        high = [p.high if p.neutral == p.high else math.inf for p in table]
+        ranges = free.new_tensor([low, high])
+        limits = torch.cat((torch.stack((-free, free)), ranges), 1)
+        state, actions = inputs(2, system)
 
-    @given(data=st.data())
-    @settings(max_examples=10)
-    def test_a_row_does_not_depend_on_its_batch(self, name, data):
+        def test(values):
+            given = torch.tensor([values[p.name] for p in table], dtype=torch.float64).expand(2, -1)
+            assert_gradients_agree(total, torch.cat((state, actions.movedim(0, 1).flatten(1), given), 1), limits)
+
+        drawn(name, system, test)
+
+    def test_a_row_does_not_depend_on_its_batch(self, name, system):
         """Nor on whether its parameters are scalars or entries of (B,)."""
         batch = 3
-        values = data.draw(from_table(name, batch))
-        state, actions = inputs(batch)
-        together = readings(world_of(build(name, values)), state, actions)
-        for b in range(batch):
-            own = {key: value[b] for key, value in values.items()}
-            alone = readings(world_of(build(name, own)), state[b : b + 1], actions[:, b : b + 1])
-            torch.testing.assert_close(together[:, b], alone[:, 0], rtol=1e-10, atol=1e-12)
+        state, actions = inputs(batch, system)
+
+        def test(values):
+            together = readings(world_of(build(name, values), system=system), state, actions)
+            for b in range(batch):
+                own = build(name, {key: value[b] for key, value in values.items()})
+                alone = readings(world_of(own, system=system), state[b : b + 1], actions[:, b : b + 1])
+                torch.testing.assert_close(together[:, b], alone[:, 0], rtol=1e-10, atol=1e-12)
+
+        drawn(name, system, test, batch=batch)
 
 
 def test_an_effect_without_gradient_says_why():
-    assert {name: EFFECTS[name].no_gradient for name in set(ON_CART) - set(SMOOTH)} == {
+    assert {name: EFFECTS[name].no_gradient for name in NAMED if EFFECTS[name].no_gradient} == {
         "dropout": "whether a row is lost is drawn, yes or no"
     }
 
@@ -244,7 +266,10 @@ def test_the_catalogue_is_complete():
         *("actuator_saturation", "actuator_backlash", "constant_force", "periodic_force", "gust"),
         *("viscous_friction", "coulomb_friction", "quadratic_drag", "friction_patch", "spring", "pole_damping"),
         *("track_tilt", "cart_mass", "pole_mass", "pole_length", "angle_offset", "position_offset"),
-        *("measurement_delay", "sensor_scale", "frozen_zone", "dropout", "linear_drag"),
+        *("measurement_delay", "sensor_scale", "frozen_zone", "dropout"),
+        *("linear_drag", "wind", "periodic_wind", "thrust_gain", "battery_sag", "ground_effect", "rotor_efficiency"),
+        *("inertia", "payload", "center_of_mass_offset", "mass", "lift_slope", "drag", "control_effectiveness"),
+        *("trim_offset",),
     }
 
 

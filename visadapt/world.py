@@ -127,7 +127,8 @@ class World(nn.Module):
             command = commands[:, k]
 
             def derivative(t: Tensor, s: Tensor, u: Tensor = command) -> Tensor:
-                return system.derivative(s, u, self._load(t, s, system))
+                now = self._varied(system, t, s)
+                return now.derivative(s, u, self._load(t, s, now))
 
             state = integrate(derivative, time, state, h)
             time = time + h
@@ -152,14 +153,23 @@ class World(nn.Module):
 
     def load(self, at: WorldState) -> Tensor:
         """Sum of the loads (B, n_load) of all effects at an instant."""
-        return self._load(at.time, at.state, self.altered(at.state))
+        return self._load(at.time, at.state, self.system_at(at))
+
+    def system_at(self, at: WorldState) -> System:
+        """The system with the parameters that effects give it at an instant."""
+        return self._varied(self.altered(at.state), at.time, at.state)
 
     def altered(self, like: Tensor) -> System:
-        """The system with the parameters that effects give it, with the device and dtype of `like`."""
+        """The system with the parameters that effects give it for good, with the device and dtype of `like`."""
         system = self.system
         for effect in self._dynamics:
             system = effect.alter(system)
         return system if system is self.system else system.to(like)
+
+    def _varied(self, system: System, time: Tensor, state: Tensor) -> System:
+        for effect in self._dynamics:
+            system = effect.vary(system, time, state)
+        return system
 
     def _load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         load = torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)

@@ -117,10 +117,12 @@ class Family:
         nothing = torch.zeros(len(state), len(system.loads), dtype=state.dtype, device=state.device)
 
         def derivative(t: Tensor, s: Tensor, u: Tensor) -> Tensor:
-            load = nothing
+            now, load = system, nothing
             for effect in loads:
-                load = load + effect.load(t, s, system)
-            return system.derivative(s, u, load)
+                now = effect.vary(now, t, s)
+            for effect in loads:
+                load = load + effect.load(t, s, now)
+            return now.derivative(s, u, load)
 
         for k in range(self.substeps):
             u = commands[:, k : k + 1]

@@ -9,7 +9,7 @@ from visadapt.effects.actuation import (
     ActuatorLag,
     ActuatorSaturation,
 )
-from visadapt.effects.aerial import LinearDrag
+from visadapt.effects.aerial import LinearDrag, PeriodicWind, Wind
 from visadapt.effects.base import (
     EFFECTS,
     ActuationEffect,
@@ -31,6 +31,16 @@ from visadapt.effects.sensing import (
     PositionOffset,
     SensorScale,
 )
+from visadapt.effects.vehicle import (
+    BatterySag,
+    CenterOfMassOffset,
+    GroundEffect,
+    Inertia,
+    Payload,
+    RotorEfficiency,
+    ThrustGain,
+)
+from visadapt.effects.wing import ControlEffectiveness, Drag, LiftSlope, Mass, TrimOffset
 
 __all__ = [
     "EFFECTS",
@@ -43,29 +53,43 @@ __all__ = [
     "ActuatorLag",
     "ActuatorSaturation",
     "AngleOffset",
+    "BatterySag",
     "CartMass",
+    "CenterOfMassOffset",
     "ConstantForce",
+    "ControlEffectiveness",
     "CoulombFriction",
+    "Drag",
     "Dropout",
     "DynamicsEffect",
     "Effect",
     "FrictionPatch",
     "FrozenZone",
+    "GroundEffect",
     "Gust",
+    "Inertia",
+    "LiftSlope",
     "LinearDrag",
+    "Mass",
     "MeasurementDelay",
     "Parameter",
+    "Payload",
     "PeriodicForce",
+    "PeriodicWind",
     "PoleDamping",
     "PoleLength",
     "PoleMass",
     "PositionOffset",
     "QuadraticDrag",
     "Residual",
+    "RotorEfficiency",
     "SensingEffect",
     "SensorScale",
     "Spring",
     "Stage",
+    "ThrustGain",
     "TrackTilt",
+    "TrimOffset",
     "ViscousFriction",
+    "Wind",
 ]

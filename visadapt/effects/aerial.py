@@ -1,26 +1,121 @@
-"""Forces of the air on vehicles that fly."""
+"""Forces of the air on vehicles that fly: drag, and wind.
+
+Drag follows the velocity against the air, in world axes: where there is wind too, it acts on every drag. Drags add.
+"""
 
 from __future__ import annotations
 
+import math
+from typing import TypeAlias
+
+import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from visadapt.effects.base import DynamicsEffect, Parameter
-from visadapt.systems import RigidBody, System
+from visadapt.effects.base import DynamicsEffect, Effect, Parameter, with_parameters
+from visadapt.systems import FixedWing, Quadrotor, System
 from visadapt.systems.rigid_body import VELOCITY
 
+Vehicle: TypeAlias = Quadrotor | FixedWing
+VEHICLES: tuple[type[System], ...] = (Quadrotor, FixedWing)
+"""The systems around which the air can move."""
 
-class LinearDrag(DynamicsEffect):
+
+def expect_vehicle(system: System, effect: Effect) -> Vehicle:
+    """The system as one of `VEHICLES`.
+
+    Raises:
+        TypeError: it is another.
+    """
+    if not isinstance(system, Quadrotor | FixedWing):
+        raise TypeError(f"{effect.name} acts on a quadrotor or a fixed_wing, not on a {system.name}")
+    return system
+
+
+def airspeed(state: Tensor, vehicle: Vehicle) -> Tensor:
+    """Velocity (B, 3) against the air in m/s, world axes, in states (B, 13)."""
+    wind = (torch.as_tensor(v).to(state) for v in (vehicle.wind_x, vehicle.wind_y, vehicle.wind_z))
+    return state[:, VELOCITY] - torch.stack(torch.broadcast_tensors(*wind), -1)
+
+
+class AirDrag(DynamicsEffect):
+    """Drag in proportion to the velocity against the air."""
+
+    systems = VEHICLES
+
+    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+        velocity = airspeed(state, expect_vehicle(system, self))
+        return pad(-self.value("coefficient", state)[..., None] * velocity, (0, 3))
+
+
+class LinearDrag(AirDrag):
     """Drag in proportion to the speed, as rotors in forward flight have it.
 
     The paper's v' = v' - r v, with r = 0.3 1/s, is coefficient = r mass, on both vehicles.
     """
 
     name = "linear_drag"
-    equation = "F = -coefficient v, v the velocity in world axes"
+    equation = "F = -coefficient v, v the velocity against the air"
     source = "Faessler, Franchi and Scaramuzza (2017), Differential flatness of quadrotor dynamics; the paper, 3.2.1"
     table = (Parameter("coefficient", "N s/m", 0.0, 3.0, 0.0, linear=True),)
-    systems = (RigidBody,)
 
-    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        return pad(-self.value("coefficient", state)[..., None] * state[:, VELOCITY], (0, 3))
+
+class Wind(AirDrag):
+    """Air that moves at a steady velocity.
+
+    The wing's aerodynamics are those of its velocity against the air. The quadrotor has none, so wind needs a drag
+    to act by, and brings one: a coefficient of the vehicle's own would be 0 in the source, and wind alone would
+    silently do nothing. On the wing, and beside a drag effect, which feels the wind too, a coefficient of 0 will do.
+    """
+
+    name = "wind"
+    equation = "F = coefficient (w - v), w = (velocity_x, velocity_y, velocity_z); to the wing, v - w is v"
+    source = "Beard and McLain (2012), Small Unmanned Aircraft, section 2.4; Faessler, Franchi and Scaramuzza (2017)"
+    table = (
+        Parameter("velocity_x", "m/s", -10.0, 10.0, 0.0),
+        Parameter("velocity_y", "m/s", -10.0, 10.0, 0.0),
+        Parameter("velocity_z", "m/s", -10.0, 10.0, 0.0),
+        Parameter("coefficient", "N s/m", 0.0, 3.0, 0.0),
+    )
+
+    velocity_x: Tensor
+    velocity_y: Tensor
+    velocity_z: Tensor
+
+    def alter(self, system: System) -> System:
+        air = expect_vehicle(system, self)
+        return with_parameters(
+            air,
+            wind_x=air.wind_x + self.velocity_x,
+            wind_y=air.wind_y + self.velocity_y,
+            wind_z=air.wind_z + self.velocity_z,
+        )
+
+
+class PeriodicWind(AirDrag):
+    """Level wind that comes and goes, to and fro along one direction; its drag is as that of wind.
+
+    Phases count from the start of the episode; a direction of 0 is along x, of pi/2 along y.
+    """
+
+    name = "periodic_wind"
+    equation = (
+        "F = coefficient (w - v), w = amplitude cos(2 pi frequency t + phase) (cos(direction), sin(direction), 0); "
+        "to the wing, v - w is v"
+    )
+    source = "Hoblit (1988), Gust Loads on Aircraft, chapter 3 (one harmonic); Beard and McLain (2012), section 4.4"
+    table = (
+        Parameter("amplitude", "m/s", 0.0, 10.0, 0.0),
+        Parameter("frequency", "Hz", 0.02, 5.0, None),
+        Parameter("phase", "rad", -math.pi, math.pi, None),
+        Parameter("direction", "rad", -math.pi / 2, math.pi / 2, None),
+        Parameter("coefficient", "N s/m", 0.0, 3.0, 0.0),
+    )
+
+    def vary(self, system: System, time: Tensor, state: Tensor) -> System:
+        air = expect_vehicle(system, self)
+        angle = 2 * math.pi * self.value("frequency", state) * time + self.value("phase", state)
+        speed, direction = self.value("amplitude", state) * angle.cos(), self.value("direction", state)
+        return with_parameters(
+            air, wind_x=air.wind_x + speed * direction.cos(), wind_y=air.wind_y + speed * direction.sin()
+        )

@@ -7,9 +7,9 @@ Subclasses register themselves by name, so adding an effect is adding a class.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -121,10 +121,17 @@ class DynamicsEffect(Effect):
         """The system with the parameters that this effect gives it; its fields may then be tensors, () or (B,)."""
         return system
 
+    def vary(self, system: System, time: Tensor, state: Tensor) -> System:
+        """The altered system at the time (B,) since the start of the episode, in a state (B, n_state).
+
+        For parameters that change under way. Called for every derivative, where `alter` is called once a period.
+        """
+        return system
+
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         """Load (B, n_load) at the time (B,) since the start of the episode, in a state (B, n_state).
 
-        `system` is the one that all effects have altered.
+        `system` is the one that all effects have altered and varied.
         """
         return torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)
 
@@ -160,6 +167,13 @@ def expect(system: System, kind: type[SystemKind], effect: Effect) -> SystemKind
     if not isinstance(system, kind):
         raise TypeError(f"{effect.name} acts on a {kind.name}, not on a {system.name}")
     return system
+
+
+def with_parameters(system: SystemKind, **values: float | Tensor) -> SystemKind:
+    """The system with other values of the parameters that are named."""
+    itself: Any = system  # a dataclass, which the base of all systems is not
+    changed: SystemKind = replace(itself, **values)
+    return changed
 
 
 def inside(place: Tensor, start: Tensor, end: Tensor, width: float) -> Tensor:

@@ -32,6 +32,11 @@ class CartForce(ForceAlongX):
 
     systems = (CartPole,)
 
+    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+        # A cart-pole's two loads, so that it does not fit a vehicle, whose columns `push` would misread.
+        push = self.push(time, state, system)
+        return torch.stack((push, torch.zeros_like(push)), -1)
+
 
 class ConstantForce(ForceAlongX):
     """A push along x that never lets up: a cable's weight, say.

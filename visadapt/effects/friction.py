@@ -1,4 +1,4 @@
-"""Friction and drag on a cart-pole: forces against the motion."""
+"""Friction on a cart-pole, and drag: forces against the motion."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
+from visadapt.effects.aerial import VEHICLES, Vehicle, airspeed
 from visadapt.effects.base import DynamicsEffect, Parameter, expect, inside
 from visadapt.effects.forces import CartForce
 from visadapt.systems import CartPole, System
@@ -55,16 +57,19 @@ class CoulombFriction(CartForce):
         return -force * (speed - 4 / 27 * speed**3)
 
 
-class QuadraticDrag(CartForce):
-    """Drag of the air on the cart."""
+class QuadraticDrag(DynamicsEffect):
+    """Drag of the air at high Reynolds numbers, on the cart or on a vehicle."""
 
     name = "quadratic_drag"
-    equation = "F = -coefficient x_dot |x_dot|"
+    equation = "F = -coefficient |v| v, v the velocity against the air (of the cart: x_dot)"
     source = "Batchelor (1967), An Introduction to Fluid Dynamics, section 5.11"
     table = (Parameter("coefficient", "N s2/m2", 0.0, 20.0, 0.0, linear=True),)
+    systems = (CartPole, *VEHICLES)
 
-    def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        return -self.value("coefficient", state) * state[:, 1] * state[:, 1].abs()
+    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+        velocity = airspeed(state, system) if isinstance(system, Vehicle) else state[:, 1:2]
+        force = -self.value("coefficient", state)[..., None] * velocity * velocity.norm(dim=-1, keepdim=True)
+        return pad(force, (0, len(system.loads) - force.shape[1]))
 
 
 class FrictionPatch(CartForce):

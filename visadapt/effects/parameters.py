@@ -1,27 +1,24 @@
-"""Effects that change parameters of a cart-pole. Each scales one and leaves the others as they are."""
+"""Effects that change parameters of a system. Each scales some and leaves the others as they are."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import ClassVar
 
-from torch import Tensor
-
-from visadapt.effects.base import DynamicsEffect, Parameter, expect
+from visadapt.effects.base import DynamicsEffect, Parameter, expect, with_parameters
 from visadapt.systems import CartPole, System
 
 
 class ParameterScale(DynamicsEffect):
-    """A factor on one parameter of a cart-pole; adds no load."""
+    """Factors on parameters of the one system that a subclass acts on; adds no load."""
 
-    systems = (CartPole,)
-    field: ClassVar[str]
-    """the parameter's name in the system"""
-    scale: Tensor
+    scaled: ClassVar[dict[str, str]]
+    """the system's parameter for each of the effect's"""
 
     def alter(self, system: System) -> System:
-        cart_pole = expect(system, CartPole, self)
-        return replace(cart_pole, **{self.field: self.scale * getattr(cart_pole, self.field)})
+        own = expect(system, self.systems[0], self)
+        return with_parameters(
+            own, **{field: getattr(self, factor) * getattr(own, field) for factor, field in self.scaled.items()}
+        )
 
 
 class CartMass(ParameterScale):
@@ -31,7 +28,8 @@ class CartMass(ParameterScale):
     equation = "M = scale M_source"
     source = "Barto, Sutton and Anderson (1983), appendix, the cart's mass"
     table = (Parameter("scale", "1", 0.3, 8.0, 1.0),)
-    field = "cart_mass"
+    systems = (CartPole,)
+    scaled: ClassVar[dict[str, str]] = {"scale": "cart_mass"}
 
 
 class PoleMass(ParameterScale):
@@ -41,7 +39,8 @@ class PoleMass(ParameterScale):
     equation = "m = scale m_source"
     source = "Barto, Sutton and Anderson (1983), appendix, the pole's mass"
     table = (Parameter("scale", "1", 0.05, 5.0, 1.0),)
-    field = "pole_mass"
+    systems = (CartPole,)
+    scaled: ClassVar[dict[str, str]] = {"scale": "pole_mass"}
 
 
 class PoleLength(ParameterScale):
@@ -51,4 +50,5 @@ class PoleLength(ParameterScale):
     equation = "l = scale l_source"
     source = "Barto, Sutton and Anderson (1983), appendix, the pole's half-length"
     table = (Parameter("scale", "1", 0.4, 2.5, 1.0),)
-    field = "pole_half_length"
+    systems = (CartPole,)
+    scaled: ClassVar[dict[str, str]] = {"scale": "pole_half_length"}

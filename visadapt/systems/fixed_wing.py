@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from visadapt.systems.base import Variable
-from visadapt.systems.rigid_body import RigidBody, from_angles, times
+from visadapt.systems.rigid_body import POSITION, VELOCITY, RigidBody, from_angles, times
 
 _EFFECTS = ("drag", "side", "lift", "roll", "pitch", "yaw")
 _CAUSES = ("zero", "sideslip", "attack", "elevator", "aileron", "rudder", "roll_rate", "pitch_rate", "yaw_rate")
@@ -81,6 +81,12 @@ class FixedWing(RigidBody):
     """rad at a command of 1"""
     linear_range: float | Tensor = 10 * _DEGREE
     """rad; angle of attack and sideslip beyond which coefficients stay as they are there"""
+    wind_x: float | Tensor = 0.0
+    """m/s, velocity of the air in world axes"""
+    wind_y: float | Tensor = 0.0
+    """m/s"""
+    wind_z: float | Tensor = 0.0
+    """m/s"""
 
     lift_zero: float | Tensor = 0.39
     """C_L0"""
@@ -151,7 +157,7 @@ class FixedWing(RigidBody):
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name == "inertia_xz" or field.name.startswith(_EFFECTS):
+            if field.name == "inertia_xz" or field.name.startswith((*_EFFECTS, "wind")):
                 if not _holds(abs(value) < math.inf):
                     raise ValueError(f"fixed_wing: {field.name} must be finite, got {value!r}")
             elif not _holds(value > 0):
@@ -161,6 +167,16 @@ class FixedWing(RigidBody):
                 "fixed_wing: inertia_xz must be smaller than the geometric mean of inertia_x and inertia_z, "
                 f"got {self.inertia_xz!r}"
             )
+
+    def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:
+        wind = (self.wind_x, self.wind_y, self.wind_z)
+        if not any(isinstance(value, Tensor) or value for value in wind):
+            return super().derivative(state, command, load)
+        # All but the change of place is as it would be if the air stood still and the wing flew at its airspeed.
+        velocity = state[:, VELOCITY]
+        airborne = torch.cat((state[:, POSITION], velocity - _gather(wind, state), state[:, VELOCITY.stop :]), 1)
+        change = super().derivative(airborne, command, load)
+        return torch.cat((velocity, change[:, VELOCITY.start :]), 1)
 
     def inertia(self, like: Tensor) -> Tensor:
         # With z up, the product of inertia has the other sign than in the book.

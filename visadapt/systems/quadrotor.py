@@ -7,6 +7,8 @@ gyroscopic torque. Rotors are fast beside the period of the commands, and follow
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
@@ -37,6 +39,36 @@ class Quadrotor(RigidBody):
     """rad/s at a command of 1"""
     gravity: float | Tensor = 9.81
     """m/s2"""
+    torque_to_thrust: float | Tensor = 0.016
+    """m, a rotor's torque about its axis for each newton of its thrust"""
+
+    # What the flight controller does not know of. Nothing of it is there unless an effect, or a rig's file, says so.
+    payload: float | Tensor = 0.0
+    """kg, the part of `mass` that hangs at the centre"""
+    centre_x: float | Tensor = 0.0
+    """m, how far ahead of the rotors' middle the centre of mass lies"""
+    centre_y: float | Tensor = 0.0
+    """m, how far to the left of it"""
+    inertia_scale_x: float | Tensor = 1.0
+    """moment of inertia about x, as a share of the one that the rate loops count on"""
+    inertia_scale_y: float | Tensor = 1.0
+    """the same about y"""
+    inertia_scale_z: float | Tensor = 1.0
+    """the same about z"""
+    rotor_1: float | Tensor = 1.0
+    """share of the thrust asked of it that the rotor in front on the left gives"""
+    rotor_2: float | Tensor = 1.0
+    """in front on the right"""
+    rotor_3: float | Tensor = 1.0
+    """behind on the right"""
+    rotor_4: float | Tensor = 1.0
+    """behind on the left"""
+    wind_x: float | Tensor = 0.0
+    """m/s, velocity of the air in world axes, for effects of the air: the vehicle itself feels none"""
+    wind_y: float | Tensor = 0.0
+    """m/s"""
+    wind_z: float | Tensor = 0.0
+    """m/s"""
 
     name: ClassVar[str] = "quadrotor"
     actions: ClassVar[tuple[Variable, ...]] = (
@@ -47,17 +79,29 @@ class Quadrotor(RigidBody):
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            least = 0.0 if field.name == "min_thrust" else torch.finfo(torch.float32).tiny
-            if not bool(torch.as_tensor(value >= least).all()):
+            if field.name in _ANY:
+                if not _holds(abs(value) < math.inf):
+                    raise ValueError(f"quadrotor: {field.name} must be finite, got {value!r}")
+            elif not _holds(value >= (0.0 if field.name in _FROM_ZERO else torch.finfo(torch.float32).tiny)):
                 raise ValueError(f"quadrotor: {field.name} must be positive, got {value!r}")
-        if not bool(torch.as_tensor(self.max_thrust > self.min_thrust).all()):
+        if not _holds(self.max_thrust > self.min_thrust):
             raise ValueError(
                 f"quadrotor: max_thrust must be beyond min_thrust, got {self.max_thrust!r} and {self.min_thrust!r}"
             )
+        if not _holds(self.mass > self.payload):
+            raise ValueError(f"quadrotor: mass must be beyond payload, got {self.mass!r} and {self.payload!r}")
 
     def inertia(self, like: Tensor) -> Tensor:
-        """Of a plate with rotors, as Flightmare has it: m l^2 / 12 times (4.5, 4.5, 7) about x, y and z."""
-        size = torch.as_tensor(self.mass * self.arm_length**2 / 12).to(like)
+        known = self.known_inertia(like)
+        scales = (self.inertia_scale_x, self.inertia_scale_y, self.inertia_scale_z)
+        return known * _beside(scales, like)[..., None] if _differ(scales, 1.0) else known
+
+    def known_inertia(self, like: Tensor) -> Tensor:
+        """Moments of inertia that the rate loops count on, kg m2: (3, 3), or (B, 3, 3).
+
+        Of a plate with rotors, as Flightmare has it: m l^2 / 12 times (4.5, 4.5, 7) about x, y and z.
+        """
+        size = torch.as_tensor((self.mass - self.payload) * self.arm_length**2 / 12).to(like)
         return size[..., None, None] * torch.diag(like.new_tensor((4.5, 4.5, 7.0)))
 
     def thrust(self, command: Tensor) -> Tensor:
@@ -66,14 +110,53 @@ class Quadrotor(RigidBody):
         return middle + half * command[:, 0]
 
     def wrench(self, velocity: Tensor, rates: Tensor, command: Tensor) -> tuple[Tensor, Tensor]:
-        force = torch.zeros_like(velocity)
-        force[:, 2] = self.mass * self.thrust(command)
         asked = columns(self.max_rate) * command[:, 1:]
-        gain = torch.stack([torch.as_tensor(g).to(rates) for g in (self.roll_gain, self.roll_gain, self.yaw_gain)], -1)
-        inertia = self.inertia(rates)
-        return force, times(inertia, gain * (asked - rates)) + torch.linalg.cross(rates, times(inertia, rates))
+        gain = _beside((self.roll_gain, self.roll_gain, self.yaw_gain), rates)
+        inertia = self.known_inertia(rates)
+        torque = times(inertia, gain * (asked - rates)) + torch.linalg.cross(rates, times(inertia, rates))
+        thrust = (self.mass - self.payload) * self.thrust(command)
+        if _differ((self.rotor_1, self.rotor_2, self.rotor_3, self.rotor_4), 1.0):
+            thrust, torque = self._given(thrust, torque)
+        if _differ((self.centre_x, self.centre_y), 0.0):
+            torque = torque + thrust[:, None] * _beside((-self.centre_y, self.centre_x, 0.0), torque)
+        force = torch.zeros_like(velocity)
+        force[:, 2] = thrust
+        return force, torque
 
     def hover(self) -> float | Tensor:
-        """The thrust command that carries the weight."""
+        """The thrust command that carries the weight, where every rotor gives what is asked."""
         middle, half = (self.max_thrust + self.min_thrust) / 2, (self.max_thrust - self.min_thrust) / 2
-        return (self.gravity - middle) / half
+        return (self.gravity * (self.mass / (self.mass - self.payload)) - middle) / half
+
+    def _given(self, thrust: Tensor, torque: Tensor) -> tuple[Tensor, Tensor]:
+        """What the rotors give, each its share, of a thrust (B,) and a torque (B, 3) asked of all four together."""
+        reach = self.arm_length / math.sqrt(2)
+        levers = _beside((1.0, reach, reach, self.torque_to_thrust), torque)
+        mixer = torque.new_tensor(_MIXER)
+        shares = _beside((self.rotor_1, self.rotor_2, self.rotor_3, self.rotor_4), torque)
+        # The mixer's rows are orthogonal and of length 2: its transpose is 4 times its inverse.
+        asked = torch.cat((thrust[:, None], torque), 1) / levers @ mixer / 4
+        given = (shares * asked) @ mixer.mT * levers
+        return given[:, 0], given[:, 1:]
+
+
+_ANY = ("centre_x", "centre_y", "wind_x", "wind_y", "wind_z")
+"""Parameters of either sign."""
+_FROM_ZERO = ("min_thrust", "payload", "rotor_1", "rotor_2", "rotor_3", "rotor_4")
+"""Parameters that may be 0."""
+_MIXER = ((1.0, 1.0, 1.0, 1.0), (1.0, -1.0, -1.0, 1.0), (-1.0, -1.0, 1.0, 1.0), (1.0, -1.0, 1.0, -1.0))
+"""Signs with which rotors 1 to 4 add to the thrust and to the torques about x, y and z (Flightmare's allocation)."""
+
+
+def _beside(values: Sequence[float | Tensor], like: Tensor) -> Tensor:
+    """Parameters side by side, (n,), or (B, n) where one of them is (B,)."""
+    return torch.stack(torch.broadcast_tensors(*(torch.as_tensor(value).to(like) for value in values)), -1)
+
+
+def _differ(values: Sequence[float | Tensor], nominal: float) -> bool:
+    """Whether one of the parameters may differ from its nominal value; tensors are not looked into."""
+    return any(isinstance(value, Tensor) or value != nominal for value in values)
+
+
+def _holds(condition: bool | Tensor) -> bool:
+    return bool(condition.all()) if isinstance(condition, Tensor) else condition

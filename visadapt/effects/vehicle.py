@@ -1,0 +1,150 @@
+"""Effects on what drives a vehicle, and on the body of a quadrotor.
+
+The quadrotor's flight controller knows of none of them: it asks for the thrust and the torques that the vehicle
+without them would need. They act in the order of the world's list where that matters, which is nowhere: factors
+multiply, and masses and offsets add.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from torch import Tensor
+
+from visadapt.effects.aerial import VEHICLES, Vehicle, expect_vehicle
+from visadapt.effects.base import DynamicsEffect, Parameter, expect, with_parameters
+from visadapt.effects.parameters import ParameterScale
+from visadapt.systems import Quadrotor, System
+
+
+def with_thrust(vehicle: Vehicle, factor: Tensor) -> Vehicle:
+    """The vehicle whose thrust is multiplied by a factor, () or (B,), at every command."""
+    most = factor * vehicle.max_thrust
+    if isinstance(vehicle, Quadrotor):
+        return with_parameters(vehicle, min_thrust=factor * vehicle.min_thrust, max_thrust=most)
+    return with_parameters(vehicle, max_thrust=most)
+
+
+class ThrustGain(DynamicsEffect):
+    """Rotors or a propeller that give more or less thrust than is asked; torques stay as they are."""
+
+    name = "thrust_gain"
+    equation = "T = scale T_asked"
+    source = "Beard and McLain (2012), Small Unmanned Aircraft, section 4.3"
+    table = (Parameter("scale", "1", 0.3, 2.0, 1.0),)
+    systems = VEHICLES
+    indistinguishable_from = ("payload",)
+
+    scale: Tensor
+
+    def alter(self, system: System) -> System:
+        return with_thrust(expect_vehicle(system, self), self.scale)
+
+
+class BatterySag(DynamicsEffect):
+    """A battery whose voltage falls, and the collective thrust with it, from the start of the episode on."""
+
+    name = "battery_sag"
+    equation = "T = exp(-rate t) T_asked"
+    source = "Bangura and Mahony (2017), Thrust control for multirotor aerial vehicles (thrust follows the bus voltage)"
+    table = (Parameter("rate", "1/s", 0.0, 0.2, 0.0),)
+    systems = (Quadrotor,)
+
+    def vary(self, system: System, time: Tensor, state: Tensor) -> System:
+        return with_thrust(expect(system, Quadrotor, self), (-self.value("rate", state) * time).exp())
+
+
+class GroundEffect(DynamicsEffect):
+    """More thrust near the ground, whose air cannot give way.
+
+    Cheeseman and Bennett's ratio holds from about a radius above the ground and has a pole at a quarter of one. Here it
+    rises to 4/3 at the ground and stays there below: with x = (radius / 4 height)^2, the x of the formula is
+    x / (1 + (4 x)^4)^(1/4), which at a height of one radius is x to 0.1 %.
+    """
+
+    name = "ground_effect"
+    equation = "T = T_asked / (1 - (radius / (4 (z - ground)))^2)"
+    source = (
+        "Cheeseman and Bennett (1955), The effect of the ground on a helicopter rotor in forward flight, ARC R&M 3021"
+    )
+    table = (Parameter("radius", "m", 0.0, 1.0, 0.0), Parameter("ground", "m", -3.0, 3.0, None))
+    systems = (Quadrotor,)
+
+    LEAST: ClassVar[float] = 1e-30
+    """m8, under a root where nothing else is: at the ground, without a radius"""
+
+    def vary(self, system: System, time: Tensor, state: Tensor) -> System:
+        vehicle = expect(system, Quadrotor, self)
+        height = (state[:, 2] - self.value("ground", state)).clamp_min(0)
+        square = self.value("radius", state).square()
+        # x / (1 + (4 x)^4)^(1/4), multiplied out: neither a height of 0 nor a radius of 0 is divided by.
+        x = square / ((4 * height) ** 8 + (4 * square) ** 4 + self.LEAST) ** 0.25
+        return with_thrust(vehicle, 1 / (1 - x))
+
+
+class RotorEfficiency(ParameterScale):
+    """Rotors of an X that each give a share of the thrust asked of them: chipped blades, a failing motor.
+
+    Rotors count from the one in front on the left, clockwise seen from above. With unequal shares thrust turns into
+    torque and torque into thrust.
+    """
+
+    name = "rotor_efficiency"
+    equation = "f_i = scale_i f_i_asked, f_asked the thrusts that the mixer finds for T and the torques"
+    source = "Mahony, Kumar and Corke (2012), Multirotor aerial vehicles; numbers: Song et al. (2020), Flightmare"
+    table = tuple(Parameter(f"scale_{k}", "1", 0.1, 1.5, 1.0) for k in (1, 2, 3, 4))
+    systems = (Quadrotor,)
+    scaled: ClassVar[dict[str, str]] = {f"scale_{k}": f"rotor_{k}" for k in (1, 2, 3, 4)}
+
+
+class Inertia(ParameterScale):
+    """Moments of inertia that differ from those that the rate loops' torques count on."""
+
+    name = "inertia"
+    equation = "J = diag(scale_x, scale_y, scale_z) J_known"
+    source = "Euler's equations: Stevens, Lewis and Johnson (2016), Aircraft Control and Simulation, section 1.7"
+    table = tuple(Parameter(f"scale_{axis}", "1", 0.3, 4.0, 1.0) for axis in "xyz")
+    systems = (Quadrotor,)
+    scaled: ClassVar[dict[str, str]] = {f"scale_{axis}": f"inertia_scale_{axis}" for axis in "xyz"}
+
+
+class Payload(DynamicsEffect):
+    """A point mass at the quadrotor's centre of which the flight controller does not know.
+
+    Weight and translational inertia grow, the force of the rotors does not. Without other forces that is a
+    thrust_gain of m / (m + mass), to the last digit; only a gain above 1 is no payload.
+    """
+
+    name = "payload"
+    equation = "(m + mass) v' = T_asked m R e_z - (m + mass) g e_z, T_asked in m/s2"
+    source = "Newton's second law; the paper's introduction (a payload)"
+    table = (Parameter("mass", "kg", 0.0, 1.0, 0.0),)
+    systems = (Quadrotor,)
+    indistinguishable_from = ("thrust_gain",)
+
+    mass: Tensor
+
+    def alter(self, system: System) -> System:
+        own = expect(system, Quadrotor, self)
+        return with_parameters(own, mass=own.mass + self.mass, payload=own.payload + self.mass)
+
+
+class CenterOfMassOffset(DynamicsEffect):
+    """A centre of mass that does not lie amid the rotors: x ahead, y to the left.
+
+    The state is that of the centre of mass, where the weight acts, so thrust alone has a lever. Moments of inertia
+    stay as they are: they would change by the offset's square.
+    """
+
+    name = "center_of_mass_offset"
+    equation = "torque = -(x, y, 0) cross (0, 0, T) = (-y T, x T, 0)"
+    source = "Stevens, Lewis and Johnson (2016), Aircraft Control and Simulation, section 2.3 (moment transfer)"
+    table = (Parameter("x", "m", -0.1, 0.1, 0.0), Parameter("y", "m", -0.1, 0.1, 0.0))
+    systems = (Quadrotor,)
+
+    x: Tensor
+    y: Tensor
+
+    def alter(self, system: System) -> System:
+        own = expect(system, Quadrotor, self)
+        return with_parameters(own, centre_x=own.centre_x + self.x, centre_y=own.centre_y + self.y)
