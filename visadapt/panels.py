@@ -11,21 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from renderers import Camera, DrawnCartPole
-from visadapt.canvas import (
-    BLUE,
-    HAIRLINE,
-    INK,
-    MUTED,
-    ORANGE,
-    PAPER,
-    RED,
-    TEAL,
-    TROUGH,
-    Canvas,
-    Colour,
-    Picture,
-    text_width,
-)
+from visadapt.canvas import BLUE, INK, MUTED, ORANGE, TEAL, TROUGH, Canvas, Picture
+from visadapt.gauges import Plot, banner, bar, ceiling, headline, reading, signed
 from visadapt.rollout import Run
 
 WIDTH, SCENE = 480, 400
@@ -33,7 +20,6 @@ WIDTH, SCENE = 480, 400
 TITLE, GAP, NUMBERS, CHART = 40, 16, 122, 128
 """px, heights of the parts below each other"""
 HEIGHT = TITLE + SCENE + GAP + NUMBERS + GAP + CHART
-MINUS = "\N{MINUS SIGN}"
 
 
 @dataclass(frozen=True)
@@ -139,11 +125,11 @@ class Scales:
         fastest = max(float(panel.speed.max()) for panel in panels)
         speed = min(fastest, max(*upright, 0.5)) if upright else fastest
         force = max(float(np.abs(panel.run.force).max()) for panel in panels)
-        step = _ceiling(duration / 7)
+        step = ceiling(duration / 7)
         return cls(
             duration,
-            max(_ceiling(speed), 0.1),
-            max(_ceiling(force), 1.0),
+            max(ceiling(speed), 0.1),
+            max(ceiling(force), 1.0),
             tuple(float(t) for t in np.arange(0, duration * 1.0001, step)),
         )
 
@@ -153,10 +139,7 @@ def draw_panel(canvas: Canvas, panel: Panel, t: float, scales: Scales) -> None:
     row = panel.row(t)
     over = bool(panel.verdict) and row == len(panel.state) - 1
     clock = f"t = {panel.end if over else t:5.2f} s"
-    room = WIDTH - text_width(clock, 15) - 20
-    size = next((size for size in range(20, 11, -1) if text_width(panel.title, size, True) <= room), 11)
-    canvas.text(0, TITLE - 14, panel.title, size, bold=True)
-    canvas.text(WIDTH, TITLE - 14, clock, 15, MUTED, align="right")
+    headline(canvas, TITLE - 14, WIDTH, panel.title, clock)
     _draw_scene(canvas.part(0, TITLE, WIDTH, SCENE), panel, row, scales, over)
     top = TITLE + SCENE + GAP
     _draw_numbers(canvas.part(0, top, WIDTH, NUMBERS), panel, row, scales, over)
@@ -183,10 +166,7 @@ def _draw_scene(canvas: Canvas, panel: Panel, row: int, scales: Scales, over: bo
         canvas.arrow((tip - way * length, top + height), (tip, top + height), ORANGE, 8)
     if over:
         canvas.fade(0.6)
-        said = f"{panel.verdict} at t = {panel.end:.2f} s"
-        half = text_width(said, 18, True) / 2 + 18
-        canvas.box(WIDTH / 2 - half, 28, WIDTH / 2 + half, 64, RED)
-        canvas.text(WIDTH / 2, 52, said, 18, PAPER, bold=True, align="centre")
+        banner(canvas, WIDTH / 2, 46, f"{panel.verdict} at t = {panel.end:.2f} s")
     elif panel.run.survived and row == len(panel.state) - 1 and panel.end < scales.duration - 1e-6:
         canvas.text(WIDTH / 2, 52, f"ends upright at t = {panel.end:.1f} s", 15, MUTED, align="centre")
     canvas.frame(0, 0, WIDTH, SCENE)
@@ -209,92 +189,35 @@ def _draw_numbers(canvas: Canvas, panel: Panel, row: int, scales: Scales, over: 
         canvas.text(WIDTH, size[1] + 17, "the policy's view", 12, MUTED, align="right")
     state = panel.state[row]
     readings = (
-        ("position", _signed(state[0], 2), "m"),
-        ("speed", _signed(state[1], 2), "m/s"),
-        ("angle", _signed(math.degrees(state[2]), 1), "\N{DEGREE SIGN}"),
+        ("position", signed(state[0], 2), "m"),
+        ("speed", signed(state[1], 2), "m/s"),
+        ("angle", signed(math.degrees(state[2]), 1), "\N{DEGREE SIGN}"),
     )
     for place, (name, value, unit) in enumerate(readings):
-        x = place * room / 3
-        canvas.text(x, 12, name, 12, MUTED)
-        canvas.text(x, 35, value, 18, MUTED if over else INK)
-        gap = 0 if unit == "\N{DEGREE SIGN}" else 5
-        canvas.text(x + text_width(value, 18) + gap, 35, unit, 13 if gap else 18, MUTED)
+        reading(canvas, place * room / 3, name, value, unit, MUTED if over else INK)
     live = row < len(panel.state) - 1
     command = float(panel.run.episode.action[row, 0])
-    _bar(canvas, 66, room, "command", command if live else None, 1.0, "", BLUE)
+    bar(canvas, 66, room, "command", command if live else None, 1.0, "", BLUE)
     if panel.force_known:
         force = float(panel.run.force[row])
-        _bar(canvas, 102, room, "force", None if over else force, scales.force, " N", ORANGE)
-
-
-def _bar(
-    canvas: Canvas, y: float, room: float, name: str, value: float | None, end: float, unit: str, colour: Colour
-) -> None:
-    """A bar from 0 in the middle towards -end or +end, with its value; None is shown as a dash."""
-    left, right = 74.0, room - 66.0
-    middle, half = (left + right) / 2, (right - left) / 2
-    canvas.text(0, y + 5, name, 13, MUTED)
-    canvas.box(left, y - 6, right, y + 6, TROUGH)
-    if value is not None:
-        edge = middle + half * min(max(value / end, -1.0), 1.0)
-        canvas.box(min(middle, edge), y - 6, max(middle, edge), y + 6, colour)
-    canvas.box(middle - 0.5, y - 9, middle + 0.5, y + 9, MUTED)
-    canvas.text(left, y + 19, f"{MINUS}{end:g}", 10, MUTED)
-    canvas.text(right, y + 19, f"{end:g}{unit}", 10, MUTED, align="right")
-    shown = "\N{EN DASH}" if value is None else _signed(value, 2 if end <= 1 else 1) + unit
-    loud = any(digit in shown for digit in "123456789")
-    canvas.text(room, y + 5, shown, 14, colour if loud else MUTED, bold=loud, align="right")
+        bar(canvas, 102, room, "force", None if over else force, scales.force, " N", ORANGE)
 
 
 def _draw_chart(canvas: Canvas, panel: Panel, row: int, scales: Scales) -> None:
     """The cart's speed until now, and its mean until now."""
-    left, right, top, bottom = 34.0, WIDTH - 5.0, 26.0, CHART - 22.0
+    inside = Plot(WIDTH, CHART, scales.duration)
     time, speed = panel.run.episode.time[: row + 1], panel.speed[: row + 1]
     mean = np.cumsum(speed) / np.arange(1, row + 2)
 
-    def place(t: NDArray[np.floating], v: NDArray[np.floating]) -> NDArray[np.floating]:
-        x = left + (right - left) * t / scales.duration
-        return np.stack([x, bottom - (bottom - top) * v / scales.speed], -1)
-
     canvas.text(0, 12, "cart speed |v|", 12, TEAL, bold=True)
     canvas.text(WIDTH, 12, f"mean {mean[-1]:.2f} m/s", 12, INK, bold=True, align="right")
-    for share in (0.0, 0.5, 1.0):
-        y = round(bottom - (bottom - top) * share)
-        canvas.box(left, y, right, y + 1, HAIRLINE)
-        canvas.text(left - 7, y + 4, f"{scales.speed * share:g}", 11, MUTED, align="right")
-    for tick in scales.ticks:
-        x = round(left + (right - left) * tick / scales.duration)
-        canvas.box(x, bottom, x + 1, bottom + 5, HAIRLINE)
-        first, last = tick == scales.ticks[0], x > right - 12
-        said = f"{tick:g} s" if first else f"{tick:g}"
-        canvas.text(x, bottom + 18, said, 11, MUTED, align="right" if last else "centre")
-    # What is faster than the scale leaves the chart at its top.
-    above = round(top) - 4
-    inside = canvas.part(0, above, WIDTH, CHART - above)
-    inside.line(place(time, speed) - (0, above), TEAL, 2)
-    inside.line(place(time, mean) - (0, above), INK, 1)
-    here = place(time[-1:], speed[-1:])[0] - (0, above)
-    if panel.verdict and row == len(panel.state) - 1:
-        inside.box(here[0] - 1, top - above, here[0] + 1, bottom - above, RED)
-    else:
-        around = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-        inside.polygon(here + 4 * np.stack([np.cos(around), np.sin(around)], -1), TEAL)
+    inside.axes(canvas, {share: f"{scales.speed * share:g}" for share in (0.0, 0.5, 1.0)}, scales.ticks)
+    line = inside.place(time, speed / scales.speed)
+    inside.line(canvas, line, TEAL, 2)
+    inside.line(canvas, inside.place(time, mean / scales.speed), INK, 1)
+    inside.cursor(canvas, line[-1], TEAL, lost=bool(panel.verdict) and row == len(panel.state) - 1)
 
 
 def _colour(picture: NDArray[np.uint8]) -> Picture:
     """(H, W, 3) of a grey (H, W) or coloured picture."""
     return np.repeat(picture[..., None], 3, 2) if picture.ndim == 2 else picture
-
-
-def _signed(value: float, digits: int) -> str:
-    """A number that always has a sign, and the same sign for what rounds to zero."""
-    rounded = round(float(value), digits) + 0.0
-    return f"{MINUS if rounded < 0 else '+'}{abs(rounded):.{digits}f}"
-
-
-def _ceiling(value: float) -> float:
-    """The next of ... 0.1, 0.2, 0.5, 1, 2, 4, 5, 10 ... at or above a value."""
-    if value <= 0:
-        return 0.0
-    power = 10.0 ** math.floor(math.log10(value))
-    return next(power * step for step in (1, 2, 4, 5, 10) if power * step >= value * (1 - 1e-6))

@@ -24,7 +24,7 @@ from visadapt.canvas import Canvas, Picture
 from visadapt.files import replacing
 from visadapt.panels import HEIGHT, WIDTH, Panel, Scales, draw_panel
 
-__all__ = ["Panel", "still", "write_clip", "write_film", "write_still"]
+__all__ = ["Panel", "still", "write_clip", "write_film", "write_frames", "write_picture", "write_still"]
 
 MARGIN, GUTTER = 28, 36
 """px, around the panels and between them"""
@@ -44,7 +44,11 @@ def still(panels: Sequence[Panel], t: float) -> Picture:
 
 def write_still(path: StrPath, panels: Sequence[Panel], t: float) -> None:
     """Write the film's frame at t s as a PNG."""
-    picture = still(panels, t)
+    write_picture(path, still(panels, t))
+
+
+def write_picture(path: StrPath, picture: Picture) -> None:
+    """Write a picture as a PNG."""
     with replacing(path) as temporary:
         Image.fromarray(picture).save(temporary, "PNG", optimize=True)
 
@@ -58,9 +62,26 @@ def write_film(path: StrPath, panels: Sequence[Panel], period: float, progress: 
         FilmError: ffmpeg gave up for another reason.
     """
     times, scales = _times(panels, period), _scales(panels)
+    write_frames(path, lambda t: _still(panels, t, scales), times, period, progress)
+
+
+def write_frames(
+    path: StrPath,
+    draw: Callable[[float], Picture],
+    times: Sequence[float],
+    period: float,
+    progress: Progress | None = None,
+) -> None:
+    """Write an mp4 (H.264, yuv420p) of what `draw` shows at times in s, one every `period` s; width and height even.
+
+    Raises:
+        DiskFullError: the disk is full; nothing stands under the film's name that did not before.
+        FilmError: ffmpeg gave up for another reason.
+    """
+    height, width = draw(times[0]).shape[:2]
     with replacing(path) as temporary:
-        frames = (_still(panels, t, scales) for t in times)
-        _encode(temporary, Path(path), _counted(frames, len(times), progress), _size(panels), 1 / period)
+        frames = _counted(map(draw, times), len(times), progress)
+        _encode(temporary, Path(path), frames, (width, height), 1 / period)
 
 
 def write_clip(
