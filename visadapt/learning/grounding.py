@@ -1,5 +1,6 @@
 """Grounding: the residual learns what the source leaves out (equation 10).
 
+Where the source has effects of its own, their parameters are fitted first: an effect with a name leaves less to learn.
 What the residual's network has learnt to see beforehand stays as it is; its head is fitted to all samples so far: a
 linear one by ridge regression, an MLP by descent from where the last round left it.
 """
@@ -7,16 +8,21 @@ linear one by ridge regression, an MLP by descent from where the last round left
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from visadapt.console import Progress
-from visadapt.effects import Residual
+from visadapt.effects import Effect, Parameter, Residual
 from visadapt.learning.windows import Windows
 from visadapt.networks import ResidualNetwork
 from visadapt.world import World
+
+NAMED_STEPS = 8
+NUDGE = 1e-3
+"""Iterations of the fit of named effects, and its finite difference as a share of a parameter's range."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,46 @@ def gap(world: World, windows: Windows) -> Tensor:
     """s*_{t+1} - f(s_t, a_t) (N, n_state): what the source leaves out in one step."""
     with torch.no_grad():
         return windows.next_state - world.step(world.start(windows.state), windows.action).state
+
+
+def fit_named(source: World, windows: Windows) -> None:
+    """Fit the parameters of the source's own effects to all windows so far, in place: least squares of one step.
+
+    Errors count in units of what the source leaves out without them, state by state; parameters stay within the ranges
+    that their effects state.
+    """
+    parameters = [(effect, each) for effect in source.effects for each in effect.table]
+    if not parameters:
+        return
+    bare = World(source.system, (), source.period, source.integrator, source.substeps)
+    unit = gap(bare, windows).square().mean(0).sqrt().clamp(min=1e-9)
+    values = [getattr(effect, each.name) for effect, each in parameters]
+    # The problem is small and nearly linear: full steps of Gauss and Newton's method, from wherever it stands.
+    for _ in range(NAMED_STEPS):
+        left, slopes = _one_step_errors(source, windows, parameters, unit)
+        step = torch.linalg.lstsq(slopes, -left[:, None]).solution[:, 0]
+        with torch.no_grad():
+            for value, change, (_, each) in zip(values, step, parameters, strict=True):
+                value.copy_((value + change * (each.high - each.low)).clamp(each.low, each.high))
+
+
+def _one_step_errors(
+    source: World, windows: Windows, parameters: Sequence[tuple[Effect, Parameter]], unit: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Errors (N n_state,), and how they change with each parameter as a share of its range, (N n_state, P)."""
+    left = -(gap(source, windows) / unit).flatten()
+    slopes = []
+    for effect, each in parameters:
+        value, span = getattr(effect, each.name), each.high - each.low
+        with torch.no_grad():
+            kept = value.clone()
+            # Inwards, so that no parameter leaves its range.
+            nudge = -NUDGE if float(kept) + NUDGE * span > each.high else NUDGE
+            value.add_(nudge * span)
+            moved = -(gap(source, windows) / unit).flatten()
+            value.copy_(kept)
+        slopes.append((moved - left) / nudge)
+    return left, torch.stack(slopes, 1)
 
 
 def rescale(residual: Residual, source: World, windows: Windows) -> None:

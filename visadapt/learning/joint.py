@@ -17,7 +17,7 @@ import torch
 from visadapt.checkpoints import load_tree, load_weights, save_tree
 from visadapt.console import Progress, Report, staged
 from visadapt.effects import Residual
-from visadapt.learning.grounding import GroundLoss, GroundSettings, ground, rescale
+from visadapt.learning.grounding import GroundLoss, GroundSettings, fit_named, ground, rescale
 from visadapt.learning.ledger import Ledger
 from visadapt.learning.policy import TuneSettings, oppose, tune
 from visadapt.learning.windows import Observe, Windows
@@ -115,7 +115,7 @@ def adapt(
 
     Args:
         policy, residual: the networks, changed in place; the policy listens to the residual.
-        source: the physics known beforehand.
+        source: the physics known beforehand; effects that it has are named guesses, whose parameters are fitted.
         observe: what a camera would show of a simulated state: the learnt renderer, or the identity.
         see: what the policy is shown of the target.
         label: estimates the states from what a camera saw; without it, the states that the target tells are used.
@@ -124,7 +124,8 @@ def adapt(
         TargetError: the target misbehaves. BudgetExceeded: a step more than the budget.
         CheckpointError: `folder` holds a run of other networks.
     """
-    grounded = World(source.system, [residual], source.period, source.integrator, source.substeps)
+    effects = [*source.effects, residual]
+    grounded = World(source.system, effects, source.period, source.integrator, source.substeps)
     policy.residual = residual
     ledger = Ledger(settings.budget)
     episodes: list[Episode] = []
@@ -138,16 +139,14 @@ def adapt(
             ledger.count(f"{name}: data", episode.samples)
         episodes += new if label is None else label(new)
         windows = Windows.cut(episodes, settings.observations, observe)
-        if number == 0:
-            rescale(residual, source, windows)
-        grounding = _grounded(
-            here / "residual.safetensors",
-            lambda progress, w=windows, n=number: ground(  # type: ignore[misc]
-                residual, source, w, settings.ground, _generator(settings, n, 1), progress
-            ),
-            residual,
-            staged(report, f"{name}: ground"),
-        )
+
+        def fit(progress: Progress | None, windows: Windows = windows, number: int = number) -> list[GroundLoss]:
+            fit_named(source, windows)
+            if number == 0:
+                rescale(residual, source, windows)
+            return ground(residual, source, windows, settings.ground, _generator(settings, number, 1), progress)
+
+        grounding = _grounded(here / "residual.safetensors", fit, grounded, staged(report, f"{name}: ground"))
         if number == 0 and settings.feedforward:
             oppose(policy, source, residual.scale)
         losses = _tuned(here, policy, grounded, observe, settings, windows, number, staged(report, f"{name}: tune"))
@@ -193,15 +192,15 @@ def _collected(
 def _grounded(
     path: Path,
     fit: Callable[[Progress | None], list[GroundLoss]],
-    residual: Residual,
+    grounded: World,
     progress: Progress | None,
 ) -> list[tuple[int, float, float]]:
     if path.exists():
         tree = load_tree(path)
-        load_weights(residual, tree["weights"], path)
+        load_weights(grounded, tree["weights"], path)
         return [(int(step), float(train), float(held)) for step, train, held in tree["losses"]]
     losses = [(loss.step, loss.train, loss.held_out) for loss in fit(progress)]
-    save_tree(path, {"weights": residual.state_dict(), "losses": losses})
+    save_tree(path, {"weights": grounded.state_dict(), "losses": losses})
     return losses
 
 

@@ -38,6 +38,9 @@ class TuneSettings:
     learning_rate: float = 1e-3
     longest: int = 150
     """steps after which a stream starts anew"""
+    moving: int | None = None
+    """streams, drawn anew, that take a step in each iteration; the others stay, and are learnt from again: where steps
+    are counted. Without it, all move"""
     recorded: float = 0.0
     """share of the starts that are recorded windows of the target, histories and all"""
     observation_noise: float = 0.01
@@ -71,12 +74,14 @@ class Streams:
     @torch.no_grad()
     def advance(self, at: WorldState, action: Tensor, progress: float, generator: torch.Generator) -> None:
         """Take the step to `at` under `action`; restart what strayed. `progress` in [0, 1] drives the curriculum."""
+        before = self.at, self.history, self.place, self.age.clone()
         state = self.task.disturb(at.state, generator)
         self.at = WorldState(at.time, state, at.memory).detach()
         self.place = self.task.onward(self.place)
         self.history = self.history.acting(action).observing(self.show(state)).detach()
         self.age += 1
-        keep = (self.age < self.settings.longest) & ~self.task.astray(state, self.place, progress)
+        self._hold(before, generator)
+        keep = (self.age < self.settings.longest) & ~self.task.astray(self.at.state, self.place, progress)
         if not bool(keep.all()):
             at, history, place = self._fresh(progress, generator)
             self.at = self.at.where(keep, at)
@@ -102,6 +107,17 @@ class Streams:
         self.history = History(kept["observations"], kept["actions"])
         self.place = kept["place"]
         self.age = kept["age"]
+
+    def _hold(self, before: tuple[WorldState, History, Tensor, Tensor], generator: torch.Generator) -> None:
+        """Put all streams back but those that move."""
+        if self.settings.moving is None:
+            return
+        moved = torch.zeros(self.settings.batch, dtype=torch.bool)
+        moved[torch.randperm(self.settings.batch, generator=generator)[: self.settings.moving]] = True
+        at, history, place, age = before
+        self.at, self.history = self.at.where(moved, at), self.history.where(moved, history)
+        self.place = torch.where(moved.reshape(-1, *[1] * (place.dim() - 1)), self.place, place)
+        self.age = torch.where(moved, self.age, age)
 
     def _fresh(self, progress: float, generator: torch.Generator) -> tuple[WorldState, History, Tensor]:
         settings = self.settings

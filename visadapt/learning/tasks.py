@@ -77,6 +77,23 @@ class Balance(Task):
         return curriculum(self.first_divergence, progress) * torch.tensor(self.diverged)
 
 
+@dataclass(frozen=True)
+class SwingUp(Balance):
+    """As `Balance`, but the pole may be anywhere (A.5): a turn more or less is the same angle."""
+
+    def show(self, seen: Tensor, place: Tensor) -> Tensor:
+        return within_a_turn(seen)
+
+    def disturb(self, state: Tensor, generator: torch.Generator) -> Tensor:
+        return within_a_turn(super().disturb(state, generator))
+
+
+def within_a_turn(state: Tensor) -> Tensor:
+    """States (B, 4) of a cart-pole with the angle between -pi and pi."""
+    x, x_dot, theta, theta_dot = state.unbind(-1)
+    return torch.stack((x, x_dot, torch.atan2(theta.sin(), theta.cos()), theta_dot), -1)
+
+
 def curriculum(first: float, progress: float) -> float:
     """A share that grows from `first` to 1 over the first half of the training."""
     return first + (1 - first) * min(1.0, 2 * progress)
