@@ -34,8 +34,11 @@ def expect_vehicle(system: System, effect: Effect) -> Vehicle:
 
 def airspeed(state: Tensor, vehicle: Vehicle) -> Tensor:
     """Velocity (B, 3) against the air in m/s, world axes, in states (B, 13)."""
-    wind = (torch.as_tensor(v).to(state) for v in (vehicle.wind_x, vehicle.wind_y, vehicle.wind_z))
-    return state[:, VELOCITY] - torch.stack(torch.broadcast_tensors(*wind), -1)
+    wind = (vehicle.wind_x, vehicle.wind_y, vehicle.wind_z)
+    if not any(isinstance(value, Tensor) or value for value in wind):
+        return state[:, VELOCITY]
+    columns = torch.broadcast_tensors(*(torch.as_tensor(value).to(state) for value in wind))
+    return state[:, VELOCITY] - torch.stack(columns, -1)
 
 
 class AirDrag(DynamicsEffect):

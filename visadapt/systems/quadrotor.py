@@ -150,6 +150,8 @@ _MIXER = ((1.0, 1.0, 1.0, 1.0), (1.0, -1.0, -1.0, 1.0), (-1.0, -1.0, 1.0, 1.0), 
 
 def _beside(values: Sequence[float | Tensor], like: Tensor) -> Tensor:
     """Parameters side by side, (n,), or (B, n) where one of them is (B,)."""
+    if not any(isinstance(value, Tensor) for value in values):
+        return like.new_tensor(values)
     return torch.stack(torch.broadcast_tensors(*(torch.as_tensor(value).to(like) for value in values)), -1)
 
 
