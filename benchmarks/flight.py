@@ -81,6 +81,8 @@ def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
     if not settings.references.exists():
         quadrotor_references.main(quadrotor_references.Settings(out=settings.references))
+    for name in settings.experiments:  # before the jobs, which share them
+        _source_policy(settings, vehicle(EXPERIMENTS[name], settings.references))
     jobs = [(name, seed) for name in settings.experiments for seed in range(settings.seeds)]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(settings.jobs, mp_context=context) as pool:
@@ -123,7 +125,7 @@ def _scores(settings: Settings, name: str, seed: int) -> dict[str, FlightScore]:
     folder = settings.work / name.replace(", ", "-").replace(" ", "-") / f"seed-{seed}"
     open_run(folder, {"seed": seed, "flights": settings.flights, **_plain(experiment), **asdict(flight.settings)})
     draw = hidden(experiment, float(flight.system.mass))
-    policy = flight.pretrain(settings.assets / f"{flight.system.name}.safetensors", 0)
+    policy = _source_policy(settings, flight)
     adapting = copy.deepcopy(policy)
     adapted = flight.adapt(
         adapting,
@@ -139,13 +141,19 @@ def _scores(settings: Settings, name: str, seed: int) -> dict[str, FlightScore]:
         def fresh() -> dict[str, object]:
             return asdict(score(flight.target(draws), which, SCORE_SEED, settings.flights))
 
-        return FlightScore(**once(folder / f"{key}.json", fresh))
+        # JSON has no infinity: that of a flight that was not finite is null there.
+        kept = once(folder / f"{key}.json", fresh)
+        return FlightScore(**{**kept, **{name: math.inf for name, value in kept.items() if value is None}})
 
     found = {"source": scored("source", no_effects, policy), "target": scored("target", draw, policy)}
     for samples in [each.samples for each in adapted.rounds]:
         adapted.restore(adapting, samples)
         found[str(samples)] = scored(str(samples), draw, adapting)
     return found
+
+
+def _source_policy(settings: Settings, flight: Flight) -> FlightPolicy:
+    return flight.pretrain(settings.assets / f"{flight.system.name}.safetensors", 0)
 
 
 def _plain(experiment: Experiment) -> dict[str, object]:
@@ -155,7 +163,7 @@ def _plain(experiment: Experiment) -> dict[str, object]:
 def _row(name: str, key: str, scores: Sequence[FlightScore]) -> Row:
     """Over all flights of all seeds; a flight that failed is in the mean with all it missed by, and counted apart."""
     means = np.array([score.mean for score in scores])
-    spread = np.sqrt(np.mean([score.std**2 for score in scores]) + means.var())
+    spread = np.sqrt(np.mean([score.std**2 for score in scores]) + means.var()) if np.isfinite(means).all() else np.inf
     experiment = EXPERIMENTS[name]
     return Row(
         experiment=name,

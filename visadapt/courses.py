@@ -49,7 +49,7 @@ class AlongReferences(Course):
         """References without repetition, as far as there are so many."""
         count = len(self.references.positions)
         drawn = [torch.randperm(count, generator=generator) for _ in range(-(-batch // count))]
-        which = torch.cat(drawn)[:batch]
+        which = torch.cat(drawn)[:batch].to(self.references.positions.device)
         row = torch.zeros_like(which)
         return self.on(which, row), torch.stack((which, row), 1)
 
@@ -57,7 +57,7 @@ class AlongReferences(Course):
         return self.ahead(place).flatten(1)
 
     def onward(self, place: Tensor) -> Tensor:
-        return place + torch.tensor([0, 1])
+        return place + place.new_tensor((0, 1))
 
     def misses(self, states: Tensor, place: Tensor) -> Tensor:
         """The distance to the reference at every row but the first (the paper's average tracking error)."""
@@ -73,7 +73,7 @@ class AlongReferences(Course):
     def ahead(self, place: Tensor) -> Tensor:
         """Positions and velocities (B, HORIZON, 6) after the rows of `place`; beyond its end a reference goes on."""
         which = place[:, :1]
-        rows = place[:, 1:] + torch.arange(1, HORIZON + 1)
+        rows = place[:, 1:] + torch.arange(1, HORIZON + 1).to(place)
         beyond = (rows - self.last).clamp(min=0)[..., None] * self.references.period
         rows = rows.clamp(max=self.last)
         velocity = self.references.velocities[which, rows]

@@ -213,7 +213,7 @@ class FlightResidualNetwork(ResidualNetwork):
 
     def __init__(self, system: RigidBody, period: float, predict: Predict | None = None) -> None:
         inputs = 15 + len(system.actions) + (0 if predict is None else 6 * (LENGTH - 1))
-        super().__init__(nn.Linear(inputs, len(system.states)))
+        super().__init__(nn.Linear(inputs, len(system.states), bias=False))
         self.n_state = len(system.states)
         self.period = period
         self.predict = predict

@@ -56,11 +56,13 @@ def run(
     steps: int,
     generator: torch.Generator,
     exploration: float = 0.0,
+    strict: bool = True,
 ) -> list[Run]:
     """Run `batch` episodes of at most `steps` steps each; an episode that ends is cut there, and marked.
 
     Args:
         exploration: standard deviation of white noise on the commands, so that what they do shows in the data.
+        strict: whether a state that is not finite is an error; if not, it is where its episode ends.
 
     Raises:
         TargetError: the target shows a state that is not finite while its episode goes on, or no frame.
@@ -79,9 +81,10 @@ def run(
             action = (action + exploration * torch.randn(action.shape, generator=generator).to(action)).clamp(-1, 1)
         rows.append((observation, action))
         observation = target.step(action)
-        _check_finite(target, observation, running, f"the state after step {len(rows)}")
+        if strict:
+            _check_finite(target, observation, running, f"the state after step {len(rows)}")
         length += running
-        running &= observation.alive
+        running &= observation.alive & observation.state.isfinite().all(1)
         history = history.acting(action).observing(see(observation))
     rows.append((observation, torch.zeros(batch, target.n_action)))
     return [_cut(rows, b, int(length[b]), bool(running[b]), target.period) for b in range(batch)]

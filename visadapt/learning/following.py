@@ -53,13 +53,15 @@ class Follow(Task):
 
     def begin(self, batch: int, progress: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Somewhere on a reference, and a little off it."""
-        which = torch.randint(len(self.course.references.positions), (batch,), generator=generator)
-        row = torch.randint(self.course.last, (batch,), generator=generator)
+        positions = self.course.references.positions
+        which = torch.randint(len(positions), (batch,), generator=generator).to(positions.device)
+        row = torch.randint(self.course.last, (batch,), generator=generator).to(which)
         state = self.course.on(which, row)
         metres, speed = self.start_spread
         spread = torch.tensor([metres] * 3 + [speed] * 3)
         share = curriculum(self.first_divergence, progress)
-        state[:, : len(spread)] += share * spread * torch.randn(batch, len(spread), generator=generator)
+        off = share * spread * torch.randn(batch, len(spread), generator=generator)
+        state[:, : len(spread)] += off.to(state)
         return state, torch.stack((which, row), 1)
 
     def cost(self, states: Tensor, plan: Tensor, now: Tensor, place: Tensor) -> Tensor:

@@ -65,7 +65,8 @@ def fit_named(source: World, windows: Windows) -> None:
     Errors count in units of what the source leaves out without them, state by state; parameters stay within the ranges
     that their effects state.
     """
-    parameters = [(effect, each) for effect in source.effects for each in effect.table]
+    named = [effect for effect in source.effects if isinstance(effect, Effect)]
+    parameters = [(effect, each) for effect in named for each in effect.table]
     if not parameters:
         return
     bare = World(source.system, (), source.period, source.integrator, source.substeps)

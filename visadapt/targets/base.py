@@ -23,10 +23,10 @@ class Observation:
     """(B,) whether the episode can go on: the pole up and the cart in the frame"""
     frame: Tensor | None = None
     """(B, H, W) uint8"""
-    goal: Tensor | None = None
-    """(B, n_goal) what the policy is to do, where that is not always the same"""
     force: Tensor | None = None
     """(B,) the disturbance in N, where the target knows it: for films only"""
+    goal: Tensor | None = None
+    """(B, n_goal) what the policy is to do, where that is not always the same"""
 
 
 class Target(ABC):

@@ -119,4 +119,4 @@ class SyntheticTarget(Target):
             # A fallen cart-pole may be anywhere; the camera shows it at its last sensible place.
             shown = state.nan_to_num().clamp(-10, 10).double().numpy()
             frame = torch.from_numpy(self.camera(shown[:, 0], shown[:, 2]))
-        return Observation(measured, alive, frame, self._world.load(self._at)[:, 0])
+        return Observation(measured, alive, frame, force=self._world.load(self._at)[:, 0])
