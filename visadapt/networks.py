@@ -230,9 +230,10 @@ class FlightResidualNetwork(ResidualNetwork):
     def unexplained(self, predict: Predict, states: Tensor, actions: Tensor) -> Tensor:
         """Changes of velocity and rates beyond the source's over the periods between states, (B, 6 (LENGTH - 1)).
 
-        In units of EXPECTED times a period.
+        In units of EXPECTED times a period. Before a flight begins its first state stands still, which says nothing.
         """
         before, after = states[:, :-1].flatten(0, 1), states[:, 1:].flatten(0, 1)
         left = after - predict(before, actions[:, :-1].flatten(0, 1))
         moving = torch.cat((left[:, VELOCITY], left[:, RATES]), 1) / (EXPECTED * self.period)
-        return moving.unflatten(0, (len(states), LENGTH - 1)).flatten(1)
+        known = (after != before).any(1, keepdim=True)
+        return (moving * known).unflatten(0, (len(states), LENGTH - 1)).flatten(1)

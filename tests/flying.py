@@ -1,0 +1,47 @@
+"""Gentle references with closed forms, and small flights, for the tests of vehicles."""
+
+import dataclasses
+import math
+
+import torch
+
+from visadapt.courses import AlongReferences
+from visadapt.effects import LinearDrag
+from visadapt.flights import quadrotor
+from visadapt.references import Reference
+
+PERIOD = 0.1
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def waves(count, rows=41, seed=0, dtype=torch.float32):
+    """References on which each axis swings to and fro by 0.5 m to 1 m, once in 5 s to 10 s."""
+    generator = seeded(seed)
+    size, speed, phase = torch.rand(3, count, 1, 3, generator=generator, dtype=torch.float64)
+    size, speed, phase = 0.5 + size / 2, math.pi / 5 * (1 + speed), 2 * math.pi * phase
+    angle = speed * PERIOD * torch.arange(rows)[:, None] + phase
+    motion = [size * speed**order * (angle + order * math.pi / 2).sin() for order in range(4)]
+    return Reference.of(torch.stack(motion).to(dtype), PERIOD)
+
+
+def straight(count=2, rows=41, dtype=torch.float32):
+    """References that go straight on at a steady velocity, another one each."""
+    velocity = torch.randn(count, 1, 3, generator=seeded(5), dtype=torch.float64).expand(count, rows, 3)
+    position = velocity * PERIOD * torch.arange(rows)[:, None] + 1.0
+    still = torch.zeros_like(velocity)
+    return Reference.of(torch.stack((position, velocity, still, still)).to(dtype), PERIOD)
+
+
+def small_flight(rows=21, **settings):
+    """The quadrotor on a few short references; `settings` are FlightSettings'."""
+    flight = quadrotor(AlongReferences(waves(8, rows)), AlongReferences(waves(5, rows, seed=1)))
+    flight.settings = dataclasses.replace(flight.settings, **settings)
+    return flight
+
+
+def drag(rate):
+    """Draws v' = ... - rate v for the quadrotor of 1 kg."""
+    return lambda batch, generator: (LinearDrag(coefficient=rate),)
