@@ -90,7 +90,12 @@ def main(settings: Settings) -> None:
     rows = []
     for name in settings.experiments:
         scores = [found[name, seed] for seed in range(settings.seeds)]
-        rows += [_row(name, samples, [each[samples] for each in scores]) for samples in scores[0]]
+        for key in scores[0]:
+            own = [each[key] for each in scores]
+            if key in ("source", "target"):
+                rows.append(flight_row(name, "unadapted", key, 0, own))
+            else:
+                rows.append(flight_row(name, OURS, "adapted", int(key), own))
     write_rows(settings.out, rows)
     for row in rows:
         print(f"{row.experiment:20} {row.domain:8} {row.samples:5} samples  {row.mean:.4f} +- {row.std:.4f} m")
@@ -160,18 +165,18 @@ def _plain(experiment: Experiment) -> dict[str, object]:
     return {**asdict(experiment), "vehicle": experiment.vehicle.name}
 
 
-def _row(name: str, key: str, scores: Sequence[FlightScore]) -> Row:
+def flight_row(experiment: str, method: str, domain: str, samples: int, scores: Sequence[FlightScore]) -> Row:
     """Over all flights of all seeds; a flight that failed is in the mean with all it missed by, and counted apart."""
     means = np.array([score.mean for score in scores])
-    spread = np.sqrt(np.mean([score.std**2 for score in scores]) + means.var()) if np.isfinite(means).all() else np.inf
-    experiment = EXPERIMENTS[name]
+    spread = np.sqrt(np.mean([score.std**2 for score in scores]) + means.var())
+    wing = experiment.startswith("fixed wing")
     return Row(
-        experiment=name,
-        system=experiment.vehicle.name,
-        method="unadapted" if key in ("source", "target") else OURS,
-        domain=key if key in ("source", "target") else "adapted",
-        samples=0 if key in ("source", "target") else int(key),
-        measure="mean tracking error" if experiment.vehicle is Quadrotor else "miss of the target",
+        experiment=experiment,
+        system="fixed_wing" if wing else "quadrotor",
+        method=method,
+        domain=domain,
+        samples=samples,
+        measure="miss of the target" if wing else "mean tracking error",
         unit="m",
         mean=round(float(means.mean()), 5),
         std=round(float(spread), 5),

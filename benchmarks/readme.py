@@ -66,6 +66,66 @@ def pendulum(rows: Rows) -> list[list[str]]:
     return table + [[f"{row['method']}, {row['domain']}", f"{int(row['samples']):,}", *_said(row)] for row in ours]
 
 
+VEHICLES = {
+    "quadrotor, drag": ("quadrotor, drag 0.3 1/s: mean tracking error", "0.05", "0.56", "0.07 (1,000)"),
+    "fixed wing, drag": ("fixed wing, drag 0.3 1/s: miss of the target", "0.01", "0.07", "0.02 (2,000)"),
+    "quadrotor, 2 cos t": ("quadrotor, 2 cos t N: mean tracking error", "", "", "figure 2"),
+    "fixed wing, 2 cos t": ("fixed wing, 2 cos t N: miss of the target", "", "", "figure 6"),
+}
+"""What the README calls the experiments of `benchmarks.flight`, and the paper's source, target before and after."""
+
+
+def vehicles(rows: Rows) -> list[list[str]]:
+    """The paper's vehicles beside ours, in m."""
+    table = [
+        ["m", "paper: source, before, after (samples)", "source", "before", "after: first round", "after: last round"]
+    ]
+    for name, (said, *papers) in VEHICLES.items():
+        own = [row for row in rows if row["experiment"] == name]
+        if own:
+            adapted = sorted((row for row in own if row["domain"] == "adapted"), key=lambda row: int(row["samples"]))
+            source, before = (next(row for row in own if row["domain"] == domain) for domain in ("source", "target"))
+            cells = [
+                f"{float(row['mean']):.4f} ± {float(row['std']):.4f}" + (f" ({int(row['samples']):,})" if k > 1 else "")
+                for k, row in enumerate((source, before, adapted[0], adapted[-1]))
+            ]
+            table.append([said, ", ".join(filter(None, papers)), *cells])
+    return table
+
+
+LOOPS = {"2.6": "0.05", "3.4": "0.09", "4.1": "0.12", "4.6": "0.21", "5.0": "0.31"}
+"""Speeds in m/s, and the paper's mean errors in m."""
+
+
+def loops(rows: Rows) -> list[list[str]]:
+    """The power loop, in m."""
+    found = {(row["experiment"], row["measure"]): f"{float(row['mean']):.3f}" for row in rows}
+    table = [["power loop, m", *(f"{speed} m/s" for speed in LOOPS)], ["paper, mean error", *LOOPS.values()]]
+    for name, said in (("power loop", "radius 7 m"), ("power loop, tightest", "tightest radius")):
+        for measure, short in (("mean tracking error", "mean error"), ("greatest tracking error", "greatest error")):
+            table.append([f"{said}, {short}", *(found.get((f"{name}, {speed} m/s", measure), "") for speed in LOOPS)])
+    return table
+
+
+def swing(rows: Rows) -> list[list[str]]:
+    """The swing-up."""
+    own = {row["measure"]: row for row in rows if row["experiment"] == "CartPole, swing-up"}
+    table = [["swing-up, 20,000 samples", "paper", "here"]]
+    if not own:
+        return table
+    whole = own["mean cart speed"]
+    episodes = int(whole["episodes"])
+    table.append(["episodes that succeed", "100 %", f"{episodes - int(whole['failed'])} of {episodes}"])
+    for measure, paper_says in (
+        ("mean cart speed", "0.29 m/s"),
+        ("mean cart speed after 100 steps", ""),
+        ("mean distance from the middle after 100 steps", "0.01 m"),
+    ):
+        row = own[measure]
+        table.append([measure, paper_says, f"{float(row['mean']):.3f} ± {float(row['std']):.3f} {row['unit']}"])
+    return table
+
+
 def blind(rows: Rows) -> list[list[str]]:
     """The sealed check of the diagnosis: every diagnoser on both sets."""
     found = {(row["kind"], row["diagnoser"], row["measure"]): row for row in rows}
@@ -124,6 +184,9 @@ TABLES: dict[str, Callable[[Rows], list[list[str]]]] = {
     "curve": curve,
     "grounding": grounding,
     "pendulum": pendulum,
+    "vehicles": vehicles,
+    "loops": loops,
+    "swing": swing,
 }
 """from the experiments' rows"""
 
