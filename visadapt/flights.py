@@ -22,7 +22,7 @@ from visadapt.learning.joint import Adapted, AdaptSettings, adapt
 from visadapt.learning.policy import TuneSettings, tune
 from visadapt.learning.tasks import Task
 from visadapt.networks import FlightResidualNetwork
-from visadapt.policies import FlightPolicy, FollowPolicy, ReachPolicy
+from visadapt.policies import FlightPolicy, FollowPolicy, Policy, ReachPolicy
 from visadapt.rollout import run, see_goals
 from visadapt.systems import FixedWing, Quadrotor, RigidBody
 from visadapt.targets import FlightTarget
@@ -152,7 +152,7 @@ def quadrotor(train: AlongReferences, test: AlongReferences) -> Flight:
 def fixed_wing(period: float = 0.05) -> Flight:
     """The fixed wing that flies through points 50 m ahead."""
     course = ToTarget(period)
-    settings = FlightSettings(source_iterations=3000, source_rate=3e-3, iterations=200, rate=1e-3, batch=128)
+    settings = FlightSettings(source_iterations=3000, source_rate=3e-3, iterations=200, rate=3e-4, batch=128)
     return Flight(FixedWing(), period, 1, course, course, Reach(course), ReachPolicy, settings)
 
 
@@ -178,7 +178,7 @@ FAR = 1.0
 """m off the course: the flight has failed."""
 
 
-def score(target: FlightTarget, policy: FlightPolicy, seed: int, flights: int = 100) -> FlightScore:
+def score(target: FlightTarget, policy: Policy, seed: int, flights: int = 100) -> FlightScore:
     """Fly `flights` courses drawn with `seed`; the steps are free and not counted."""
     policy.eval()
     generator = torch.Generator().manual_seed(seed)
