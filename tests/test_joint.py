@@ -192,6 +192,12 @@ class TestLearning:
         assert adapted.rounds[0].grounding[0][2] == pytest.approx(1.0, abs=0.5)
         assert min(held for _, _, held in adapted.rounds[1].grounding) < 0.5
 
+    @pytest.mark.parametrize("feedforward", [True, False])
+    def test_the_policy_begins_by_opposing_what_the_residual_expects_if_it_is_to(self, tmp_path, feedforward):
+        settings = dataclasses.replace(QUICK, tune=dataclasses.replace(QUICK.tune, learning_rate=0.0))
+        policy, _ = run(tmp_path, dataclasses.replace(settings, feedforward=feedforward))
+        assert bool(policy.feedforward.weight.any()) == feedforward
+
     def test_each_round_and_each_seed_meets_the_target_in_other_states(self, whole, tmp_path):
         _, adapted, _ = whole
         _, other = run(tmp_path, dataclasses.replace(QUICK, seed=2))

@@ -62,7 +62,7 @@ def run(
 
     Args:
         exploration: standard deviation of white noise on the commands, so that what they do shows in the data.
-        strict: whether a state that is not finite is an error; if not, it is where its episode ends.
+        strict: whether a state that is not finite is an error; if not, its episode ends before it.
 
     Raises:
         TargetError: the target shows a state that is not finite while its episode goes on, or no frame.
@@ -81,10 +81,11 @@ def run(
             action = (action + exploration * torch.randn(action.shape, generator=generator).to(action)).clamp(-1, 1)
         rows.append((observation, action))
         observation = target.step(action)
+        finite = observation.state.isfinite().all(1)
         if strict:
             _check_finite(target, observation, running, f"the state after step {len(rows)}")
-        length += running
-        running &= observation.alive & observation.state.isfinite().all(1)
+        length += running & finite
+        running &= observation.alive & finite
         history = history.acting(action).observing(see(observation))
     rows.append((observation, torch.zeros(batch, target.n_action)))
     return [_cut(rows, b, int(length[b]), bool(running[b]), target.period) for b in range(batch)]
