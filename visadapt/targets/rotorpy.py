@@ -1,0 +1,168 @@
+"""rotorpy's multirotor as a target: a quadrotor whose air, motors and rate loop no one here wrote.
+
+Folk, Paulos and Kumar (2023), RotorPy: a Python-based multirotor simulator with aerodynamics, arXiv:2306.04485. The
+vehicle is its Crazyflie Brushless with propeller guards, as it stands there, flown by collective thrust and body rates
+(`cmd_ctbr`). `SOURCE` is the model that its published mass, arm and rate gain give.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from visadapt.courses import AlongReferences
+from visadapt.systems import Quadrotor
+from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY
+from visadapt.targets.base import Observation, TargetError
+from visadapt.targets.flight import FlightTarget
+
+INSTALL = "pip install 'visadapt[rotorpy]'"
+TICK = 0.01
+"""s between runs of rotorpy's rate loop, its simulator's own default; thrusts are held for as long"""
+
+SOURCE = Quadrotor(
+    mass=0.044,
+    arm_length=0.043,
+    roll_gain=5.27,
+    yaw_gain=5.27,
+    max_rate=1.0,
+    torque_to_thrust=7.8e-10 / 4.052e-8,
+)
+"""What an engineer reads off the vehicle's parameters.
+
+Thrusts are mass-normalised, so their range is the default's. Commands ask for rates twice as fast, since the default's
+rate loop is three times as stiff. Its inertia is that of a plate of that mass and arm: rate loops undo their own.
+
+What it leaves out, on purpose: the drag of the rotors, and how thrust falls and rises with the air that flows through
+and across them; the wind; the motors' lag of 50 ms; the rate loop's tick; the gyroscopic torque, which rotorpy's rate
+loop does not undo.
+"""
+
+
+@dataclass(frozen=True)
+class Air:
+    """Wind in world axes: one steady velocity (rotorpy's ConstantWind), and one that swings (its SinusoidWind).
+
+    Every flight draws the phases of what swings, uniformly.
+    """
+
+    steady: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """m/s"""
+    amplitude: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """m/s"""
+    frequency: tuple[float, float, float] = (0.1, 0.15, 0.1)
+    """Hz"""
+
+
+BREEZE = Air(steady=(1.5, 0.0, 0.0), amplitude=(0.5, 1.0, 0.0))
+
+
+class RotorpyTarget(FlightTarget):
+    """A batch of rotorpy's multirotors along references: rotor drag, motor lag and wind on, 0.1 s between commands.
+
+    Thrust commands are forces in N of the same range as the source's, by the mass that both know; rates are rates.
+    States are rotorpy's in our order: its quaternion is (x, y, z, w). Rotors start at the speed of a hover.
+
+    Args:
+        course: where flights start and what a policy is told.
+        air: the wind.
+        aero: whether the air acts at all.
+        changes: parameters of rotorpy's vehicle in the place of the published ones, by rotorpy's names.
+
+    Raises:
+        TargetError: rotorpy, or what its batched multirotor needs, is not installed.
+    """
+
+    def __init__(
+        self,
+        course: AlongReferences,
+        air: Air = BREEZE,
+        aero: bool = True,
+        changes: Mapping[str, Any] | None = None,
+        name: str = "rotorpy's Crazyflie Brushless",
+    ) -> None:
+        super().__init__(course, SOURCE, course.references.period, name=name)
+        self._physics = _import("rotorpy.vehicles.multirotor", "torchdiffeq", "roma")
+        self._winds = _import("rotorpy.wind.default_winds")
+        self.vehicle = {**_import("rotorpy.vehicles.crazyfliebrushless_params").quad_params, **(changes or {})}
+        self.air = air
+        self.aero = aero
+        self._multirotors: Any = None
+        self._blowing: list[Any] = []
+        self._state: dict[str, Tensor] = {}
+        self._ticks = 0
+
+    def reset(self, batch: int, generator: torch.Generator) -> Observation:
+        state, self.first = self.course.start(batch, generator)
+        self._place = self.first
+        state = state.double()
+        hover = (self.vehicle["mass"] * 9.81 / 4 / self.vehicle["k_eta"]) ** 0.5
+        self._state = {
+            "x": state[:, POSITION],
+            "v": state[:, VELOCITY],
+            "q": state[:, ATTITUDE].roll(-1, 1),
+            "w": state[:, RATES],
+            "rotor_speeds": state.new_full((batch, 4), hover),
+        }
+        self._ticks = 0
+        self._blowing = self._wind(batch, generator)
+        self._blow()
+        device = torch.device("cpu")
+        parameters = self._physics.BatchedMultirotorParams([self.vehicle] * batch, batch, device)
+        self._multirotors = self._physics.BatchedMultirotor(
+            parameters, batch, self._state, device, "cmd_ctbr", self.aero, integrator="rk4"
+        )
+        return self._observation()
+
+    def step(self, action: Tensor) -> Observation:
+        if self._multirotors is None:
+            raise TargetError(f"{self.name}: step before reset")
+        command = action.detach().double().clamp(-1, 1)
+        control = {
+            "cmd_thrust": SOURCE.mass * SOURCE.thrust(command)[:, None],
+            "cmd_w": SOURCE.max_rate * command[:, 1:],
+        }
+        with torch.no_grad():
+            for _ in range(round(self.period / TICK)):
+                self._state = self._multirotors.step(self._state, control, TICK)
+                self._ticks += 1
+                self._blow()
+        self._place = self.course.onward(self._place)
+        return self._observation()
+
+    def _wind(self, batch: int, generator: torch.Generator) -> list[Any]:
+        """rotorpy's profiles, whose sum blows."""
+        own = self.air
+        amplitude, frequency = (torch.tensor([each] * batch).double() for each in (own.amplitude, own.frequency))
+        delay = torch.rand(batch, 3, generator=generator, dtype=torch.double) / frequency
+        return [
+            self._winds.BatchedConstantWind(batch, *own.steady),
+            self._winds.BatchedSinusoidWind(amplitude, frequency, delay),
+        ]
+
+    def _blow(self) -> None:
+        """Tell the vehicles the wind at the next tick."""
+        now, where = self._ticks * TICK, self._state["x"]
+        self._state["wind"] = sum((each.update(now, where) for each in self._blowing), torch.zeros_like(where))
+
+    def _observation(self) -> Observation:
+        own = self._state
+        state = torch.cat((own["x"], own["v"], own["q"].roll(1, 1), own["w"]), 1).to(torch.get_default_dtype())
+        return Observation(state, alive=state.isfinite().all(1), goal=self.course.goal(self._place))
+
+
+def _import(module: str, *needs: str) -> Any:
+    """A module of rotorpy's, which passes over in silence what it `needs`."""
+    try:
+        found = importlib.import_module(module)
+        for each in needs:
+            importlib.import_module(each)
+        return found
+    except ImportError as error:
+        missing = (error.name or module).partition(".")[0]
+        raise TargetError(f"{missing} is not installed: {INSTALL}") from error
