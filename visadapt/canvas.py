@@ -61,6 +61,17 @@ class Canvas:
         """A filled convex polygon."""
         cv2.fillConvexPoly(self.pixels, _fixed(np.array(corners)), colour, cv2.LINE_AA, FRACTION_BITS)
 
+    def glass(self, corners: NDArray[np.floating], colour: Colour, share: float) -> None:
+        """A filled convex polygon that lets through all but `share` of what is behind it."""
+        height, width = self.pixels.shape[:2]
+        left, top = np.clip(np.floor(corners.min(0)).astype(int) - 1, 0, (width, height))
+        right, bottom = np.clip(np.ceil(corners.max(0)).astype(int) + 1, 0, (width, height))
+        if left < right and top < bottom:
+            cover = np.zeros((bottom - top, right - left), np.uint8)
+            cv2.fillConvexPoly(cover, _fixed(corners - (left, top)), 255, cv2.LINE_AA, FRACTION_BITS)
+            inside = (slice(top, bottom), slice(left, right))
+            self._blend(inside, cover.astype(np.float32) * (share / 255), colour)
+
     def box(self, left: float, top: float, right: float, bottom: float, colour: Colour) -> None:
         """A filled box; its edges blend with what is behind them in proportion to the pixels they cover."""
         height, width = self.pixels.shape[:2]

@@ -1,0 +1,123 @@
+"""A film of one flight three times: in the source, in the target before adaptation, and after it.
+
+    python -m train.flight_film --vehicle quadrotor --experiment drag
+
+Source policies are those in assets/ (from train.flight_policies). Adapted weights are those that `benchmarks.flight`
+left in runs/flight; where they are not there yet, or not all, the policy is adapted there first, in the same way. Do
+not start it while the benchmark is at work on the same experiment and seed. Writes
+
+    runs/films/<vehicle>-<experiment>.mp4    source, before and after side by side
+    runs/films/<vehicle>-<experiment>.png    a still of it
+
+and prints how far each of the three was off.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+import tyro
+
+from benchmarks.flight import EXPERIMENTS, hidden
+from train.flight_policies import made
+from visadapt.console import reporting
+from visadapt.flight_film import FlownPanel, write_flight_film, write_flight_still
+from visadapt.flights import Flight
+from visadapt.policies import Policy
+from visadapt.rollout import run, see_goals
+from visadapt.targets import TargetError
+from visadapt.targets.synthetic import DrawEffects, no_effects
+
+NAMES = {
+    ("quadrotor", "drag"): "quadrotor, drag",
+    ("quadrotor", "force"): "quadrotor, 2 cos t",
+    ("fixed_wing", "drag"): "fixed wing, drag",
+    ("fixed_wing", "force"): "fixed wing, 2 cos t",
+}
+"""What the benchmark calls them."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is filmed, and where its policies are."""
+
+    vehicle: Literal["quadrotor", "fixed_wing"] = "quadrotor"
+    experiment: Literal["drag", "force"] = "drag"
+    """hidden in the target: a drag of 0.3 1/s, or 2 cos(t + phase) N along x"""
+    seed: int = 0
+    """of the adaptation"""
+    flight: int = 12
+    """seed of the course, and of the force's phase: one that was not trained on"""
+    still: float = 6.0
+    """s at which the still is taken; 0.3 s after it passed its target, if it flies through one"""
+    references: Path = Path("data/quadrotor_references.npz")
+    """made where it is not there"""
+    assets: Path = Path("assets")
+    work: Path = Path("runs/flight")
+    out: Path = Path("runs/films")
+
+
+def main(settings: Settings) -> None:
+    """Adapt what is not adapted yet, fly, and film."""
+    torch.set_num_threads(1)
+    name = NAMES[settings.vehicle, settings.experiment]
+    experiment = EXPERIMENTS[name]
+    weights = settings.assets / f"{settings.vehicle}.safetensors"
+    if not weights.exists():
+        raise ValueError(f"{weights} is not there: python -m train.flight_policies --vehicles {settings.vehicle}")
+    flight = made(settings.vehicle, settings.references)
+    policy = flight.pretrain(weights, 0)
+    adapting = copy.deepcopy(policy)
+    draw = hidden(experiment, float(flight.system.mass))
+    with reporting() as report:
+        adapted = flight.adapt(
+            adapting,
+            flight.target(draw, test=False),
+            settings.work / name.replace(", ", "-").replace(" ", "-") / f"seed-{settings.seed}",
+            experiment.budget,
+            experiment.round_samples,
+            settings.seed,
+            with_history=experiment.hidden == "force",
+            report=report,
+        )
+        before = flown(flight, draw, policy, settings.flight, "Target, before adaptation")
+        panels = [
+            flown(flight, no_effects, policy, settings.flight, "Source, 0 samples"),
+            before,
+            flown(flight, draw, adapting, settings.flight, f"Target, after {adapted.ledger.used:,} samples", before),
+        ]
+        path = settings.out / f"{settings.vehicle}-{settings.experiment}.mp4"
+        passed = max(panel.passed for panel in panels) + 0.3
+        write_flight_still(path.with_suffix(".png"), panels, settings.still if before.follows else passed)
+        write_flight_film(path, panels, lambda done, total: report("film", done, total, float("nan")))
+    for panel in panels:
+        print(f"{panel.title:30} {100 * float(panel.score[-1]):7.2f} cm {'mean' if before.follows else 'nearest'}")
+    print(f"{path} and {path.with_suffix('.png').name} are written")
+
+
+def flown(
+    flight: Flight,
+    draw: DrawEffects,
+    policy: Policy,
+    seed: int,
+    title: str,
+    earlier: FlownPanel | None = None,
+) -> FlownPanel:
+    """One flight under hidden effects; the seed alone decides on its course and its force."""
+    policy.eval()
+    target = flight.target(draw)
+    flights = run(target, policy, see_goals, 1, target.course.steps, torch.Generator().manual_seed(seed), strict=False)
+    return FlownPanel(title, flights[0], flight.system, target.course, target.first[0], earlier)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Settings, description=__doc__))
+    except (TargetError, ValueError, OSError) as error:
+        raise SystemExit(f"flight_film: {error}") from error
+    except KeyboardInterrupt:
+        raise SystemExit("interrupted: run it again to go on") from None
