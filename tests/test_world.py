@@ -11,10 +11,12 @@ from visadapt.effects import (
     ConstantForce,
     MeasurementDelay,
     Residual,
+    RotorEfficiency,
+    Spring,
     ViscousFriction,
 )
 from visadapt.history import History
-from visadapt.systems import CartPole
+from visadapt.systems import CartPole, Quadrotor
 from visadapt.world import ACTUATION_CHAIN, SENSING_CHAIN, World, place_in_chain
 
 
@@ -232,3 +234,10 @@ class TestResidual:
         state, actions = inputs()
         with pytest.raises(ValueError, match="needs the history"):
             world.step(world.start(state), actions[0])
+
+
+def test_an_effect_of_another_system_is_refused():
+    with pytest.raises(TypeError, match="spring acts on a cartpole, not on a quadrotor"):
+        World(Quadrotor(), [Spring(stiffness=1.0, rest=0.0)])
+    with pytest.raises(TypeError, match="rotor_efficiency acts on a quadrotor, not on a cartpole"):
+        World(CartPole(), [RotorEfficiency(scale_1=1.0, scale_2=1.0, scale_3=1.0, scale_4=1.0)])

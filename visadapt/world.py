@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, Residual, SensingEffect
 from visadapt.history import History
 from visadapt.integrators import INTEGRATORS
-from visadapt.systems import System
+from visadapt.systems import SYSTEMS, System
 
 ACTUATION_CHAIN = (
     "actuator_delay",
@@ -70,6 +70,7 @@ class World(nn.Module):
 
     Raises:
         ValueError: an unknown integrator, or a period or number of substeps that is not positive.
+        TypeError: an effect that does not act on this system.
     """
 
     def __init__(
@@ -85,6 +86,11 @@ class World(nn.Module):
             raise ValueError(f"unknown integrator {integrator!r}; there are {', '.join(INTEGRATORS)}")
         if not period > 0 or substeps < 1:
             raise ValueError(f"period and substeps must be positive, got {period!r} s and {substeps!r}")
+        for effect in effects:
+            # A system of one's own may be near enough to the one that an effect was written for.
+            if type(system) in SYSTEMS.values() and not isinstance(system, effect.systems):
+                kinds = " or a ".join(getattr(kind, "name", kind.__name__) for kind in effect.systems)
+                raise TypeError(f"{effect.name} acts on a {kinds}, not on a {system.name}")
         self.system = system
         self.period = period
         self.integrator = integrator
