@@ -19,6 +19,8 @@ from datasets import quadrotor_references
 from visadapt.console import reporting
 from visadapt.courses import AlongReferences
 from visadapt.flights import Flight, fixed_wing, quadrotor, score
+from visadapt.rig import RigError, load_rig
+from visadapt.systems import FixedWing, Quadrotor
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,8 @@ class Settings:
     """What is trained, and where it goes."""
 
     vehicles: tuple[str, ...] = ("quadrotor", "fixed_wing")
+    params: Path | None = None
+    """a TOML file with the parameters of one's own vehicle, in its table [parameters]; give --out too"""
     references: Path = Path("data/quadrotor_references.npz")
     """made where it is not there"""
     seed: int = 0
@@ -37,22 +41,26 @@ def main(settings: Settings) -> None:
     torch.set_num_threads(1)
     with reporting() as report:
         for name in settings.vehicles:
-            flight = made(name, settings.references)
+            flight = made(name, settings.references, settings.params)
             began = time.perf_counter()
             policy = flight.pretrain(settings.out / f"{name}.safetensors", settings.seed, report)
             took = time.perf_counter() - began
             print(f"{name}: {score(flight.target(), policy, seed=2026)} in the source; {took:.0f} s", flush=True)
 
 
-def made(vehicle: str, references: Path) -> Flight:
-    """A vehicle and its courses."""
+def made(vehicle: str, references: Path, params: Path | None = None) -> Flight:
+    """A vehicle, the default one or that of a file, and its courses."""
     if vehicle == "fixed_wing":
-        return fixed_wing()
+        return fixed_wing(system=load_rig(params, FixedWing) if params else None)
     if not references.exists():
         quadrotor_references.main(quadrotor_references.Settings(out=references))
     train, test = quadrotor_references.read(references)
-    return quadrotor(AlongReferences(train), AlongReferences(test))
+    own = load_rig(params, Quadrotor) if params else None
+    return quadrotor(AlongReferences(train), AlongReferences(test), own)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Settings, description=__doc__))
+    try:
+        main(tyro.cli(Settings, description=__doc__))
+    except RigError as error:
+        raise SystemExit(f"flight_policies: {error}") from error

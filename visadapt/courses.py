@@ -90,10 +90,10 @@ class ToTarget(Course):
     speed = 11.5
     """m/s at the start, along x"""
 
-    def __init__(self, period: float) -> None:
+    def __init__(self, period: float, system: FixedWing | None = None) -> None:
         self.period = period
         self.steps = round(1.6 * self.distance / self.speed / period)
-        self._start = FixedWing().trim(torch.tensor([self.speed]))[0]
+        self._start = (system or FixedWing()).trim(torch.tensor([self.speed]))[0]
 
     def start(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """In trimmed level flight at the origin."""

@@ -142,18 +142,19 @@ class Flight:
         return adapt(policy, residual, source, target, _states, see_goals, settings, folder, report=report)
 
 
-def quadrotor(train: AlongReferences, test: AlongReferences) -> Flight:
-    """The quadrotor that follows references 0.1 s a row."""
+def quadrotor(train: AlongReferences, test: AlongReferences, system: Quadrotor | None = None) -> Flight:
+    """The quadrotor, Flightmare's or one's own, that follows references 0.1 s a row."""
     period = train.references.period
     settings = FlightSettings(source_iterations=4000, source_rate=4e-3, iterations=200, rate=1e-3)
-    return Flight(Quadrotor(), period, 2, train, test, Follow(train), lambda: FollowPolicy(period), settings)
+    return Flight(system or Quadrotor(), period, 2, train, test, Follow(train), lambda: FollowPolicy(period), settings)
 
 
-def fixed_wing(period: float = 0.05) -> Flight:
-    """The fixed wing that flies through points 50 m ahead."""
-    course = ToTarget(period)
+def fixed_wing(period: float = 0.05, system: FixedWing | None = None) -> Flight:
+    """The fixed wing, Waldock's or one's own, that flies through points 50 m ahead."""
+    system = system or FixedWing()
+    course = ToTarget(period, system)
     settings = FlightSettings(source_iterations=3000, source_rate=3e-3, iterations=200, rate=3e-4, batch=128)
-    return Flight(FixedWing(), period, 1, course, course, Reach(course), ReachPolicy, settings)
+    return Flight(system, period, 1, course, course, Reach(course), ReachPolicy, settings)
 
 
 @dataclass(frozen=True)
