@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import pytest
@@ -9,7 +10,8 @@ from visadapt.courses import AlongReferences, ToTarget
 from visadapt.effects import LinearDrag, Residual
 from visadapt.history import History
 from visadapt.learning.following import Follow, FollowCost, Reach
-from visadapt.learning.policy import Streams, TuneSettings, imagine, tune
+from visadapt.learning.policy import TuneSettings, imagine, tune
+from visadapt.learning.streams import Streams, StreamSettings
 from visadapt.networks import FlightResidualNetwork
 from visadapt.policies import HORIZON, FollowPolicy, ReachPolicy
 from visadapt.systems import FixedWing, Quadrotor
@@ -32,7 +34,7 @@ def reaching(**changes):
 
 
 def streams(task, world, batch, longest=1000, seed=0):
-    made = Streams(world, identity, None, TuneSettings(task, 10, batch, longest=longest))
+    made = Streams(world, task, identity, None, StreamSettings(batch, longest, 0.0))
     made.start(seeded(seed))
     return made
 
@@ -165,10 +167,10 @@ class TestStreams:
 
     def step(self, made, off, progress):
         """One step without a command from states that are `off` (B, 3) m from where they were."""
-        state = made.at.state.clone()
+        state = made.now.at.state.clone()
         state[:, POSITION] += off
         at = self.WORLD.step(self.WORLD.start(state), torch.zeros(len(state), 4))
-        before = made.place.clone()
+        before = made.now.place.clone()
         made.advance(at, torch.zeros(len(state), 4), progress, seeded(3))
         return before
 
@@ -176,8 +178,9 @@ class TestStreams:
         """Streams of one age amid their references."""
         made = streams(following(), self.WORLD, batch)
         made.age[:] = 7
-        made.place = torch.stack((torch.arange(batch), torch.full((batch,), 12)), 1)
-        made.at = self.WORLD.start(made.task.course.on(*made.place.unbind(1)))
+        place = torch.stack((torch.arange(batch), torch.full((batch,), 12)), 1)
+        at = self.WORLD.start(made.task.course.on(*place.unbind(1)))
+        made.now = dataclasses.replace(made.now, at=at, place=place)
         return made
 
     @pytest.mark.parametrize(("progress", "far"), [(0.0, 0.1), (0.25, 1.05), (0.5, 2.0), (1.0, 2.0)])
@@ -187,24 +190,24 @@ class TestStreams:
         before = self.step(made, off, progress)
         assert made.age.tolist() == [8, 8, 8, 0, 0, 8]
         kept = torch.tensor([0, 1, 2, 5])
-        assert torch.equal(made.place[kept], before[kept] + torch.tensor([0, 1]))
-        assert made.at.state.isfinite().all()
-        assert not made.task.astray(made.at.state, made.place, 1.0).any()
+        assert torch.equal(made.now.place[kept], before[kept] + torch.tensor([0, 1]))
+        assert made.now.at.state.isfinite().all()
+        assert not made.task.astray(made.now.at.state, made.now.place, 1.0).any()
         # What the policy is shown goes with the place: of those that go on and of those that begin.
-        assert torch.equal(made.history.observations[:, -1, :13], made.at.state)
-        assert torch.equal(made.history.observations[:, -1, 13:], made.task.course.goal(made.place))
-        assert torch.equal(made.history.observations[3, 0], made.history.observations[3, -1])
+        assert torch.equal(made.now.history.observations[:, -1, :13], made.now.at.state)
+        assert torch.equal(made.now.history.observations[:, -1, 13:], made.task.course.goal(made.now.place))
+        assert torch.equal(made.now.history.observations[3, 0], made.now.history.observations[3, -1])
 
     def test_one_at_the_end_of_its_reference_starts_anew(self):
         made = self.middle()
-        made.place[2, 1] = ROWS - 2
-        made.at.state[2] = made.task.course.on(*made.place[2:3].unbind(1))[0]
+        made.now.place[2, 1] = ROWS - 2
+        made.now.at.state[2] = made.task.course.on(*made.now.place[2:3].unbind(1))[0]
         self.step(made, torch.zeros(6, 3), 1.0)
         assert made.age.tolist() == [8, 8, 0, 8, 8, 8]
 
     def test_one_that_has_gone_on_for_long_enough_starts_anew(self):
         made = self.middle()
-        made.settings = TuneSettings(made.task, 10, 6, longest=20)
+        made.settings = StreamSettings(6, 20, 0.0)
         made.age[5] = 19
         self.step(made, torch.zeros(6, 3), 1.0)
         assert made.age.tolist() == [8, 8, 8, 8, 8, 0]
@@ -214,7 +217,7 @@ class TestStreams:
         made = streams(reaching(), world, 5)
         made.age[:] = 7
         state, place = made.task.course.start(5, seeded())
-        made.place = place
+        made.now = dataclasses.replace(made.now, place=place)
         state[:, POSITION] = 0.5 * place
         state[1, POSITION] = place[1] + torch.tensor([0.1, 0.0, 0.0])
         state[2, POSITION] += torch.tensor([0.0, 9.0, 0.0])
@@ -222,8 +225,8 @@ class TestStreams:
         at = world.step(world.start(state), torch.zeros(5, 4))
         made.advance(at, torch.zeros(5, 4), 0.0, seeded(3))
         assert made.age.tolist() == [8, 0, 0, 8, 8]
-        assert torch.equal(made.place[[0, 3, 4]], place[[0, 3, 4]])
-        assert torch.equal(made.history.observations[:, -1, 13:], made.place)
+        assert torch.equal(made.now.place[[0, 3, 4]], place[[0, 3, 4]])
+        assert torch.equal(made.now.history.observations[:, -1, 13:], made.now.place)
 
     def test_tuned_along_references_the_cost_of_a_plan_falls(self):
         torch.manual_seed(0)

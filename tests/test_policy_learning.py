@@ -217,7 +217,7 @@ class TestOpposing:
         assert ((found > -2.0) & (found < 0.0)).all()
 
 
-def learn(checkpoint, stop=None, iterations=120):
+def learn(checkpoint, stop=None, iterations=120, **more):
     """Tune a policy in a world with memory; interrupt it once `stop` iterations are done."""
 
     def progress(done, total, loss):
@@ -227,19 +227,44 @@ def learn(checkpoint, stop=None, iterations=120):
     torch.manual_seed(0)
     policy = StatePolicy(4, with_history=True)
     world = World(CartPole(), [ActuatorDelay(delay=0.05)], integrator="euler")
-    settings = TuneSettings(Balance(PAPER_CARTPOLE), iterations, 8, longest=30)
+    settings = TuneSettings(Balance(PAPER_CARTPOLE), iterations, 8, longest=30, **more)
     generator = torch.Generator().manual_seed(1)
     losses = tune(policy, world, identity, settings, generator, progress=progress, checkpoint=checkpoint)
     return policy.state_dict(), losses
 
 
+class Stepped(Balance):
+    """Counts the steps that streams take."""
+
+    steps = 0
+
+    def disturb(self, state, generator):
+        type(self).steps += len(state)
+        return super().disturb(state, generator)
+
+
+class TestReplay:
+    """Streams of which every scene is kept and learnt from."""
+
+    def test_few_steps_are_taken_and_still_the_pole_stays_up(self):
+        torch.manual_seed(0)
+        Stepped.steps = 0
+        policy = StatePolicy(4)
+        task = Stepped(PAPER_CARTPOLE, diverged=ANYWHERE)
+        settings = TuneSettings(task, 300, 32, 1e-2, 100, streams=4, every=3, observation_noise=0.0)
+        tune(policy, World(CartPole(), integrator="euler"), identity, settings, torch.Generator().manual_seed(0))
+        assert Stepped.steps == 4 * 100
+        assert evaluate(SyntheticTarget(), policy, see_states, 0, 20, 100)[0].survived == 20
+
+
 class TestResuming:
-    def test_interrupted_after_a_checkpoint_it_goes_on_to_the_same_numbers(self, tmp_path):
-        weights, losses = learn(None)
+    @pytest.mark.parametrize("more", [{}, {"streams": 3, "every": 2}])
+    def test_interrupted_after_a_checkpoint_it_goes_on_to_the_same_numbers(self, tmp_path, more):
+        weights, losses = learn(None, **more)
         path = tmp_path / "partial.safetensors"
         with pytest.raises(KeyboardInterrupt):
-            learn(path, stop=110)
-        resumed, again = learn(path)
+            learn(path, stop=110, **more)
+        resumed, again = learn(path, **more)
         assert again == losses
         for key, value in weights.items():
             assert torch.equal(value, resumed[key]), key

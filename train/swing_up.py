@@ -43,14 +43,22 @@ SCORE_SEED = 2026
 ANYWHERE = (0.5, 0.5, math.pi, 1.0)
 """half-widths of the uniform distribution of the first state"""
 TASK = SwingUp(
-    Cost(state=(2.0, 3.0, 10.0, 1.0)),
+    Cost(state=(1.0, 3.0, 10.0, 1.0)),
     start_spread=ANYWHERE,
     kick=(0.0, 0.0, 0.0, 0.0),
     diverged=(8.0, 30.0, 1e9, 40.0),
     first_divergence=1.0,
 )
+STREAMS, EVERY = 16, 4
 LEARN = TuneSettings(
-    TASK, iterations=10_000, batch=256, learning_rate=3e-3, longest=150, moving=2, observation_noise=0.0
+    TASK,
+    iterations=EVERY * SAMPLES // STREAMS,
+    batch=64,
+    learning_rate=3e-3,
+    longest=200,
+    streams=STREAMS,
+    every=EVERY,
+    observation_noise=0.0,
 )
 
 

@@ -45,6 +45,10 @@ class History:
             torch.where(keep[:, None, None], self.actions, other.actions),
         )
 
+    def joined(self, other: History) -> History:
+        """The rows of this history and, after them, those of another."""
+        return History(torch.cat((self.observations, other.observations)), torch.cat((self.actions, other.actions)))
+
     def detach(self) -> History:
         """The same history, cut off from the graph."""
         return History(self.observations.detach(), self.actions.detach())

@@ -49,6 +49,14 @@ class WorldState:
         """The same, cut off from the graph."""
         return WorldState(self.time.detach(), self.state.detach(), tuple(m.detach() for m in self.memory))
 
+    def __getitem__(self, rows: Tensor) -> WorldState:
+        return WorldState(self.time[rows], self.state[rows], tuple(m[rows] for m in self.memory))
+
+    def joined(self, other: WorldState) -> WorldState:
+        """The rows of this world state and, after them, those of another."""
+        memory = tuple(torch.cat(pair) for pair in zip(self.memory, other.memory, strict=True))
+        return WorldState(torch.cat((self.time, other.time)), torch.cat((self.state, other.state)), memory)
+
     def where(self, keep: Tensor, other: WorldState) -> WorldState:
         """This world state in the rows where `keep` (B,) holds, `other` in the rest."""
         return WorldState(

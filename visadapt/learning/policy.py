@@ -9,8 +9,8 @@ starts anew, and delta_div grows as training goes on, so the policy learns to re
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from visadapt.console import Progress
 from visadapt.history import History
 from visadapt.learning.resume import EVERY, Training
+from visadapt.learning.streams import Scene, Streams, StreamSettings
 from visadapt.learning.tasks import Task
 from visadapt.learning.windows import Observe, Windows
 from visadapt.policies import HORIZON, Policy
@@ -38,101 +39,15 @@ class TuneSettings:
     learning_rate: float = 1e-3
     longest: int = 150
     """steps after which a stream starts anew"""
-    moving: int | None = None
-    """streams, drawn anew, that take a step in each iteration; the others stay, and are learnt from again: where steps
-    are counted. Without it, all move"""
+    streams: int | None = None
+    """streams, where they are not the batch itself: every scene that they come to is kept, and each batch drawn from
+    all of these, so that much is learnt from few steps"""
+    every: int = 1
+    """iterations for each step of the streams"""
     recorded: float = 0.0
     """share of the starts that are recorded windows of the target, histories and all"""
     observation_noise: float = 0.01
     """standard deviation of white noise on what the policy sees"""
-
-
-class Streams:
-    """A batch of simulated episodes in progress."""
-
-    def __init__(self, world: World, observe: Observe, windows: Windows | None, settings: TuneSettings) -> None:
-        self.world = world
-        self.observe = observe
-        self.windows = windows
-        self.settings = settings
-        self.task = settings.task
-        self.at: WorldState
-        self.history: History
-        self.place: Tensor
-        self.age: Tensor
-
-    def show(self, state: Tensor) -> Tensor:
-        """What the policy is shown of states (B, n_state) where the streams are now."""
-        return self.task.show(self.observe(state), self.place)
-
-    @torch.no_grad()
-    def start(self, generator: torch.Generator) -> None:
-        """Start all streams, at random ages, so that they do not end together."""
-        self.at, self.history, self.place = self._fresh(0.0, generator)
-        self.age = torch.randint(self.settings.longest, (self.settings.batch,), generator=generator)
-
-    @torch.no_grad()
-    def advance(self, at: WorldState, action: Tensor, progress: float, generator: torch.Generator) -> None:
-        """Take the step to `at` under `action`; restart what strayed. `progress` in [0, 1] drives the curriculum."""
-        before = self.at, self.history, self.place, self.age.clone()
-        state = self.task.disturb(at.state, generator)
-        self.at = WorldState(at.time, state, at.memory).detach()
-        self.place = self.task.onward(self.place)
-        self.history = self.history.acting(action).observing(self.show(state)).detach()
-        self.age += 1
-        self._hold(before, generator)
-        keep = (self.age < self.settings.longest) & ~self.task.astray(self.at.state, self.place, progress)
-        if not bool(keep.all()):
-            at, history, place = self._fresh(progress, generator)
-            self.at = self.at.where(keep, at)
-            self.history = self.history.where(keep, history)
-            self.place = torch.where(keep.reshape(-1, *[1] * (place.dim() - 1)), self.place, place)
-            self.age = torch.where(keep, self.age, 0)
-
-    def kept(self) -> dict[str, Any]:
-        """All that `restore` needs."""
-        return {
-            "time": self.at.time,
-            "state": self.at.state,
-            "memory": list(self.at.memory),
-            "observations": self.history.observations,
-            "actions": self.history.actions,
-            "place": self.place,
-            "age": self.age,
-        }
-
-    def restore(self, kept: dict[str, Any]) -> None:
-        """Go on from what `kept` gave."""
-        self.at = WorldState(kept["time"], kept["state"], tuple(kept["memory"]))
-        self.history = History(kept["observations"], kept["actions"])
-        self.place = kept["place"]
-        self.age = kept["age"]
-
-    def _hold(self, before: tuple[WorldState, History, Tensor, Tensor], generator: torch.Generator) -> None:
-        """Put all streams back but those that move."""
-        if self.settings.moving is None:
-            return
-        moved = torch.zeros(self.settings.batch, dtype=torch.bool)
-        moved[torch.randperm(self.settings.batch, generator=generator)[: self.settings.moving]] = True
-        at, history, place, age = before
-        self.at, self.history = self.at.where(moved, at), self.history.where(moved, history)
-        self.place = torch.where(moved.reshape(-1, *[1] * (place.dim() - 1)), self.place, place)
-        self.age = torch.where(moved, self.age, age)
-
-    def _fresh(self, progress: float, generator: torch.Generator) -> tuple[WorldState, History, Tensor]:
-        settings = self.settings
-        state, place = self.task.begin(settings.batch, progress, generator)
-        history = History.start(self.task.show(self.observe(state), place), len(self.world.system.actions))
-        windows = self.windows
-        if windows is not None and settings.recorded > 0:
-            # A fall on record is beyond delta_div; starting from it would drown what can be learnt.
-            near = (~self.task.astray(windows.state, place, progress)).nonzero()[:, 0]
-            if len(near):
-                from_record = torch.rand(settings.batch, generator=generator) < settings.recorded
-                rows = near[torch.randint(len(near), (settings.batch,), generator=generator)]
-                state = torch.where(from_record[:, None], windows.state[rows], state)
-                history = windows.history(rows).where(from_record, history)
-        return self.world.start(state), history, place
 
 
 def oppose(policy: Policy, source: World, scale: Tensor) -> None:
@@ -173,20 +88,28 @@ def tune(
         optimiser, settings.learning_rate, total_steps=settings.iterations, pct_start=0.1
     )
     training = Training(policy, optimiser, schedule, generator)
-    streams = Streams(world, observe, windows, settings)
+    task = settings.task
+    running = StreamSettings(settings.streams or settings.batch, settings.longest, settings.recorded)
+    streams = Streams(world, task, observe, windows, running)
+    past: Scene | None = None
     losses: list[float] = []
     if checkpoint is not None and checkpoint.exists():
         losses, kept = training.resume(checkpoint)
-        streams.restore(kept)
+        streams.now, streams.age = Scene.of(kept["now"]), kept["age"]
+        past = Scene.of(kept["past"]) if "past" in kept else None
     else:
         streams.start(generator)
     policy.train()
     for iteration in range(len(losses), settings.iterations):
-        noise = settings.observation_noise * torch.randn(streams.history.observations.shape, generator=generator)
-        seen = History(streams.history.observations + noise.to(streams.history.observations), streams.history.actions)
-        plan = policy(seen)
-        states, first = imagine(world, streams.show, streams.at, streams.history, plan)
-        loss = settings.task.cost(states, plan, streams.at.state, streams.place).mean()
+        scene = streams.now
+        if settings.streams is not None:
+            past = past or scene
+            scene = past[torch.randint(len(past.place), (settings.batch,), generator=generator)]
+        history = scene.history
+        noise = settings.observation_noise * torch.randn(history.observations.shape, generator=generator)
+        plan = policy(History(history.observations + noise.to(history.observations), history.actions))
+        states, first = imagine(world, partial(streams.show, place=scene.place), scene.at, history, plan)
+        loss = task.cost(states, plan, scene.at.state, scene.place).mean()
         if not bool(loss.isfinite()):
             raise DivergedError(f"the policy's loss is {float(loss.detach())} at iteration {iteration}")
         optimiser.zero_grad()
@@ -194,14 +117,27 @@ def tune(
         nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
         optimiser.step()
         schedule.step()
-        streams.advance(first, plan[:, 0].detach(), iteration / settings.iterations, generator)
+        done = iteration / settings.iterations
+        if past is None:
+            streams.advance(first, plan[:, 0].detach(), done, generator)
+        elif (iteration + 1) % settings.every == 0:
+            streams.advance(*_step(world, policy, streams.now), done, generator)
+            past = past.joined(streams.now)
         losses.append(float(loss.detach()))
         if progress is not None:
             progress(iteration + 1, settings.iterations, losses[-1])
         if checkpoint is not None and (iteration + 1) % EVERY == 0:
-            training.keep(checkpoint, losses, streams.kept())
+            kept = {"now": streams.now.tree(), "age": streams.age}
+            training.keep(checkpoint, losses, kept if past is None else {**kept, "past": past.tree()})
     policy.eval()
     return losses
+
+
+@torch.no_grad()
+def _step(world: World, policy: Policy, scene: Scene) -> tuple[WorldState, Tensor]:
+    """The world a step on under the policy, and what it did."""
+    action = policy.act(scene.history)
+    return world.step(scene.at, action, scene.history), action
 
 
 def imagine(
