@@ -197,6 +197,7 @@ def _rows(
     after: dict[str, list[FlightScore]],
     gaps: Sequence[dict[str, float]],
 ) -> list[Row]:
+    """How far flights miss, and what the gap is: the spread of the latter is over adaptations."""
     what, system, used = "rotorpy", "rotorpy's Crazyflie Brushless", settings.budget
 
     def row(method: str, domain: str, samples: int, scores: Sequence[FlightScore]) -> Row:
