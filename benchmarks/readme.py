@@ -93,6 +93,17 @@ def vehicles(rows: Rows) -> list[list[str]]:
     return table
 
 
+def rotorpy(rows: Rows) -> list[list[str]]:
+    """rotorpy's multirotor, in m."""
+    table = [["rotorpy's Crazyflie, mean tracking error in m", "counted samples", "here", "within 1 m", "seeds"]]
+    for row in rows:
+        if row["experiment"] == "rotorpy" and row["measure"] == "mean tracking error":
+            error = f"{float(row['mean']):.3f} ± {float(row['std']):.3f}"
+            near = f"{int(row['episodes']) - int(row['failed'])} of {row['episodes']}"
+            table.append([f"{row['method']}, {row['domain']}", f"{int(row['samples']):,}", error, near, row["seeds"]])
+    return table
+
+
 LOOPS = {"2.6": "0.05", "3.4": "0.09", "4.1": "0.12", "4.6": "0.21", "5.0": "0.31"}
 """Speeds in m/s, and the paper's mean errors in m."""
 
@@ -187,6 +198,7 @@ TABLES: dict[str, Callable[[Rows], list[list[str]]]] = {
     "grounding": grounding,
     "pendulum": pendulum,
     "vehicles": vehicles,
+    "rotorpy": rotorpy,
     "loops": loops,
     "swing": swing,
 }
