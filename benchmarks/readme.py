@@ -93,6 +93,18 @@ def vehicles(rows: Rows) -> list[list[str]]:
     return table
 
 
+def residual(rows: Rows) -> list[list[str]]:
+    """What is left of the quadrotor's gap, by counted samples."""
+    own = [row for row in rows if row["experiment"] == "quadrotor, drag, residual by samples"]
+    samples = sorted({int(row["samples"]) for row in own})
+    table = [["gap in velocity that is left", *(f"{count:,} samples" for count in samples)]]
+    for method in dict.fromkeys(row["method"] for row in own):
+        found = {int(row["samples"]): row for row in own if row["method"] == method}
+        cells = (f"{100 * float(found[n]['mean']):.1f} ± {100 * float(found[n]['std']):.1f} %" for n in samples)
+        table.append([method, *cells])
+    return table
+
+
 def rotorpy(rows: Rows) -> list[list[str]]:
     """rotorpy's multirotor, in m."""
     table = [["rotorpy's Crazyflie, mean tracking error in m", "counted samples", "here", "within 1 m", "seeds"]]
@@ -198,6 +210,7 @@ TABLES: dict[str, Callable[[Rows], list[list[str]]]] = {
     "grounding": grounding,
     "pendulum": pendulum,
     "vehicles": vehicles,
+    "residual": residual,
     "rotorpy": rotorpy,
     "loops": loops,
     "swing": swing,

@@ -1,0 +1,122 @@
+"""What a residual learns from how many samples (the paper's figure 8): ours and the paper's MLP.
+
+    python -m benchmarks.residual_samples
+
+The quadrotor under a drag of 0.3 1/s, flown by the policy of the source with a little noise on its commands. Each seed
+draws flights of its own; both residuals are grounded on the first 50 to 1,000 samples, and judged by what they leave of
+the gap in velocity on 1,000 samples of other flights, that no one learnt from: root mean square, as a share of the gap.
+
+Writes results/residual_samples.csv.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+
+from benchmarks.flight import EXPERIMENTS, hidden, vehicle
+from visadapt.effects import Residual
+from visadapt.flights import Flight
+from visadapt.learning.grounding import gap, ground, rescale
+from visadapt.learning.windows import Windows
+from visadapt.networks import FlightResidualNetwork, ResidualNetwork, StateResidualNetwork
+from visadapt.policies import FlightPolicy
+from visadapt.results import Row, write_rows
+from visadapt.rollout import run, see_goals
+from visadapt.systems.rigid_body import VELOCITY
+
+EXPERIMENT = EXPERIMENTS["quadrotor, drag"]
+SAMPLES = (50, 100, 200, 500, 1000)
+FLIGHTS = 10
+"""of 100 samples each"""
+NOISE = 0.05
+OURS, PAPER = "ours, linear", "the paper's MLP, 64-64"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is run, and where."""
+
+    seeds: int = 3
+    references: Path = Path("data/quadrotor_references.npz")
+    assets: Path = Path("assets")
+    out: Path = Path("results/residual_samples.csv")
+
+
+def main(settings: Settings) -> None:
+    """Ground all residuals and write the table."""
+    flight = vehicle(EXPERIMENT, settings.references)
+    policy = flight.pretrain(settings.assets / "quadrotor.safetensors", 0)
+    left: dict[tuple[str, int], list[float]] = {}
+    for seed in range(settings.seeds):
+        train, test = (_flown(flight, policy, 2 * seed + k) for k in (0, 1))
+        for method in (OURS, PAPER):
+            for samples in SAMPLES:
+                left.setdefault((method, samples), []).append(_left(flight, method, train, samples, test, seed))
+    rows = [
+        Row(
+            experiment="quadrotor, drag, residual by samples",
+            system="quadrotor",
+            method=method,
+            domain="target",
+            samples=samples,
+            measure="gap in velocity that is left",
+            unit="1",
+            mean=round(float(np.mean(values)), 4),
+            std=round(float(np.std(values)), 4),
+            episodes=None,
+            failed=0,
+            seeds=settings.seeds,
+        )
+        for (method, samples), values in left.items()
+    ]
+    write_rows(settings.out, rows)
+    for row in rows:
+        print(f"{row.method:24} {row.samples:5} samples  {row.mean:.4f} +- {row.std:.4f} of the gap left")
+
+
+def _flown(flight: Flight, policy: FlightPolicy, seed: int) -> Windows:
+    """Samples of flights in the target."""
+    target = flight.target(hidden(EXPERIMENT, float(flight.system.mass)), test=False)
+    generator = torch.Generator().manual_seed(seed)
+    runs = run(target, policy, see_goals, FLIGHTS, target.course.steps, generator, NOISE)
+    return Windows.cut([each.episode for each in runs], "state")
+
+
+def _left(flight: Flight, method: str, train: Windows, samples: int, test: Windows, seed: int) -> float:
+    """The share of the gap in velocity that a residual leaves on `test`."""
+    torch.manual_seed(seed)
+    network: ResidualNetwork = (
+        FlightResidualNetwork(flight.system, flight.source.period)
+        if method == OURS
+        else StateResidualNetwork(len(flight.system.states), len(flight.system.actions))
+    )
+    residual = Residual(network, torch.ones(len(flight.system.states)))
+    few = _first(train, samples)
+    rescale(residual, flight.source, few)
+    ground(residual, flight.source, few, flight.settings.ground, torch.Generator().manual_seed(seed))
+    before = gap(flight.source, test)
+    rows = torch.arange(len(test))
+    with torch.no_grad():
+        after = before - residual.delta(test.history(rows).acting(test.action))
+    return _size(after) / _size(before)
+
+
+def _first(windows: Windows, count: int) -> Windows:
+    """The first windows only."""
+    each = {field.name: getattr(windows, field.name) for field in dataclasses.fields(windows)}
+    return Windows(**{name: value if name == "observations" else value[:count] for name, value in each.items()})
+
+
+def _size(change: Tensor) -> float:
+    return float(change[:, VELOCITY].square().mean().sqrt())
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings, description=__doc__))
