@@ -100,7 +100,7 @@ def ahead(family: Family, fits: Fits, extra: Tensor | None = None) -> Ahead:
     extra = torch.zeros_like(fits.state[0, :, 1:]) if extra is None else extra
     problem = linear_problem([family], fits)
     problem = replace(problem.data(), drive=problem.drive[..., :1] + extra[..., None])
-    smoothed, _ = backward(problem, forward(problem, *variances(fits.log_process, fits.log_noise, windows)))
+    smoothed, _ = backward(problem, forward(problem, *variances(family, fits.log_process, fits.log_noise)))
     predicted = _run_on(family, fits.theta[0], fits.state[0] + smoothed[..., 0], horizon, extra)
     shape = (horizon + 1, windows, length, len(rows.channels))
     error, there = torch.zeros(shape, dtype=torch.float64), torch.zeros(shape, dtype=torch.float64)
@@ -120,7 +120,7 @@ def _run_on(family: Family, theta: Tensor, state: Tensor, horizon: int, extra: T
     beyond = torch.zeros(windows, horizon + 1, extra.shape[-1], dtype=extra.dtype)
     extra = torch.cat((extra, beyond), 1)
     commands = family.commands(theta[None])[0]
-    commands = torch.cat((commands, commands[:, -1:].expand(-1, horizon, -1)), 1)
+    commands = torch.cat((commands, commands[:, -1:].expand(-1, horizon, -1, -1)), 1)
     each = theta.expand(windows * length, -1)
     out = [state]
     for h in range(horizon):

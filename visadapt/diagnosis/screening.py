@@ -15,7 +15,8 @@ from torch import Tensor
 from visadapt.diagnosis.data import Rows
 from visadapt.diagnosis.fitting import Fits
 from visadapt.diagnosis.innovations import Innovations
-from visadapt.diagnosis.models import Family
+from visadapt.diagnosis.models import GLANCE, Family
+from visadapt.diagnosis.subjects import subject_of
 from visadapt.effects import Effect
 from visadapt.effects.base import Parameter
 from visadapt.systems import System
@@ -49,7 +50,7 @@ def screen(
 ) -> list[Lead]:
     """The best lead of every candidate beside the one fitted set in `fits`, best first."""
     seen = Innovations(Family(system, effects, rows), fits)
-    seen_at = spans(rows, fits.state[0])
+    seen_at = spans(system, rows, fits.state[0])
     leads = []
     for effect in candidates:
         shapes, linear = grid(effect, seen_at)
@@ -94,21 +95,22 @@ def _values(parameter: Parameter) -> Tensor:
     return torch.cat([neutral + shares * (end - neutral) for end in (low, high) if end != neutral])
 
 
-def spans(rows: Rows, state: Tensor) -> dict[str, tuple[float, float]]:
-    """By unit, the least and the greatest time, position and angle of states (W, T, n)."""
+def spans(system: System, rows: Rows, state: Tensor) -> dict[str, tuple[float, float]]:
+    """By unit, the least and the greatest of the variable along which regions lie, in states (W, T, n)."""
     inside = rows.inside > 0
 
     def span(values: Tensor) -> tuple[float, float]:
         return float(values[inside].min()), float(values[inside].max())
 
-    return {"s": span(rows.time), "m": span(state[..., 0]), "rad": span(state[..., 2])}
+    variables = {"time": rows.time} | {v.name: state[..., k] for k, v in enumerate(system.states)}
+    return {unit: span(variables[name]) for unit, name in subject_of(system).places.items()}
 
 
 def _columns(
     system: System, effects: list[type[Effect]], fits: Fits, rows: Rows, shapes: Tensor, linear: list[int]
 ) -> tuple[Tensor, Tensor]:
     """What every point of a grid adds to drive (W, T - 1, n, M) and reading (W, T, m, M), M = points x columns."""
-    family = Family(system, effects, rows, substeps=1)
+    family = Family(system, effects, rows, GLANCE)
     own = shapes.shape[1]
     tried = shapes[:, None].repeat(1, max(1, len(linear)), 1)
     unit = torch.ones(max(1, len(linear)), dtype=torch.float64)
@@ -127,7 +129,7 @@ def _columns(
         if parameter.neutral is None:
             theta[0, j - own] = tried[1, j]
     windows, length = rows.shape
-    commands = family.commands(theta)[:, :, :-1].reshape(-1, family.substeps)
+    commands = family.commands(theta)[:, :, :-1].flatten(0, 2)
     count, n = len(theta), fits.state.shape[-1]
 
     def spread(x: Tensor) -> Tensor:

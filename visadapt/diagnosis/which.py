@@ -14,6 +14,7 @@ from visadapt.diagnosis.data import Rows
 from visadapt.diagnosis.fitting import Fits, fit, rough
 from visadapt.diagnosis.models import COARSE, FINE, Family
 from visadapt.diagnosis.screening import screen
+from visadapt.diagnosis.subjects import subject_of
 from visadapt.effects import Effect
 from visadapt.systems import System
 
@@ -22,19 +23,15 @@ Effects = tuple[type[Effect], ...]
 MOST = 6
 """Effects in a set."""
 
-BEAM = 3
 LEADS = 8
-"""Sets that are taken further at each size, and effects that are tried beside each."""
+"""Effects that are tried beside each set."""
 
 SUSPICIOUS = 5.0
 WIDE = 6
 """Log likelihood that process noise adds to the best set from which on the search is widened, to so many sets."""
 
-PROMISING = 1.0
-"""Log likelihood that a lead must promise to be fitted; an effect costs more."""
-
 QUICK, CAREFUL = (8, COARSE), (20, FINE)
-"""Iterations and substeps of a fit that only has to show promise, and of one whose figures are reported."""
+"""Iterations and effort of a fit that only has to show promise, and of one whose figures are reported."""
 
 CLOSE = 8.0
 POLISHED = 8
@@ -68,12 +65,11 @@ class Fitted:
 
 def first_fits(system: System, rows: Rows) -> Fits:
     """A start for the source as it stands."""
-    n = len(system.states)
-    state = rough(rows, n)[None]
+    state = rough(rows, system)[None]
     return Fits(
         torch.zeros(1, 0, dtype=torch.float64),
         state,
-        torch.full((1, 2), math.log(0.2**2), dtype=torch.float64),
+        torch.full((1, len(subject_of(system).driven)), math.log(0.2**2), dtype=torch.float64),
         torch.full((1, len(rows.channels)), math.log(0.01**2), dtype=torch.float64),
         torch.full((1,), -math.inf, dtype=torch.float64),
         torch.zeros(1, 0, 0, dtype=torch.float64),
@@ -85,6 +81,7 @@ class Search:
 
     def __init__(self, system: System, rows: Rows, catalogue: Sequence[type[Effect]]) -> None:
         self.system = system
+        self.subject = subject_of(system)
         self.rows = rows
         self.catalogue = tuple(catalogue)
         self.fitted: dict[frozenset[str], Fitted] = {}
@@ -100,7 +97,7 @@ class Search:
             children = self.extend(beam)
             if not children:
                 break
-            beam = sorted(children, key=lambda f: -f.evidence)[:BEAM]
+            beam = sorted(children, key=lambda f: -f.evidence)[: self.subject.beam]
             if beam[0].evidence < before.evidence:
                 break
         self._settle()
@@ -148,7 +145,7 @@ class Search:
         for base in bases:
             rest = [e for e in self.catalogue if e not in base.effects]
             for lead in screen(self.system, base.effects, base.fits, self.rows, rest)[:leads]:
-                if lead.gain < PROMISING:
+                if lead.gain < self.subject.promising:
                     continue
                 effects = (*base.effects, lead.effect)
                 key = frozenset(e.name for e in effects)
@@ -207,8 +204,8 @@ class Search:
         """Fit sets of effects, each from a start, QUICK or CAREFUL; what is better than before is kept."""
         if not starts:
             return []
-        iterations, substeps = effort
-        families = [Family(self.system, effects, self.rows, substeps) for effects, _ in starts]
+        iterations, care = effort
+        families = [Family(self.system, effects, self.rows, care) for effects, _ in starts]
         out = fit(families, joined([fits for _, fits in starts]), self._counts(len(starts)), iterations)
         results = []
         for k, (effects, _) in enumerate(starts):

@@ -1,0 +1,136 @@
+"""What a diagnosis needs to know of a system beside its physics, in one place for each system that can be diagnosed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+
+from visadapt.systems import CartPole, FixedWing, Quadrotor, RigidBody, System
+from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY
+
+Columns = tuple[int, ...]
+"""Of the state."""
+
+
+@dataclass(frozen=True)
+class Convention:
+    """Another sign convention than the source's."""
+
+    what: str
+    states: float
+    """factor on the columns that a worn sensor holds: the angle and its rate"""
+    command: float
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A system as the diagnosis sees it."""
+
+    driven: tuple[Columns, ...]
+    """velocities, in which process noise enters, one for each load in the order of the loads; those of a group have
+    the same variance"""
+    slopes: Mapping[int, int]
+    """of a velocity that may be missing from a recording: the column that it is the rate of"""
+    sensors: tuple[Columns, ...]
+    """columns that one kind of sensor reads, with the same noise"""
+    spread: tuple[float, ...]
+    """variances of the first state around the measured one"""
+    places: Mapping[str, str]
+    """by unit, the variable along which regions of that unit lie"""
+    drawn: tuple[str, ...]
+    """variables over which the report draws what is left, the most telling first"""
+    residual: str
+    """what the first load is, in words"""
+    factors: Mapping[str, tuple[str | None, ...]]
+    """by which variables a black box's function on each load is multiplied; (None,) where it is not listed"""
+    window: int = 120
+    """rows of a window; a longer episode is cut, since states far apart say nothing about each other's noise"""
+    smooth_step: float = float("inf")
+    """s, the longest step of Runge-Kutta's that smooth physics bears"""
+    substeps: tuple[int, int, int] = (1, 4, 10)
+    """in a period where an effect changes within one: to propose it, to try it, and for figures that are reported"""
+    held: Columns = ()
+    """an angle and its rate, of whose sensor defects are looked for"""
+    conventions: tuple[Convention, ...] = ()
+    """other sign conventions in which a recording may be"""
+    separable: tuple[frozenset[str], ...] = ()
+    """pairs of effects that are the same to passive data of another system, and not of this one"""
+    promising: float = 1.0
+    """log likelihood that a lead must promise to be fitted; an effect costs more"""
+    beam: int = 3
+    """sets that are taken further at each size"""
+    points: int | None = None
+    """most points of a grid in which an effect's parameters are tried; None: as many as it takes"""
+
+    @property
+    def columns(self) -> list[int]:
+        """All driven columns."""
+        return [column for group in self.driven for column in group]
+
+
+_CART_POLE = Subject(
+    driven=((1,), (3,)),
+    slopes={1: 0, 3: 2},
+    sensors=((0,), (1,), (2,), (3,)),
+    spread=(0.3**2, 2.0**2, 0.3**2, 3.0**2),
+    places={"s": "time", "m": "x", "rad": "theta"},
+    drawn=("x_dot", "x", "command", "time", "theta", "theta_dot"),
+    residual="force on the cart",
+    factors={"cart_force": (None, "x_dot", "command"), "pivot_torque": (None, "theta_dot")},
+    held=(2, 3),
+    conventions=(
+        Convention("the angle", -1, 1),
+        Convention("the command", 1, -1),
+        # The position's sign is that of angle and command together, by the symmetry of the cart-pole.
+        Convention("the position", -1, -1),
+    ),
+)
+
+
+def _span(columns: slice) -> Columns:
+    return tuple(range(columns.start, columns.stop))
+
+
+@dataclass(frozen=True)
+class _Vehicle(Subject):
+    """What the vehicles share."""
+
+    driven: tuple[Columns, ...] = (_span(VELOCITY), _span(RATES))
+    slopes: Mapping[int, int] = field(default_factory=lambda: dict(zip(_span(VELOCITY), _span(POSITION), strict=True)))
+    sensors: tuple[Columns, ...] = tuple(_span(s) for s in (POSITION, VELOCITY, ATTITUDE, RATES))
+    spread: tuple[float, ...] = (0.3**2,) * 3 + (1.0,) * 3 + (0.1**2,) * 4 + (1.0,) * 3
+    places: Mapping[str, str] = field(default_factory=lambda: {"s": "time", "m": "z"})
+    drawn: tuple[str, ...] = ("x_dot", "thrust", "time", "z")
+    residual: str = "force along x"
+    factors: Mapping[str, tuple[str | None, ...]] = field(default_factory=dict)
+    window: int = 25
+    substeps: tuple[int, int, int] = (2, 4, 4)
+    separable: tuple[frozenset[str], ...] = (frozenset({"constant_force", "actuator_bias"}),)
+    promising: float = 4.0
+    beam: int = 2
+    points: int | None = 200
+
+
+SUBJECTS: dict[type[System], Subject] = {
+    CartPole: _CART_POLE,
+    # The rate loop decays at 16.6 a second, the wing's roll rate at 1.95 a metre.
+    Quadrotor: _Vehicle(smooth_step=0.035),
+    FixedWing: _Vehicle(smooth_step=0.025),
+}
+"""By the class of the system."""
+
+DIAGNOSABLE: dict[str, type[System]] = {system.name: system for system in SUBJECTS}
+"""The systems that can be diagnosed, by name."""
+
+
+def subject_of(system: System) -> Subject:
+    """What is known of a system, or of one derived from it.
+
+    Raises:
+        ValueError: it cannot be diagnosed.
+    """
+    for kind, subject in SUBJECTS.items():
+        if isinstance(system, kind):
+            return subject
+    raise ValueError(f"diagnose: {', '.join(DIAGNOSABLE)} is what can be diagnosed, got {system.name}")
