@@ -100,6 +100,8 @@ def linear_problem(families: Sequence[Family], fits: Fits) -> Linear:
     for c, family in enumerate(families):
         count = len(family.table)
         lin = linearise(family, fits.theta[c, :count], fits.state[c])
+        if family.subject.refresh > 1:
+            family.slopes = lin.transition, lin.sensing
         transition.append(torch.where(inside > 0, lin.transition, identity))
         sensing.append(lin.sensing * used)
         drive[c, ..., 0] = lin.following - fits.state[c, :, 1:]
@@ -222,7 +224,11 @@ def fit(families: Sequence[Family], start: Fits, counts: Tensor, iterations: int
     live = torch.arange(len(families))
     here = best = start
     at: Slope | None = None
-    for _ in range(iterations):
+    refresh = families[0].subject.refresh
+    for iteration in range(iterations):
+        if (iteration + 1) % refresh == 0:
+            for family in families:
+                family.slopes = None
         now = slope([families[k] for k in live.tolist()], here.of(live), counts[live])
         tried = replace(here.of(live), likelihood=now.likelihood, information=now.information)
         if at is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
@@ -55,6 +55,8 @@ class Family:
         self.high = torch.tensor([p.high for p in self.table], dtype=torch.float64) + turns
         chain = sorted((e for e in effects if issubclass(e, ActuationEffect)), key=place_in_chain)
         sensors = sorted((e for e in effects if issubclass(e, SensingEffect)), key=place_in_chain)
+        self.slopes: tuple[Tensor, Tensor] | None = None
+        """transition (W, T - 1, n, n) and sensing (W, T, m, n) of an earlier linearisation that are near enough"""
         self._order = [*chain, *(e for e in effects if issubclass(e, DynamicsEffect)), *sensors]
 
     def _made(self, kind: type[Made], theta: Tensor) -> list[Made]:
@@ -171,9 +173,11 @@ def linearise(family: Family, theta: Tensor, state: Tensor) -> Linearised:
     shifted = torch.cat((theta[None], theta + torch.diag(step)))
     commands = family.commands(shifted)
     # The replicas: the base, one per state, one per parameter.
-    alike = [0] * (1 + n) + list(range(1, 1 + count))
+    known = family.slopes
+    varied = 0 if known is not None else n
+    alike = [0] * (1 + varied) + list(range(1, 1 + count))
     moved = state[None].repeat(len(alike), 1, 1, 1)
-    for i in range(n):
+    for i in range(varied):
         moved[1 + i, ..., i] += STATE_STEP
 
     def parameters(used: int) -> Tensor:
@@ -188,6 +192,7 @@ def linearise(family: Family, theta: Tensor, state: Tensor) -> Linearised:
 
     def differences(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         change = (values[1:] - values[:1]).movedim(0, -1)
-        return values[0], change[..., :n] / STATE_STEP, change[..., n:] / step
+        return values[0], change[..., :varied] / STATE_STEP, change[..., varied:] / step
 
-    return Linearised(*differences(after), *differences(seen))
+    out = Linearised(*differences(after), *differences(seen))
+    return out if known is None else replace(out, transition=known[0], sensing=known[1])

@@ -50,6 +50,9 @@ class Subject:
     """s, the longest step of Runge-Kutta's that smooth physics bears"""
     substeps: tuple[int, int, int] = (1, 4, 10)
     """in a period where an effect changes within one: to propose it, to try it, and for figures that are reported"""
+    refresh: int = 1
+    """iterations of a fit for which derivatives by the states are kept: those of states that are all measured change
+    little on the way"""
     held: Columns = ()
     """an angle and its rate, of whose sensor defects are looked for"""
     conventions: tuple[Convention, ...] = ()
@@ -107,6 +110,7 @@ class _Vehicle(Subject):
     window: int = 25
     substeps: tuple[int, int, int] = (2, 4, 4)
     separable: tuple[frozenset[str], ...] = (frozenset({"constant_force", "actuator_bias"}),)
+    refresh: int = 4
     promising: float = 4.0
     beam: int = 2
     points: int | None = 200
