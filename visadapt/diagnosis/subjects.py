@@ -63,8 +63,8 @@ class Subject:
     """log likelihood that a lead must promise to be fitted; an effect costs more"""
     beam: int = 3
     """sets that are taken further at each size"""
-    points: int | None = None
-    """most points of a grid in which an effect's parameters are tried; None: as many as it takes"""
+    tried_rows: float = float("inf")
+    """rows, over all points at which an effect is tried, beyond which only some of the windows are looked at"""
 
     @property
     def columns(self) -> list[int]:
@@ -113,7 +113,7 @@ class _Vehicle(Subject):
     refresh: int = 4
     promising: float = 4.0
     beam: int = 2
-    points: int | None = 200
+    tried_rows: float = 1.5e4
 
 
 SUBJECTS: dict[type[System], Subject] = {

@@ -85,6 +85,7 @@ class Search:
         self.rows = rows
         self.catalogue = tuple(catalogue)
         self.fitted: dict[frozenset[str], Fitted] = {}
+        self._slopes: tuple[Tensor, Tensor] | None = None
         self.fit([((), first_fits(system, rows))], CAREFUL)
 
     def run(self, progress: Progress | None = None) -> None:
@@ -206,7 +207,11 @@ class Search:
             return []
         iterations, care = effort
         families = [Family(self.system, effects, self.rows, care) for effects, _ in starts]
+        for family in families:
+            family.slopes = self._slopes
         out = fit(families, joined([fits for _, fits in starts]), self._counts(len(starts)), iterations)
+        if self._slopes is None:
+            self._slopes = families[0].slopes
         results = []
         for k, (effects, _) in enumerate(starts):
             own = _apart(out.of(torch.tensor([k])), len(families[k].table))
