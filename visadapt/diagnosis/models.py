@@ -47,7 +47,7 @@ class Family:
         self.effects = tuple(effects)
         self.rows = rows
         abrupt = any(issubclass(e, ActuationEffect | CoulombFriction | FrictionPatch | Gust) for e in effects)
-        smooth = math.ceil(rows.period / self.subject.smooth_step)
+        smooth = 1 if effort == GLANCE else math.ceil(rows.period / self.subject.smooth_step)
         self.substeps = max(smooth, self.subject.substeps[effort] if abrupt else 1)
         self.table = [parameter for effect in effects for parameter in effect.table]
         turns = torch.tensor([TURNS * (p.name == "phase") for p in self.table], dtype=torch.float64)

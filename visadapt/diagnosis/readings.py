@@ -21,10 +21,6 @@ from visadapt.diagnosis.which import Search
 from visadapt.recordings import Recording
 from visadapt.systems import System
 
-MOST_ROWS = 1600
-"""Rows that a search uses; of more, windows spread evenly over the recording are taken."""
-
-
 WRONG = math.log(0.02**2)
 """Log variance of a change of velocity in a period, from which on it is asked whether a sign is wrong."""
 
@@ -77,7 +73,7 @@ class Readings:
             rows = cut(measured, holds.used, commands, channels, recording.period, subject.window, stretches)
             raw = cut(measured, every, commands, channels, recording.period, subject.window, stretches)
             count, length = rows.shape
-            most = max(4, int(MOST_ROWS / float(rows.inside.sum(1).mean())))
+            most = max(4, int(subject.rows / float(rows.inside.sum(1).mean())))
             if count > most:
                 chosen = torch.linspace(0, count - 1, most).round().long()
                 rows, raw = rows.of(chosen), raw.of(chosen)

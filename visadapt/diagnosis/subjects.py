@@ -44,10 +44,12 @@ class Subject:
     """what the first load is, in words"""
     factors: Mapping[str, tuple[str | None, ...]]
     """by which variables a black box's function on each load is multiplied; (None,) where it is not listed"""
+    rows: int = 1600
+    """that a search uses; of more, windows spread evenly over the recording are taken"""
     window: int = 120
     """rows of a window; a longer episode is cut, since states far apart say nothing about each other's noise"""
     smooth_step: float = float("inf")
-    """s, the longest step of Runge-Kutta's that smooth physics bears"""
+    """s, the longest step of Runge-Kutta's that smooth physics bears where an effect is not only to be proposed"""
     substeps: tuple[int, int, int] = (1, 4, 10)
     """in a period where an effect changes within one: to propose it, to try it, and for figures that are reported"""
     refresh: int = 1
@@ -61,6 +63,10 @@ class Subject:
     """pairs of effects that are the same to passive data of another system, and not of this one"""
     promising: float = 1.0
     """log likelihood that a lead must promise to be fitted; an effect costs more"""
+    weighed: int = 8
+    """sets, the most probable ones, of which it is asked what they leave unexplained"""
+    folds: int = 4
+    """in which episodes are held out"""
     beam: int = 3
     """sets that are taken further at each size"""
     tried_rows: float = float("inf")
@@ -107,11 +113,14 @@ class _Vehicle(Subject):
     drawn: tuple[str, ...] = ("x_dot", "thrust", "time", "z")
     residual: str = "force along x"
     factors: Mapping[str, tuple[str | None, ...]] = field(default_factory=dict)
+    rows: int = 650
     window: int = 25
-    substeps: tuple[int, int, int] = (2, 4, 4)
+    substeps: tuple[int, int, int] = (2, 3, 4)
     separable: tuple[frozenset[str], ...] = (frozenset({"constant_force", "actuator_bias"}),)
     refresh: int = 4
     promising: float = 4.0
+    weighed: int = 4
+    folds: int = 2
     beam: int = 2
     tried_rows: float = 1.5e4
 

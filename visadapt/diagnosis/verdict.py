@@ -12,9 +12,6 @@ from visadapt.diagnosis.models import Family
 from visadapt.diagnosis.which import Effects, Fitted, Search
 from visadapt.effects import Effect
 
-WEIGHED = 8
-"""Sets, the most probable ones, of which it is asked what they leave unexplained."""
-
 WITHIN = 10.0
 """Log posterior odds that such a set may be behind the best."""
 
@@ -74,7 +71,7 @@ class Judgement:
 
 def judge(search: Search) -> Judgement:
     """Weigh what a search has fitted."""
-    close = [f for f in search.ranked if f.evidence > search.best.evidence - WITHIN][:WEIGHED]
+    close = [f for f in search.ranked if f.evidence > search.best.evidence - WITHIN][: search.subject.weighed]
     if all(f is not search.source for f in close):
         close.append(search.source)
     left = search.leftover(close)
