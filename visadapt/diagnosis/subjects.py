@@ -61,8 +61,10 @@ class Subject:
     """other sign conventions in which a recording may be"""
     separable: tuple[frozenset[str], ...] = ()
     """pairs of effects that are the same to passive data of another system, and not of this one"""
-    promising: float = 1.0
-    """log likelihood that a lead must promise to be fitted; an effect costs more"""
+    promising: tuple[float, float] = (1.0, 0.0)
+    """log likelihood that a lead must promise to be fitted, and more of it for each parameter; an effect costs more"""
+    rivalling: float = 0.0
+    """share of what the best lead promises that another must promise to be fitted"""
     weighed: int = 8
     """sets, the most probable ones, of which it is asked what they leave unexplained"""
     folds: int = 4
@@ -118,7 +120,8 @@ class _Vehicle(Subject):
     substeps: tuple[int, int, int] = (2, 3, 4)
     separable: tuple[frozenset[str], ...] = (frozenset({"constant_force", "actuator_bias"}),)
     refresh: int = 4
-    promising: float = 4.0
+    promising: tuple[float, float] = (1.0, 3.0)
+    rivalling: float = 0.3
     weighed: int = 4
     folds: int = 2
     beam: int = 2

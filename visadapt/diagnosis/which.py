@@ -13,7 +13,7 @@ from visadapt.console import Progress
 from visadapt.diagnosis.data import Rows
 from visadapt.diagnosis.fitting import Fits, fit, rough
 from visadapt.diagnosis.models import COARSE, FINE, Family
-from visadapt.diagnosis.screening import screen
+from visadapt.diagnosis.screening import Lead, screen
 from visadapt.diagnosis.subjects import subject_of
 from visadapt.effects import Effect
 from visadapt.systems import System
@@ -86,6 +86,7 @@ class Search:
         self.catalogue = tuple(catalogue)
         self.fitted: dict[frozenset[str], Fitted] = {}
         self._slopes: tuple[Tensor, Tensor] | None = None
+        self._screened: dict[tuple[str, ...], tuple[Fits, list[Lead]]] = {}
         self.fit([((), first_fits(system, rows))], CAREFUL)
 
     def run(self, progress: Progress | None = None) -> None:
@@ -144,16 +145,25 @@ class Search:
         starts = []
         seen = set()
         for base in bases:
-            rest = [e for e in self.catalogue if e not in base.effects]
-            for lead in screen(self.system, base.effects, base.fits, self.rows, rest)[:leads]:
-                if lead.gain < self.subject.promising:
-                    continue
+            for lead in self._leads(base)[:leads]:
                 effects = (*base.effects, lead.effect)
                 key = frozenset(e.name for e in effects)
                 if key not in self.fitted and key not in seen:
                     seen.add(key)
                     starts.append((effects, _grown(base.fits, lead.values)))
         return self.fit(starts, QUICK)
+
+    def _leads(self, base: Fitted) -> list[Lead]:
+        """What is worth fitting beside a set, the most promising first."""
+        fits, leads = self._screened.get(base.names, (None, []))
+        if fits is not base.fits:
+            rest = [e for e in self.catalogue if e not in base.effects]
+            every = screen(self.system, base.effects, base.fits, self.rows, rest)
+            least, each = self.subject.promising
+            beside = self.subject.rivalling * max((lead.gain for lead in every), default=0.0)
+            leads = [lead for lead in every if lead.gain >= max(beside, least + each * len(lead.values))]
+            self._screened[base.names] = base.fits, leads
+        return leads
 
     def neighbours(self, centre: Fitted) -> None:
         """Sets with one effect less, and with one exchanged for another."""
