@@ -4,8 +4,8 @@
 
     python -m benchmarks.blind_diagnosis --system quadrotor --count 30 --seed 7
 
-Makes the recordings with datasets.blind_gaps, or datasets.blind_flights, where they are not there yet, hands every diagnoser the path of one CSV at
-a time, and opens the key only to score. Every answer is a line of a log, so an interrupted run goes on where it was;
+Makes the recordings with datasets.blind_gaps, or datasets.blind_flights, where they are not there yet, hands every
+diagnoser the path of one CSV at a time, and opens the key only to score. Every answer is a line of a log, so an interrupted run goes on where it was;
 with --data a folder made elsewhere is scored. Writes results/blind_diagnosis.csv (one row per set, diagnoser and
 measure) and results/blind_confusion.csv; lines of diagnosers and sets that were not run this time stay.
 """
@@ -183,10 +183,10 @@ def recordings_of(settings: Settings, kind: Kind) -> Path:
         return settings.data
     folder = Path("data/blind") / f"{kind}-{settings.count}-{settings.seed}"
     if len(list(folder.glob("*.csv"))) != settings.count or not key_of(folder).exists():
-        if kind in ("quadrotor", "fixed_wing"):
-            blind_flights.main(blind_flights.Settings(folder, kind, settings.count, settings.seed))
-        else:
+        if kind == "easy" or kind == "hard":
             blind_gaps.main(blind_gaps.Settings(folder, kind, settings.count, settings.seed))
+        else:
+            blind_flights.main(blind_flights.Settings(folder, kind, settings.count, settings.seed))
     return folder
 
 

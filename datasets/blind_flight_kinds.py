@@ -102,21 +102,32 @@ def _periodic(rng: np.random.Generator, _: float) -> Shape:
     return {"frequency": float(np.exp(rng.uniform(np.log(0.25), np.log(2.0)))), "phase": phase}
 
 
-def _windy(rng: np.random.Generator, _: float) -> Shape:
-    return _directed(("velocity_x", "velocity_y", "velocity_z"))(rng, 0.0) | {"drag": float(rng.uniform(0.1, 0.5))}
+def _windy(least: float, most: float) -> Draw:
+    """A direction of the wind, and the drag by which it acts."""
+
+    def draw(rng: np.random.Generator, _: float) -> Shape:
+        direction = _directed(("velocity_x", "velocity_y", "velocity_z"))(rng, 0.0)
+        return direction | {"drag": float(rng.uniform(least, most))}
+
+    return draw
 
 
 def _wind(size: float, shape: Shape) -> Shape:
     return {name: size * shape[name] for name in shape if name != "drag"} | {"coefficient": shape["drag"]}
 
 
+def _wavy(least: float, most: float) -> Draw:
+    """The same of a wind that comes and goes."""
+
+    def draw(rng: np.random.Generator, _: float) -> Shape:
+        direction, drag = float(rng.uniform(-np.pi / 2, np.pi / 2)), float(rng.uniform(least, most))
+        return _periodic(rng, 0.0) | {"direction": direction, "drag": drag}
+
+    return draw
+
+
 def _waves(size: float, shape: Shape) -> Shape:
     return {"amplitude": size, "coefficient": shape["drag"]} | {n: v for n, v in shape.items() if n != "drag"}
-
-
-def _wavy(rng: np.random.Generator, _: float) -> Shape:
-    direction, drag = float(rng.uniform(-np.pi / 2, np.pi / 2)), float(rng.uniform(0.1, 0.5))
-    return _periodic(rng, 0.0) | {"direction": direction, "drag": drag}
 
 
 ROTORS = tuple(f"scale_{k}" for k in (1, 2, 3, 4))
@@ -135,8 +146,11 @@ NAMED: tuple[tuple[Kind, tuple[str, ...]], ...] = (
     (Kind("periodic_force", "dynamics", 0.02, 4.0, lambda s, f: {"amplitude": s, "offset": 0.0, **f}, _periodic), BOTH),
     (Kind("linear_drag", "dynamics", 0.01, 1.0, _plain("coefficient")), BOTH),
     (Kind("quadratic_drag", "dynamics", 0.005, 1.0, _plain("coefficient")), BOTH),
-    (Kind("wind", "dynamics", 0.1, 5.0, _wind, _windy), BOTH),
-    (Kind("periodic_wind", "dynamics", 0.2, 6.0, _waves, _wavy), BOTH),
+    # The wing feels the wind without a drag of its own.
+    (Kind("wind", "dynamics", 0.5, 5.0, _wind, _windy(0.1, 0.5)), QUADROTOR),
+    (Kind("wind", "dynamics", 0.05, 5.0, _wind, _windy(0.0, 0.0)), WING),
+    (Kind("periodic_wind", "dynamics", 0.5, 6.0, _waves, _wavy(0.1, 0.5)), QUADROTOR),
+    (Kind("periodic_wind", "dynamics", 0.05, 5.0, _waves, _wavy(0.0, 0.0)), WING),
     (Kind("thrust_gain", "dynamics", 0.005, 0.3, _scale, _sign), BOTH),
     (Kind("payload", "dynamics", 0.005, 0.35, _plain("mass")), QUADROTOR),
     (Kind("center_of_mass_offset", "dynamics", 0.0003, 0.01, _along, _directed(("x", "y"))), QUADROTOR),
@@ -147,9 +161,7 @@ NAMED: tuple[tuple[Kind, tuple[str, ...]], ...] = (
     (Kind("lift_slope", "dynamics", 0.02, 0.7, _scale, _sign), WING),
     (Kind("drag", "dynamics", 0.03, 1.2, _scale, _sign), WING),
     (
-        Kind(
-            "control_effectiveness", "dynamics", 0.03, 1.2, _scales, _one_weak(tuple(f"scale_{s}" for s in SURFACES))
-        ),
+        Kind("control_effectiveness", "dynamics", 0.03, 1.2, _scales, _one_weak(tuple(f"scale_{s}" for s in SURFACES))),
         WING,
     ),
     (Kind("trim_offset", "dynamics", 0.0005, 0.06, _along, _directed(SURFACES)), WING),

@@ -23,7 +23,7 @@ import tyro
 
 from datasets.blind_flight_control import CONTROLLERS, PERIODS, Chain, Flyers, starts
 from datasets.blind_flight_kinds import FOREIGN, NAMED, NEUTRAL
-from datasets.blind_flight_plants import PLANTS, Array, Motion, Parameters, step
+from datasets.blind_flight_plants import PLANTS, Array, Motion, step
 from datasets.blind_kinds import Kind, Shape
 
 System = Literal["quadrotor", "fixed_wing"]
@@ -154,7 +154,9 @@ def _flown(drafts: list[Draft], system: System, fly: Flyers, h: float) -> Flight
     at, period = starts(system, fly), PERIODS[system]
     chain = Chain(parameters, at.place.shape[0])
     substeps = round(period / h)
-    motions, states, commands = [], [], []
+    motions: list[Motion] = []
+    states: list[Array] = []
+    commands: list[Array] = []
     for row in range(ROWS):
         motions.append(at)
         states.append(as_states(at, states[-1][:, 6:10] if states else None))

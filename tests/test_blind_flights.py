@@ -27,7 +27,9 @@ def test_columns_are_the_library_s(system):
 
 
 @pytest.mark.parametrize(
-    ("kind", "system"), [(kind, system) for kind, systems in NAMED for system in systems], ids=lambda x: getattr(x, "name", x)
+    ("kind", "system"),
+    [(kind, system) for kind, systems in NAMED for system in systems],
+    ids=lambda x: getattr(x, "name", x),
 )
 def test_an_effect_is_the_catalogue_s(kind, system):
     """The derivative of a random motion with the effect, by both codes."""
@@ -50,8 +52,12 @@ def test_an_effect_is_the_catalogue_s(kind, system):
         at = type(at)(time, state, at.memory)
         altered = world.system_at(at)
         expected = altered.derivative(state, command, world.load(at))
-    p = {name: np.full(count, parameters.get(name.split(".")[1], neutral) if name.split(".")[0] == kind.name else neutral)
-         for name, neutral in NEUTRAL.items()}
+    p = {
+        name: np.full(
+            count, parameters.get(name.split(".")[1], neutral) if name.split(".")[0] == kind.name else neutral
+        )
+        for name, neutral in NEUTRAL.items()
+    }
     motion = Motion(
         state[:, :3].numpy(), state[:, 3:6].numpy(), rotation(state[:, 6:10]).numpy(), state[:, 10:].numpy()
     )

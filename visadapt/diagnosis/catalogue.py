@@ -35,8 +35,7 @@ def twins(effect: type[Effect], effects: Iterable[type[Effect]], subject: Subjec
     return [
         other
         for other in effects
-        if other.name in effect.indistinguishable_from
-        and frozenset({other.name, effect.name}) not in subject.separable
+        if other.name in effect.indistinguishable_from and frozenset({other.name, effect.name}) not in subject.separable
     ]
 
 

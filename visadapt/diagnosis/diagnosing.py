@@ -25,7 +25,7 @@ from visadapt.diagnosis.result import (
     Region,
     Where,
 )
-from visadapt.diagnosis.subjects import DIAGNOSABLE, subject_of
+from visadapt.diagnosis.subjects import Subject, subject_of
 from visadapt.diagnosis.verdict import Judgement, judge
 from visadapt.diagnosis.which import Search
 from visadapt.effects import Effect
@@ -129,7 +129,7 @@ def _diagnose(
         causes=told,
         ranking=ranking(judgement, effects, subject, closing, [each.cause for each in held]),
         gap=errors.gap(),
-        next_experiment=_next(judgement, verdict, places),
+        next_experiment=_next(judgement, verdict, places, subject),
         warnings=(*recording.warnings, *readings.warnings, *_doubts(judgement, verdict)),
         evidence=evidence(search, source, corrected, errors, before, after, regions, terms),
     )
@@ -145,7 +145,9 @@ def _verdict(judgement: Judgement, errors: Errors, held: bool) -> str:
     return IDENTIFIED if judgement.best.effects or held else NO_GAP
 
 
-def _regions(told: Sequence[Cause], found: where.Disturbance, places: Mapping[str, str], seed: int) -> tuple[Region, ...]:
+def _regions(
+    told: Sequence[Cause], found: where.Disturbance, places: Mapping[str, str], seed: int
+) -> tuple[Region, ...]:
     """Those of the causes that act in one, as they were fitted; then those where the residual stands out."""
     own = []
     for cause in told:
@@ -165,13 +167,13 @@ def _regions(told: Sequence[Cause], found: where.Disturbance, places: Mapping[st
     return (*own, *(region for region in where.regions(found, seed) if region.variable not in taken))
 
 
-def _next(judgement: Judgement, verdict: str, places: Sequence[Sequence[Named]]) -> str:
+def _next(judgement: Judgement, verdict: str, places: Sequence[Sequence[Named]], subject: Subject) -> str:
     if verdict == NO_GAP:
-        return experiments.more()
+        return experiments.more(subject)
     if verdict == UNEXPLAINED:
         first = judgement.functions[0]
         return experiments.explain(first.port, first.variable)
-    return experiments.separate([[named.effect for named in place] for place in places])
+    return experiments.separate([[named.effect for named in place] for place in places], subject)
 
 
 def _doubts(judgement: Judgement, verdict: str) -> list[str]:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
 
-from visadapt.systems import CartPole, FixedWing, Quadrotor, RigidBody, System
+from visadapt.systems import CartPole, FixedWing, Quadrotor, System
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY
 
 Columns = tuple[int, ...]
@@ -46,6 +45,8 @@ class Subject:
     """by which variables a black box's function on each load is multiplied; (None,) where it is not listed"""
     rows: int = 1600
     """that a search uses; of more, windows spread evenly over the recording are taken"""
+    flies: bool = False
+    """what is worth recording of it next is told in other words"""
     window: int = 120
     """rows of a window; a longer episode is cut, since states far apart say nothing about each other's noise"""
     smooth_step: float = float("inf")
@@ -116,6 +117,7 @@ class _Vehicle(Subject):
     residual: str = "force along x"
     factors: Mapping[str, tuple[str | None, ...]] = field(default_factory=dict)
     rows: int = 650
+    flies: bool = True
     window: int = 25
     substeps: tuple[int, int, int] = (2, 3, 4)
     separable: tuple[frozenset[str], ...] = (frozenset({"constant_force", "actuator_bias"}),)
