@@ -5,7 +5,8 @@
     python -m benchmarks.blind_diagnosis --system quadrotor --count 30 --seed 7
 
 Makes the recordings with datasets.blind_gaps, or datasets.blind_flights, where they are not there yet, hands every
-diagnoser the path of one CSV at a time, and opens the key only to score. Every answer is a line of a log, so an interrupted run goes on where it was;
+diagnoser the path of one CSV at a time, and opens the key only to score. Every answer is a line of a log, so an
+interrupted run goes on where it was;
 with --data a folder made elsewhere is scored. Writes results/blind_diagnosis.csv (one row per set, diagnoser and
 measure) and results/blind_confusion.csv; lines of diagnosers and sets that were not run this time stay.
 """

@@ -1,4 +1,4 @@
-"""The blind flights: their physics against the library's, which is other code; sealed and told apart by their columns."""
+"""The blind flights: their physics against the library's, which is other code; sealed, and told by their columns."""
 
 import json
 from pathlib import Path

@@ -70,7 +70,8 @@ def cut(
 ) -> Rows:
     """Cut episodes into windows of equal length within each: measured (T, m), valid (T, m), commands (T, n_action).
 
-    A window has `longest` rows at most. `stretches`, where given, are what is used: an episode's index, and the rows from which and up to which.
+    A window has `longest` rows at most. `stretches`, where given, are what is used: an episode's index, and the rows
+    from which and up to which.
     """
     pieces = []
     for index, begin, end in stretches or [(k, 0, len(values)) for k, values in enumerate(measured)]:

@@ -87,8 +87,8 @@ class Family:
     def instead(self, theta: Tensor, actions: Tensor) -> Tensor:
         """(W, T, K, S, 1) what acts over a row's substeps if its command alone were another, for parameters (P,).
 
-        `actions` (W, T, K) are the other commands of a system with one action; those before the row stay as they were given, since the chain
-        remembers them.
+        `actions` (W, T, K) are the other commands of a system with one action; those before the row stay as they were
+        given, since the chain remembers them.
         """
         rows = self.rows
         h = rows.period / self.substeps
@@ -112,7 +112,7 @@ class Family:
         return out
 
     def step(self, theta: Tensor, commands: Tensor, time: Tensor, state: Tensor) -> Tensor:
-        """One period on from states (N, n) under commands (N, S, n_action), with parameters (P,), or (N, P), a row's own."""
+        """One period on from states (N, n) under commands (N, S, n_action); parameters (P,), or a row's own (N, P)."""
         loads = self._made(DynamicsEffect, theta)
         system = self.system
         for effect in loads:
