@@ -6,9 +6,9 @@
 
 Makes the recordings with datasets.blind_gaps, or datasets.blind_flights, where they are not there yet, hands every
 diagnoser the path of one CSV at a time, and opens the key only to score. Every answer is a line of a log, so an
-interrupted run goes on where it was;
-with --data a folder made elsewhere is scored. Writes results/blind_diagnosis.csv (one row per set, diagnoser and
-measure) and results/blind_confusion.csv; lines of diagnosers and sets that were not run this time stay.
+interrupted run goes on where it was; with --data a folder made elsewhere is scored. Writes results/blind_diagnosis.csv
+(one row per set, diagnoser and measure) and results/blind_confusion.csv; lines of diagnosers and sets that were not run
+this time stay.
 """
 
 from __future__ import annotations

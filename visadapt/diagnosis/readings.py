@@ -84,6 +84,8 @@ class Readings:
 
         thinned: list[str] = []
         rows, raw = windows(None, thinned)
+        if not subject.doubted:
+            return cls(rows, raw, holds, None, tuple(thinned))
         source = Search(system, rows, ()).source.fits
         defect = _contradicted(system, rows, source)
         band = None

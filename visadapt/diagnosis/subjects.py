@@ -56,6 +56,8 @@ class Subject:
     refresh: int = 1
     """iterations of a fit for which derivatives by the states are kept: those of states that are all measured change
     little on the way"""
+    doubted: bool = True
+    """whether worn sensors, other conventions, and velocities that are no measurements of their own are looked for"""
     held: Columns = ()
     """an angle and its rate, of whose sensor defects are looked for"""
     conventions: tuple[Convention, ...] = ()
@@ -122,6 +124,7 @@ class _Vehicle(Subject):
     substeps: tuple[int, int, int] = (2, 3, 4)
     separable: tuple[frozenset[str], ...] = (frozenset({"constant_force", "actuator_bias"}),)
     refresh: int = 4
+    doubted: bool = False
     promising: tuple[float, float] = (1.0, 3.0)
     rivalling: float = 0.3
     weighed: int = 4
