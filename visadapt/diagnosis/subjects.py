@@ -68,6 +68,10 @@ class Subject:
     """log likelihood that a lead must promise to be fitted, and more of it for each parameter; an effect costs more"""
     rivalling: float = 0.0
     """share of what the best lead promises that another must promise to be fitted"""
+    retried: bool = False
+    """whether a subset of a set that was fitted before is fitted again from the set's own parameters"""
+    function: float = 4.0
+    """log odds of a function of the black box beside a set from which on it counts as something unexplained"""
     weighed: int = 8
     """sets, the most probable ones, of which it is asked what they leave unexplained"""
     folds: int = 4
@@ -127,6 +131,9 @@ class _Vehicle(Subject):
     doubted: bool = False
     promising: tuple[float, float] = (1.0, 3.0)
     rivalling: float = 0.3
+    retried: bool = True
+    # Of more functions the most evident is more evident by chance.
+    function: float = 6.0
     weighed: int = 4
     folds: int = 2
     beam: int = 2

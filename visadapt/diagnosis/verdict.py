@@ -18,9 +18,6 @@ WITHIN = 10.0
 NOISE = 5.0
 """Log likelihood that process noise must add to a set to count as something unexplained, and what a set pays for it."""
 
-FUNCTION = 4.0
-"""Log odds of a function of the black box beside a set from which on it counts as something unexplained."""
-
 SLIGHT = 0.05
 """Log likelihood left over, beside that which the best set brings, that is not worth the word unexplained."""
 
@@ -52,6 +49,8 @@ class Judgement:
     """for each effect of the best set: the sets with another effect in its place that fit as well"""
     gained: float
     """log likelihood of the best beyond the source's"""
+    function: float
+    """log odds of a function from which on it counts as something unexplained"""
 
     @property
     def best(self) -> Fitted:
@@ -61,7 +60,7 @@ class Judgement:
     @property
     def unexplained(self) -> bool:
         """Whether something is left that no set explains."""
-        return self.leftover > NOISE or self.functions[0].evidence > FUNCTION
+        return self.leftover > NOISE or self.functions[0].evidence > self.function
 
     @property
     def slight(self) -> bool:
@@ -83,7 +82,7 @@ def judge(search: Search) -> Judgement:
     family = Family(search.system, best.effects, search.rows)
     classes = {effect: _class(weighed, effect) for effect in best.effects}
     gained = float(best.fits.likelihood[0] - search.source.fits.likelihood[0])
-    return Judgement(weighed, left[order[0]], functions(family, best.fits), classes, gained)
+    return Judgement(weighed, left[order[0]], functions(family, best.fits), classes, gained, search.subject.function)
 
 
 def _class(weighed: Sequence[Weighed], effect: type[Effect]) -> list[Weighed]:

@@ -172,7 +172,7 @@ class Search:
         for gone in centre.effects:
             effects = tuple(e for e in centre.effects if e is not gone)
             key = frozenset(e.name for e in effects)
-            if key in self.fitted:
+            if key in self.fitted and not self.subject.retried:
                 smaller.append(self.fitted[key])
             else:
                 starts.append((effects, _shrunk(centre, gone)))
