@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import torch
 
 from visadapt.diagnosis.catalogue import twins
+from visadapt.diagnosis.grids import spans
 from visadapt.diagnosis.result import Cause, Estimate, Ranked
-from visadapt.diagnosis.screening import spans
 from visadapt.diagnosis.subjects import Subject
 from visadapt.diagnosis.verdict import Judgement, Weighed, exchanged
 from visadapt.diagnosis.which import Fitted, Search, posterior
@@ -100,7 +100,7 @@ def _estimate(
         return Estimate(value - turn, parameter.unit, (low - turn, high - turn))
     if parameter.name in ("start", "end"):
         # A region that goes beyond where the data are ends somewhere there.
-        first, last = seen[parameter.unit]
+        first, last = seen.get(parameter.unit, (parameter.low, parameter.high))
         if value < first:
             return Estimate(first, parameter.unit, (parameter.low, first))
         if value > last:

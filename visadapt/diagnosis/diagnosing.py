@@ -151,8 +151,8 @@ def _regions(
     """Those of the causes that act in one, as they were fitted; then those where the residual stands out."""
     own = []
     for cause in told:
-        if {"start", "end"} <= set(cause.parameters):
-            start, end = cause.parameters["start"], cause.parameters["end"]
+        start, end = cause.parameters.get("start"), cause.parameters.get("end")
+        if start is not None and end is not None and start.unit in places:
             variable = places[start.unit]
             own.append(
                 Region(
