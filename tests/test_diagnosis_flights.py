@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from visadapt import diagnose
 from visadapt.cli import main
 from visadapt.diagnosis.catalogue import catalogue, searched
+from visadapt.diagnosis.readings import Readings
 from visadapt.diagnosis.subjects import SUBJECTS, subject_of
 from visadapt.effects import ActuatorDelay, ConstantForce, LiftSlope, LinearDrag, ThrustGain, Wind
 from visadapt.recordings import Episode, Recording
@@ -124,6 +126,20 @@ def test_the_command_reads_a_quadrotor_s_csv(tmp_path, capsys, monkeypatch):
     assert (answer["system"], answer["verdict"]) == ("quadrotor", "identified")
     assert answer["causes"][0]["parameters"]["coefficient"]["value"] == pytest.approx(0.5, rel=0.1)
     assert "force along x" in page.read_text()
+
+
+def test_a_quaternion_s_sign_has_no_meaning():
+    recording = record(Quadrotor(), episodes=2)
+    flipped = []
+    for episode in recording.episodes:
+        state = episode.state.copy()
+        state[7:15, 6:10] *= -1
+        flipped.append(Episode(episode.time, episode.action, state))
+    rows, again = (
+        Readings.of(each, Quadrotor()).rows
+        for each in (recording, dataclasses.replace(recording, episodes=tuple(flipped)))
+    )
+    torch.testing.assert_close(again.measured, rows.measured)
 
 
 def test_terms_for_a_policy_need_one_action():

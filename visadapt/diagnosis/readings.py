@@ -64,6 +64,8 @@ class Readings:
         subject = subject_of(system)
         channels = tuple(system.index(name) for name in recording.measured)
         measured = [torch.tensor(np.asarray(e.state, dtype=np.float64)) for e in recording.episodes]
+        attitude = [k for k, channel in enumerate(channels) if channel in subject.attitude]
+        measured = [_one_sign(values, attitude) for values in measured]
         commands = [torch.tensor(np.asarray(e.action, dtype=np.float64)) for e in recording.episodes]
         holds = find_holds(measured, channels, subject.held)
         warnings: list[str] = []
@@ -145,6 +147,17 @@ def _contradicted(system: System, rows: Rows, fits: Fits) -> tuple[float, float,
     bands = loud.nonzero()[:, 0]
     low, high = (BAND * (float(k) + extra) - math.pi for k, extra in ((bands.min(), 0), (bands.max(), 1)))
     return low, high, float((count > 0).double().mean()) > ROUND
+
+
+def _one_sign(measured: Tensor, attitude: Sequence[int]) -> Tensor:
+    """An episode (T, m) whose quaternion does not jump to the other one of the same attitude."""
+    if not attitude:
+        return measured
+    quaternion = measured[:, attitude]
+    turned = (quaternion[1:] * quaternion[:-1]).sum(1) < 0
+    out = measured.clone()
+    out[1:, attitude] *= torch.where(turned, -1.0, 1.0).to(measured).cumprod(0)[:, None]
+    return out
 
 
 def _within(theta: Tensor, low: float, high: float) -> Tensor:

@@ -33,6 +33,8 @@ class Subject:
     """of a velocity that may be missing from a recording: the column that it is the rate of"""
     sensors: tuple[Columns, ...]
     """columns that one kind of sensor reads, with the same noise"""
+    attitude: Columns
+    """of a quaternion, which is the same attitude with either sign; none where there is none"""
     spread: tuple[float, ...]
     """variances of the first state around the measured one"""
     places: Mapping[str, str]
@@ -91,6 +93,7 @@ _CART_POLE = Subject(
     driven=((1,), (3,)),
     slopes={1: 0, 3: 2},
     sensors=((0,), (1,), (2,), (3,)),
+    attitude=(),
     spread=(0.3**2, 2.0**2, 0.3**2, 3.0**2),
     places={"s": "time", "m": "x", "rad": "theta"},
     drawn=("x_dot", "x", "command", "time", "theta", "theta_dot"),
@@ -114,6 +117,7 @@ _VEHICLE = Subject(
     driven=(_span(VELOCITY), _span(RATES)),
     slopes=dict(zip(_span(VELOCITY), _span(POSITION), strict=True)),
     sensors=tuple(_span(columns) for columns in (POSITION, VELOCITY, ATTITUDE, RATES)),
+    attitude=_span(ATTITUDE),
     spread=(0.3**2,) * 3 + (1.0,) * 3 + (0.1**2,) * 4 + (1.0,) * 3,
     places={"s": "time", "m": "z"},
     drawn=("x_dot", "thrust", "time", "z"),
