@@ -81,7 +81,9 @@ def forward(problem: Linear, process: Tensor, noise: Tensor) -> Filtered:
         covariances.append(covariance)
         sensing = problem.sensing[:, t]
         seen = torch.bmm(sensing, covariance)
-        root = torch.linalg.cholesky(torch.baddbmm(disturbed, seen, sensing.mT))
+        root, failed = torch.linalg.cholesky_ex(torch.baddbmm(disturbed, seen, sensing.mT))
+        # A step too far can leave no covariance; its likelihood is then no number, and the step is not taken.
+        root = torch.where(failed[:, None, None] > 0, math.nan, root)
         error = torch.baddbmm(problem.reading[:, t], sensing, mean, alpha=-1)
         cross, white = torch.linalg.solve_triangular(root, torch.cat((seen, error), -1), upper=False).split(
             (n, error.shape[-1]), -1
