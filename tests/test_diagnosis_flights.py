@@ -20,12 +20,12 @@ from visadapt.systems import CartPole, FixedWing, Quadrotor
 from visadapt.world import World
 
 NOISE = torch.tensor([0.01] * 3 + [0.02] * 3 + [0.0025] * 4 + [0.005] * 3, dtype=torch.float64)
-PERIODS = {Quadrotor: 0.1, FixedWing: 0.05}
+PERIODS = {"quadrotor": 0.1, "fixed_wing": 0.05}
 
 
 def record(system, effects=(), episodes=5, rows=25, seed=0):
     """Episodes with random steps around hovering, or level flight at 11.5 m/s; all 13 states."""
-    period = PERIODS[type(system)]
+    period = PERIODS[system.name]
     generator = torch.Generator().manual_seed(seed)
     world = World(system, [effect.double() for effect in effects], period=period, substeps=10)
     state = torch.zeros(episodes, 13, dtype=torch.float64)
@@ -60,7 +60,7 @@ def record(system, effects=(), episodes=5, rows=25, seed=0):
 
 
 def diagnosed(system, effects=(), candidates=None):
-    source = World(system, period=PERIODS[type(system)])
+    source = World(system, period=PERIODS[system.name])
     return diagnose(record(system, effects), source, catalogue=candidates)
 
 
