@@ -2,10 +2,13 @@
 
     python -m benchmarks.blind_diagnosis --count 200 --seed 7 --jobs 2 --diagnosers ours afternoon greedy refit chance
 
-Makes the recordings with datasets.blind_gaps where they are not there yet, hands every diagnoser the path of one CSV at
-a time, and opens the key only to score. Every answer is a line of a log, so an interrupted run goes on where it was;
-with --data a folder made elsewhere is scored. Writes results/blind_diagnosis.csv (one row per set, diagnoser and
-measure) and results/blind_confusion.csv; lines of diagnosers and sets that were not run this time stay.
+    python -m benchmarks.blind_diagnosis --system quadrotor --count 30 --seed 7
+
+Makes the recordings with datasets.blind_gaps, or datasets.blind_flights, where they are not there yet, hands every
+diagnoser the path of one CSV at a time, and opens the key only to score. Every answer is a line of a log, so an
+interrupted run goes on where it was; with --data a folder made elsewhere is scored. Writes results/blind_diagnosis.csv
+(one row per set, diagnoser and measure) and results/blind_confusion.csv; lines of diagnosers and sets that were not run
+this time stay.
 """
 
 from __future__ import annotations
@@ -30,21 +33,25 @@ import tyro
 from benchmarks.blind_baselines import BASELINES
 from benchmarks.blind_scoring import Answer, Score, Truth, score
 from benchmarks.blind_tables import Row, confusion, label, read_table, tabulate, write_csv, write_table
-from datasets import blind_gaps
+from datasets import blind_flights, blind_gaps
 
-Kind = Literal["easy", "hard"]
+Kind = Literal["easy", "hard", "quadrotor", "fixed_wing"]
+"""A set of the cart-pole, or the one of a vehicle."""
+System = Literal["cartpole", "quadrotor", "fixed_wing"]
 
 
 @dataclass(frozen=True)
 class Settings:
     """What is scored, and where things are kept."""
 
+    system: System = "cartpole"
+    """what is recorded; of a vehicle there is one set, and the library alone diagnoses it"""
     count: int = 200
     """recordings of each set"""
     seed: int = 7
     """of the recordings"""
     kinds: tuple[Kind, ...] = ("easy", "hard")
-    """which sets"""
+    """which sets of the cart-pole"""
     diagnosers: tuple[str, ...] = ("ours", *BASELINES)
     """who is scored"""
     jobs: int = 1
@@ -60,6 +67,23 @@ class Settings:
     wrong: int = 0
     """list so many wrong answers of each diagnoser"""
 
+    @property
+    def sets(self) -> tuple[Kind, ...]:
+        """Those of the system."""
+        return self.kinds if self.system == "cartpole" else (self.system,)
+
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """Diagnosers that know the system."""
+        return self.diagnosers if self.system == "cartpole" else ("ours",)
+
+
+def system_of(path: Path) -> str:
+    """The system that a recording is of, by the names of its commands."""
+    with path.open(encoding="utf-8") as file:
+        columns = set(file.readline().strip().split(","))
+    return next((name for name, actions in blind_flights.ACTIONS.items() if columns.issuperset(actions)), "cartpole")
+
 
 def ours(path: Path) -> Answer:
     """What the command `visadapt diagnose` writes, run in this process."""
@@ -69,7 +93,7 @@ def ours(path: Path) -> Answer:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "answer.json"
         with redirect_stdout(said), redirect_stderr(said):
-            status = cli.main(["diagnose", str(path), "--system", "cartpole", "--json", str(out)])
+            status = cli.main(["diagnose", str(path), "--system", system_of(path), "--json", str(out)])
         if status != 0:
             raise RuntimeError(f"exit status {status}: {said.getvalue().strip()}")
         answer: Answer = json.loads(out.read_text(encoding="utf-8"))
@@ -160,7 +184,10 @@ def recordings_of(settings: Settings, kind: Kind) -> Path:
         return settings.data
     folder = Path("data/blind") / f"{kind}-{settings.count}-{settings.seed}"
     if len(list(folder.glob("*.csv"))) != settings.count or not key_of(folder).exists():
-        blind_gaps.main(blind_gaps.Settings(folder, kind, settings.count, settings.seed))
+        if kind == "easy" or kind == "hard":
+            blind_gaps.main(blind_gaps.Settings(folder, kind, settings.count, settings.seed))
+        else:
+            blind_flights.main(blind_flights.Settings(folder, kind, settings.count, settings.seed))
     return folder
 
 
@@ -193,14 +220,14 @@ def main(settings: Settings) -> None:
     """Run, score, print and write."""
     if unknown := set(settings.diagnosers) - DIAGNOSERS.keys():
         raise SystemExit(f"no such diagnoser: {', '.join(sorted(unknown))}; there are {', '.join(DIAGNOSERS)}")
-    if settings.data is not None and len(settings.kinds) != 1:
+    if settings.data is not None and len(settings.sets) != 1:
         raise SystemExit("--data is one set: say which with --kinds easy or --kinds hard")
     rows: list[Row] = []
     taken: list[dict[str, str | int]] = []
-    for kind in settings.kinds:
+    for kind in settings.sets:
         folder = recordings_of(settings, kind)
         recordings = sorted(folder.glob("*.csv"))
-        for name in settings.diagnosers:
+        for name in settings.asked:
             log = settings.work / folder.name / f"{name}.jsonl"
             if settings.fresh:
                 log.unlink(missing_ok=True)

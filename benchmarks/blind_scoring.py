@@ -38,8 +38,27 @@ SIZE: dict[str, tuple[str, float]] = {
     "angle_offset": ("offset", 0.0),
     "measurement_delay": ("delay", 0.0),
     "dropout": ("rate", 0.0),
+    "linear_drag": ("coefficient", 0.0),
+    "periodic_wind": ("amplitude", 0.0),
+    "thrust_gain": ("scale", 1.0),
+    "payload": ("mass", 0.0),
+    "battery_sag": ("rate", 0.0),
+    "mass": ("scale", 1.0),
+    "lift_slope": ("scale", 1.0),
+    "drag": ("scale", 1.0),
 }
 """the parameter that says how large an effect is, and its value where the effect does nothing"""
+
+LARGEST: dict[str, tuple[tuple[str, ...], float]] = {
+    "sensor_scale": (("position", "angle"), 1.0),
+    "wind": (("velocity_x", "velocity_y", "velocity_z"), 0.0),
+    "center_of_mass_offset": (("x", "y"), 0.0),
+    "inertia": (("scale_x", "scale_y", "scale_z"), 1.0),
+    "rotor_efficiency": (("scale_1", "scale_2", "scale_3", "scale_4"), 1.0),
+    "control_effectiveness": (("scale_elevator", "scale_aileron", "scale_rudder"), 1.0),
+    "trim_offset": (("elevator", "aileron", "rudder"), 0.0),
+}
+"""effects with several such parameters, of which the one counts that is furthest from doing nothing"""
 
 REGION = {"friction_patch": "x", "gust": "time", "frozen_zone": "theta"}
 """effects that live in a region, and the variable of `where.regions` that shows it"""
@@ -154,9 +173,9 @@ def score(truth: Truth, answer: Answer) -> Score:
 
 def _parameters(result: Score, cause: dict[str, Any], true: dict[str, float]) -> None:
     name, neutral = SIZE.get(cause["effect"], ("", 0.0))
-    if cause["effect"] == "sensor_scale":
-        # Of the two scales, the one that is off.
-        name, neutral = max(("position", "angle"), key=lambda n: abs(true[n] - 1.0)), 1.0
+    if cause["effect"] in LARGEST:
+        names, neutral = LARGEST[cause["effect"]]
+        name = max(names, key=lambda n: abs(true[n] - neutral))
     for parameter, estimate in cause["parameters"].items():
         if parameter not in true or estimate.get("value") is None:
             continue

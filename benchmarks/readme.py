@@ -163,6 +163,18 @@ def blind(rows: Rows, again: Rows) -> list[list[str]]:
     return table
 
 
+def blind_flights(rows: Rows) -> list[list[str]]:
+    """The sealed check of the diagnosis of the vehicles: the measures that there are."""
+    found = {(row["kind"], row["measure"]): row for row in rows}
+    vehicles = [name for name in ("quadrotor", "fixed_wing") if any(kind == name for kind, _ in found)]
+    table = [["sealed check", *(name.replace("_", " ") for name in vehicles)]]
+    for measure, told in MEASURES.items():
+        cells = [found.get((name, measure)) for name in vehicles]
+        if any(cells):
+            table.append([told, *(_share(row) for row in cells)])
+    return table
+
+
 def _share(row: dict[str, str] | None) -> str:
     if row is None:
         return ""
@@ -225,7 +237,10 @@ def main() -> None:
     diagnosed, again = (read_rows(RESULTS / f"{name}.csv") for name in ("blind_diagnosis", "blind_diagnosis_2029"))
     readme = Path("README.md")
     text = readme.read_text()
-    tables = {name: make(rows) for name, make in TABLES.items()} | {"blind": blind(diagnosed, again)}
+    tables = {name: make(rows) for name, make in TABLES.items()} | {
+        "blind": blind(diagnosed, again),
+        "blind flights": blind_flights(diagnosed),
+    }
     for name, (header, *body) in tables.items():
         lines = ["| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *body)]
         block = f"<!-- table: {name} -->\n" + "\n".join(lines) + "\n<!-- end -->"

@@ -202,7 +202,6 @@ class TestBadInput:
             ["--jobs", "many"],
             ["--seed", "a"],
             ["--system", "unicycle"],
-            ["--system", "quadrotor"],
         ],
     )
     def test_arguments(self, recording, stub, capsys, arguments):

@@ -141,7 +141,7 @@ class TestWhatThePolicyIsGiven:
         windows, length = pushed.rows.shape
         observations = spy.given[-1].observations.reshape(windows, length - 1, 5, 4)
         done = spy.given[-1].actions.reshape(windows, length - 1, 5)
-        state, command = pushed.best.fits.state[0].float(), pushed.rows.command[:, :length].float()
+        state, command = pushed.best.fits.state[0].float(), pushed.rows.command[:, :length, 0].float()
         torch.testing.assert_close(observations[:, 10], state[:, 6:11], atol=1e-3, rtol=0)
         torch.testing.assert_close(observations[:, 1, :4], state[:, :1].expand(-1, 4, -1), atol=1e-3, rtol=0)
         torch.testing.assert_close(done[:, 10], command[:, 5:10])
@@ -161,7 +161,7 @@ class TestWhatThePolicyIsGiven:
         rows = Readings.of(record(rows=150, episodes=2), CartPole()).rows  # two windows each
         theta = torch.tensor([next(effect.parameters()).item()], dtype=torch.float64)
         family = Family(CartPole(), [type(effect)], rows)
-        given = rows.command[rows.episode[:, None], rows.first[:, None] + torch.arange(rows.shape[1])]
+        given = rows.command[rows.episode[:, None], rows.first[:, None] + torch.arange(rows.shape[1]), 0]
         tried = torch.stack((given, given + 0.3), -1)
         acting = family.instead(theta, tried)
         torch.testing.assert_close(acting[:, :, 0], family.commands(theta[None])[0])

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import torch
 
+from visadapt.diagnosis.subjects import Subject
 from visadapt.effects import EFFECTS, ActuationEffect, Dropout, DynamicsEffect, Effect, FrozenZone, SensingEffect
 from visadapt.systems import System
 
@@ -19,19 +20,23 @@ def catalogue(system: System) -> list[type[Effect]]:
     return [e for e in EFFECTS.values() if issubclass(e, stages) and isinstance(system, e.systems)]
 
 
-def searched(effects: Iterable[type[Effect]]) -> list[type[Effect]]:
+def searched(effects: Iterable[type[Effect]], subject: Subject) -> list[type[Effect]]:
     """Those that are fitted: the first of each group of twins, and no sensor that remembers."""
     out: list[type[Effect]] = []
     for effect in effects:
-        twin = any(effect.name in other.indistinguishable_from for other in out)
+        twin = bool(twins(effect, out, subject))
         if not twin and effect not in HOLDING and not _remembers(effect):
             out.append(effect)
     return out
 
 
-def twins(effect: type[Effect], effects: Iterable[type[Effect]]) -> list[type[Effect]]:
+def twins(effect: type[Effect], effects: Iterable[type[Effect]], subject: Subject) -> list[type[Effect]]:
     """Effects among `effects` that passive data cannot tell from this one."""
-    return [other for other in effects if other.name in effect.indistinguishable_from]
+    return [
+        other
+        for other in effects
+        if other.name in effect.indistinguishable_from and frozenset({other.name, effect.name}) not in subject.separable
+    ]
 
 
 def _remembers(effect: type[Effect]) -> bool:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import torch
 
 from visadapt.diagnosis.catalogue import twins
-from visadapt.diagnosis.data import Rows
+from visadapt.diagnosis.grids import spans
 from visadapt.diagnosis.result import Cause, Estimate, Ranked
-from visadapt.diagnosis.screening import spans
+from visadapt.diagnosis.subjects import Subject
 from visadapt.diagnosis.verdict import Judgement, Weighed, exchanged
 from visadapt.diagnosis.which import Fitted, Search, posterior
 from visadapt.effects import Effect
@@ -35,13 +35,13 @@ class Named:
     """the effect that was fitted in its place: itself, or its twin"""
 
 
-def classes(judgement: Judgement, effects: Sequence[type[Effect]]) -> list[list[Named]]:
+def classes(judgement: Judgement, effects: Sequence[type[Effect]], subject: Subject) -> list[list[Named]]:
     """For each place of the best set, the effects that fit as well there, the best first, twins behind each other."""
     out = []
     for effect, rivals in judgement.classes.items():
         here = [(effect, judgement.weighed[0])]
         here += [(exchanged(judgement.best.effects, rival.fitted.effects), rival) for rival in rivals]
-        members = [Named(twin, weighed, own) for own, weighed in here for twin in [own, *twins(own, effects)]]
+        members = [Named(twin, weighed, own) for own, weighed in here for twin in [own, *twins(own, effects, subject)]]
         out.append([member for member in members if member.effect in effects])
     return out
 
@@ -52,7 +52,7 @@ def causes(search: Search, judgement: Judgement, places: Sequence[Sequence[Named
     for place in places:
         names = [member.effect.name for member in place]
         for member in place:
-            own = estimates(member.weighed.fitted, member.canonical, search.rows)
+            own = estimates(search, member.weighed.fitted, member.canonical)
             out.append(
                 Cause(
                     member.effect.name,
@@ -76,15 +76,15 @@ def _twin(search: Search, member: Named, own: Mapping[str, Estimate]) -> Mapping
     if [(p.name, p.unit) for p in member.effect.table] == [(p.name, p.unit) for p in member.canonical.table]:
         return own
     fitted = search.exchange(member.weighed.fitted, member.canonical, member.effect)
-    return estimates(fitted, member.effect, search.rows)
+    return estimates(search, fitted, member.effect)
 
 
-def estimates(fitted: Fitted, effect: type[Effect], rows: Rows) -> dict[str, Estimate]:
+def estimates(search: Search, fitted: Fitted, effect: type[Effect]) -> dict[str, Estimate]:
     """Maximum likelihood estimates of one effect's parameters, with 90 % intervals from Fisher's information."""
     _, whole = posterior(fitted.effects, fitted.fits)
     deviation = torch.linalg.inv(whole).diagonal().sqrt()
     first = sum(len(e.table) for e in fitted.effects[: fitted.effects.index(effect)])
-    seen = spans(rows, fitted.fits.state[0])
+    seen = spans(search.system, search.rows, fitted.fits.state[0])
     out = {}
     for k, parameter in enumerate(effect.table, first):
         out[parameter.name] = _estimate(parameter, float(fitted.fits.theta[0, k]), float(deviation[k]), seen)
@@ -100,7 +100,7 @@ def _estimate(
         return Estimate(value - turn, parameter.unit, (low - turn, high - turn))
     if parameter.name in ("start", "end"):
         # A region that goes beyond where the data are ends somewhere there.
-        first, last = seen[parameter.unit]
+        first, last = seen.get(parameter.unit, (parameter.low, parameter.high))
         if value < first:
             return Estimate(first, parameter.unit, (parameter.low, first))
         if value > last:
@@ -109,7 +109,7 @@ def _estimate(
 
 
 def ranking(
-    judgement: Judgement, effects: Sequence[type[Effect]], closing: Closing, held: Sequence[Cause]
+    judgement: Judgement, effects: Sequence[type[Effect]], subject: Subject, closing: Closing, held: Sequence[Cause]
 ) -> tuple[Ranked, ...]:
     """All sets weighed, each twin on its own, the most probable first; what is held for sure is in all of them."""
     sure = tuple(cause.effect for cause in held)
@@ -117,7 +117,7 @@ def ranking(
     for weighed in judgement.weighed:
         versions: list[tuple[str, ...]] = [()]
         for effect in weighed.fitted.effects:
-            alike = [e.name for e in [effect, *twins(effect, effects)] if e in effects]
+            alike = [e.name for e in [effect, *twins(effect, effects, subject)] if e in effects]
             versions = [(*version, name) for version in versions for name in alike]
         for version in versions:
             share = weighed.probability / len(versions)

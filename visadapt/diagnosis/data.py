@@ -9,9 +9,6 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-LONGEST = 120
-"""Rows of a window; a longer episode is cut, since states far apart say nothing about each other's noise."""
-
 ROUNDING = 1e-6
 """Differences that arithmetic makes of equal readings (turning an angle round, say), not the sensor."""
 
@@ -29,7 +26,7 @@ class Rows:
     time: Tensor
     """(W, T) s since the episode began"""
     command: Tensor
-    """(E, L) of whole episodes, from their beginning"""
+    """(E, L, n_action) of whole episodes, from their beginning"""
     first: Tensor
     """(W,) row of the episode at which the window begins"""
     episode: Tensor
@@ -68,15 +65,17 @@ def cut(
     commands: Sequence[Tensor],
     channels: tuple[int, ...],
     period: float,
+    longest: int,
     stretches: Sequence[tuple[int, int, int]] | None = None,
 ) -> Rows:
-    """Cut episodes into windows of equal length within each: measured (T, m), valid (T, m) and commands (T,).
+    """Cut episodes into windows of equal length within each: measured (T, m), valid (T, m), commands (T, n_action).
 
-    `stretches`, where given, are what is used: an episode's index, and the rows from which and up to which.
+    A window has `longest` rows at most. `stretches`, where given, are what is used: an episode's index, and the rows
+    from which and up to which.
     """
     pieces = []
     for index, begin, end in stretches or [(k, 0, len(values)) for k, values in enumerate(measured)]:
-        count = -(-(end - begin) // LONGEST)
+        count = -(-(end - begin) // longest)
         edges = torch.linspace(begin, end, count + 1).round().long().tolist()
         pieces += [(index, a, b) for a, b in pairwise(edges)]
     rows = max(b - a for _, a, b in pieces)
@@ -88,7 +87,9 @@ def cut(
         out[w, : b - a] = measured[index][a:b]
         used[w, : b - a] = valid[index][a:b]
         inside[w, : b - a] = 1
-    command = torch.zeros(len(commands), max(len(c) for c in commands) + rows, dtype=torch.float64)
+    command = torch.zeros(
+        len(commands), max(len(c) for c in commands) + rows, commands[0].shape[1], dtype=torch.float64
+    )
     for index, values in enumerate(commands):
         command[index, : len(values)] = values
     first = torch.tensor([a for _, a, _ in pieces])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 
@@ -25,15 +25,13 @@ from visadapt.diagnosis.result import (
     Region,
     Where,
 )
+from visadapt.diagnosis.subjects import Subject, subject_of
 from visadapt.diagnosis.verdict import Judgement, judge
 from visadapt.diagnosis.which import Search
 from visadapt.effects import Effect
 from visadapt.recordings import Recording
-from visadapt.systems import CartPole, System
+from visadapt.systems import System
 from visadapt.world import World
-
-DIAGNOSABLE: dict[str, type[System]] = {CartPole.name: CartPole}
-"""The systems that can be diagnosed, by name."""
 
 ENOUGH = 0.95
 """Share of the gap that the causes must close to be the explanation where something is left over."""
@@ -71,8 +69,7 @@ def diagnose(
     """
     if len(world.effects):
         raise ValueError("diagnose: the world is the source and has no effects; give the bare system")
-    if not isinstance(world.system, tuple(DIAGNOSABLE.values())):
-        raise ValueError(f"diagnose: {', '.join(DIAGNOSABLE)} is what can be diagnosed, got {world.system.name}")
+    subject_of(world.system)
     torch.set_num_threads(jobs)
     effects = list(all_effects(world.system) if catalogue is None else catalogue)
     with torch.inference_mode():
@@ -89,13 +86,14 @@ def _diagnose(
     progress: Report | None,
     policy: theorem.StatesToActions | None,
 ) -> Diagnosis:
+    subject = subject_of(system)
     readings = Readings.of(recording, system)
     rows = readings.rows
-    search = Search(system, rows, searched(effects))
+    search = Search(system, rows, searched(effects, subject))
     search.run(staged(progress, "search"))
     judgement = judge(search)
     best = judgement.best
-    places = classes(judgement, effects)
+    places = classes(judgement, effects, subject)
     held = held_causes(readings, search, judgement)
 
     # How far: the source, the best set, each cause alone, the runners-up; all on episodes held out.
@@ -118,7 +116,7 @@ def _diagnose(
             verdict = AMBIGUOUS
     terms = None if policy is None else theorem.policy_terms(policy, system, rows, best)
     before, after = disturbances(search, judgement)
-    regions = _regions(told, before if told else after, seed)
+    regions = _regions(told, before if told else after, subject.places, seed)
     return Diagnosis(
         system=system.name,
         recording=RecordingSummary(len(recording.episodes), recording.samples, float(f"{recording.period:.9g}")),
@@ -129,9 +127,9 @@ def _diagnose(
             regions,
         ),
         causes=told,
-        ranking=ranking(judgement, effects, closing, [each.cause for each in held]),
+        ranking=ranking(judgement, effects, subject, closing, [each.cause for each in held]),
         gap=errors.gap(),
-        next_experiment=_next(judgement, verdict, places),
+        next_experiment=_next(judgement, verdict, places, subject),
         warnings=(*recording.warnings, *readings.warnings, *_doubts(judgement, verdict)),
         evidence=evidence(search, source, corrected, errors, before, after, regions, terms),
     )
@@ -147,13 +145,15 @@ def _verdict(judgement: Judgement, errors: Errors, held: bool) -> str:
     return IDENTIFIED if judgement.best.effects or held else NO_GAP
 
 
-def _regions(told: Sequence[Cause], found: where.Disturbance, seed: int) -> tuple[Region, ...]:
+def _regions(
+    told: Sequence[Cause], found: where.Disturbance, places: Mapping[str, str], seed: int
+) -> tuple[Region, ...]:
     """Those of the causes that act in one, as they were fitted; then those where the residual stands out."""
     own = []
     for cause in told:
-        if {"start", "end"} <= set(cause.parameters):
-            start, end = cause.parameters["start"], cause.parameters["end"]
-            variable = {"s": "time", "m": "x", "rad": "theta"}[start.unit]
+        start, end = cause.parameters.get("start"), cause.parameters.get("end")
+        if start is not None and end is not None and start.unit in places:
+            variable = places[start.unit]
             own.append(
                 Region(
                     variable,
@@ -167,13 +167,13 @@ def _regions(told: Sequence[Cause], found: where.Disturbance, seed: int) -> tupl
     return (*own, *(region for region in where.regions(found, seed) if region.variable not in taken))
 
 
-def _next(judgement: Judgement, verdict: str, places: Sequence[Sequence[Named]]) -> str:
+def _next(judgement: Judgement, verdict: str, places: Sequence[Sequence[Named]], subject: Subject) -> str:
     if verdict == NO_GAP:
-        return experiments.more()
+        return experiments.more(subject)
     if verdict == UNEXPLAINED:
         first = judgement.functions[0]
         return experiments.explain(first.port, first.variable)
-    return experiments.separate([[named.effect for named in place] for place in places])
+    return experiments.separate([[named.effect for named in place] for place in places], subject)
 
 
 def _doubts(judgement: Judgement, verdict: str) -> list[str]:

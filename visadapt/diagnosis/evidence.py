@@ -100,13 +100,13 @@ def evidence(
 ) -> Evidence:
     """What the report draws."""
     units = {v.name: v.unit for v in (*search.system.states, *search.system.actions)} | {"time": "s"}
-    drawn = [region.variable for region in regions] + ["x_dot", "x", "command", "time", "theta", "theta_dot"]
+    drawn = [region.variable for region in regions] + list(search.subject.drawn)
     names = [name for name in dict.fromkeys(drawn) if name in units][:PROFILES]
     return Evidence(
         _predictions(search, source, corrected),
-        tuple(profile(name, units[name], before, after) for name in names),
+        tuple(profile(name, units[name], search.subject.residual, before, after) for name in names),
         errors.growth(search.rows.period),
-        spectrum(before, after, search.rows.period),
+        spectrum(search.subject.residual, before, after, search.rows.period),
         policy,
     )
 

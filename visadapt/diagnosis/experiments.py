@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 from visadapt.diagnosis.report_words import listed
+from visadapt.diagnosis.subjects import Subject
 from visadapt.effects import Effect, Stage
 
 SETTLES: dict[frozenset[str], str] = {
@@ -19,6 +20,9 @@ SETTLES: dict[frozenset[str], str] = {
     frozenset({"actuator_delay", "actuator_lag"}): (
         "record steps of the command, large and held for half a second, at the highest rate that the sensors have: "
         "after a delay the acceleration jumps, after a lag it creeps up"
+    ),
+    frozenset({"thrust_gain", "payload"}): (
+        "weigh the vehicle: a payload is on the scales, a thrust that is off is not"
     ),
     frozenset({"actuator_gain", "cart_mass"}): (
         "push the cart by hand with the motor off, or weigh it: a heavier cart accelerates less under any force, a "
@@ -40,15 +44,18 @@ BY_STAGE: dict[Stage, str] = {
     Stage.SENSING: "known positions and angles, set by hand and held still",
 }
 
+IN_FLIGHT = {Stage.DYNAMICS: "slow and fast flights in all directions, at several heights, with and without turns"}
+"""The same for a vehicle, where it differs."""
 
-def separate(classes: Sequence[Collection[type[Effect]]]) -> str:
+
+def separate(classes: Sequence[Collection[type[Effect]]], subject: Subject) -> str:
     """What tells the members of every class apart; empty where each has only one."""
     parts = []
     for members in classes:
         names = {effect.name for effect in members}
-        known = [text for pair, text in SETTLES.items() if pair <= names]
+        known = [text for pair, text in SETTLES.items() if pair <= names and pair not in subject.separable]
         if len(names) > 1:
-            told = known or [_general(members)]
+            told = known or [_general(members, subject)]
             parts.append(f"To tell {listed(sorted(names))} apart: " + "; ".join(told) + ".")
     return " ".join(parts)
 
@@ -62,14 +69,15 @@ def explain(port: str, variable: str) -> str:
     )
 
 
-def more() -> str:
+def more(subject: Subject) -> str:
     """What would show a gap where none was seen."""
     return (
         "Nothing departs from the source beyond the noise. A gap that shows only elsewhere needs other motions: larger "
-        "commands, higher speeds, other parts of the track."
+        f"commands, higher speeds, other {'winds and heights' if subject.flies else 'parts of the track'}."
     )
 
 
-def _general(members: Collection[type[Effect]]) -> str:
+def _general(members: Collection[type[Effect]], subject: Subject) -> str:
+    told = BY_STAGE | (IN_FLIGHT if subject.flies else {})
     stages = sorted({effect.stage for effect in members})
-    return "record " + ", then ".join(BY_STAGE[stage] for stage in stages if stage in BY_STAGE)
+    return "record " + ", then ".join(told[stage] for stage in stages if stage in told)

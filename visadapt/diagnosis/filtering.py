@@ -3,7 +3,8 @@
     x_{t+1} = A_t x_t + c_t + w_t,   w_t ~ N(0, diag(q))        x_0 ~ N(0, diag(p))
     r_t     = H_t x_t + v_t,         v_t ~ N(0, diag(s))
 
-Kalman (1960, J. Basic Eng. 82(1)) forwards, one channel after the other; backwards the adjoint form of Bryson and
+Kalman (1960, J. Basic Eng. 82(1)) forwards, with a Cholesky factor of the innovations' covariance, so that a channel's
+innovation and variance are those after the channels before it; backwards the adjoint form of Bryson and
 Frazier (1963), which inverts nothing, so that it also holds where there is no process noise. c and r have M columns:
 the first is the data, the others are sensitivities, which pass through the same gains.
 """
@@ -47,12 +48,14 @@ class Filtered:
     """T of (N, n, M): x_t given rows before t"""
     covariance: list[Tensor]
     """T of (N, n, n): its covariance"""
-    gain: list[list[Tensor]]
-    """T x m of (N, n)"""
+    root: list[Tensor]
+    """T of (N, m, m): lower factors of the innovations' covariances"""
+    cross: list[Tensor]
+    """T of (N, m, n): what a whitened innovation moves the states by"""
     innovation: Tensor
-    """(N, T, m, M)"""
+    """(N, T, m, M) of each channel, given the rows before and the channels before it"""
     variance: Tensor
-    """(N, T, m) of the innovations"""
+    """(N, T, m) of these"""
 
     @property
     def white(self) -> Tensor:
@@ -62,11 +65,13 @@ class Filtered:
 
 def forward(problem: Linear, process: Tensor, noise: Tensor) -> Filtered:
     """Filter with process variances q (N, n) and measurement variances s (N, m)."""
-    rows, channels = problem.reading.shape[1:3]
+    rows = problem.reading.shape[1]
     mean = problem.start
     covariance = torch.diag_embed(problem.spread.expand(len(mean), -1))
     added = torch.diag_embed(process)
-    predicted, covariances, gains, innovations, variances = [], [], [], [], []
+    n = covariance.shape[-1]
+    disturbed = torch.diag_embed(noise)
+    predicted, covariances, roots, crosses, innovations, variances = [], [], [], [], [], []
     for t in range(rows):
         if t:
             a = problem.transition[:, t - 1]
@@ -74,27 +79,23 @@ def forward(problem: Linear, process: Tensor, noise: Tensor) -> Filtered:
             covariance = torch.baddbmm(added, torch.bmm(a, covariance), a.mT)
         predicted.append(mean)
         covariances.append(covariance)
-        here = []
-        for k in range(channels):
-            row = problem.sensing[:, t, k]
-            seen = torch.bmm(covariance, row[..., None])[..., 0]
-            variance = (row * seen).sum(-1) + noise[:, k]
-            gain = seen / variance[:, None]
-            innovation = problem.reading[:, t, k] - torch.bmm(row[:, None], mean)[:, 0]
-            mean = mean + gain[..., None] * innovation[:, None]
-            covariance = covariance - gain[..., None] * seen[:, None]
-            here.append(gain)
-            innovations.append(innovation)
-            variances.append(variance)
-        gains.append(here)
-    shape = (len(mean), rows, channels)
-    return Filtered(
-        predicted,
-        covariances,
-        gains,
-        torch.stack(innovations, 1).reshape(*shape, -1),
-        torch.stack(variances, 1).reshape(shape),
-    )
+        sensing = problem.sensing[:, t]
+        seen = torch.bmm(sensing, covariance)
+        root, failed = torch.linalg.cholesky_ex(torch.baddbmm(disturbed, seen, sensing.mT))
+        # A step too far can leave no covariance; its likelihood is then no number, and the step is not taken.
+        root = torch.where(failed[:, None, None] > 0, math.nan, root)
+        error = torch.baddbmm(problem.reading[:, t], sensing, mean, alpha=-1)
+        cross, white = torch.linalg.solve_triangular(root, torch.cat((seen, error), -1), upper=False).split(
+            (n, error.shape[-1]), -1
+        )
+        mean = torch.baddbmm(mean, cross.mT, white)
+        covariance = torch.baddbmm(covariance, cross.mT, cross, alpha=-1)
+        deviation = root.diagonal(dim1=1, dim2=2)
+        roots.append(root)
+        crosses.append(cross)
+        innovations.append(white * deviation[..., None])
+        variances.append(deviation.square())
+    return Filtered(predicted, covariances, roots, crosses, torch.stack(innovations, 1), torch.stack(variances, 1))
 
 
 def respond(problem: Linear, filtered: Filtered, drive: Tensor, reading: Tensor) -> Tensor:
@@ -104,24 +105,22 @@ def respond(problem: Linear, filtered: Filtered, drive: Tensor, reading: Tensor)
     for t in range(reading.shape[1]):
         if t:
             mean = torch.baddbmm(drive[:, t - 1], problem.transition[:, t - 1], mean)
-        for k, gain in enumerate(filtered.gain[t]):
-            innovation = reading[:, t, k] - torch.bmm(problem.sensing[:, t, k, None], mean)[:, 0]
-            mean = mean + gain[..., None] * innovation[:, None]
-            out.append(innovation)
-    return torch.stack(out, 1).reshape(reading.shape)
+        error = torch.baddbmm(reading[:, t], problem.sensing[:, t], mean, alpha=-1)
+        white = torch.linalg.solve_triangular(filtered.root[t], error, upper=False)
+        mean = torch.baddbmm(mean, filtered.cross[t].mT, white)
+        out.append(white * filtered.root[t].diagonal(dim1=1, dim2=2)[..., None])
+    return torch.stack(out, 1)
 
 
 def backward(problem: Linear, filtered: Filtered) -> tuple[Tensor, Tensor]:
     """Smoothed states (N, T, n, M), and adjoints (N, T, n, M): minus q times them is the smoothed w before row t."""
-    rows, channels = problem.reading.shape[1:3]
+    white = filtered.white
     adjoint = torch.zeros_like(problem.start)
     states, adjoints = [], []
-    for t in reversed(range(rows)):
-        for k in reversed(range(channels)):
-            row = problem.sensing[:, t, k]
-            along = (filtered.gain[t][k][..., None] * adjoint).sum(1, keepdim=True)
-            weight = along + (filtered.innovation[:, t, k] / filtered.variance[:, t, k, None])[:, None]
-            adjoint = adjoint - row[..., None] * weight
+    for t in reversed(range(white.shape[1])):
+        along = torch.baddbmm(white[:, t], filtered.cross[t], adjoint)
+        weight = torch.linalg.solve_triangular(filtered.root[t].mT, along, upper=True)
+        adjoint = torch.baddbmm(adjoint, problem.sensing[:, t].mT, weight, alpha=-1)
         states.append(filtered.predicted[t] - torch.bmm(filtered.covariance[t], adjoint))
         adjoints.append(adjoint)
         if t:

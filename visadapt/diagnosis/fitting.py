@@ -23,6 +23,8 @@ from torch import Tensor
 from visadapt.diagnosis.data import Rows
 from visadapt.diagnosis.filtering import Linear, backward, forward, log_likelihood
 from visadapt.diagnosis.models import Family, linearise
+from visadapt.diagnosis.subjects import subject_of
+from visadapt.systems import System
 
 SMOOTH = 1e-6
 """Process noise of position and angle, m and rad: they follow from their velocities."""
@@ -30,9 +32,6 @@ SMOOTH = 1e-6
 QUIET = math.log(1e-4**2)
 LOUD = math.log(3.0**2)
 """Bounds of the log variance of w in the velocities, (m/s)^2 and (rad/s)^2."""
-
-SPREAD = (0.3**2, 2.0**2, 0.3**2, 3.0**2)
-"""Variances of the first state around its rough estimate."""
 
 ENOUGH = 0.02
 """Log likelihood that is not worth an iteration."""
@@ -57,7 +56,7 @@ class Fits:
     state: Tensor
     """(C, W, T, n)"""
     log_process: Tensor
-    """(C, 2) log variances of w in the velocities"""
+    """(C, G) log variances of w in the velocities, by group"""
     log_noise: Tensor
     """(C, m) log variances of the measurements"""
     likelihood: Tensor
@@ -70,14 +69,14 @@ class Fits:
         return Fits(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
 
 
-def rough(rows: Rows, n: int) -> Tensor:
+def rough(rows: Rows, system: System) -> Tensor:
     """States (W, T, n) from the measurements alone: a velocity that was not measured is a difference."""
-    out = torch.zeros(*rows.shape, n, dtype=torch.float64)
+    out = torch.zeros(*rows.shape, len(system.states), dtype=torch.float64)
     for k, channel in enumerate(rows.channels):
         out[..., channel] = rows.measured[..., k]
-    for channel in (1, 3):
+    for channel, place in subject_of(system).slopes.items():
         if channel not in rows.channels:
-            position = out[..., channel - 1]
+            position = out[..., place]
             change = torch.zeros_like(position)
             change[:, 1:-1] = (position[:, 2:] - position[:, :-2]) / (2 * rows.period)
             change[:, 0] = (position[:, 1] - position[:, 0]) / rows.period
@@ -88,7 +87,7 @@ def rough(rows: Rows, n: int) -> Tensor:
 def linear_problem(families: Sequence[Family], fits: Fits) -> Linear:
     """The models, one after the other, along the states of `fits`."""
     rows = families[0].rows
-    origin = rough(rows, fits.state.shape[-1])[:, 0]
+    origin = rough(rows, families[0].system)[:, 0]
     used = rows.used[..., None]
     inside = rows.inside[:, 1:, None, None]
     windows, length, n = fits.state.shape[1:]
@@ -101,6 +100,8 @@ def linear_problem(families: Sequence[Family], fits: Fits) -> Linear:
     for c, family in enumerate(families):
         count = len(family.table)
         lin = linearise(family, fits.theta[c, :count], fits.state[c])
+        if family.subject.refresh > 1:
+            family.slopes = lin.transition, lin.sensing
         transition.append(torch.where(inside > 0, lin.transition, identity))
         sensing.append(lin.sensing * used)
         drive[c, ..., 0] = lin.following - fits.state[c, :, 1:]
@@ -114,15 +115,25 @@ def linear_problem(families: Sequence[Family], fits: Fits) -> Linear:
         torch.cat(sensing),
         (reading * used).flatten(0, 1),
         start.flatten(0, 1),
-        torch.tensor(SPREAD, dtype=torch.float64),
+        torch.tensor(families[0].subject.spread, dtype=torch.float64),
     )
 
 
-def variances(log_process: Tensor, log_noise: Tensor, windows: int) -> tuple[Tensor, Tensor]:
-    """Process (C W, 4) and measurement (C W, m) variances for the filter."""
-    process = torch.full((len(log_process), 4), SMOOTH**2, dtype=torch.float64)
-    process[:, 1::2] = log_process.exp()
+def variances(family: Family, log_process: Tensor, log_noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Process (C W, n) and measurement (C W, m) variances for the filter."""
+    windows = family.rows.shape[0]
+    process = torch.full((len(log_process), len(family.system.states)), SMOOTH**2, dtype=torch.float64)
+    for k, group in enumerate(family.subject.driven):
+        process[:, list(group)] = log_process[:, k, None].exp()
     return process.repeat_interleave(windows, 0), log_noise.exp().repeat_interleave(windows, 0)
+
+
+def noise_groups(family: Family) -> Tensor:
+    """(G + S, G + m) which variances, of process noise by group and of channels, are one: 1 where it is this one."""
+    groups, channels = len(family.subject.driven), family.rows.channels
+    sensors = [[float(c in kind) for c in channels] for kind in family.subject.sensors]
+    seen = torch.tensor([row for row in sensors if any(row)], dtype=torch.float64)
+    return torch.block_diag(torch.eye(groups, dtype=torch.float64), seen)
 
 
 Chosen = TypeVar("Chosen", "Fits", "Slope")
@@ -139,9 +150,9 @@ class Slope:
     pull: Tensor
     """(C, K) gradient of the log likelihood in the free parameters"""
     noise_information: Tensor
-    """(C, 2 + m, 2 + m)"""
+    """(C, G + S, G + S) of the groups of process noise and the kinds of sensors"""
     noise_pull: Tensor
-    """(C, 2 + m)"""
+    """(C, G + S)"""
     smoothed: Tensor
     """(C, W, T, n, 1 + K) change of the states, and with each parameter"""
 
@@ -152,18 +163,19 @@ def slope(families: Sequence[Family], fits: Fits, counts: Tensor) -> Slope:
     logs = torch.cat((fits.log_process, fits.log_noise), 1)
     problem = linear_problem(families, fits)
     used = families[0].rows.used.repeat(models, 1, 1) * counts.reshape(-1, 1, 1)
-    here = forward(problem, *variances(fits.log_process, fits.log_noise, windows))
+    here = forward(problem, *variances(families[0], fits.log_process, fits.log_noise))
     likelihood = log_likelihood(here, used).reshape(models, windows).sum(-1)
     white = (here.white * used[..., None]).reshape(models, -1, here.innovation.shape[-1])
     error, columns = white[..., :1], white[..., 1:]
     # The noise's turn: the data's column alone, filtered with each variance a little larger.
-    varied = (logs + LOG_STEP * torch.eye(logs.shape[1], dtype=logs.dtype)[:, None]).flatten(0, 1)
-    swayed = forward(_repeated(problem.data(), logs.shape[1]), *variances(varied[:, :2], varied[:, 2:], windows))
-    gains = log_likelihood(swayed, used.repeat(logs.shape[1], 1, 1)).reshape(-1, models, windows).sum(-1) - likelihood
+    alike = noise_groups(families[0])
+    varied = (logs + LOG_STEP * alike[:, None]).flatten(0, 1).split((fits.log_process.shape[1], used.shape[-1]), 1)
+    swayed = forward(_repeated(problem.data(), len(alike)), *variances(families[0], *varied))
+    gains = log_likelihood(swayed, used.repeat(len(alike), 1, 1)).reshape(-1, models, windows).sum(-1) - likelihood
 
     def by_noise(there: Tensor, now: Tensor) -> Tensor:
         change = (there.reshape(-1, *now.shape) - now) / LOG_STEP * used
-        return change.reshape(logs.shape[1], models, -1).permute(1, 2, 0)
+        return change.reshape(len(alike), models, -1).permute(1, 2, 0)
 
     sways = by_noise(swayed.variance.log(), here.variance.log())
     shifts = by_noise(swayed.innovation[..., 0], here.innovation[..., 0]) / here.variance.sqrt().reshape(models, -1, 1)
@@ -212,7 +224,11 @@ def fit(families: Sequence[Family], start: Fits, counts: Tensor, iterations: int
     live = torch.arange(len(families))
     here = best = start
     at: Slope | None = None
-    for _ in range(iterations):
+    refresh = families[0].subject.refresh
+    for iteration in range(iterations):
+        if (iteration + 1) % refresh == 0:
+            for family in families:
+                family.slopes = None
         now = slope([families[k] for k in live.tolist()], here.of(live), counts[live])
         tried = replace(here.of(live), likelihood=now.likelihood, information=now.information)
         if at is None:
@@ -228,13 +244,13 @@ def fit(families: Sequence[Family], start: Fits, counts: Tensor, iterations: int
             live = live[(stale[live] < 2) & (damping[live] < STUCK)]
             if not len(live):
                 break
-        here = _step(best, at, damping, bounds)
+        here = _step(best, at, damping, bounds, noise_groups(families[0]))
         if still:
             here = replace(here, log_process=start.log_process)
     return best
 
 
-def _step(fits: Fits, at: Slope, damping: Tensor, bounds: Bounds) -> Fits:
+def _step(fits: Fits, at: Slope, damping: Tensor, bounds: Bounds, alike: Tensor) -> Fits:
     width = bounds.high - bounds.low
     # Weak enough to matter only where the data say nothing; a parameter that a set does not have stays where it is.
     prior = torch.where(width > 0, (2 / width).square(), 1.0)
@@ -246,13 +262,14 @@ def _step(fits: Fits, at: Slope, damping: Tensor, bounds: Bounds) -> Fits:
     moves = torch.cat((torch.ones(len(change), 1, dtype=change.dtype), change), 1)
     share = 1 / (1 + damping)[:, None]
     matrix = at.noise_information + 0.3 * torch.eye(at.noise_pull.shape[1], dtype=change.dtype)
-    sway = torch.linalg.solve(matrix, at.noise_pull[..., None])[..., 0].clamp(-GREATEST, GREATEST) * share
+    sway = torch.linalg.solve(matrix, at.noise_pull[..., None])[..., 0].clamp(-GREATEST, GREATEST) * share @ alike
+    groups = fits.log_process.shape[1]
     return replace(
         fits,
         theta=theta,
         state=fits.state + (at.smoothed * moves[:, None, None, None]).sum(-1),
-        log_process=(fits.log_process + sway[:, :2]).clamp(QUIET, LOUD),
-        log_noise=torch.maximum(fits.log_noise + sway[:, 2:], bounds.noise),
+        log_process=(fits.log_process + sway[:, :groups]).clamp(QUIET, LOUD),
+        log_noise=torch.maximum(fits.log_noise + sway[:, groups:], bounds.noise),
     )
 
 

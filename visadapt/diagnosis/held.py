@@ -89,7 +89,7 @@ def _zone(readings: Readings, search: Search, judgement: Judgement) -> tuple[flo
     inside = rows.inside > 0
     if readings.defect is not None:
         return *readings.defect, BAND
-    channel = rows.channels.index(search.system.index("theta"))
+    channel = rows.channels.index(search.subject.held[0])
     deviation = ROUGH * float((fits.log_noise[0, channel] / 2).exp())
-    angle = fits.state[0, ..., 2][inside]
+    angle = fits.state[0, ..., search.subject.held[0]][inside]
     return zone(_marks(readings, whole=False)[inside], torch.atan2(angle.sin(), angle.cos()), deviation)

@@ -20,9 +20,6 @@ MOVING = 8
 GRID = 120
 """Places tried for either edge of a zone in which a sensor stands still."""
 
-POLE = (2, 3)
-"""Columns of the state that a worn angle sensor holds."""
-
 
 @dataclass(frozen=True)
 class Holds:
@@ -36,12 +33,12 @@ class Holds:
     """(T,) the angle was held, the rest of the row was not"""
 
 
-def find_holds(measured: Sequence[Tensor], channels: tuple[int, ...]) -> Holds:
-    """Held readings in episodes (T, m) of these columns of the state."""
+def find_holds(measured: Sequence[Tensor], channels: tuple[int, ...], worn: Sequence[int]) -> Holds:
+    """Held readings in episodes (T, m) of these columns of the state, of which a `worn` angle sensor may hold some."""
     together = torch.cat(list(measured))
     steps = [smallest_step(together[:, k]) for k in range(len(channels))]
-    pole = torch.tensor([c in POLE for c in channels])
-    angle = channels.index(POLE[0]) if POLE[0] in channels else None
+    pole = torch.tensor([c in worn for c in channels], dtype=torch.bool)
+    angle = channels.index(worn[0]) if worn and worn[0] in channels else None
     used, lost, frozen = [], [], []
     for values in measured:
         same = torch.stack([_held(values[:, k], MOVING * steps[k]) for k in range(len(channels))], 1)

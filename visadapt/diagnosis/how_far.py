@@ -21,13 +21,12 @@ from visadapt.diagnosis.data import Rows
 from visadapt.diagnosis.filtering import backward, forward
 from visadapt.diagnosis.fitting import Fits, fit, linear_problem, variances
 from visadapt.diagnosis.models import COARSE, Family
+from visadapt.diagnosis.subjects import subject_of
 from visadapt.diagnosis.which import Effects, joined
 from visadapt.systems import System
 
 AHEAD = 0.5
 """s ahead: the horizon at which the gap is measured."""
-
-FOLDS = 4
 
 REFIT = 5
 """Iterations of a fit that starts from the fit to all episodes."""
@@ -68,16 +67,16 @@ def closed(before: float, after: float, floor: float) -> float:
     return (before - after) / (before - floor) if before > floor * 1.001 else math.nan
 
 
-def folds(rows: Rows) -> Tensor:
+def folds(rows: Rows, most: int) -> Tensor:
     """(F, W) 1 for the windows that are held out; by episode where there are several."""
     units = rows.episode if int(rows.episode.max()) > 0 else torch.arange(rows.shape[0])
-    count = min(FOLDS, int(units.max()) + 1)
+    count = min(most, int(units.max()) + 1)
     return torch.stack([(units % count == k).double() for k in range(count)])
 
 
 def held_out(system: System, rows: Rows, sets: Sequence[tuple[Effects, Fits]], black_box: bool = False) -> list[Ahead]:
     """Each set, fitted without each fold and predicting it; with a black box beside it, if one is asked for."""
-    out = folds(rows)
+    out = folds(rows, subject_of(system).folds)
     count = len(out)
     families = [Family(system, effects, rows, COARSE) for effects, _ in sets for _ in range(count)]
     starts = joined([fits for _, fits in sets for _ in range(count)])
@@ -100,7 +99,7 @@ def ahead(family: Family, fits: Fits, extra: Tensor | None = None) -> Ahead:
     extra = torch.zeros_like(fits.state[0, :, 1:]) if extra is None else extra
     problem = linear_problem([family], fits)
     problem = replace(problem.data(), drive=problem.drive[..., :1] + extra[..., None])
-    smoothed, _ = backward(problem, forward(problem, *variances(fits.log_process, fits.log_noise, windows)))
+    smoothed, _ = backward(problem, forward(problem, *variances(family, fits.log_process, fits.log_noise)))
     predicted = _run_on(family, fits.theta[0], fits.state[0] + smoothed[..., 0], horizon, extra)
     shape = (horizon + 1, windows, length, len(rows.channels))
     error, there = torch.zeros(shape, dtype=torch.float64), torch.zeros(shape, dtype=torch.float64)
@@ -120,7 +119,7 @@ def _run_on(family: Family, theta: Tensor, state: Tensor, horizon: int, extra: T
     beyond = torch.zeros(windows, horizon + 1, extra.shape[-1], dtype=extra.dtype)
     extra = torch.cat((extra, beyond), 1)
     commands = family.commands(theta[None])[0]
-    commands = torch.cat((commands, commands[:, -1:].expand(-1, horizon, -1)), 1)
+    commands = torch.cat((commands, commands[:, -1:].expand(-1, horizon, -1, -1)), 1)
     each = theta.expand(windows * length, -1)
     out = [state]
     for h in range(horizon):

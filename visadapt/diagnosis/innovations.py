@@ -22,7 +22,7 @@ class Innovations:
         rows = family.rows
         self.rows = rows
         self._problem = linear_problem([family], fits)
-        self._filtered = forward(self._problem, *variances(fits.log_process, fits.log_noise, rows.shape[0]))
+        self._filtered = forward(self._problem, *variances(family, fits.log_process, fits.log_noise))
         white = self._white(self._filtered.innovation)
         self._known, _ = torch.linalg.qr(white[:, 1:])
         self.error: Tensor = self._projected(white[:, :1])[:, 0]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -28,23 +29,24 @@ BUMPS = 10
 MOST = 8
 """Functions of a black box."""
 
-FACTORS: dict[str, tuple[str | None, ...]] = {
-    "cart_force": (None, "x_dot", "command"),
-    "pivot_torque": (None, "theta_dot"),
-}
-"""By what a function on each load is multiplied."""
+PREVIOUS = "previous_"
+"""What a command of the period before is called, before the command's name."""
 
 SIZES = (0.03, 0.3, 3.0, 30.0)
 """Prior deviations that are tried of what the bumps together change of the innovations, in deviations of these."""
 
 
-class Push(DynamicsEffect):
+@cache
+def push(system: type[System]) -> type[DynamicsEffect]:
     """A load of its own on each degree of freedom, to differentiate by; not in the catalogue, as it has no name."""
 
-    table = (Parameter("cart_force", "N", -1.0, 1.0, 0.0), Parameter("pivot_torque", "N m", -1.0, 1.0, 0.0))
+    class Push(DynamicsEffect):
+        table = tuple(Parameter(load.name, load.unit, -1.0, 1.0, 0.0) for load in system.loads)
 
-    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        return torch.stack((self.value("cart_force", state), self.value("pivot_torque", state)), -1)
+        def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+            return torch.stack([self.value(load.name, state) for load in system.loads], -1)
+
+    return Push
 
 
 @dataclass(frozen=True)
@@ -52,9 +54,9 @@ class Function:
     """One function of the black box, fitted alone."""
 
     port: str
-    """cart_force, pivot_torque, or the state that is read"""
+    """a load, or the state that is read"""
     variable: str
-    """a state, command, previous_command or time"""
+    """a state, a command, one of the period before, or time"""
     factor: str | None
     """a variable that multiplies it, so that it is a friction or a gain; None for a plain load"""
     evidence: float
@@ -130,7 +132,7 @@ def _blocks(family: Family, fits: Fits) -> list[Block]:
         centres, bumps = _bumps(place, _ends(place, rows.inside > 0))
         inner = bumps[:, :-1] * rows.inside[:, 1:, None]
         for k, load in enumerate(system.loads):
-            for factor in FACTORS[load.name]:
+            for factor in family.subject.factors.get(load.name, (None,)):
                 by = 1.0 if factor is None else variables[factor][:, :-1, None]
                 drive = loads[..., k, None] * (by * inner)[:, :, None]
                 out.append(Block(load.name, name, factor, centres, drive, silent))
@@ -148,16 +150,19 @@ def variables_of(family: Family, state: Tensor) -> dict[str, Tensor]:
     rows = family.rows
     index = rows.first[:, None] + torch.arange(rows.shape[1])
     command = rows.command[rows.episode[:, None], index]
-    before = rows.command[rows.episode[:, None], (index - 1).clamp(min=0)] * (index > 0)
+    before = rows.command[rows.episode[:, None], (index - 1).clamp(min=0)] * (index > 0)[..., None]
     out = {variable.name: state[..., k] for k, variable in enumerate(family.system.states)}
-    return {**out, "command": command, "previous_command": before, "time": rows.time}
+    for k, action in enumerate(family.system.actions):
+        out |= {action.name: command[..., k], f"{PREVIOUS}{action.name}": before[..., k]}
+    return {**out, "time": rows.time}
 
 
 def loads_of(family: Family, fits: Fits) -> Tensor:
     """What a unit of each load, held for a period, adds to the states, (W, T - 1, n, loads)."""
-    pushed = Family(family.system, [*family.effects, Push], family.rows)
-    theta = torch.cat((fits.theta[0, : len(family.table)], torch.zeros(len(Push.table), dtype=torch.float64)))
-    return linearise(pushed, theta, fits.state[0]).by_parameter[..., -len(Push.table) :]
+    count = len(family.system.loads)
+    pushed = Family(family.system, [*family.effects, push(type(family.system))], family.rows)
+    theta = torch.cat((fits.theta[0, : len(family.table)], torch.zeros(count, dtype=torch.float64)))
+    return linearise(pushed, theta, fits.state[0]).by_parameter[..., -count:]
 
 
 def _ends(place: Tensor, inside: Tensor) -> tuple[float, float]:

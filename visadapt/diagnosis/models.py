@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from visadapt.diagnosis.data import Rows
+from visadapt.diagnosis.subjects import subject_of
 from visadapt.effects import (
     ActuationEffect,
     CoulombFriction,
@@ -33,26 +34,29 @@ PARAMETER_STEP = 1e-6
 TURNS = 4 * math.pi
 """rad that a phase may go beyond its range on its way to where it fits."""
 
-COARSE, FINE = 4, 10
-"""Substeps in a period where an effect changes within one: to see whether it is worth a look, and for figures that are
-reported. Smooth physics needs one step of Runge-Kutta."""
+GLANCE, COARSE, FINE = 0, 1, 2
+"""Which of the subject's numbers of substeps: to propose an effect, to try it, and for figures that are reported."""
 
 
 class Family:
     """All simulators that a set of effects, with any parameters, makes of a source; K parameters in all."""
 
-    def __init__(self, system: System, effects: Sequence[type[Effect]], rows: Rows, substeps: int = FINE) -> None:
+    def __init__(self, system: System, effects: Sequence[type[Effect]], rows: Rows, effort: int = FINE) -> None:
         self.system = system
+        self.subject = subject_of(system)
         self.effects = tuple(effects)
         self.rows = rows
         abrupt = any(issubclass(e, ActuationEffect | CoulombFriction | FrictionPatch | Gust) for e in effects)
-        self.substeps = substeps if abrupt else 1
+        smooth = 1 if effort == GLANCE else math.ceil(rows.period / self.subject.smooth_step)
+        self.substeps = max(smooth, self.subject.substeps[effort] if abrupt else 1)
         self.table = [parameter for effect in effects for parameter in effect.table]
         turns = torch.tensor([TURNS * (p.name == "phase") for p in self.table], dtype=torch.float64)
         self.low = torch.tensor([p.low for p in self.table], dtype=torch.float64) - turns
         self.high = torch.tensor([p.high for p in self.table], dtype=torch.float64) + turns
         chain = sorted((e for e in effects if issubclass(e, ActuationEffect)), key=place_in_chain)
         sensors = sorted((e for e in effects if issubclass(e, SensingEffect)), key=place_in_chain)
+        self.slopes: tuple[Tensor, Tensor] | None = None
+        """transition (W, T - 1, n, n) and sensing (W, T, m, n) of an earlier linearisation that are near enough"""
         self._order = [*chain, *(e for e in effects if issubclass(e, DynamicsEffect)), *sensors]
 
     def _made(self, kind: type[Made], theta: Tensor) -> list[Made]:
@@ -68,47 +72,47 @@ class Family:
         return out
 
     def commands(self, theta: Tensor) -> Tensor:
-        """(R, W, T, S) what acts over the substeps, for parameters (R, P)."""
+        """(R, W, T, S, n_action) what acts over the substeps, for parameters (R, P)."""
         rows = self.rows
         h = rows.period / self.substeps
-        episodes, length = rows.command.shape
-        commands = rows.command[None, :, :, None].expand(len(theta), -1, -1, self.substeps)
-        commands = commands.reshape(len(theta) * episodes, length * self.substeps, 1)
+        episodes, length, width = rows.command.shape
+        commands = rows.command[None, :, :, None].expand(len(theta), -1, -1, self.substeps, -1)
+        commands = commands.reshape(len(theta) * episodes, length * self.substeps, width)
         for effect in self._made(ActuationEffect, theta.repeat_interleave(episodes, 0)):
             commands, _ = effect.apply_to(commands, effect.memory(commands, h), h)
-        commands = commands.reshape(len(theta), episodes, length, self.substeps)
+        commands = commands.reshape(len(theta), episodes, length, self.substeps, width)
         index = rows.first[:, None] + torch.arange(rows.shape[1])
         return commands[:, rows.episode[:, None], index]
 
     def instead(self, theta: Tensor, actions: Tensor) -> Tensor:
-        """(W, T, K, S) what acts over a row's substeps if its command alone were another, for parameters (P,).
+        """(W, T, K, S, 1) what acts over a row's substeps if its command alone were another, for parameters (P,).
 
-        `actions` (W, T, K) are the other commands; those before the row stay as they were given, since the chain
-        remembers them.
+        `actions` (W, T, K) are the other commands of a system with one action; those before the row stay as they were
+        given, since the chain remembers them.
         """
         rows = self.rows
         h = rows.period / self.substeps
         chain = self._made(ActuationEffect, theta)
-        out = actions[..., None].expand(-1, -1, -1, self.substeps).clone()
+        out = actions[..., None, None].expand(-1, -1, -1, self.substeps, -1).clone()
         if not chain:
             return out
-        given = rows.command[..., None, None].expand(-1, -1, self.substeps, -1)
+        given = rows.command[:, :, None].expand(-1, -1, self.substeps, -1)
         memory = [effect.memory(given[:, 0], h) for effect in chain]
         length, count = actions.shape[1:]
         for row in range(int(rows.first.max()) + length):
             place = row - rows.first
             windows = ((place >= 0) & (place < length)).nonzero()[:, 0]
-            tried = out[windows, place[windows]].flatten(0, 1)[..., None]
+            tried = out[windows, place[windows]].flatten(0, 1)
             past = rows.episode[windows].repeat_interleave(count)
             was = given[:, row]
             for k, effect in enumerate(chain):
                 tried, _ = effect.apply_to(tried, memory[k][past], h)
                 was, memory[k] = effect.apply_to(was, memory[k], h)
-            out[windows, place[windows]] = tried.reshape(len(windows), count, self.substeps)
+            out[windows, place[windows]] = tried.reshape(len(windows), count, self.substeps, 1)
         return out
 
     def step(self, theta: Tensor, commands: Tensor, time: Tensor, state: Tensor) -> Tensor:
-        """One period on from states (N, n) under commands (N, S), with parameters (P,), or (N, P), a row's own."""
+        """One period on from states (N, n) under commands (N, S, n_action); parameters (P,), or a row's own (N, P)."""
         loads = self._made(DynamicsEffect, theta)
         system = self.system
         for effect in loads:
@@ -125,7 +129,7 @@ class Family:
             return now.derivative(s, u, load)
 
         for k in range(self.substeps):
-            u = commands[:, k : k + 1]
+            u = commands[:, k]
             state = rk4(lambda t, s, u=u: derivative(t, s, u), time, state, h)  # type: ignore[misc]
             time = time + h
         return state
@@ -169,9 +173,11 @@ def linearise(family: Family, theta: Tensor, state: Tensor) -> Linearised:
     shifted = torch.cat((theta[None], theta + torch.diag(step)))
     commands = family.commands(shifted)
     # The replicas: the base, one per state, one per parameter.
-    alike = [0] * (1 + n) + list(range(1, 1 + count))
+    known = family.slopes
+    varied = 0 if known is not None else n
+    alike = [0] * (1 + varied) + list(range(1, 1 + count))
     moved = state[None].repeat(len(alike), 1, 1, 1)
-    for i in range(n):
+    for i in range(varied):
         moved[1 + i, ..., i] += STATE_STEP
 
     def parameters(used: int) -> Tensor:
@@ -186,6 +192,7 @@ def linearise(family: Family, theta: Tensor, state: Tensor) -> Linearised:
 
     def differences(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         change = (values[1:] - values[:1]).movedim(0, -1)
-        return values[0], change[..., :n] / STATE_STEP, change[..., n:] / step
+        return values[0], change[..., :varied] / STATE_STEP, change[..., varied:] / step
 
-    return Linearised(*differences(after), *differences(seen))
+    out = Linearised(*differences(after), *differences(seen))
+    return out if known is None else replace(out, transition=known[0], sensing=known[1])

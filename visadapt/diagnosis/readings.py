@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -12,16 +13,13 @@ from torch import Tensor
 
 from visadapt.diagnosis.data import Rows, cut
 from visadapt.diagnosis.fitting import Fits
-from visadapt.diagnosis.holds import POLE, Holds, find_holds
+from visadapt.diagnosis.holds import Holds, find_holds
 from visadapt.diagnosis.models import Family
+from visadapt.diagnosis.subjects import Convention, subject_of
 from visadapt.diagnosis.where import disturbance
 from visadapt.diagnosis.which import Search
 from visadapt.recordings import Recording
 from visadapt.systems import System
-
-MOST_ROWS = 1600
-"""Rows that a search uses; of more, windows spread evenly over the recording are taken."""
-
 
 WRONG = math.log(0.02**2)
 """Log variance of a change of velocity in a period, from which on it is asked whether a sign is wrong."""
@@ -62,19 +60,22 @@ class Readings:
 
     @classmethod
     def of(cls, recording: Recording, system: System) -> Readings:
-        """From a recording of the states, or some of them, and the commands of a system with one action."""
+        """From a recording of the states, or some of them, and the commands of a system."""
+        subject = subject_of(system)
         channels = tuple(system.index(name) for name in recording.measured)
         measured = [torch.tensor(np.asarray(e.state, dtype=np.float64)) for e in recording.episodes]
-        commands = [torch.tensor(np.asarray(e.action, dtype=np.float64))[:, 0] for e in recording.episodes]
-        holds = find_holds(measured, channels)
+        attitude = [k for k, channel in enumerate(channels) if channel in subject.attitude]
+        measured = [_one_sign(values, attitude) for values in measured]
+        commands = [torch.tensor(np.asarray(e.action, dtype=np.float64)) for e in recording.episodes]
+        holds = find_holds(measured, channels, subject.held)
         warnings: list[str] = []
 
         def windows(stretches: list[tuple[int, int, int]] | None, notes: list[str]) -> tuple[Rows, Rows]:
             every = [torch.ones_like(m) for m in measured]
-            rows = cut(measured, holds.used, commands, channels, recording.period, stretches)
-            raw = cut(measured, every, commands, channels, recording.period, stretches)
+            rows = cut(measured, holds.used, commands, channels, recording.period, subject.window, stretches)
+            raw = cut(measured, every, commands, channels, recording.period, subject.window, stretches)
             count, length = rows.shape
-            most = max(4, int(MOST_ROWS / float(rows.inside.sum(1).mean())))
+            most = max(4, int(subject.rows / float(rows.inside.sum(1).mean())))
             if count > most:
                 chosen = torch.linspace(0, count - 1, most).round().long()
                 rows, raw = rows.of(chosen), raw.of(chosen)
@@ -85,13 +86,15 @@ class Readings:
 
         thinned: list[str] = []
         rows, raw = windows(None, thinned)
+        if not subject.doubted:
+            return cls(rows, raw, holds, None, tuple(thinned))
         source = Search(system, rows, ()).source.fits
         defect = _contradicted(system, rows, source)
         band = None
         if defect is not None:
             low, high, beyond = defect
             band = (low, high)
-            angle = channels.index(POLE[0])
+            angle = channels.index(subject.held[0])
             bad = [_within(m[:, angle], low, high) for m in measured]
             if beyond:
                 # A gap in a potentiometer's turn: of unknown width, so nothing is carried across it, and the turn
@@ -100,7 +103,7 @@ class Readings:
                 thinned = []
                 rows, raw = windows(_apart(bad), thinned)
             else:
-                rows = _without(rows, low, high)
+                rows = _without(rows, subject.held, low, high)
             warnings.append(
                 f"{sum(int(b.sum()) for b in bad)} readings of theta between {low:.2f} and {high:.2f} rad contradict "
                 "those around them and the physics: the sensor is defective there; they were set aside"
@@ -116,8 +119,8 @@ class Readings:
         # Velocities that lag would speak for the wrong sign.
         turned = _turned(system, rows, source)
         if turned is not None:
-            rows, raw = turned.of(rows), turned.of(raw)
-            if band is not None and turned.angle < 0:
+            rows, raw = (_turn(each, turned, subject.held) for each in (rows, raw))
+            if band is not None and turned.states < 0:
                 band = (-band[1], -band[0])
             warnings.append(f"{turned.what} has the other sign than the source's: it was turned round")
         return cls(rows, raw, holds, band, tuple(warnings))
@@ -128,11 +131,12 @@ def _contradicted(system: System, rows: Rows, fits: Fits) -> tuple[float, float,
 
     And whether the pole turns all the way round.
     """
-    if float(fits.log_process[0, 1]) < WRONG:
+    worn = subject_of(system).held
+    if not worn or float(fits.log_process[0, 1]) < WRONG:
         return None
     found = disturbance(Family(system, (), rows), fits, fits.log_process)
     here = found.there > 0
-    theta = found.variables["theta"][here]
+    theta = found.variables[system.states[worn[0]].name][here]
     place = ((torch.atan2(theta.sin(), theta.cos()) + math.pi) / BAND).long()
     power = found.load[..., 1][here].square()
     count = torch.zeros(int(2 * math.pi / BAND) + 1, dtype=power.dtype).index_add_(0, place, torch.ones_like(power))
@@ -143,6 +147,17 @@ def _contradicted(system: System, rows: Rows, fits: Fits) -> tuple[float, float,
     bands = loud.nonzero()[:, 0]
     low, high = (BAND * (float(k) + extra) - math.pi for k, extra in ((bands.min(), 0), (bands.max(), 1)))
     return low, high, float((count > 0).double().mean()) > ROUND
+
+
+def _one_sign(measured: Tensor, attitude: Sequence[int]) -> Tensor:
+    """An episode (T, m) whose quaternion does not jump to the other one of the same attitude."""
+    if not attitude:
+        return measured
+    quaternion = measured[:, attitude]
+    turned = (quaternion[1:] * quaternion[:-1]).sum(1) < 0
+    out = measured.clone()
+    out[1:, attitude] *= torch.where(turned, -1.0, 1.0).to(measured).cumprod(0)[:, None]
+    return out
 
 
 def _within(theta: Tensor, low: float, high: float) -> Tensor:
@@ -168,47 +183,39 @@ def _apart(bad: list[Tensor]) -> list[tuple[int, int, int]]:
     return out
 
 
-def _without(rows: Rows, low: float, high: float) -> Rows:
-    """The pole's readings at these angles not used."""
-    bad = _within(rows.measured[..., rows.channels.index(POLE[0])], low, high)
-    pole = torch.tensor([channel in POLE for channel in rows.channels])
-    return replace(rows, used=rows.used * ~(bad[..., None] & pole))
+def _without(rows: Rows, worn: Sequence[int], low: float, high: float) -> Rows:
+    """The worn sensor's readings at these angles not used."""
+    bad = _within(rows.measured[..., rows.channels.index(worn[0])], low, high)
+    own = torch.tensor([channel in worn for channel in rows.channels])
+    return replace(rows, used=rows.used * ~(bad[..., None] & own))
 
 
-@dataclass(frozen=True)
-class Turned:
-    """Another sign convention than the source's."""
-
-    what: str
-    angle: float
-    command: float
-
-    def of(self, rows: Rows) -> Rows:
-        """In the source's convention."""
-        sign = torch.tensor([self.angle if channel in POLE else 1.0 for channel in rows.channels], dtype=torch.float64)
-        return replace(rows, measured=rows.measured * sign, command=rows.command * self.command)
+def _turn(rows: Rows, other: Convention, columns: Sequence[int]) -> Rows:
+    """Rows of another convention, which has other signs of these columns and of the command, in the source's."""
+    sign = torch.tensor([other.states if channel in columns else 1.0 for channel in rows.channels], dtype=torch.float64)
+    return replace(rows, measured=rows.measured * sign, command=rows.command * other.command)
 
 
-CONVENTIONS = (Turned("the angle", -1, 1), Turned("the command", 1, -1), Turned("the position", -1, -1))
-"""The position's sign is that of angle and command together, by the symmetry of the cart-pole."""
-
-
-def _turned(system: System, rows: Rows, source: Fits) -> Turned | None:
+def _turned(system: System, rows: Rows, source: Fits) -> Convention | None:
     """The convention that the recording is in, if it is not the source's: one in which it is far likelier."""
-    if float(source.log_process.max()) < WRONG:
+    subject = subject_of(system)
+    if not subject.conventions or float(source.log_process.max()) < WRONG:
         return None
     own = Search(system, rows, ()).source.fits
-    likelihoods = [float(Search(system, other.of(rows), ()).source.fits.likelihood[0]) for other in CONVENTIONS]
-    best = max(range(len(CONVENTIONS)), key=likelihoods.__getitem__)
+    likelihoods = [
+        float(Search(system, _turn(rows, other, subject.held), ()).source.fits.likelihood[0])
+        for other in subject.conventions
+    ]
+    best = max(range(len(likelihoods)), key=likelihoods.__getitem__)
     gained = likelihoods[best] - float(own.likelihood[0])
-    return CONVENTIONS[best] if gained > FAR_LIKELIER * float(rows.used.sum()) else None
+    return subject.conventions[best] if gained > FAR_LIKELIER * float(rows.used.sum()) else None
 
 
 def _derived(system: System, rows: Rows) -> dict[str, float]:
     """Velocities that lag their position by a good part of a period, and by how much: differences, or filtered ones."""
-    positions = [k for k, channel in enumerate(rows.channels) if channel % 2 == 0]
-    velocities = [k for k, channel in enumerate(rows.channels) if channel % 2 == 1]
-    velocities = [k for k in velocities if rows.channels[k] - 1 in [rows.channels[p] for p in positions]]
+    slopes = subject_of(system).slopes
+    positions = [k for k, channel in enumerate(rows.channels) if channel not in slopes]
+    velocities = [k for k, channel in enumerate(rows.channels) if slopes.get(channel) in rows.channels]
     if not velocities:
         return {}
     state = Search(system, rows.reading(positions), ()).source.fits.state[0]

@@ -23,6 +23,9 @@ BEFORE, AFTER, BLACK_BOX = "#de7416", "#2f67c9", "#0e7a70"
 VARIABLES = {INK: "ink", MUTED: "muted", LINE: "line", BEFORE: "before", AFTER: "after", BLACK_BOX: "black-box"}
 """The colours drawn with, and the page's CSS variables that take their place."""
 
+MOST_STATES = 5
+"""that are shown of a prediction"""
+
 WIDTH = 4.0
 """inches: a phone's width at the size in which the text is set"""
 STYLE: dict[Any, Any] = {
@@ -51,7 +54,7 @@ STYLE: dict[Any, Any] = {
 
 def prediction(one: Prediction, system: type[System], corrected: bool) -> str:
     """A held-out window: measured states, and as they were predicted from its start."""
-    shown = [index for index in range(len(system.states)) if np.isfinite(one.measured[:, index]).any()]
+    shown = _telling(one, [index for index in range(len(system.states)) if np.isfinite(one.measured[:, index]).any()])
     with matplotlib.rc_context(STYLE):
         figure = Figure((WIDTH, 0.5 + 1.15 * len(shown)), layout="constrained")
         rows: list[Axes] = list(figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0])
@@ -66,6 +69,13 @@ def prediction(one: Prediction, system: type[System], corrected: bool) -> str:
         rows[-1].set_xlabel(f"time in episode {one.episode} [s]")
         _legend(figure, rows[0])
         return _svg(figure, f"measured and predicted states, episode {one.episode}")
+
+
+def _telling(one: Prediction, measured: Sequence[int]) -> list[int]:
+    """Of the measured states those, MOST_STATES at most, from which the source departs most beside their noise."""
+    error = (one.source - one.measured)[:, measured]
+    departs = np.sqrt((error**2).mean(0) / (np.diff(error, axis=0) ** 2).mean(0).clip(1e-300))
+    return sorted(measured[k] for k in np.argsort(-departs)[:MOST_STATES])
 
 
 def profile(one: Profile, regions: Sequence[Region], corrected: bool) -> str:

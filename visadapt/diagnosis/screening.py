@@ -1,37 +1,30 @@
 """Which effects are worth fitting beside a fitted set: a linear answer for a grid of shapes and sizes of each.
 
 Where a small effect is added, the innovations of the filter change by what its one-step disturbances become when
-passed through the same gains. So a whole grid is scored by one pass of the filter's means, without refitting.
+passed through the same gains. So a whole grid is scored by one pass of the filter's means, without refitting; and
+where an effect has too many strengths for a grid, a few of Gauss-Newton's steps through the same pass find them.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from visadapt.diagnosis.data import Rows
 from visadapt.diagnosis.fitting import Fits
-from visadapt.diagnosis.innovations import Innovations
-from visadapt.diagnosis.models import Family
+from visadapt.diagnosis.grids import grid, is_climbed, spans, starts
+from visadapt.diagnosis.probing import View
+from visadapt.diagnosis.subjects import subject_of
 from visadapt.effects import Effect
-from visadapt.effects.base import Parameter
 from visadapt.systems import System
 
-STRENGTHS = 9
-"""Values tried, to either side, of a strength to which an effect is not proportional: so many up to a tenth of its
-range, each a factor more, and as many beyond."""
-
-EDGES = 13
-FREQUENCIES = 24
-PHASES = 8
-SHAPES = 5
-"""Values tried of a start or an end, a frequency, a phase, and any other shape."""
-
-PROBE = 0.02
-"""Share of its range at which an effect that is proportional to a parameter is probed."""
+STEPS = 6
+SETTLED = 0.1
+"""Steps at most, and log likelihood that is not worth another."""
 
 
 @dataclass(frozen=True)
@@ -48,103 +41,74 @@ def screen(
     system: System, effects: Sequence[type[Effect]], fits: Fits, rows: Rows, candidates: Sequence[type[Effect]]
 ) -> list[Lead]:
     """The best lead of every candidate beside the one fitted set in `fits`, best first."""
-    seen = Innovations(Family(system, effects, rows), fits)
-    seen_at = spans(rows, fits.state[0])
+    seen_at = spans(system, rows, fits.state[0])
+    views: dict[int, View] = {}
+
+    def view(every: int) -> View:
+        if every not in views:
+            views[every] = View.of(system, effects, fits, rows, every)
+        return views[every]
+
     leads = []
     for effect in candidates:
-        shapes, linear = grid(effect, seen_at)
-        answer = seen.answer(*_columns(system, [*effects, effect], fits, rows, shapes, linear))
-        lead = _best(effect, shapes, linear, seen.error, answer.reshape(len(answer), len(shapes), -1))
-        if lead is not None:
-            leads.append(lead)
-    return sorted(leads, key=lambda lead: -lead.gain)
-
-
-def grid(effect: type[Effect], spans: dict[str, tuple[float, float]]) -> tuple[Tensor, list[int]]:
-    """Parameters (G, P) to try, and the columns to which the effect is proportional.
-
-    `spans` gives by unit where the data are: regions are looked for there.
-    """
-    names = [parameter.name for parameter in effect.table]
-    linear = [k for k, p in enumerate(effect.table) if p.linear and p.neutral is not None]
-    axes = []
-    for parameter in effect.table:
-        if parameter.name in ("start", "end"):
-            axes.append(torch.linspace(*spans[parameter.unit], EDGES, dtype=torch.float64))
+        points, columns = starts(effect, seen_at) if is_climbed(effect) else grid(effect, seen_at)
+        every = _every(subject_of(system).tried_rows, rows, len(points) * (1 + len(columns)))
+        if is_climbed(effect):
+            leads.append(_climbed(view(1), effect, _nearest(view(every), effect, points, columns)))
         else:
-            axes.append(_values(parameter))
-    points = torch.cartesian_prod(*axes).reshape(-1, len(names))
-    if {"start", "end"} <= set(names):
-        points = points[points[:, names.index("start")] < points[:, names.index("end")]]
-    return points, linear
+            own = view(every)
+            lead = _best(effect, points, columns, own.seen.error, own.by_unit(effect, points, columns))
+            leads.append(None if lead is None else replace(lead, gain=every * lead.gain))
+    return sorted((lead for lead in leads if lead is not None), key=lambda lead: -lead.gain)
 
 
-def _values(parameter: Parameter) -> Tensor:
-    low, high, neutral = parameter.low, parameter.high, parameter.neutral
-    if parameter.linear and neutral is not None:
-        return torch.tensor([neutral], dtype=torch.float64)
-    if parameter.unit == "Hz":
-        ends = torch.tensor([low, high]).log10().tolist()
-        return torch.logspace(ends[0], ends[1], FREQUENCIES, dtype=torch.float64)
-    if parameter.name == "phase":
-        return torch.linspace(low, high, PHASES + 1, dtype=torch.float64)[:-1]
-    if neutral is None:
-        return torch.linspace(low, high, SHAPES + 2, dtype=torch.float64)[1:-1]
-    shares = torch.cat((torch.logspace(-2.7, -1, STRENGTHS), torch.linspace(0.15, 1, STRENGTHS))).double()
-    return torch.cat([neutral + shares * (end - neutral) for end in (low, high) if end != neutral])
+def _every(most: float, rows: Rows, points: int) -> int:
+    """Of how many windows one is looked at where an effect is tried at so many points."""
+    wanted = points * float(rows.inside.sum()) / most
+    # Powers of two, so that effects share what is looked at.
+    return 2 ** max(0, min(math.ceil(math.log2(max(1.0, wanted))), int(math.log2(max(1, rows.shape[0] // 8)))))
 
 
-def spans(rows: Rows, state: Tensor) -> dict[str, tuple[float, float]]:
-    """By unit, the least and the greatest time, position and angle of states (W, T, n)."""
-    inside = rows.inside > 0
+def _nearest(view: View, effect: type[Effect], points: Tensor, strengths: list[int]) -> Tensor:
+    """Of points (G, P) the one from which one step of the strengths promises most, after that step; (P,)."""
+    change, slopes = view.beside(effect, points, strengths)
+    left, slopes = view.seen.error[:, None] + change, slopes.movedim(1, 0)
+    normal = slopes.mT @ slopes
+    ridge = 1e-3 * torch.diagonal(normal, dim1=1, dim2=2) + 1e-30
+    pull = -(slopes.mT @ left.T[..., None])[..., 0]
+    steps = torch.linalg.solve(normal + torch.diag_embed(ridge), pull[..., None])[..., 0]
+    after = (left + torch.einsum("gnk,gk->ng", slopes, steps)).square().sum(0)
+    best = int(after.argmin())
+    out = points[best].clone()
+    out[strengths] += steps[best]
+    return _inside(effect, out)
 
-    def span(values: Tensor) -> tuple[float, float]:
-        return float(values[inside].min()), float(values[inside].max())
 
-    return {"s": span(rows.time), "m": span(state[..., 0]), "rad": span(state[..., 2])}
+def _climbed(view: View, effect: type[Effect], point: Tensor) -> Lead | None:
+    """The lead that Gauss-Newton's method with damping (Levenberg 1944) reaches from a point (P,)."""
+    every = list(range(len(effect.table)))
+    damping, best, found, left = 1e-2, -math.inf, point, view.seen.error
+    slopes = torch.zeros(len(left), len(every), dtype=left.dtype)
+    for _ in range(STEPS):
+        change, there = view.beside(effect, point[None], every)
+        now = view.seen.error + change[:, 0]
+        gain = float(0.5 * (view.seen.error.square().sum() - now.square().sum()))
+        if gain > best:
+            damping, settled = damping / 5, gain - best < SETTLED
+            best, found, slopes, left = gain, point, there[:, 0], now
+            if settled:
+                break
+        else:
+            damping *= 10
+        normal = slopes.T @ slopes
+        normal = normal + torch.diag(damping * normal.diagonal() + 1e-12 * normal.diagonal().max() + 1e-30)
+        point = _inside(effect, found - torch.linalg.solve(normal, slopes.T @ left))
+    return Lead(effect, tuple(found.tolist()), best) if best > 0 else None
 
 
-def _columns(
-    system: System, effects: list[type[Effect]], fits: Fits, rows: Rows, shapes: Tensor, linear: list[int]
-) -> tuple[Tensor, Tensor]:
-    """What every point of a grid adds to drive (W, T - 1, n, M) and reading (W, T, m, M), M = points x columns."""
-    family = Family(system, effects, rows, substeps=1)
-    own = shapes.shape[1]
-    tried = shapes[:, None].repeat(1, max(1, len(linear)), 1)
-    unit = torch.ones(max(1, len(linear)), dtype=torch.float64)
-    for j, column in enumerate(linear):
-        parameter = effects[-1].table[column]
-        nothing = float(parameter.neutral or 0.0)
-        end = parameter.high if parameter.high > nothing else parameter.low
-        unit[j] = PROBE * (end - nothing)
-        tried[:, j, column] = nothing + unit[j]
-    tried = tried.reshape(-1, own)
-    neutral = torch.tensor([0.0 if p.neutral is None else p.neutral for p in effects[-1].table], dtype=torch.float64)
-    tried = torch.cat((neutral[None], tried))
-    theta = torch.cat((fits.theta[0].expand(len(tried), -1), tried), 1)
-    # The base's own value of a shape has no meaning; only what switches the effect off counts.
-    for j, parameter in enumerate(effects[-1].table):
-        if parameter.neutral is None:
-            theta[0, j - own] = tried[1, j]
-    windows, length = rows.shape
-    commands = family.commands(theta)[:, :, :-1].reshape(-1, family.substeps)
-    count, n = len(theta), fits.state.shape[-1]
-
-    def spread(x: Tensor) -> Tensor:
-        return x[None].expand(count, *x.shape).reshape(-1, *x.shape[2:])
-
-    def each(used: int) -> Tensor:
-        return theta[:, None].expand(-1, windows * used, -1).flatten(0, 1)
-
-    state = fits.state[0]
-    after = family.step(each(length - 1), commands, spread(rows.time[:, :-1]), spread(state[:, :-1]))
-    seen = family.measure(each(length), spread(state))
-    after = after.reshape(count, windows, length - 1, n)
-    seen = seen.reshape(count, windows, length, -1)
-    scale = unit.repeat(len(shapes)) if linear else torch.ones(len(tried) - 1, dtype=torch.float64)
-    drive = (after[1:] - after[:1]).movedim(0, -1) / scale * rows.inside[:, 1:, None, None]
-    reading = -(seen[1:] - seen[:1]).movedim(0, -1) / scale * rows.used[..., None]
-    return drive, reading
+def _inside(effect: type[Effect], point: Tensor) -> Tensor:
+    low, high = (torch.tensor([getattr(p, end) for p in effect.table], dtype=point.dtype) for end in ("low", "high"))
+    return point.clamp(low, high)
 
 
 def _best(effect: type[Effect], shapes: Tensor, linear: list[int], error: Tensor, answer: Tensor) -> Lead | None:

@@ -59,6 +59,8 @@ class Known:
 def check(policy: StatesToActions, system: System) -> None:
     """Raise ValueError for what cannot be a policy on the states of `system`."""
     n, n_action = len(system.states), len(system.actions)
+    if n_action != 1:
+        raise ValueError(f"diagnose: Theorem 1's terms need a system with one action; {system.name} has {n_action}")
     if isinstance(policy, ImagePolicy):
         raise ValueError("diagnose: the policy sees frames, and a diagnosis has states alone; give a policy on states")
     if isinstance(policy, Policy) and (policy.n_state, policy.n_action) != (n, n_action):
@@ -105,7 +107,7 @@ def policy_terms(policy: StatesToActions, system: System, rows: Rows, best: Fitt
 def _known(family: Family, best: Fitted) -> Known:
     fits = best.fits
     problem = linear_problem([family], fits)
-    process, noise = variances(fits.log_process, fits.log_noise, family.rows.shape[0])
+    process, noise = variances(family, fits.log_process, fits.log_noise)
     smoothed, adjoint = backward(problem.data(), forward(problem.data(), process, noise))
     beside = -(process[:, None] * adjoint[..., 0])[:, 1:]
     by_parameter = problem.drive[..., 1:]
@@ -125,10 +127,10 @@ def _histories(seen: Tensor, rows: Rows) -> tuple[History, Tensor]:
     observations = padded.unfold(1, LENGTH, 1).mT
     # The row of the episode at which each of the actions before a row began.
     row = rows.first[:, None, None] + torch.arange(length - 1)[:, None] + torch.arange(-LENGTH, 0)
-    given = rows.command[rows.episode[:, None, None], row.clamp(min=0)] * (row >= 0)
+    given = rows.command[rows.episode[:, None, None], row.clamp(min=0)] * (row >= 0)[..., None]
     # A window that begins within an episode does not hold the states before it.
     there = (rows.first[:, None] == 0) | (torch.arange(length - 1) >= LENGTH - 1)
-    return History(observations.flatten(0, 1), given.flatten(0, 1)[..., None]), there & (rows.inside[:, 1:] > 0)
+    return History(observations.flatten(0, 1), given.flatten(0, 1)), there & (rows.inside[:, 1:] > 0)
 
 
 @dataclass(frozen=True)

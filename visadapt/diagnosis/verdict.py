@@ -12,17 +12,11 @@ from visadapt.diagnosis.models import Family
 from visadapt.diagnosis.which import Effects, Fitted, Search
 from visadapt.effects import Effect
 
-WEIGHED = 8
-"""Sets, the most probable ones, of which it is asked what they leave unexplained."""
-
 WITHIN = 10.0
 """Log posterior odds that such a set may be behind the best."""
 
 NOISE = 5.0
 """Log likelihood that process noise must add to a set to count as something unexplained, and what a set pays for it."""
-
-FUNCTION = 4.0
-"""Log odds of a function of the black box beside a set from which on it counts as something unexplained."""
 
 SLIGHT = 0.05
 """Log likelihood left over, beside that which the best set brings, that is not worth the word unexplained."""
@@ -55,6 +49,8 @@ class Judgement:
     """for each effect of the best set: the sets with another effect in its place that fit as well"""
     gained: float
     """log likelihood of the best beyond the source's"""
+    function: float
+    """log odds of a function from which on it counts as something unexplained"""
 
     @property
     def best(self) -> Fitted:
@@ -64,7 +60,7 @@ class Judgement:
     @property
     def unexplained(self) -> bool:
         """Whether something is left that no set explains."""
-        return self.leftover > NOISE or self.functions[0].evidence > FUNCTION
+        return self.leftover > NOISE or self.functions[0].evidence > self.function
 
     @property
     def slight(self) -> bool:
@@ -74,7 +70,7 @@ class Judgement:
 
 def judge(search: Search) -> Judgement:
     """Weigh what a search has fitted."""
-    close = [f for f in search.ranked if f.evidence > search.best.evidence - WITHIN][:WEIGHED]
+    close = [f for f in search.ranked if f.evidence > search.best.evidence - WITHIN][: search.subject.weighed]
     if all(f is not search.source for f in close):
         close.append(search.source)
     left = search.leftover(close)
@@ -86,7 +82,7 @@ def judge(search: Search) -> Judgement:
     family = Family(search.system, best.effects, search.rows)
     classes = {effect: _class(weighed, effect) for effect in best.effects}
     gained = float(best.fits.likelihood[0] - search.source.fits.likelihood[0])
-    return Judgement(weighed, left[order[0]], functions(family, best.fits), classes, gained)
+    return Judgement(weighed, left[order[0]], functions(family, best.fits), classes, gained, search.subject.function)
 
 
 def _class(weighed: Sequence[Weighed], effect: type[Effect]) -> list[Weighed]:

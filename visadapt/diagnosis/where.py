@@ -12,7 +12,7 @@ from torch import Tensor
 
 from visadapt.diagnosis.filtering import backward, forward
 from visadapt.diagnosis.fitting import Fits, linear_problem, variances
-from visadapt.diagnosis.leftover import loads_of, variables_of
+from visadapt.diagnosis.leftover import PREVIOUS, loads_of, variables_of
 from visadapt.diagnosis.models import Family
 from visadapt.diagnosis.result import Profile, Region, Spectrum
 
@@ -50,15 +50,16 @@ class Disturbance:
 def disturbance(family: Family, fits: Fits, log_process: Tensor) -> Disturbance:
     """The loads that bring the set of `fits` to follow the recording, with process noise (1, 2) allowed to them."""
     fits = replace(fits, log_process=log_process)
+    driven = family.subject.columns
     rows = family.rows
     problem = linear_problem([family], fits)
-    process, noise = variances(fits.log_process, fits.log_noise, rows.shape[0])
+    process, noise = variances(family, fits.log_process, fits.log_noise)
     _, adjoint = backward(problem, forward(problem, process, noise))
-    added = -(process[:, None] * adjoint[..., 0])[:, 1:, 1::2]
-    by_load = loads_of(family, fits)[:, :, 1::2]
-    # Two velocities answer to two loads; beyond a window's end they answer to nothing.
+    added = -(process[:, None] * adjoint[..., 0])[:, 1:, driven]
+    by_load = loads_of(family, fits)[:, :, driven]
+    # Each velocity answers to a load of its own; beyond a window's end they answer to nothing.
     there = rows.inside[:, 1:]
-    by_load = torch.where(there[..., None, None] > 0, by_load, torch.eye(2, dtype=by_load.dtype))
+    by_load = torch.where(there[..., None, None] > 0, by_load, torch.eye(len(driven), dtype=by_load.dtype))
     load = torch.linalg.solve(by_load, added[..., None])[..., 0] * there[..., None]
     variables = {name: place[:, :-1] for name, place in variables_of(family, fits.state[0]).items()}
     variables["episode"] = rows.episode[:, None].double().expand_as(there)
@@ -81,7 +82,7 @@ def regions(found: Disturbance, seed: int) -> list[Region]:
     for name, values in found.variables.items():
         place = values.flatten()[here]
         edges, bins = _binned(place)
-        if len(edges) < 4 or name == "previous_command":
+        if len(edges) < 4 or name.startswith(PREVIOUS):
             continue
         count = torch.zeros(len(edges) - 1, dtype=power.dtype).index_add_(0, bins, torch.ones_like(power))
         total = torch.zeros(len(shifted), len(edges) - 1, dtype=power.dtype).index_add_(1, bins, shifted)
@@ -119,8 +120,8 @@ def _between(values: Tensor, first: Tensor, last: Tensor) -> Tensor:
     return sums[..., last] - sums[..., first]
 
 
-def profile(name: str, unit: str, before: Disturbance, after: Disturbance) -> Profile:
-    """The mean residual force over one variable, with and without the causes."""
+def profile(name: str, unit: str, quantity: str, before: Disturbance, after: Disturbance) -> Profile:
+    """The mean of the first residual load over one variable, with and without the causes."""
     here = before.there.flatten() > 0
     place = before.variables[name].flatten()[here]
     edges, bins = _binned(place)
@@ -132,11 +133,11 @@ def profile(name: str, unit: str, before: Disturbance, after: Disturbance) -> Pr
         means.append(np.array([float(s.mean()) if len(s) else math.nan for s in own]))
         means.append(np.array([float(s.std() / math.sqrt(len(s))) if len(s) > 1 else math.nan for s in own]))
     centres = np.array([float(place[bins == k].mean()) if bool((bins == k).any()) else math.nan for k in range(count)])
-    return Profile(name, unit, "force on the cart", "N", centres, *means)
+    return Profile(name, unit, quantity, "N", centres, *means)
 
 
-def spectrum(before: Disturbance, after: Disturbance, period: float) -> Spectrum:
-    """Mean power spectral density of the residual force over the windows (Welch 1967, one Hann window each)."""
+def spectrum(quantity: str, before: Disturbance, after: Disturbance, period: float) -> Spectrum:
+    """Mean power spectral density of the first residual load over the windows (Welch 1967, one Hann window each)."""
     densities = []
     for found in (before, after):
         size = found.load[..., 0]
@@ -144,4 +145,4 @@ def spectrum(before: Disturbance, after: Disturbance, period: float) -> Spectrum
         power = torch.fft.rfft(size * window, dim=1).abs().square().mean(0)
         densities.append((2 * period * power / window.square().sum()).numpy())
     frequency = np.fft.rfftfreq(before.load.shape[1], period)
-    return Spectrum("force on the cart", "N2/Hz", frequency, *densities)
+    return Spectrum(quantity, "N2/Hz", frequency, *densities)

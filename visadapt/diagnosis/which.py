@@ -13,7 +13,8 @@ from visadapt.console import Progress
 from visadapt.diagnosis.data import Rows
 from visadapt.diagnosis.fitting import Fits, fit, rough
 from visadapt.diagnosis.models import COARSE, FINE, Family
-from visadapt.diagnosis.screening import screen
+from visadapt.diagnosis.screening import Lead, screen
+from visadapt.diagnosis.subjects import subject_of
 from visadapt.effects import Effect
 from visadapt.systems import System
 
@@ -22,19 +23,15 @@ Effects = tuple[type[Effect], ...]
 MOST = 6
 """Effects in a set."""
 
-BEAM = 3
 LEADS = 8
-"""Sets that are taken further at each size, and effects that are tried beside each."""
+"""Effects that are tried beside each set."""
 
 SUSPICIOUS = 5.0
 WIDE = 6
 """Log likelihood that process noise adds to the best set from which on the search is widened, to so many sets."""
 
-PROMISING = 1.0
-"""Log likelihood that a lead must promise to be fitted; an effect costs more."""
-
 QUICK, CAREFUL = (8, COARSE), (20, FINE)
-"""Iterations and substeps of a fit that only has to show promise, and of one whose figures are reported."""
+"""Iterations and effort of a fit that only has to show promise, and of one whose figures are reported."""
 
 CLOSE = 8.0
 POLISHED = 8
@@ -68,12 +65,11 @@ class Fitted:
 
 def first_fits(system: System, rows: Rows) -> Fits:
     """A start for the source as it stands."""
-    n = len(system.states)
-    state = rough(rows, n)[None]
+    state = rough(rows, system)[None]
     return Fits(
         torch.zeros(1, 0, dtype=torch.float64),
         state,
-        torch.full((1, 2), math.log(0.2**2), dtype=torch.float64),
+        torch.full((1, len(subject_of(system).driven)), math.log(0.2**2), dtype=torch.float64),
         torch.full((1, len(rows.channels)), math.log(0.01**2), dtype=torch.float64),
         torch.full((1,), -math.inf, dtype=torch.float64),
         torch.zeros(1, 0, 0, dtype=torch.float64),
@@ -85,9 +81,12 @@ class Search:
 
     def __init__(self, system: System, rows: Rows, catalogue: Sequence[type[Effect]]) -> None:
         self.system = system
+        self.subject = subject_of(system)
         self.rows = rows
         self.catalogue = tuple(catalogue)
         self.fitted: dict[frozenset[str], Fitted] = {}
+        self._slopes: tuple[Tensor, Tensor] | None = None
+        self._screened: dict[tuple[str, ...], tuple[Fits, list[Lead]]] = {}
         self.fit([((), first_fits(system, rows))], CAREFUL)
 
     def run(self, progress: Progress | None = None) -> None:
@@ -100,7 +99,7 @@ class Search:
             children = self.extend(beam)
             if not children:
                 break
-            beam = sorted(children, key=lambda f: -f.evidence)[:BEAM]
+            beam = sorted(children, key=lambda f: -f.evidence)[: self.subject.beam]
             if beam[0].evidence < before.evidence:
                 break
         self._settle()
@@ -146,16 +145,25 @@ class Search:
         starts = []
         seen = set()
         for base in bases:
-            rest = [e for e in self.catalogue if e not in base.effects]
-            for lead in screen(self.system, base.effects, base.fits, self.rows, rest)[:leads]:
-                if lead.gain < PROMISING:
-                    continue
+            for lead in self._leads(base)[:leads]:
                 effects = (*base.effects, lead.effect)
                 key = frozenset(e.name for e in effects)
                 if key not in self.fitted and key not in seen:
                     seen.add(key)
                     starts.append((effects, _grown(base.fits, lead.values)))
         return self.fit(starts, QUICK)
+
+    def _leads(self, base: Fitted) -> list[Lead]:
+        """What is worth fitting beside a set, the most promising first."""
+        fits, leads = self._screened.get(base.names, (None, []))
+        if fits is not base.fits:
+            rest = [e for e in self.catalogue if e not in base.effects]
+            every = screen(self.system, base.effects, base.fits, self.rows, rest)
+            least, each = self.subject.promising
+            beside = self.subject.rivalling * max((lead.gain for lead in every), default=0.0)
+            leads = [lead for lead in every if lead.gain >= max(beside, least + each * len(lead.values))]
+            self._screened[base.names] = base.fits, leads
+        return leads
 
     def neighbours(self, centre: Fitted) -> None:
         """Sets with one effect less, and with one exchanged for another."""
@@ -164,7 +172,7 @@ class Search:
         for gone in centre.effects:
             effects = tuple(e for e in centre.effects if e is not gone)
             key = frozenset(e.name for e in effects)
-            if key in self.fitted:
+            if key in self.fitted and not self.subject.retried:
                 smaller.append(self.fitted[key])
             else:
                 starts.append((effects, _shrunk(centre, gone)))
@@ -207,9 +215,13 @@ class Search:
         """Fit sets of effects, each from a start, QUICK or CAREFUL; what is better than before is kept."""
         if not starts:
             return []
-        iterations, substeps = effort
-        families = [Family(self.system, effects, self.rows, substeps) for effects, _ in starts]
+        iterations, care = effort
+        families = [Family(self.system, effects, self.rows, care) for effects, _ in starts]
+        for family in families:
+            family.slopes = self._slopes
         out = fit(families, joined([fits for _, fits in starts]), self._counts(len(starts)), iterations)
+        if self._slopes is None:
+            self._slopes = families[0].slopes
         results = []
         for k, (effects, _) in enumerate(starts):
             own = _apart(out.of(torch.tensor([k])), len(families[k].table))
