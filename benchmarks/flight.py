@@ -24,10 +24,9 @@ import numpy as np
 import torch
 import tyro
 
-from datasets import quadrotor_references
-from visadapt.courses import AlongReferences
+from train.flight_policies import made
 from visadapt.effects import Effect, LinearDrag, PeriodicForce
-from visadapt.flights import Flight, FlightScore, fixed_wing, quadrotor, score
+from visadapt.flights import Flight, FlightScore, score
 from visadapt.policies import FlightPolicy
 from visadapt.results import Row, write_rows
 from visadapt.runs import once, open_run
@@ -79,9 +78,7 @@ class Settings:
 
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
-    if not settings.references.exists():
-        quadrotor_references.main(quadrotor_references.Settings(out=settings.references))
-    for name in settings.experiments:  # before the jobs, which share them
+    for name in settings.experiments:  # before the jobs, which share references and source policies
         _source_policy(settings, vehicle(EXPERIMENTS[name], settings.references))
     jobs = [(name, seed) for name in settings.experiments for seed in range(settings.seeds)]
     context = multiprocessing.get_context("spawn")
@@ -103,10 +100,7 @@ def main(settings: Settings) -> None:
 
 def vehicle(experiment: Experiment, references: Path) -> Flight:
     """The vehicle of an experiment, and its courses."""
-    if experiment.vehicle is FixedWing:
-        return fixed_wing()
-    train, test = quadrotor_references.read(references)
-    return quadrotor(AlongReferences(train), AlongReferences(test))
+    return made(experiment.vehicle.name, references)
 
 
 def hidden(experiment: Experiment, mass: float) -> DrawEffects:
