@@ -105,6 +105,18 @@ def residual(rows: Rows) -> list[list[str]]:
     return table
 
 
+def named(rows: Rows) -> list[list[str]]:
+    """Named effects beside the residual, from very few samples, in m."""
+    own = [row for row in rows if row["experiment"] == "quadrotor, drag, named effects"]
+    samples = sorted({int(row["samples"]) for row in own})
+    table = [["quadrotor, drag: mean tracking error in m", *(f"{count:,} samples" for count in samples)]]
+    for method in dict.fromkeys(row["method"] for row in own):
+        found = {int(row["samples"]): row for row in own if row["method"] == method}
+        cells = (f"{float(found[count]['mean']):.4f} ± {float(found[count]['std']):.4f}" for count in samples)
+        table.append([method, *cells])
+    return table
+
+
 def rotorpy(rows: Rows) -> list[list[str]]:
     """rotorpy's multirotor, in m."""
     table = [["rotorpy's Crazyflie, mean tracking error in m", "counted samples", "here", "within 1 m", "seeds"]]
@@ -223,6 +235,7 @@ TABLES: dict[str, Callable[[Rows], list[list[str]]]] = {
     "pendulum": pendulum,
     "vehicles": vehicles,
     "residual": residual,
+    "named": named,
     "rotorpy": rotorpy,
     "loops": loops,
     "swing": swing,
