@@ -3,8 +3,8 @@ import pytest
 import torch
 
 from tests.scenes import image_residual_network, observing, small_renderer, state_residual_network
-from visadapt.effects import ConstantForce, Residual
-from visadapt.learning.grounding import GroundSettings, gap, ground, rescale, split
+from visadapt.effects import ConstantForce, QuadraticDrag, Residual, ViscousFriction
+from visadapt.learning.grounding import GroundSettings, fit_named, gap, ground, rescale, split
 from visadapt.learning.windows import Windows
 from visadapt.networks import StateResidualNetwork
 from visadapt.recordings import Episode
@@ -181,3 +181,30 @@ class TestSplit:
     def test_too_few_to_hold_any_out_are_all_used_for_both(self, count):
         train, held = split(count, 0.2, torch.Generator().manual_seed(0))
         assert train.tolist() == held.tolist() == list(range(count))
+
+
+class TestNamed:
+    """Effects that the source has of its own are fitted before the residual."""
+
+    def fitted(self, *effects):
+        source = World(CartPole(), effects)
+        fit_named(source, Windows.cut(recorded(3), "state"))
+        return source
+
+    def test_the_right_one_is_found_and_nothing_is_left(self):
+        source = self.fitted(ConstantForce(force=0.0))
+        assert source.effects[0].force.item() == pytest.approx(NEWTONS, abs=1e-3)
+        windows = Windows.cut(recorded(4), "state")
+        assert gap(source, windows).abs().max() < 1e-3 * gap(SOURCE, windows).abs().max()
+
+    def test_a_wrong_one_beside_it_stays_at_what_does_nothing(self):
+        _, friction = self.fitted(ConstantForce(force=0.0), ViscousFriction(coefficient=1.0)).effects
+        assert friction.coefficient.item() == pytest.approx(0.0, abs=1e-2)
+
+    def test_what_would_leave_its_range_ends_at_its_border(self):
+        (effect,) = self.fitted(QuadraticDrag(coefficient=0.5)).effects
+        # The force pushes the carts along; a drag that did would be negative.
+        assert effect.coefficient.item() == QuadraticDrag.table[0].low
+
+    def test_a_source_without_effects_is_left_as_it_is(self):
+        assert not list(self.fitted().parameters())
