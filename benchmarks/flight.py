@@ -20,16 +20,17 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 import tyro
 
 from train.flight_policies import made
+from visadapt.console import Report
 from visadapt.effects import Effect, LinearDrag, PeriodicForce
-from visadapt.flights import Flight, FlightScore, score
+from visadapt.flights import Flight, FlightScore, kept_score
+from visadapt.learning.joint import Adapted
 from visadapt.policies import FlightPolicy
-from visadapt.results import Row, write_rows
-from visadapt.runs import once, open_run
+from visadapt.results import miss_row, write_rows
+from visadapt.runs import open_run
 from visadapt.systems import FixedWing, Quadrotor, RigidBody
 from visadapt.targets.synthetic import DrawEffects, no_effects
 
@@ -37,6 +38,7 @@ DRAG = 0.3
 """1/s, r in v' = ... - r v"""
 SCORE_SEED = 2026
 OURS = "ours, states"
+MEASURES: dict[type[RigidBody], str] = {Quadrotor: "mean tracking error", FixedWing: "miss of the target"}
 
 
 @dataclass(frozen=True)
@@ -86,13 +88,12 @@ def main(settings: Settings) -> None:
         found = dict(zip(jobs, pool.map(_scores, [settings] * len(jobs), *zip(*jobs, strict=True)), strict=True))
     rows = []
     for name in settings.experiments:
+        kind = EXPERIMENTS[name].vehicle
         scores = [found[name, seed] for seed in range(settings.seeds)]
         for key in scores[0]:
             own = [each[key] for each in scores]
-            if key in ("source", "target"):
-                rows.append(flight_row(name, "unadapted", key, 0, own))
-            else:
-                rows.append(flight_row(name, OURS, "adapted", int(key), own))
+            where = ("unadapted", key, 0) if key in ("source", "target") else (OURS, "adapted", int(key))
+            rows.append(miss_row(name, kind.name, *where, MEASURES[kind], own))
     write_rows(settings.out, rows)
     for row in rows:
         print(f"{row.experiment:20} {row.domain:8} {row.samples:5} samples  {row.mean:.4f} +- {row.std:.4f} m")
@@ -121,28 +122,15 @@ def _scores(settings: Settings, name: str, seed: int) -> dict[str, FlightScore]:
     torch.set_num_threads(1)
     experiment = EXPERIMENTS[name]
     flight = vehicle(experiment, settings.references)
-    folder = settings.work / name.replace(", ", "-").replace(" ", "-") / f"seed-{seed}"
+    folder = _folder(settings.work, name, seed)
     open_run(folder, {"seed": seed, "flights": settings.flights, **_plain(experiment), **asdict(flight.settings)})
     draw = hidden(experiment, float(flight.system.mass))
     policy = _source_policy(settings, flight)
     adapting = copy.deepcopy(policy)
-    adapted = flight.adapt(
-        adapting,
-        flight.target(draw, test=False),
-        folder,
-        experiment.budget,
-        experiment.round_samples,
-        seed,
-        with_history=experiment.hidden == "force",
-    )
+    adapted = adapt(flight, name, settings.work, adapting, seed)
 
     def scored(key: str, draws: DrawEffects, which: FlightPolicy) -> FlightScore:
-        def fresh() -> dict[str, object]:
-            return asdict(score(flight.target(draws), which, SCORE_SEED, settings.flights))
-
-        # JSON has no infinity: that of a flight that was not finite is null there.
-        kept = once(folder / f"{key}.json", fresh)
-        return FlightScore(**{**kept, **{name: math.inf for name, value in kept.items() if value is None}})
+        return kept_score(folder / f"{key}.json", flight.target(draws), which, SCORE_SEED, settings.flights)
 
     found = {"source": scored("source", no_effects, policy), "target": scored("target", draw, policy)}
     for samples in [each.samples for each in adapted.rounds]:
@@ -151,33 +139,33 @@ def _scores(settings: Settings, name: str, seed: int) -> dict[str, FlightScore]:
     return found
 
 
+def adapt(
+    flight: Flight, name: str, work: Path, policy: FlightPolicy, seed: int, report: Report | None = None
+) -> Adapted:
+    """Adapt `policy`, in place, to the target of the experiment `name`, going on from what is in `work`."""
+    experiment = EXPERIMENTS[name]
+    return flight.adapt(
+        policy,
+        flight.target(hidden(experiment, float(flight.system.mass)), test=False),
+        _folder(work, name, seed),
+        experiment.budget,
+        experiment.round_samples,
+        seed,
+        with_history=experiment.hidden == "force",
+        report=report,
+    )
+
+
+def _folder(work: Path, name: str, seed: int) -> Path:
+    return work / name.replace(", ", "-").replace(" ", "-") / f"seed-{seed}"
+
+
 def _source_policy(settings: Settings, flight: Flight) -> FlightPolicy:
     return flight.pretrain(settings.assets / f"{flight.system.name}.safetensors", 0)
 
 
 def _plain(experiment: Experiment) -> dict[str, object]:
     return {**asdict(experiment), "vehicle": experiment.vehicle.name}
-
-
-def flight_row(experiment: str, method: str, domain: str, samples: int, scores: Sequence[FlightScore]) -> Row:
-    """Over all flights of all seeds; a flight that failed is in the mean with all it missed by, and counted apart."""
-    means = np.array([score.mean for score in scores])
-    spread = np.sqrt(np.mean([score.std**2 for score in scores]) + means.var())
-    wing = experiment.startswith("fixed wing")
-    return Row(
-        experiment=experiment,
-        system="fixed_wing" if wing else "quadrotor",
-        method=method,
-        domain=domain,
-        samples=samples,
-        measure="miss of the target" if wing else "mean tracking error",
-        unit="m",
-        mean=round(float(means.mean()), 5),
-        std=round(float(spread), 5),
-        episodes=sum(score.flights for score in scores),
-        failed=sum(score.failed for score in scores),
-        seeds=len(scores),
-    )
 
 
 if __name__ == "__main__":

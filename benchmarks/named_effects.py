@@ -20,11 +20,11 @@ from pathlib import Path
 import torch
 import tyro
 
-from benchmarks.flight import EXPERIMENTS, SCORE_SEED, flight_row, hidden, vehicle
+from benchmarks.flight import EXPERIMENTS, SCORE_SEED, hidden, vehicle
 from visadapt.effects import ConstantForce, Effect, LinearDrag, ThrustGain
-from visadapt.flights import FlightScore, score
-from visadapt.results import write_rows
-from visadapt.runs import once, open_run
+from visadapt.flights import FlightScore, kept_score
+from visadapt.results import miss_row, write_rows
+from visadapt.runs import open_run
 
 EXPERIMENT = EXPERIMENTS["quadrotor, drag"]
 BUDGETS = (20, 50, 100)
@@ -60,7 +60,8 @@ def main(settings: Settings) -> None:
     for name in NAMES:
         for budget in BUDGETS:
             scores = [found[name, budget, seed] for seed in range(settings.seeds)]
-            rows.append(flight_row("quadrotor, drag, named effects", name, "adapted", budget, scores))
+            told = ("quadrotor, drag, named effects", "quadrotor", name, "adapted", budget, "mean tracking error")
+            rows.append(miss_row(*told, scores))
     write_rows(settings.out, rows)
     for row in rows:
         print(f"{row.method:44} {row.samples:4} samples  {row.mean:.4f} +- {row.std:.4f} m")
@@ -71,14 +72,10 @@ def _scored(settings: Settings, name: str, budget: int, seed: int) -> FlightScor
     flight = vehicle(EXPERIMENT, settings.references)
     folder = settings.work / name.replace(" ", "-").replace(",", "") / f"{budget}-{seed}"
     open_run(folder, {"seed": seed, "flights": settings.flights, "budget": budget, **asdict(flight.settings)})
-    policy = flight.pretrain(settings.assets / "quadrotor.safetensors", 0)
+    policy = flight.load(settings.assets / "quadrotor.safetensors")
     draw = hidden(EXPERIMENT, float(flight.system.mass))
     flight.adapt(policy, flight.target(draw, test=False), folder, budget, budget, seed, named=NAMES[name]())
-
-    def fresh() -> dict[str, object]:
-        return asdict(score(flight.target(draw), policy, SCORE_SEED, settings.flights))
-
-    return FlightScore(**once(folder / "score.json", fresh))
+    return kept_score(folder / "score.json", flight.target(draw), policy, SCORE_SEED, settings.flights)
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ def _flown(settings: Settings, name: str, loop: Reference) -> list[Row]:
     motion = torch.stack((loop.positions, loop.velocities, loop.accelerations, loop.jerks))
     course = AlongReferences(Reference.of(motion[:, None], loop.period))
     flight = quadrotor(course, course)
-    policy = flight.pretrain(settings.assets / "quadrotor.safetensors", 0)
+    policy = flight.load(settings.assets / "quadrotor.safetensors")
     found = score(flight.target(), policy, seed=0, flights=1)
     row = Row(
         name, "quadrotor", "ours, states", "source", 0, "mean tracking error", "m", found.mean, None, 1, found.failed, 1

@@ -77,44 +77,50 @@ VEHICLES = {
 
 def vehicles(rows: Rows) -> list[list[str]]:
     """The paper's vehicles beside ours, in m."""
-    table = [
-        ["m", "paper: source, before, after (samples)", "source", "before", "after: first round", "after: last round"]
-    ]
+    head = ("source", "before", "after: first round", "after: last round", "flights that failed")
+    table = [["m", "paper: source, before, after (samples)", *head]]
     for name, (said, *papers) in VEHICLES.items():
         own = [row for row in rows if row["experiment"] == name]
         if own:
             adapted = sorted((row for row in own if row["domain"] == "adapted"), key=lambda row: int(row["samples"]))
             source, before = (next(row for row in own if row["domain"] == domain) for domain in ("source", "target"))
+            shown = (source, before, adapted[0], adapted[-1])
             cells = [
                 f"{float(row['mean']):.4f} ± {float(row['std']):.4f}" + (f" ({int(row['samples']):,})" if k > 1 else "")
-                for k, row in enumerate((source, before, adapted[0], adapted[-1]))
+                for k, row in enumerate(shown)
             ]
-            table.append([said, ", ".join(filter(None, papers)), *cells])
+            failed, flown = (sum(int(row[key]) for row in shown) for key in ("failed", "episodes"))
+            table.append([said, ", ".join(filter(None, papers)), *cells, f"{failed} of {flown:,}"])
     return table
 
 
 def residual(rows: Rows) -> list[list[str]]:
     """What is left of the quadrotor's gap, by counted samples."""
-    own = [row for row in rows if row["experiment"] == "quadrotor, drag, residual by samples"]
-    samples = sorted({int(row["samples"]) for row in own})
-    table = [["gap in velocity that is left", *(f"{count:,} samples" for count in samples)]]
-    for method in dict.fromkeys(row["method"] for row in own):
-        found = {int(row["samples"]): row for row in own if row["method"] == method}
-        cells = (f"{100 * float(found[n]['mean']):.1f} ± {100 * float(found[n]['std']):.1f} %" for n in samples)
-        table.append([method, *cells])
-    return table
+    return _by_samples(
+        rows,
+        "quadrotor, drag, residual by samples",
+        "gap in velocity that is left",
+        lambda row: f"{100 * float(row['mean']):.1f} ± {100 * float(row['std']):.1f} %",
+    )
 
 
 def named(rows: Rows) -> list[list[str]]:
     """Named effects beside the residual, from very few samples, in m."""
-    own = [row for row in rows if row["experiment"] == "quadrotor, drag, named effects"]
-    samples = sorted({int(row["samples"]) for row in own})
-    table = [["quadrotor, drag: mean tracking error in m", *(f"{count:,} samples" for count in samples)]]
-    for method in dict.fromkeys(row["method"] for row in own):
-        found = {int(row["samples"]): row for row in own if row["method"] == method}
-        cells = (f"{float(found[count]['mean']):.4f} ± {float(found[count]['std']):.4f}" for count in samples)
-        table.append([method, *cells])
-    return table
+    return _by_samples(
+        rows,
+        "quadrotor, drag, named effects",
+        "quadrotor, drag: mean tracking error in m",
+        lambda row: f"{float(row['mean']):.4f} ± {float(row['std']):.4f}",
+    )
+
+
+def _by_samples(rows: Rows, experiment: str, head: str, tell: Callable[[dict[str, str]], str]) -> list[list[str]]:
+    """An experiment's methods, one a line, over counted samples."""
+    found = {(row["method"], int(row["samples"])): row for row in rows if row["experiment"] == experiment}
+    samples = sorted({count for _, count in found})
+    table = [[head, *(f"{count:,} samples" for count in samples)]]
+    methods = dict.fromkeys(method for method, _ in found)
+    return table + [[method, *(tell(found[method, count]) for count in samples)] for method in methods]
 
 
 def rotorpy(rows: Rows) -> list[list[str]]:

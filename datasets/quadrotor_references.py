@@ -188,5 +188,12 @@ def read(path: Path) -> tuple[Reference, Reference]:
     return Reference.of(rows[:, :train], period), Reference.of(rows[:, train:], period)
 
 
+def ready(path: Path) -> tuple[Reference, Reference]:
+    """Read the data set in `path`, made first with the default settings where it is not there."""
+    if not path.exists():
+        main(Settings(out=path))
+    return read(path)
+
+
 if __name__ == "__main__":
     main(tyro.cli(Settings, description=__doc__))

@@ -22,7 +22,7 @@ from typing import Literal
 import torch
 import tyro
 
-from benchmarks.flight import EXPERIMENTS, hidden
+from benchmarks.flight import EXPERIMENTS, adapt, hidden
 from train.flight_policies import made
 from visadapt.console import reporting
 from visadapt.flight_film import FlownPanel, write_flight_film, write_flight_still
@@ -65,25 +65,15 @@ def main(settings: Settings) -> None:
     """Adapt what is not adapted yet, fly, and film."""
     torch.set_num_threads(1)
     name = NAMES[settings.vehicle, settings.experiment]
-    experiment = EXPERIMENTS[name]
     weights = settings.assets / f"{settings.vehicle}.safetensors"
     if not weights.exists():
         raise ValueError(f"{weights} is not there: python -m train.flight_policies --vehicles {settings.vehicle}")
     flight = made(settings.vehicle, settings.references)
-    policy = flight.pretrain(weights, 0)
+    policy = flight.load(weights)
     adapting = copy.deepcopy(policy)
-    draw = hidden(experiment, float(flight.system.mass))
+    draw = hidden(EXPERIMENTS[name], float(flight.system.mass))
     with reporting() as report:
-        adapted = flight.adapt(
-            adapting,
-            flight.target(draw, test=False),
-            settings.work / name.replace(", ", "-").replace(" ", "-") / f"seed-{settings.seed}",
-            experiment.budget,
-            experiment.round_samples,
-            settings.seed,
-            with_history=experiment.hidden == "force",
-            report=report,
-        )
+        adapted = adapt(flight, name, settings.work, adapting, settings.seed, report)
         before = flown(flight, draw, policy, settings.flight, "Target, before adaptation")
         panels = [
             flown(flight, no_effects, policy, settings.flight, "Source, 0 samples"),

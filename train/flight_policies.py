@@ -52,9 +52,7 @@ def made(vehicle: str, references: Path, params: Path | None = None) -> Flight:
     """A vehicle, the default one or that of a file, and its courses."""
     if vehicle == "fixed_wing":
         return fixed_wing(system=load_rig(params, FixedWing) if params else None)
-    if not references.exists():
-        quadrotor_references.main(quadrotor_references.Settings(out=references))
-    train, test = quadrotor_references.read(references)
+    train, test = quadrotor_references.ready(references)
     own = load_rig(params, Quadrotor) if params else None
     return quadrotor(AlongReferences(train), AlongReferences(test), own)
 

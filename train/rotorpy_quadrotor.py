@@ -24,7 +24,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -34,11 +33,10 @@ from torch import Tensor
 from datasets import quadrotor_references
 from visadapt.console import reporting
 from visadapt.courses import AlongReferences
-from visadapt.flights import Flight, FlightScore, FlightSettings, score
-from visadapt.learning.following import Follow
-from visadapt.policies import FlightPolicy, FollowPolicy
+from visadapt.flights import FlightScore, kept_score, quadrotor
+from visadapt.policies import FlightPolicy
 from visadapt.recordings import Episode
-from visadapt.results import Row, write_rows
+from visadapt.results import Row, miss_row, write_rows
 from visadapt.runs import once, open_run, write_json
 from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, rotation, times
 from visadapt.targets import TargetError
@@ -48,8 +46,6 @@ from visadapt.targets.rotorpy import BREEZE, SOURCE, RotorpyTarget
 SCORE_SEED = 2026
 METHODS = {"ours, states": False, "ours, states with history": True}
 """Whether the residual sees what was left unexplained over the last periods."""
-TRAINING = FlightSettings(source_iterations=4000, source_rate=4e-3, iterations=200, rate=1e-3)
-"""As for the default quadrotor; the source's part is of no use here."""
 UNITS = {"drag_x": "1/s", "drag_y": "1/s", "drag_z": "1/s", "lift": "1/m", "lag": "s", "wind_x": "m/s", "wind_y": "m/s"}
 """What `explain` finds; drag and lift are divided by the mass."""
 
@@ -77,14 +73,12 @@ class Settings:
 def main(settings: Settings) -> None:
     """Do the whole job in `settings.out`, going on from what is there."""
     torch.set_num_threads(1)
-    if not settings.references.exists():
-        quadrotor_references.main(quadrotor_references.Settings(out=settings.references))
-    train, test = (AlongReferences(part) for part in quadrotor_references.read(settings.references))
-    flight = Flight(SOURCE, train.references.period, 2, train, test, Follow(train), _new_policy, TRAINING)
-    policy = flight.pretrain(settings.policy, 0)
+    train, test = (AlongReferences(part) for part in quadrotor_references.ready(settings.references))
+    flight = quadrotor(train, test, SOURCE)
+    policy = flight.load(settings.policy)
     targets = {"source": flight.target(), "no air": RotorpyTarget(test, aero=False), "target": RotorpyTarget(test)}
     told = {key: getattr(settings, key) for key in ("budget", "round_samples", "flights")}
-    about = open_run(settings.out, {**told, "air": asdict(BREEZE), "training": asdict(TRAINING)})
+    about = open_run(settings.out, {**told, "air": asdict(BREEZE), "training": asdict(flight.settings)})
     before = {name: [_scored(settings, name.replace(" ", "-"), where, policy)] for name, where in targets.items()}
     after: dict[str, list[FlightScore]] = {method: [] for method in settings.methods}
     gaps = []
@@ -177,16 +171,8 @@ def _published(target: RotorpyTarget) -> dict[str, float]:
     return {**drag, "lift": 4 * own["k_h"] / own["mass"], "lag": own["tau_m"], **wind}
 
 
-def _new_policy() -> FlightPolicy:
-    return FollowPolicy(period=0.1)
-
-
 def _scored(settings: Settings, name: str, target: FlightTarget, policy: FlightPolicy) -> FlightScore:
-    def fresh() -> dict[str, Any]:
-        return asdict(score(target, policy, SCORE_SEED, settings.flights))
-
-    kept = once(settings.out / f"{name}.json", fresh)
-    found = FlightScore(**{**kept, **{key: float("inf") for key, value in kept.items() if value is None}})
+    found = kept_score(settings.out / f"{name}.json", target, policy, SCORE_SEED, settings.flights)
     print(f"{name}: {found}", flush=True)
     return found
 
@@ -201,13 +187,7 @@ def _rows(
     what, system, used = "rotorpy", "rotorpy's Crazyflie Brushless", settings.budget
 
     def row(method: str, domain: str, samples: int, scores: Sequence[FlightScore]) -> Row:
-        """Over all flights of all seeds; a flight that failed is in the mean with all it missed by."""
-        means = np.array([each.mean for each in scores])
-        variance = np.mean([each.std**2 for each in scores]) + means.var() if np.isfinite(means).all() else np.inf
-        mean, std = round(float(means.mean()), 5), round(float(variance) ** 0.5, 5)
-        flights, failed = sum(each.flights for each in scores), sum(each.failed for each in scores)
-        named = (what, system, method, domain, samples, "mean tracking error", "m")
-        return Row(*named, mean, std, flights, failed, len(scores))
+        return miss_row(what, system, method, domain, samples, "mean tracking error", scores)
 
     rows = [
         row("unadapted", "source", 0, before["source"]),

@@ -23,9 +23,8 @@ import torch
 import tyro
 from torch import Tensor
 
-from visadapt.checkpoints import load_network, save_network
 from visadapt.learning.cost import Cost
-from visadapt.learning.policy import TuneSettings, tune
+from visadapt.learning.policy import TuneSettings, learnt
 from visadapt.learning.tasks import SwingUp, within_a_turn
 from visadapt.policies import StatePolicy
 from visadapt.results import Row, write_rows
@@ -129,14 +128,9 @@ def _seed(settings: Settings, seed: int) -> Score:
     folder = settings.work / f"seed-{seed}"
     open_run(folder, {"seed": seed, "episodes": settings.episodes, **asdict(LEARN)})
     policy = StatePolicy(n_state=4)
-    path, partial = folder / "policy.safetensors", folder / "policy.partial.safetensors"
-    if path.exists():
-        load_network(path, policy)
-    else:
-        generator = torch.Generator().manual_seed(seed)
-        tune(policy, World(CartPole()), _states, LEARN, generator, checkpoint=partial)
-        save_network(path, policy, {"seed": seed, "samples": SAMPLES})
-        partial.unlink(missing_ok=True)
+    generator = torch.Generator().manual_seed(seed)
+    about = {"seed": seed, "samples": SAMPLES}
+    learnt(folder / "policy.safetensors", policy, World(CartPole()), _states, LEARN, generator, about)
     return Score(**once(folder / "score.json", lambda: asdict(score(policy, settings.episodes))))
 
 

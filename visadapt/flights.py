@@ -7,23 +7,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from visadapt.checkpoints import load_network, save_network
+from visadapt.checkpoints import load_network
 from visadapt.console import Report, staged
 from visadapt.courses import AlongReferences, Course, ToTarget
 from visadapt.effects import Effect, Residual
 from visadapt.learning.following import Follow, Reach
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.joint import Adapted, AdaptSettings, adapt
-from visadapt.learning.policy import TuneSettings, tune
+from visadapt.learning.policy import TuneSettings, learnt
 from visadapt.learning.tasks import Task
 from visadapt.networks import FlightResidualNetwork
 from visadapt.policies import FlightPolicy, FollowPolicy, Policy, ReachPolicy
 from visadapt.rollout import run, see_goals
+from visadapt.runs import once
 from visadapt.systems import FixedWing, Quadrotor, RigidBody
 from visadapt.targets import FlightTarget
 from visadapt.targets.synthetic import DrawEffects, no_effects
@@ -83,25 +85,19 @@ class Flight:
         """The policy of the source, trained there or read from `path`."""
         torch.manual_seed(seed)
         policy = self.policy()
-        if path.exists():
-            load_network(path, policy)
-            return policy
         own = self.settings
         settings = TuneSettings(
             self.task, own.source_iterations, own.batch, own.source_rate, own.longest, observation_noise=0.0
         )
-        partial_path = path.with_suffix(".partial.safetensors")
-        tune(
-            policy,
-            self.source,
-            _states,
-            settings,
-            torch.Generator().manual_seed(seed),
-            progress=staged(report, f"{self.system.name}: source policy"),
-            checkpoint=partial_path,
-        )
-        save_network(path, policy, {"seed": seed, **asdict(own)})
-        partial_path.unlink(missing_ok=True)
+        generator = torch.Generator().manual_seed(seed)
+        progress = staged(report, f"{self.system.name}: source policy")
+        learnt(path, policy, self.source, _states, settings, generator, {"seed": seed, **asdict(own)}, progress)
+        return policy
+
+    def load(self, path: Path) -> FlightPolicy:
+        """A policy that `pretrain` left; raises CheckpointError where there is none, or it does not fit."""
+        policy = self.policy()
+        load_network(path, policy)
         return policy
 
     def adapt(
@@ -197,6 +193,14 @@ def score(target: FlightTarget, policy: Policy, seed: int, flights: int = 100) -
     mean = float(means.mean())
     std = float(means.std()) if math.isfinite(mean) else math.inf
     return FlightScore(flights, int((worst > FAR).sum()), mean, std, float(worst.max()))
+
+
+def kept_score(path: Path, target: FlightTarget, policy: Policy, seed: int, flights: int) -> FlightScore:
+    """`score`, flown only where it is not kept in `path` yet."""
+    found = once(path, lambda: asdict(score(target, policy, seed, flights)))
+    # JSON has no infinity: that of a flight that was not finite is null there.
+    missing: dict[str, Any] = {key: math.inf for key, value in found.items() if value is None}
+    return FlightScore(**(found | missing))
 
 
 def _states(state: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from visadapt.learning.cost import CENTRED_CARTPOLE
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.joint import Adapted, AdaptSettings, adapt
 from visadapt.learning.perception import PerceptionSettings, learn_to_see, scale
-from visadapt.learning.policy import TuneSettings, tune
+from visadapt.learning.policy import TuneSettings, learnt
 from visadapt.learning.tasks import Balance
 from visadapt.learning.tracking import Tracker
 from visadapt.networks import FrameEncoder, ImageResidualNetwork
@@ -116,24 +116,17 @@ class PixelTask:
             )
             save_network(seen, encoder, {"seed": seed, **asdict(settings)})
             partial.unlink(missing_ok=True)
-        learnt = folder / "policy.safetensors"
-        if learnt.exists():
-            load_network(learnt, policy)
-        else:
-            policy.encoder.load_state_dict(encoder.state_dict())
-            generator = torch.Generator().manual_seed(seed + 1)
-            partial = folder / "policy.partial.safetensors"
-            tune(
-                policy,
-                self.source,
-                self.observe,
-                self.settings.source,
-                generator,
-                progress=staged(report, "source policy"),
-                checkpoint=partial,
-            )
-            save_network(learnt, policy, {"seed": seed, **asdict(self.settings.source)})
-            partial.unlink(missing_ok=True)
+        policy.encoder.load_state_dict(encoder.state_dict())
+        learnt(
+            folder / "policy.safetensors",
+            policy,
+            self.source,
+            self.observe,
+            self.settings.source,
+            torch.Generator().manual_seed(seed + 1),
+            {"seed": seed, **asdict(self.settings.source)},
+            staged(report, "source policy"),
+        )
         return encoder, policy
 
     def load(self, folder: Path) -> tuple[FrameEncoder, ImagePolicy]:

@@ -11,11 +11,15 @@ import numpy as np
 
 from visadapt.evaluation import Evaluation
 from visadapt.files import replacing
+from visadapt.flights import FlightScore
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row. `samples` are counted target samples; `failed` episodes are never in `mean`; None does not apply."""
+    """One row. `samples` are counted target samples; None does not apply.
+
+    `failed` episodes are counted apart: never in a mean of speeds, always in a mean of misses.
+    """
 
     experiment: str
     system: str
@@ -55,6 +59,29 @@ def speed_row(
         std=round(variance**0.5, 4),
         episodes=episodes,
         failed=episodes - int(total),
+        seeds=len(scores),
+    )
+
+
+def miss_row(
+    experiment: str, system: str, method: str, domain: str, samples: int, measure: str, scores: Sequence[FlightScore]
+) -> Row:
+    """How far flights miss, over those of all seeds (one FlightScore each); one that failed is in the mean."""
+    means = np.array([score.mean for score in scores])
+    whole = bool(np.isfinite(means).all())
+    variance = np.mean([score.std**2 for score in scores]) + means.var() if whole else np.inf
+    return Row(
+        experiment=experiment,
+        system=system,
+        method=method,
+        domain=domain,
+        samples=samples,
+        measure=measure,
+        unit="m",
+        mean=round(float(means.mean()), 5),
+        std=round(float(np.sqrt(variance)), 5),
+        episodes=sum(score.flights for score in scores),
+        failed=sum(score.failed for score in scores),
         seeds=len(scores),
     )
 

@@ -8,13 +8,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from visadapt.checkpoints import load_network, save_network
 from visadapt.console import Report, staged
 from visadapt.effects import Residual
 from visadapt.learning.cost import PAPER_CARTPOLE
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.joint import Adapted, AdaptSettings, adapt
-from visadapt.learning.policy import TuneSettings, tune
+from visadapt.learning.policy import TuneSettings, learnt
 from visadapt.learning.tasks import Balance
 from visadapt.networks import StateResidualNetwork
 from visadapt.policies import StatePolicy
@@ -67,12 +66,9 @@ def pretrain(
     """The policy of the source, trained there or read from `path`."""
     torch.manual_seed(seed)
     policy = StatePolicy(n_state=4, with_history=settings.with_history)
-    if path.exists():
-        load_network(path, policy)
-        return policy
+    about = {"seed": seed, **asdict(settings.source)}
     generator = torch.Generator().manual_seed(seed)
-    tune(policy, source, observe, settings.source, generator, progress=staged(report, "source policy"))
-    save_network(path, policy, {"seed": seed, **asdict(settings.source)})
+    learnt(path, policy, source, observe, settings.source, generator, about, staged(report, "source policy"))
     return policy
 
 

@@ -8,13 +8,16 @@ starts anew, and delta_div grows as training goes on, so the policy learns to re
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from visadapt.checkpoints import load_network, save_network
 from visadapt.console import Progress
 from visadapt.history import History
 from visadapt.learning.resume import EVERY, Training
@@ -131,6 +134,29 @@ def tune(
             training.keep(checkpoint, losses, kept if past is None else {**kept, "past": past.tree()})
     policy.eval()
     return losses
+
+
+def learnt(
+    path: Path,
+    policy: Policy,
+    world: World,
+    observe: Observe,
+    settings: TuneSettings,
+    generator: torch.Generator,
+    about: Mapping[str, Any],
+    progress: Progress | None = None,
+) -> None:
+    """Give `policy` the weights in `path`; where there are none yet, tune it, and keep it there with `about` it.
+
+    An interrupted training goes on from what it left beside `path`.
+    """
+    if path.exists():
+        load_network(path, policy)
+        return
+    partial_path = path.with_suffix(".partial.safetensors")
+    tune(policy, world, observe, settings, generator, progress=progress, checkpoint=partial_path)
+    save_network(path, policy, about)
+    partial_path.unlink(missing_ok=True)
 
 
 @torch.no_grad()
