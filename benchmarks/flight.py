@@ -91,9 +91,11 @@ def main(settings: Settings) -> None:
         kind = EXPERIMENTS[name].vehicle
         scores = [found[name, seed] for seed in range(settings.seeds)]
         for key in scores[0]:
-            own = [each[key] for each in scores]
-            where = ("unadapted", key, 0) if key in ("source", "target") else (OURS, "adapted", int(key))
-            rows.append(miss_row(name, kind.name, *where, MEASURES[kind], own))
+            if key in ("source", "target"):  # one policy, which all seeds share
+                rows.append(miss_row(name, kind.name, "unadapted", key, 0, MEASURES[kind], [scores[0][key]]))
+            else:
+                own = [each[key] for each in scores]
+                rows.append(miss_row(name, kind.name, OURS, "adapted", int(key), MEASURES[kind], own))
     write_rows(settings.out, rows)
     for row in rows:
         print(f"{row.experiment:20} {row.domain:8} {row.samples:5} samples  {row.mean:.4f} +- {row.std:.4f} m")
