@@ -11,7 +11,6 @@ second of prediction by the source from the true states, in units of the measure
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -25,6 +24,7 @@ from datasets.blind_flight_control import CONTROLLERS, PERIODS, Chain, Flyers, s
 from datasets.blind_flight_kinds import FOREIGN, NAMED, NEUTRAL
 from datasets.blind_flight_plants import PLANTS, Array, Motion, step
 from datasets.blind_kinds import Kind, Shape
+from datasets.blind_sealing import names, place_of_key, seal
 
 System = Literal["quadrotor", "fixed_wing"]
 
@@ -205,11 +205,6 @@ def as_states(at: Motion, near: Array | None) -> Array:
     return np.concatenate([at.place, at.velocity, q, at.rates], 1)
 
 
-def names(count: int) -> list[str]:
-    """File names of the recordings, in order."""
-    return [f"{i:04d}.csv" for i in range(count)]
-
-
 def key_text(settings: Settings, drafts: list[Draft]) -> str:
     """The answers as JSON; the same settings give the same text."""
     answers = []
@@ -236,19 +231,9 @@ def lines(draft: Draft, system: System) -> Iterator[str]:
 
 def main(settings: Settings) -> None:
     """Make the recordings, print the key's SHA-256, then write the key and the recordings."""
-    key = settings.key or settings.out.with_name(settings.out.name + ".key.json")
-    if settings.out.resolve() in key.resolve().parents:
-        raise ValueError(f"{key}: the key must not lie in the folder of the recordings")
+    key = place_of_key(settings.out, settings.key)
     drafts = make(settings)
-    text = key_text(settings, drafts)
-    print(f"SHA-256 of the key: {hashlib.sha256(text.encode()).hexdigest()}", flush=True)
-    settings.out.mkdir(parents=True, exist_ok=True)
-    key.parent.mkdir(parents=True, exist_ok=True)
-    key.write_text(text, encoding="utf-8")
-    for name, draft in zip(names(len(drafts)), drafts, strict=True):
-        recording = "\n".join(lines(draft, settings.system)) + "\n"
-        (settings.out / name).write_text(recording, encoding="utf-8")
-    print(f"{settings.out}: {len(drafts)} recordings; key: {key}")
+    seal(settings.out, key, key_text(settings, drafts), (lines(draft, settings.system) for draft in drafts))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ it does to the readings. Each member of a pair or triple has its strength by its
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -25,6 +24,7 @@ import tyro
 from datasets.blind_control import draw_driver
 from datasets.blind_kinds import FOREIGN, INSEPARABLE, KINDS, NAMED, Shape
 from datasets.blind_plant import PERIOD, Array
+from datasets.blind_sealing import names, place_of_key, seal
 from datasets.blind_simulation import Case, Run, simulate
 
 
@@ -248,11 +248,6 @@ def _miss(strength: float, target: float) -> float:
     return float(abs(np.log(max(strength, 1e-9) / target)))
 
 
-def names(count: int) -> list[str]:
-    """File names of the recordings, in order."""
-    return [f"{i:04d}.csv" for i in range(count)]
-
-
 def key_text(settings: Settings, drafts: list[Draft]) -> str:
     """The answers as JSON; the same settings give the same text."""
     answers = []
@@ -284,19 +279,14 @@ def lines(draft: Draft, velocities: bool) -> Iterator[str]:
 
 def main(settings: Settings) -> None:
     """Make the recordings, print the key's SHA-256, then write the key and the recordings."""
-    key = settings.key or settings.out.with_name(settings.out.name + ".key.json")
-    if settings.out.resolve() in key.resolve().parents:
-        raise ValueError(f"{key}: the key must not lie in the folder of the recordings")
+    key = place_of_key(settings.out, settings.key)
     drafts = make(settings)
-    text = key_text(settings, drafts)
-    print(f"SHA-256 of the key: {hashlib.sha256(text.encode()).hexdigest()}", flush=True)
-    settings.out.mkdir(parents=True, exist_ok=True)
-    key.parent.mkdir(parents=True, exist_ok=True)
-    key.write_text(text, encoding="utf-8")
-    for name, draft in zip(names(len(drafts)), drafts, strict=True):
-        recording = "\n".join(lines(draft, DIFFICULTIES[settings.kind].velocities)) + "\n"
-        (settings.out / name).write_text(recording, encoding="utf-8")
-    print(f"{settings.out}: {len(drafts)} recordings; key: {key}")
+    seal(
+        settings.out,
+        key,
+        key_text(settings, drafts),
+        (lines(draft, DIFFICULTIES[settings.kind].velocities) for draft in drafts),
+    )
 
 
 if __name__ == "__main__":

@@ -8,13 +8,12 @@ from __future__ import annotations
 import math
 from typing import TypeAlias
 
-import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from visadapt.effects.base import DynamicsEffect, Effect, Parameter, with_parameters
 from visadapt.systems import FixedWing, Quadrotor, System
-from visadapt.systems.rigid_body import VELOCITY
+from visadapt.systems.rigid_body import VELOCITY, beside
 
 Vehicle: TypeAlias = Quadrotor | FixedWing
 VEHICLES: tuple[type[System], ...] = (Quadrotor, FixedWing)
@@ -37,8 +36,7 @@ def airspeed(state: Tensor, vehicle: Vehicle) -> Tensor:
     wind = (vehicle.wind_x, vehicle.wind_y, vehicle.wind_z)
     if not any(isinstance(value, Tensor) or value for value in wind):
         return state[:, VELOCITY]
-    columns = torch.broadcast_tensors(*(torch.as_tensor(value).to(state) for value in wind))
-    return state[:, VELOCITY] - torch.stack(columns, -1)
+    return state[:, VELOCITY] - beside(wind, state)
 
 
 class AirDrag(DynamicsEffect):

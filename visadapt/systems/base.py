@@ -49,3 +49,8 @@ class System(ABC):
         if name not in names:
             raise KeyError(f"{cls.name} has no state {name!r}; its states are {', '.join(names)}")
         return names.index(name)
+
+
+def holds(condition: bool | Tensor) -> bool:
+    """Whether a condition on a parameter, a number or a tensor, holds in every row."""
+    return bool(condition.all()) if isinstance(condition, Tensor) else condition

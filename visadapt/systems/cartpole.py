@@ -13,7 +13,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from visadapt.systems.base import System, Variable
+from visadapt.systems.base import System, Variable, holds
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class CartPole(System):
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if not bool(torch.as_tensor(value > 0).all()):
+            if not holds(value > 0):
                 raise ValueError(f"cartpole: {field.name} must be positive, got {value!r}")
 
     def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:

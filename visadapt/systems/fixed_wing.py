@@ -22,15 +22,14 @@ tilted down by 0.165 rad.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from visadapt.systems.base import Variable
-from visadapt.systems.rigid_body import POSITION, VELOCITY, RigidBody, from_angles, times
+from visadapt.systems.base import Variable, holds
+from visadapt.systems.rigid_body import POSITION, VELOCITY, RigidBody, beside, from_angles, times
 
 _EFFECTS = ("drag", "side", "lift", "roll", "pitch", "yaw")
 _CAUSES = ("zero", "sideslip", "attack", "elevator", "aileron", "rudder", "roll_rate", "pitch_rate", "yaw_rate")
@@ -158,11 +157,11 @@ class FixedWing(RigidBody):
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name == "inertia_xz" or field.name.startswith((*_EFFECTS, "wind")):
-                if not _holds(abs(value) < math.inf):
+                if not holds(abs(value) < math.inf):
                     raise ValueError(f"fixed_wing: {field.name} must be finite, got {value!r}")
-            elif not _holds(value > 0):
+            elif not holds(value > 0):
                 raise ValueError(f"fixed_wing: {field.name} must be positive, got {value!r}")
-        if not _holds(self.inertia_xz**2 < self.inertia_x * self.inertia_z):
+        if not holds(self.inertia_xz**2 < self.inertia_x * self.inertia_z):
             raise ValueError(
                 "fixed_wing: inertia_xz must be smaller than the geometric mean of inertia_x and inertia_z, "
                 f"got {self.inertia_xz!r}"
@@ -174,14 +173,14 @@ class FixedWing(RigidBody):
             return super().derivative(state, command, load)
         # All but the change of place is as it would be if the air stood still and the wing flew at its airspeed.
         velocity = state[:, VELOCITY]
-        airborne = torch.cat((state[:, POSITION], velocity - _gather(wind, state), state[:, VELOCITY.stop :]), 1)
+        airborne = torch.cat((state[:, POSITION], velocity - beside(wind, state), state[:, VELOCITY.stop :]), 1)
         change = super().derivative(airborne, command, load)
         return torch.cat((velocity, change[:, VELOCITY.start :]), 1)
 
     def inertia(self, like: Tensor) -> Tensor:
         # With z up, the product of inertia has the other sign than in the book.
         x, y, z, xz = self.inertia_x, self.inertia_y, self.inertia_z, self.inertia_xz
-        return _gather((x, 0.0, xz, 0.0, y, 0.0, xz, 0.0, z), like).unflatten(-1, (3, 3))
+        return beside((x, 0.0, xz, 0.0, y, 0.0, xz, 0.0, z), like).unflatten(-1, (3, 3))
 
     def wrench(self, velocity: Tensor, rates: Tensor, command: Tensor) -> tuple[Tensor, Tensor]:
         """Beard and McLain's section 4.2, and thrust; force and torque (B, 3) each."""
@@ -250,7 +249,7 @@ class FixedWing(RigidBody):
             for row, names in enumerate(_TABLE)
             for column, name in enumerate(names)
         ]
-        gathered = _gather([*values, self.linear_range], like)
+        gathered = beside([*values, self.linear_range], like)
         return gathered[..., :-1].unflatten(-1, (len(_EFFECTS), len(_CAUSES))), gathered[..., -1:]
 
 
@@ -259,18 +258,3 @@ _TABLE = tuple(
     for effect in _EFFECTS
 )
 """Names of the coefficients, a row for each effect; empty where a cause has no such effect."""
-
-
-def _gather(values: Sequence[float | Tensor], like: Tensor) -> Tensor:
-    """Parameters side by side, (n,), or (B, n) where one of them is (B,)."""
-    tensors = {i: value for i, value in enumerate(values) if isinstance(value, Tensor)}
-    gathered = like.new_tensor([0.0 if isinstance(value, Tensor) else value for value in values])
-    if tensors:
-        gathered = gathered.repeat(*torch.broadcast_shapes(*(value.shape for value in tensors.values())), 1)
-        for i, value in tensors.items():
-            gathered[..., i] = value
-    return gathered
-
-
-def _holds(condition: bool | Tensor) -> bool:
-    return bool(condition.all()) if isinstance(condition, Tensor) else condition

@@ -15,8 +15,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from visadapt.systems.base import Variable
-from visadapt.systems.rigid_body import RigidBody, columns, times
+from visadapt.systems.base import Variable, holds
+from visadapt.systems.rigid_body import RigidBody, beside, columns, times
 
 
 @dataclass(frozen=True)
@@ -80,29 +80,29 @@ class Quadrotor(RigidBody):
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name in _ANY:
-                if not _holds(abs(value) < math.inf):
+                if not holds(abs(value) < math.inf):
                     raise ValueError(f"quadrotor: {field.name} must be finite, got {value!r}")
-            elif not _holds(value >= (0.0 if field.name in _FROM_ZERO else torch.finfo(torch.float32).tiny)):
+            elif not holds(value >= (0.0 if field.name in _FROM_ZERO else torch.finfo(torch.float32).tiny)):
                 raise ValueError(f"quadrotor: {field.name} must be positive, got {value!r}")
-        if not _holds(self.max_thrust > self.min_thrust):
+        if not holds(self.max_thrust > self.min_thrust):
             raise ValueError(
                 f"quadrotor: max_thrust must be beyond min_thrust, got {self.max_thrust!r} and {self.min_thrust!r}"
             )
-        if not _holds(self.mass > self.payload):
+        if not holds(self.mass > self.payload):
             raise ValueError(f"quadrotor: mass must be beyond payload, got {self.mass!r} and {self.payload!r}")
 
     def inertia(self, like: Tensor) -> Tensor:
         known = self.known_inertia(like)
         scales = (self.inertia_scale_x, self.inertia_scale_y, self.inertia_scale_z)
-        return known * _beside(scales, like)[..., None] if _differ(scales, 1.0) else known
+        return known * beside(scales, like)[..., None] if _differ(scales, 1.0) else known
 
     def known_inertia(self, like: Tensor) -> Tensor:
         """Moments of inertia that the rate loops count on, kg m2: (3, 3), or (B, 3, 3).
 
         Of a plate with rotors, as Flightmare has it: m l^2 / 12 times (4.5, 4.5, 7) about x, y and z.
         """
-        size = torch.as_tensor((self.mass - self.payload) * self.arm_length**2 / 12).to(like)
-        return size[..., None, None] * torch.diag(like.new_tensor((4.5, 4.5, 7.0)))
+        size = beside(((self.mass - self.payload) * self.arm_length**2 / 12,), like)
+        return size[..., None] * torch.diag(like.new_tensor((4.5, 4.5, 7.0)))
 
     def thrust(self, command: Tensor) -> Tensor:
         """Mass-normalised thrust (B,) in m/s2 at commands (B, 4)."""
@@ -111,14 +111,14 @@ class Quadrotor(RigidBody):
 
     def wrench(self, velocity: Tensor, rates: Tensor, command: Tensor) -> tuple[Tensor, Tensor]:
         asked = columns(self.max_rate) * command[:, 1:]
-        gain = _beside((self.roll_gain, self.roll_gain, self.yaw_gain), rates)
+        gain = beside((self.roll_gain, self.roll_gain, self.yaw_gain), rates)
         inertia = self.known_inertia(rates)
         torque = times(inertia, gain * (asked - rates)) + torch.linalg.cross(rates, times(inertia, rates))
         thrust = (self.mass - self.payload) * self.thrust(command)
         if _differ((self.rotor_1, self.rotor_2, self.rotor_3, self.rotor_4), 1.0):
             thrust, torque = self._given(thrust, torque)
         if _differ((self.centre_x, self.centre_y), 0.0):
-            torque = torque + thrust[:, None] * _beside((-self.centre_y, self.centre_x, 0.0), torque)
+            torque = torque + thrust[:, None] * beside((-self.centre_y, self.centre_x, 0.0), torque)
         force = torch.zeros_like(velocity)
         force[:, 2] = thrust
         return force, torque
@@ -131,9 +131,9 @@ class Quadrotor(RigidBody):
     def _given(self, thrust: Tensor, torque: Tensor) -> tuple[Tensor, Tensor]:
         """What the rotors give, each its share, of a thrust (B,) and a torque (B, 3) asked of all four together."""
         reach = self.arm_length / math.sqrt(2)
-        levers = _beside((1.0, reach, reach, self.torque_to_thrust), torque)
+        levers = beside((1.0, reach, reach, self.torque_to_thrust), torque)
         mixer = torque.new_tensor(_MIXER)
-        shares = _beside((self.rotor_1, self.rotor_2, self.rotor_3, self.rotor_4), torque)
+        shares = beside((self.rotor_1, self.rotor_2, self.rotor_3, self.rotor_4), torque)
         # The mixer's rows are orthogonal and of length 2: its transpose is 4 times its inverse.
         asked = torch.cat((thrust[:, None], torque), 1) / levers @ mixer / 4
         given = (shares * asked) @ mixer.mT * levers
@@ -148,17 +148,6 @@ _MIXER = ((1.0, 1.0, 1.0, 1.0), (1.0, -1.0, -1.0, 1.0), (-1.0, -1.0, 1.0, 1.0), 
 """Signs with which rotors 1 to 4 add to the thrust and to the torques about x, y and z (Flightmare's allocation)."""
 
 
-def _beside(values: Sequence[float | Tensor], like: Tensor) -> Tensor:
-    """Parameters side by side, (n,), or (B, n) where one of them is (B,)."""
-    if not any(isinstance(value, Tensor) for value in values):
-        return like.new_tensor(values)
-    return torch.stack(torch.broadcast_tensors(*(torch.as_tensor(value).to(like) for value in values)), -1)
-
-
 def _differ(values: Sequence[float | Tensor], nominal: float) -> bool:
     """Whether one of the parameters may differ from its nominal value; tensors are not looked into."""
     return any(isinstance(value, Tensor) or value != nominal for value in values)
-
-
-def _holds(condition: bool | Tensor) -> bool:
-    return bool(condition.all()) if isinstance(condition, Tensor) else condition

@@ -8,6 +8,7 @@ physics normalises it wherever it is used.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
@@ -113,6 +114,17 @@ class RigidBody(System):
 def columns(value: float | Tensor) -> float | Tensor:
     """A parameter, () or (B,), as a factor on what is (B, n)."""
     return value[:, None] if isinstance(value, Tensor) and value.dim() else value
+
+
+def beside(values: Sequence[float | Tensor], like: Tensor) -> Tensor:
+    """Parameters side by side, (n,), or (B, n) where one of them is (B,)."""
+    tensors = {i: value for i, value in enumerate(values) if isinstance(value, Tensor)}
+    gathered = like.new_tensor([0.0 if isinstance(value, Tensor) else value for value in values])
+    if tensors:
+        gathered = gathered.repeat(*torch.broadcast_shapes(*(value.shape for value in tensors.values())), 1)
+        for i, value in tensors.items():
+            gathered[..., i] = value
+    return gathered
 
 
 def times(matrix: Tensor, vector: Tensor) -> Tensor:

@@ -1,0 +1,32 @@
+"""Sealed recordings: the key's hash is told before anything is written, and the key lies apart from the recordings."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+
+def names(count: int) -> list[str]:
+    """File names of the recordings, in order."""
+    return [f"{i:04d}.csv" for i in range(count)]
+
+
+def place_of_key(folder: Path, key: Path | None) -> Path:
+    """Where the key goes: beside the folder of the recordings unless told; raises ValueError where that is within."""
+    place = key or folder.with_name(folder.name + ".key.json")
+    if folder.resolve() in place.resolve().parents:
+        raise ValueError(f"{place}: the key must not lie in the folder of the recordings")
+    return place
+
+
+def seal(folder: Path, key: Path, text: str, recordings: Iterable[Iterator[str]]) -> None:
+    """Print the SHA-256 of the key's text, then write the key, and the recordings, each given by its lines."""
+    print(f"SHA-256 of the key: {hashlib.sha256(text.encode()).hexdigest()}", flush=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    key.parent.mkdir(parents=True, exist_ok=True)
+    key.write_text(text, encoding="utf-8")
+    drawn = list(recordings)
+    for name, lines in zip(names(len(drawn)), drawn, strict=True):
+        (folder / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print(f"{folder}: {len(drawn)} recordings; key: {key}")
