@@ -67,6 +67,7 @@ class FlightTarget(Target):
         return Observation(
             measured,
             alive=self._at.state.isfinite().all(1),
-            force=world.load(self._at)[:, 0],
+            force=world.load(self._at)[:, :3],
             goal=self.course.goal(self._place),
+            place=self._place,
         )
