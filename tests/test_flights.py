@@ -8,7 +8,7 @@ from tests.flying import PERIOD, drag, seeded, small_flight, waves
 from visadapt.checkpoints import CheckpointError
 from visadapt.courses import AlongReferences, ToTarget
 from visadapt.effects import ConstantForce
-from visadapt.flights import FAR, fixed_wing, score
+from visadapt.flights import FAR, Training, fixed_wing, score
 from visadapt.policies import HORIZON, FollowPolicy, Policy
 from visadapt.rollout import run, see_goals
 from visadapt.systems import FixedWing, Quadrotor
@@ -163,7 +163,8 @@ class TestScore:
         assert found.failed == int((aside > FAR).sum())
 
 
-SMALL = {"source_iterations": 3, "source_rate": 1e-3, "iterations": 4, "batch": 8, "longest": 10}
+BRIEF = Training(4, 1e-3, batch=8)
+SMALL = {"source": BRIEF, "tuning": BRIEF, "recovering": BRIEF, "longest": 10}
 
 
 def adapted(folder, with_history=False, report=None, stops_at=None, draw=None):

@@ -17,7 +17,7 @@ from visadapt.checkpoints import load_network
 from visadapt.console import Report, staged
 from visadapt.courses import AlongReferences, Course, ToTarget
 from visadapt.effects import Effect, Residual
-from visadapt.learning.following import Follow, Reach
+from visadapt.learning.following import Follow, Reach, RecoverCost
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.joint import Adapted, AdaptSettings, adapt
 from visadapt.learning.policy import TuneSettings, learnt
@@ -36,14 +36,23 @@ RECORDED = 0.8
 
 
 @dataclass(frozen=True)
-class FlightSettings:
-    """How a vehicle's policy is trained in the source, and tuned in each round."""
+class Training:
+    """How long and how fast a policy learns."""
 
-    source_iterations: int
-    source_rate: float
     iterations: int
     rate: float
     batch: int = 256
+
+
+@dataclass(frozen=True)
+class FlightSettings:
+    """How a vehicle's policy is trained."""
+
+    source: Training
+    tuning: Training
+    """in each round of the adaptation"""
+    recovering: Training
+    """the same, where the residual reads the past"""
     longest: int = 100
     """steps of a stream"""
     ground: GroundSettings = field(default_factory=lambda: GroundSettings(ridge=0.1))
@@ -59,6 +68,7 @@ class Flight:
         train, test: courses to train on, and to be scored on.
         task: what streams do.
         policy: makes a new policy.
+        recovery: what streams do when the policy is adapted to what changes, if not the same.
     """
 
     def __init__(
@@ -71,12 +81,14 @@ class Flight:
         task: Task,
         policy: Callable[[], FlightPolicy],
         settings: FlightSettings,
+        recovery: Task | None = None,
     ) -> None:
         self.system = system
         self.source = World(system, period=period, substeps=substeps)
         self.train = train
         self.test = test
         self.task = task
+        self.recovery = recovery or task
         self.policy = policy
         self.settings = settings
 
@@ -88,13 +100,11 @@ class Flight:
         """The policy of the source, trained there or read from `path`."""
         torch.manual_seed(seed)
         policy = self.policy()
-        own = self.settings
-        settings = TuneSettings(
-            self.task, own.source_iterations, own.batch, own.source_rate, own.longest, observation_noise=0.0
-        )
+        own, how = self.settings, self.settings.source
+        settings = TuneSettings(self.task, how.iterations, how.batch, how.rate, own.longest, observation_noise=0.0)
         generator = torch.Generator().manual_seed(seed)
         progress = staged(report, f"{self.system.name}: source policy")
-        learnt(path, policy, self.source, _states, settings, generator, {"seed": seed, **asdict(own)}, progress)
+        learnt(path, policy, self.source, _states, settings, generator, {"seed": seed, **asdict(how)}, progress)
         return policy
 
     def load(self, path: Path) -> FlightPolicy:
@@ -124,16 +134,17 @@ class Flight:
         """
         torch.manual_seed(seed)
         own = self.settings
+        how = own.recovering if with_history else own.tuning
         source = World(self.system, named, self.source.period, substeps=self.source.substeps)
         predict = partial(_step, source) if with_history else None
         network = FlightResidualNetwork(self.system, self.source.period, predict)
         residual = Residual(network, torch.ones(len(self.system.states)))
         settings = AdaptSettings(
             TuneSettings(
-                self.task,
-                own.iterations,
-                own.batch,
-                own.rate,
+                self.recovery if with_history else self.task,
+                how.iterations,
+                how.batch,
+                how.rate,
                 own.longest,
                 curriculum=False,
                 # A stream that begins without a past meets no force that changes, or one that its residual makes up.
@@ -154,15 +165,18 @@ class Flight:
 def quadrotor(train: AlongReferences, test: AlongReferences, system: Quadrotor | None = None) -> Flight:
     """The quadrotor, Flightmare's or one's own, that follows references 0.1 s a row."""
     period = train.references.period
-    settings = FlightSettings(source_iterations=4000, source_rate=4e-3, iterations=200, rate=1e-3)
-    return Flight(system or Quadrotor(), period, 2, train, test, Follow(train), lambda: FollowPolicy(period), settings)
+    settings = FlightSettings(Training(4000, 4e-3), Training(200, 1e-3), Training(400, 2e-3, 128))
+    follow, recover = Follow(train), Follow(train, RecoverCost(), diverged=3.0)
+    return Flight(
+        system or Quadrotor(), period, 2, train, test, follow, lambda: FollowPolicy(period), settings, recover
+    )
 
 
 def fixed_wing(period: float = 0.05, system: FixedWing | None = None) -> Flight:
     """The fixed wing, Waldock's or one's own, that flies through points 50 m ahead."""
     system = system or FixedWing()
     course = ToTarget(period, system)
-    settings = FlightSettings(source_iterations=3000, source_rate=3e-3, iterations=200, rate=3e-4, batch=128)
+    settings = FlightSettings(Training(3000, 3e-3, 128), Training(200, 3e-4, 128), Training(200, 3e-4, 128))
     return Flight(system, period, 1, course, course, Reach(course), ReachPolicy, settings)
 
 

@@ -11,6 +11,9 @@ from visadapt.courses import AlongReferences, ToTarget
 from visadapt.learning.tasks import Task, curriculum
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
 
+NEAR = 0.01
+"""A cost that is small: about that of a plan with 1 cm of error all along."""
+
 
 @dataclass(frozen=True)
 class FollowCost:
@@ -36,6 +39,27 @@ class FollowCost:
             + self.rates * states[..., RATES].square().sum((1, 2))
             + self.action * plan.square().sum((1, 2))
         )
+
+
+@dataclass(frozen=True)
+class RecoverCost(FollowCost):
+    """The same for a vehicle that may be pushed further off its reference than a plan can bring it back.
+
+    sqrt(C + final |e_K + beyond e'_K|^2 + NEAR), with e_K the distance at the end of the plan and e'_K its rate
+
+    A plan that ends on the reference but not with its velocity flies through it and out again, further each time: what
+    counts is where the vehicle would be `beyond` s later. The root changes no best plan, but lets the many streams that
+    are near weigh as much as the few that are far off.
+    """
+
+    final: float = 10.0
+    beyond: float = 1.0
+    """s"""
+
+    def __call__(self, states: Tensor, plan: Tensor, reference: Tensor) -> Tensor:
+        away = (states[..., : VELOCITY.stop] - reference)[:, -1]
+        later = away[:, POSITION] + self.beyond * away[:, VELOCITY]
+        return (super().__call__(states, plan, reference) + self.final * later.square().sum(1) + NEAR).sqrt()
 
 
 @dataclass(frozen=True)

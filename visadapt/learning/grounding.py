@@ -23,7 +23,7 @@ from visadapt.world import World
 NAMED_STEPS = 8
 NUDGE = 1e-3
 """Iterations of the fit of named effects, and its finite difference as a share of a parameter's range."""
-NEGLIGIBLE = 1e-3
+NEGLIGIBLE = 1e-2
 """of a state's change in a period"""
 
 
