@@ -59,7 +59,7 @@ def test_the_papers_cost_does_not_care_where_the_cart_is():
 
 
 def least(cost):
-    """Eigenvalues of the cart-pole, linearised about upright, under the first action of the 10-step plan of least cost."""
+    """Eigenvalues of the cart-pole, linearised upright, under the first action of the plan that costs least."""
     world = World(CartPole())
     rest, still = torch.zeros(1, 4, dtype=torch.float64), torch.zeros(1, 10, 1, dtype=torch.float64)
 
