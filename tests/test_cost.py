@@ -3,7 +3,9 @@ import dataclasses
 import pytest
 import torch
 
-from visadapt.learning.cost import CENTRED_CARTPOLE, PAPER_CARTPOLE, Cost
+from visadapt.learning.cost import CENTRED_CARTPOLE, PAPER_CARTPOLE, Cost, SettlingCost
+from visadapt.systems import CartPole
+from visadapt.world import World
 
 
 def written_out(cost, states, actions, now):
@@ -54,3 +56,40 @@ def test_the_papers_cost_does_not_care_where_the_cart_is():
     state = torch.zeros(1, 10, 4)
     state[..., 0] = 7.0
     assert PAPER_CARTPOLE(state, torch.zeros(1, 10, 1), torch.zeros(1, 4)).tolist() == [0.0]
+
+
+def least(cost):
+    """Eigenvalues of the cart-pole, linearised upright, under the first action of the plan that costs least."""
+    world = World(CartPole())
+    rest, still = torch.zeros(1, 4, dtype=torch.float64), torch.zeros(1, 10, 1, dtype=torch.float64)
+
+    def planned(now, plan):
+        at, states = world.start(now), []
+        for k in range(10):
+            at = world.step(at, plan[:, k])
+            states.append(at.state)
+        return cost(torch.stack(states, 1), plan, now).sum()
+
+    (_, mixed), (_, second) = torch.autograd.functional.hessian(planned, (rest, still))
+    second, mixed = second.reshape(10, 10), mixed.reshape(4, 10)
+    gain = -torch.linalg.solve(second, mixed.T)[:1]
+    moves = torch.autograd.functional.jacobian(lambda s, a: world.step(world.start(s), a).state[0], (rest, still[:, 0]))
+    return torch.linalg.eigvals(moves[0][:, 0] + moves[1][:, 0] @ gain).abs()
+
+
+def test_only_where_the_end_of_the_plan_weighs_more_is_the_cart_drawn_back_to_the_middle():
+    """What the swing-up's settings rest on."""
+    near, far = (1.0, 3.0, 10.0, 1.0), (20.0, 3.0, 10.0, 1.0)
+    assert float(least(Cost(near)).max()) == pytest.approx(1.0014, abs=1e-4)
+    assert float(least(Cost(far)).max()) == pytest.approx(1.0232, abs=1e-4)
+    assert float(least(SettlingCost(near, end=9.0)).max()) == pytest.approx(0.9964, abs=1e-4)
+    assert float(least(SettlingCost(far, end=9.0)).max()) == pytest.approx(0.9288, abs=1e-4)
+
+
+def test_the_end_of_a_plan_costs_as_much_again():
+    generator = torch.Generator().manual_seed(3)
+    states, actions = torch.randn(2, 10, 4, generator=generator), torch.randn(2, 10, 1, generator=generator)
+    now, weights = torch.randn(2, 4, generator=generator), (2.0, 0.5, 3.0, 0.0)
+    more = SettlingCost(weights, end=3.0)(states, actions, now) - Cost(weights)(states, actions, now)
+    wanted = [3 * sum(w * float(s) ** 2 for w, s in zip(weights, row, strict=True)) for row in states[:, -1]]
+    assert more.tolist() == pytest.approx(wanted, rel=1e-4)

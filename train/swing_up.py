@@ -7,7 +7,12 @@ is within 10 degrees of upright, to either side, at every step after the first 1
 the source is a sample, 20,000 in all; plans are imagined in the source's equations and cost none. Each seed trains
 its own policy and is scored on 100 episodes, integrated at 1 ms by another method.
 
-Writes results/swing_up.csv. Interrupt it anywhere; started again, it goes on.
+Writes results/swing_up.csv, and, of the first seed's policy from four starts side by side,
+
+    runs/swing_up/film.mp4    the whole episodes
+    assets/swing_up.png       a still of it
+
+Interrupt it anywhere; started again, it goes on.
 """
 
 from __future__ import annotations
@@ -23,13 +28,16 @@ import torch
 import tyro
 from torch import Tensor
 
-from visadapt.learning.cost import Cost
+from visadapt.checkpoints import load_network
+from visadapt.console import reporting
+from visadapt.learning.cost import SettlingCost
 from visadapt.learning.policy import TuneSettings, learnt
 from visadapt.learning.tasks import SwingUp, within_a_turn
 from visadapt.policies import StatePolicy
 from visadapt.results import Row, write_rows
 from visadapt.rollout import run
 from visadapt.runs import once, open_run
+from visadapt.swing_film import SwingPanel, write_swing_film, write_swing_still
 from visadapt.systems import CartPole
 from visadapt.targets import Observation, Start, SyntheticTarget
 from visadapt.world import World
@@ -39,16 +47,20 @@ STEPS, SWING = 300, 100
 """of an episode, and how many of them may pass before the pole is up"""
 UP = math.radians(10)
 SCORE_SEED = 2026
+POLICY = "policy.safetensors"
 ANYWHERE = (0.5, 0.5, math.pi, 1.0)
 """half-widths of the uniform distribution of the first state"""
 TASK = SwingUp(
-    Cost(state=(1.0, 3.0, 10.0, 1.0)),
+    SettlingCost(state=(20.0, 3.0, 10.0, 1.0), end=9.0),
     start_spread=ANYWHERE,
     kick=(0.0, 0.0, 0.0, 0.0),
     diverged=(8.0, 30.0, 1e9, 40.0),
     first_divergence=1.0,
 )
-STREAMS, EVERY = 16, 4
+"""The paper's weights (A.1.3), x and the end of the plan apart. Without `end` no weight on x draws the cart back: the
+linearised cart-pole under the 10-step plan that costs least has an eigenvalue of 1.0014 a step with a weight of 1, and
+1.023 with 20; with `end`, 0.9964 and 0.929."""
+STREAMS, EVERY = 16, 8
 LEARN = TuneSettings(
     TASK,
     iterations=EVERY * SAMPLES // STREAMS,
@@ -71,6 +83,25 @@ class Settings:
     """seeds at once, one core each"""
     work: Path = Path("runs/swing_up")
     out: Path = Path("results/swing_up.csv")
+    still: Path = Path("assets/swing_up.png")
+
+
+FILMED = {
+    "Hanging": (0.0, 0.0, math.pi, 0.0),
+    "Hanging, turning": (0.3, 0.0, math.pi - 0.5, 1.0),
+    "Level, to the left": (0.0, 0.0, -math.pi / 2, 0.0),
+    "60\N{DEGREE SIGN} to the right, 0.5 m off": (0.5, 0.0, math.pi / 3, 0.0),
+}
+"""first states of the episodes in the film"""
+STILL = 1.0
+"""s, when the film's still is taken"""
+
+
+class Filmed(Start):
+    """The starts of the film, in their order."""
+
+    def draw(self, batch: int, generator: torch.Generator) -> Tensor:
+        return torch.tensor(list(FILMED.values()))[:batch]
 
 
 @dataclass(frozen=True)
@@ -120,6 +151,22 @@ def main(settings: Settings) -> None:
     for row in rows:
         print(f"{row.measure:48} {row.mean:.3f} +- {row.std:.3f} {row.unit}")
     print(f"{succeeded} of {settings.seeds * settings.episodes} episodes succeeded")
+    film(settings)
+
+
+def film(settings: Settings) -> None:
+    """Film the first seed's policy."""
+    policy = StatePolicy(n_state=4)
+    load_network(settings.work / "seed-0" / POLICY, policy)
+    target = SyntheticTarget(start=Filmed(), angle_limit=math.inf)
+    runs = run(target, policy.eval(), see, len(FILMED), STEPS, torch.Generator())
+    panels = [SwingPanel(title, each) for title, each in zip(FILMED, runs, strict=True)]
+    due = SWING * target.period
+    write_swing_still(settings.still, panels, STILL, due)
+    with reporting() as report:
+        path = settings.work / "film.mp4"
+        write_swing_film(path, panels, due, lambda done, total: report("film", done, total, float("nan")))
+    print(f"{path} and {settings.still} are written")
 
 
 def _seed(settings: Settings, seed: int) -> Score:
@@ -130,7 +177,7 @@ def _seed(settings: Settings, seed: int) -> Score:
     policy = StatePolicy(n_state=4)
     generator = torch.Generator().manual_seed(seed)
     about = {"seed": seed, "samples": SAMPLES}
-    learnt(folder / "policy.safetensors", policy, World(CartPole()), _states, LEARN, generator, about)
+    learnt(folder / POLICY, policy, World(CartPole()), _states, LEARN, generator, about)
     return Score(**once(folder / "score.json", lambda: asdict(score(policy, settings.episodes))))
 
 

@@ -29,6 +29,22 @@ class Cost:
         return tracking + self.action * actions.square().sum((1, 2))
 
 
+@dataclass(frozen=True)
+class SettlingCost(Cost):
+    """As `Cost`, and the last planned state (the reference is at the goal there) costs as much again, `end` times.
+
+    What a plan that ends after K steps leaves behind is else free: near upright, drawing the cart back begins with a
+    step away from the goal, so that a plan too short to gain from it runs away instead, the faster the more x weighs.
+    """
+
+    end: float = 0.0
+
+    def __call__(self, states: Tensor, actions: Tensor, now: Tensor) -> Tensor:
+        weights = torch.tensor(self.state, device=now.device, dtype=now.dtype)
+        settled = (weights * states[:, -1].square()).sum(1)
+        return super().__call__(states, actions, now) + self.end * settled
+
+
 PAPER_CARTPOLE = Cost(state=(0.0, 3.0, 10.0, 1.0))
 """A.1.3: angle 10, cart velocity 3, angular velocity 1; the cart may be anywhere."""
 
