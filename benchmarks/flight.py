@@ -4,8 +4,9 @@
 
 The quadrotor follows random references, the fixed wing flies through a point 50 m ahead. Each has one source policy
 (assets/, from train.flight_policies), and each seed adapts it: to a drag of 0.3 1/s with a residual that sees one
-state, to 2 cos(t + phase) N along x, a phase for each flight, with a residual that sees five. Scored on 100 flights
-that were not trained on, as it stands after every round.
+state, to 2 cos(t + phase) N, a phase for each flight, with a residual that sees five; that force acts along x on the
+quadrotor, and across the way ahead, along y, on the wing (A.2.1). Scored on 100 flights that were not trained on, as it
+stands after every round.
 
 Writes results/flight.csv, and two pictures: assets/curve_flight.png, the misses over the samples, and
 assets/alternation.png, the losses of the first seed of the quadrotor under drag (the paper's figure 5). Interrupt it
@@ -24,6 +25,7 @@ from pathlib import Path
 
 import torch
 import tyro
+from torch import Tensor
 
 from train.flight_policies import made
 from train.scoring import curves
@@ -35,7 +37,7 @@ from visadapt.plots import Panel, plot_losses, plot_panels
 from visadapt.policies import FlightPolicy, Policy
 from visadapt.results import miss_row, read_rows, write_rows
 from visadapt.runs import open_run
-from visadapt.systems import FixedWing, Quadrotor, RigidBody
+from visadapt.systems import FixedWing, Quadrotor, RigidBody, System
 from visadapt.targets.synthetic import DrawEffects, no_effects
 
 DRAG = 0.3
@@ -122,6 +124,16 @@ def _draw(settings: Settings) -> None:
         plot_losses(settings.assets / "alternation.png", curves(adapted))
 
 
+class SidePush(PeriodicForce):
+    """A push along y that comes and goes."""
+
+    name = "side_push"
+    systems = (RigidBody,)
+
+    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+        return super().load(time, state, system).roll(1, -1)
+
+
 def vehicle(experiment: Experiment, references: Path) -> Flight:
     """The vehicle of an experiment, and its courses."""
     return made(experiment.vehicle.name, references)
@@ -135,7 +147,8 @@ def hidden(experiment: Experiment, mass: float) -> DrawEffects:
 
     def force(batch: int, generator: torch.Generator) -> Sequence[Effect]:
         phase = math.pi * (2 * torch.rand(batch, generator=generator) - 1)
-        return (PeriodicForce(amplitude=2.0, frequency=1 / (2 * math.pi), phase=phase, offset=0.0),)
+        kind = SidePush if experiment.vehicle is FixedWing else PeriodicForce
+        return (kind(amplitude=2.0, frequency=1 / (2 * math.pi), phase=phase, offset=0.0),)
 
     return drag if experiment.hidden == "drag" else force
 

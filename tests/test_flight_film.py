@@ -47,7 +47,9 @@ def following(
     state = np.zeros((rows, 13))
     state[:, 0], state[:, 3], state[:, 6] = SPEED * time, SPEED, 1.0
     state[:, :3] += aside
-    run = Run(Episode(time, np.zeros((rows, 4)), state), survived, np.full(rows, other.pop("force", 0.0)))
+    run = Run(
+        Episode(time, np.zeros((rows, 4)), state), survived, np.tile(other.pop("force", (0.0, 0.0, 0.0)), (rows, 1))
+    )
     return FlownPanel("a flight", run, Quadrotor(), course, torch.tensor([0, 0]), **other)
 
 
@@ -157,8 +159,8 @@ def test_the_error_is_drawn_from_the_reference_to_the_vehicle(aside: tuple[float
 
 def test_a_hidden_force_is_drawn_towards_where_it_pushes():
     columns = []
-    for force in (2.0, -2.0):
-        panel = following(force=force)
+    for newtons in (2.0, -2.0):
+        panel = following(force=(newtons, 0.0, 0.0))
         scene = flight_still([panel], 0.5)[60:420, 28:508].astype(int)
         violet = np.abs(scene - VIOLET).max(-1) < 30
         assert violet.sum() > 150

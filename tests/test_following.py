@@ -4,18 +4,21 @@ import math
 import pytest
 import torch
 
-from tests.flying import PERIOD, seeded, straight, waves
+from tests.flying import PERIOD, drag, seeded, straight, waves
 from tests.scenes import stir
 from visadapt.courses import AlongReferences, ToTarget
 from visadapt.effects import LinearDrag, Residual
-from visadapt.history import History
+from visadapt.history import LENGTH, History
 from visadapt.learning.following import Follow, FollowCost, Reach
 from visadapt.learning.policy import TuneSettings, imagine, tune
 from visadapt.learning.streams import Streams, StreamSettings
+from visadapt.learning.windows import Windows
 from visadapt.networks import FlightResidualNetwork
 from visadapt.policies import HORIZON, FollowPolicy, ReachPolicy
+from visadapt.rollout import run, see_goals
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
+from visadapt.targets.flight import FlightTarget
 from visadapt.world import World
 
 ROWS = 31
@@ -35,7 +38,7 @@ def reaching(**changes):
 
 def streams(task, world, batch, longest=1000, seed=0):
     made = Streams(world, task, identity, None, StreamSettings(batch, longest, 0.0))
-    made.start(seeded(seed))
+    made.start(0.0, seeded(seed))
     return made
 
 
@@ -227,6 +230,30 @@ class TestStreams:
         assert made.age.tolist() == [8, 0, 0, 8, 8]
         assert torch.equal(made.now.place[[0, 3, 4]], place[[0, 3, 4]])
         assert torch.equal(made.now.history.observations[:, -1, 13:], made.now.place)
+
+    def test_recorded_starts_go_on_from_where_the_flight_was_on_its_course_with_all_that_the_policy_was_shown(self):
+        task = following(first_divergence=1.0)
+        target = FlightTarget(task.course, Quadrotor(), PERIOD, drag(0.3))
+        torch.manual_seed(0)
+        flown = run(target, FollowPolicy(PERIOD), see_goals, 2, 12, seeded(4))
+        windows = Windows.cut([each.episode for each in flown], "state")
+        made = Streams(self.WORLD, task, identity, windows, StreamSettings(40, 1000, 1.0))
+        made.start(0.0, seeded(5))
+        seen = set()
+        for b in range(40):
+            row = int((windows.state == made.now.at.state[b]).all(1).nonzero()[0])
+            number, t = int(windows.episode[row]), row % 12
+            seen.add(row)
+            assert made.now.place[b].tolist() == [int(target.first[number, 0]), t]
+            assert torch.equal(made.now.history.actions[b], windows.past_actions[row])
+            for back in range(LENGTH):
+                shown = made.now.history.observations[b, LENGTH - 1 - back]
+                earlier = max(t - back, 0)
+                assert torch.equal(shown[:13], windows.state[row - t + earlier])
+                assert torch.equal(
+                    shown[13:], task.course.goal(target.first[number : number + 1] + torch.tensor([0, earlier]))[0]
+                )
+        assert len(seen) > 12
 
     def test_tuned_along_references_the_cost_of_a_plan_falls(self):
         torch.manual_seed(0)

@@ -88,6 +88,15 @@ class TestOnStates:
         wanted = np.sqrt(np.mean((windows.next_state - stepped).numpy() ** 2, 0))
         np.testing.assert_allclose(residual.scale.numpy(), wanted, rtol=1e-4, atol=1e-8)
 
+    def test_a_gap_that_is_nought_but_rounding_is_not_heard_beside_the_others(self):
+        """Under a thousandth of what a state changes by, the unit is that thousandth."""
+        residual = Residual(StateResidualNetwork(4), torch.ones(4))
+        windows = Windows.cut(recorded(1), "state")
+        right = World(CartPole(), [ConstantForce(force=NEWTONS)]).requires_grad_(False)
+        rescale(residual, right, windows)
+        change = np.sqrt(np.mean((windows.next_state - windows.state).numpy() ** 2, 0))
+        np.testing.assert_allclose(residual.scale.numpy(), 1e-3 * change, rtol=1e-4)
+
     def test_a_source_that_is_right_leaves_numbers_finite_and_corrections_nought(self):
         residual = Residual(StateResidualNetwork(4), torch.ones(4))
         right = World(CartPole(), [ConstantForce(force=NEWTONS)]).requires_grad_(False)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -72,6 +74,15 @@ class TestAlignment:
             assert torch.equal(found.observations, lived.observations)
             assert torch.equal(found.actions, lived.actions)
             lived = lived.acting(action[t : t + 1]).observing(state[t + 1 : t + 2])
+
+    def test_places_are_those_of_the_rows_that_it_shows_and_none_where_there_are_none(self):
+        placed = [replace(each, place=np.stack([each.time, -each.time], 1)) for each in TWO]
+        windows = Windows.cut(placed, "state")
+        assert windows.place.shape == (len(windows), LENGTH, 2)
+        for row in (0, 3, 6):
+            first = [max(row - back, 0) for back in range(LENGTH - 1, -1, -1)]
+            np.testing.assert_array_equal(windows.place[row, :, 0], TWO[0].time[first])
+        assert Windows.cut(TWO, "state").place.shape == (len(windows), LENGTH, 0)
 
     def test_the_action_of_the_last_row_was_not_executed_and_is_nowhere(self):
         windows = Windows.cut(TWO, "state")

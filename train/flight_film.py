@@ -47,7 +47,7 @@ class Settings:
 
     vehicle: Literal["quadrotor", "fixed_wing"] = "quadrotor"
     experiment: Literal["drag", "force"] = "drag"
-    """hidden in the target: a drag of 0.3 1/s, or 2 cos(t + phase) N along x"""
+    """hidden in the target: a drag of 0.3 1/s, or 2 cos(t + phase) N, along x or, on the wing, along y"""
     seed: int = 0
     """of the adaptation"""
     flight: int = 12

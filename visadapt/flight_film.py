@@ -17,7 +17,7 @@ import numpy as np
 from visadapt.canvas import BLUE, INK, MUTED, TEAL, Canvas, Picture
 from visadapt.flight_views import EARLIER, VIOLET, Scales, draw_box, draw_close_up, draw_overview
 from visadapt.flown import FINE, FlownPanel
-from visadapt.gauges import Plot, banner, bar, ceiling, headline, reading, signed
+from visadapt.gauges import Plot, banner, bar, ceiling, headline, reading
 from visadapt.scene import Floats
 from visadapt.video import GUTTER, MARGIN, write_frames, write_picture
 
@@ -126,15 +126,14 @@ def _draw_verdict(canvas: Canvas, panel: FlownPanel, i: int, scales: Scales) -> 
 
 
 def _draw_readings(canvas: Canvas, panel: FlownPanel, i: int, scales: Scales) -> None:
-    force = float(panel.force[i])
+    force = float(np.linalg.norm(panel.force[i]))
     far, so_far = _split(panel.away[i]), _split(panel.scored(i))
     names = ("off the reference", "mean so far") if panel.follows else ("to the target", "nearest so far")
     reading(canvas, 0, "speed", f"{panel.speed[i]:.2f}", "m/s")
     reading(canvas, 0.22 * WIDTH, names[0], *far)
     open_still = not panel.follows and panel.times[i] < panel.passed
     reading(canvas, 0.5 * WIDTH, names[1], *so_far, INK if open_still else scales.colour(panel.scored(i)))
-    known = abs(force) >= 0.005
-    reading(canvas, 0.755 * WIDTH, "hidden force, x", signed(force, 2), "N", VIOLET if known else MUTED)
+    reading(canvas, 0.755 * WIDTH, "hidden force", f"{force:.2f}", "N", VIOLET if force >= 0.005 else MUTED)
 
 
 def _draw_commands(canvas: Canvas, panel: FlownPanel, i: int) -> None:

@@ -12,7 +12,7 @@ from visadapt.airframes import draw_vehicle, outline
 from visadapt.canvas import BLUE, HAIRLINE, INK, MUTED, RED, TEAL, TROUGH, Canvas, Colour, text_width
 from visadapt.flights import FAR
 from visadapt.flown import FINE, FlownPanel
-from visadapt.gauges import ceiling, signed
+from visadapt.gauges import ceiling
 from visadapt.scene import Floats, Pen, PinholeCamera, blend, dropped
 from visadapt.systems import Quadrotor
 
@@ -61,7 +61,7 @@ class Scales:
             max(max(panel.end for panel in panels), FINE),
             far,
             min(max(1.2 * max(well), 0.1), FAR),
-            max(*(float(np.abs(panel.force).max()) for panel in panels), 0.1),
+            max(*(float(np.linalg.norm(panel.force, axis=1).max()) for panel in panels), 0.1),
             float(np.floor((low - clearance) / step) * step),
         )
 
@@ -208,7 +208,7 @@ def _draw_target(pen: Pen, panel: FlownPanel, i: int, scales: Scales) -> None:
 
 
 def _draw_forces(pen: Pen, panel: FlownPanel, i: int, scales: Scales) -> None:
-    """Thrust, as it is commanded, and the hidden force along x."""
+    """Thrust, as it is commanded, and the hidden force."""
     command, vehicle, turned = float(panel.command(i)[0]), panel.vehicle, panel.attitude[i]
     last = panel.row(i) == len(panel.run.episode.time) - 1
     if isinstance(vehicle, Quadrotor):
@@ -220,9 +220,9 @@ def _draw_forces(pen: Pen, panel: FlownPanel, i: int, scales: Scales) -> None:
     place = panel.position[i]
     if not last:
         pen.arrow(place + tail * way, unit * thrust * way, BLUE, f"thrust {thrust:.1f} N")
-    force = float(panel.force[i])
-    length = (0.45 if panel.follows else 1.2) * force / scales.force
-    pen.arrow(place, np.array([length, 0.0, 0.0]), VIOLET, f"{signed(force, 2)} N")
+    force = panel.force[i]
+    longest = 0.45 if panel.follows else 1.2
+    pen.arrow(place, longest / scales.force * force, VIOLET, f"{np.linalg.norm(force):.2f} N")
 
 
 def _near(points: Floats) -> Floats:

@@ -31,6 +31,9 @@ from visadapt.targets import FlightTarget
 from visadapt.targets.synthetic import DrawEffects, no_effects
 from visadapt.world import World
 
+RECORDED = 0.8
+"""share of the streams that start as a recorded flight went, past and all, where the residual reads the past"""
+
 
 @dataclass(frozen=True)
 class FlightSettings:
@@ -134,7 +137,17 @@ class Flight:
         network = FlightResidualNetwork(self.system, self.source.period, predict)
         residual = Residual(network, torch.ones(len(self.system.states)))
         settings = AdaptSettings(
-            TuneSettings(self.task, own.iterations, own.batch, own.rate, own.longest, observation_noise=0.0),
+            TuneSettings(
+                self.task,
+                own.iterations,
+                own.batch,
+                own.rate,
+                own.longest,
+                curriculum=False,
+                # A stream that begins without a past meets no force that changes, or one that its residual makes up.
+                recorded=RECORDED if with_history else 0.0,
+                observation_noise=0.0,
+            ),
             own.ground,
             budget,
             round_samples,

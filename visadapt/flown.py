@@ -122,8 +122,10 @@ class FlownPanel:
 
     @cached_property
     def force(self) -> Floats:
-        """(N,) N, along x"""
-        return self._between(self.run.force[: len(self.states)].clip(-LIMIT, LIMIT))
+        """(N, 3) N"""
+        told = self.run.force[: len(self.states)]
+        known = told if told.ndim == 2 else np.zeros((len(told), 3))  # of a target that does not tell
+        return self._between(known.clip(-LIMIT, LIMIT))
 
     def command(self, instant: int) -> Floats:
         """(4,), held from a row to the next"""

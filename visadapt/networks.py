@@ -18,6 +18,9 @@ FEATURES = 128
 CHANGE_GAIN = 2.0
 EXPECTED = 2.0
 """m/s2 and rad/s2: unexplained accelerations are given to a residual's head in units of this"""
+FELT = 0.2
+"""m/s2 and rad/s2: the same, of vehicles. Small, so that ridge regression trusts a rule by which the unexplained goes
+on, from its past, before velocities and attitudes that happened to go with it."""
 Predict = Callable[[Tensor, Tensor], Tensor]
 """States and actions to the states a period later."""
 KINEMATICS = 2 * LENGTH
@@ -108,6 +111,10 @@ class ResidualNetwork(nn.Module):
     def embed(self, history: History) -> Tensor:
         """What the head reads, (B, inputs)."""
         raise NotImplementedError
+
+    def informed(self, seen: Tensor) -> Tensor:
+        """(B,) whether what the head reads (B, inputs) can tell what moves the target: it is fitted to these alone."""
+        return seen.new_ones(len(seen), dtype=torch.bool)
 
     def forward(self, history: History) -> Tensor:
         """Corrections (B, n_state) in units of the residual's scale."""
@@ -227,13 +234,26 @@ class FlightResidualNetwork(ResidualNetwork):
             return own
         return torch.cat((own, self.unexplained(self.predict, states, history.actions)), 1)
 
+    def informed(self, seen: Tensor) -> Tensor:
+        """All but the first of a flight, whose past is not whole: a rule learnt from them holds nowhere else."""
+        if self.predict is None:
+            return super().informed(seen)
+        past = seen[:, -6 * (LENGTH - 1) :].unflatten(1, (LENGTH - 1, 6))
+        return past.diff(dim=1).any(2).all(1)
+
     def unexplained(self, predict: Predict, states: Tensor, actions: Tensor) -> Tensor:
         """Changes of velocity and rates beyond the source's over the periods between states, (B, 6 (LENGTH - 1)).
 
-        In units of EXPECTED times a period. Before a flight begins its first state stands still, which says nothing.
+        In units of FELT times a period. Before a flight begins its first state stands still, which says nothing:
+        there stands what the first period of the flight said.
         """
         before, after = states[:, :-1].flatten(0, 1), states[:, 1:].flatten(0, 1)
         left = after - predict(before, actions[:, :-1].flatten(0, 1))
-        moving = torch.cat((left[:, VELOCITY], left[:, RATES]), 1) / (EXPECTED * self.period)
+        moving = torch.cat((left[:, VELOCITY], left[:, RATES]), 1) / (FELT * self.period)
         known = (after != before).any(1, keepdim=True)
-        return (moving * known).unflatten(0, (len(states), LENGTH - 1)).flatten(1)
+        periods = (len(states), LENGTH - 1)
+        found, told = moving.unflatten(0, periods).unbind(1), known.unflatten(0, periods).unbind(1)
+        past = [found[-1] * told[-1]]
+        for change, is_known in zip(found[-2::-1], told[-2::-1], strict=True):
+            past.append(torch.where(is_known, change, past[-1]))
+        return torch.cat(past[::-1], 1)

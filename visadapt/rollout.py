@@ -44,7 +44,7 @@ class Run:
     episode: Episode
     survived: bool
     force: np.ndarray
-    """(T,) the disturbance in N as the target tells it, zeros where it does not: for films only"""
+    """(T,), or of vehicles (T, 3), the disturbance in N as the target tells it, zeros where it does not: for films"""
 
 
 @torch.no_grad()
@@ -104,11 +104,15 @@ def _cut(rows: list[tuple[Observation, Tensor]], b: int, length: int, survived: 
     frames = None
     if kept[0][0].frame is not None:
         frames = np.stack([seen.frame[b].numpy() for seen, _ in kept if seen.frame is not None])
+    place = None
+    if kept[0][0].place is not None:
+        place = np.stack([seen.place[b].double().numpy() for seen, _ in kept if seen.place is not None])
     episode = Episode(
         time=np.arange(len(kept)) * period,
         action=action,
         state=np.stack([seen.state[b].numpy() for seen, _ in kept]),
         frame=frames,
+        place=place,
     )
-    force = np.array([0.0 if seen.force is None else float(seen.force[b]) for seen, _ in kept])
+    force = np.array([0.0 if seen.force is None else seen.force[b].numpy() for seen, _ in kept])
     return Run(episode, survived, force)

@@ -23,6 +23,8 @@ from visadapt.world import World
 NAMED_STEPS = 8
 NUDGE = 1e-3
 """Iterations of the fit of named effects, and its finite difference as a share of a parameter's range."""
+NEGLIGIBLE = 1e-3
+"""of a state's change in a period"""
 
 
 @dataclass(frozen=True)
@@ -108,8 +110,14 @@ def _one_step_errors(
 
 
 def rescale(residual: Residual, source: World, windows: Windows) -> None:
-    """Make the root mean square of the gap, state by state, the unit of the residual's corrections."""
-    residual.scale.copy_(gap(source, windows).square().mean(0).sqrt().clamp(min=1e-9))
+    """Make the root mean square of the gap, state by state, the unit of the residual's corrections.
+
+    A gap under NEGLIGIBLE of what a state changes by in a period is that of integrators and rounding: in units of its
+    own it would be heard as loudly as the others, and far off what was recorded more loudly.
+    """
+    missing = gap(source, windows).square().mean(0).sqrt()
+    change = (windows.next_state - windows.state).square().mean(0).sqrt()
+    residual.scale.copy_(torch.maximum(missing, NEGLIGIBLE * change).clamp(min=1e-9))
 
 
 def ground(
@@ -126,7 +134,10 @@ def ground(
     if not isinstance(network, ResidualNetwork):
         raise TypeError(f"grounding fits the head of a ResidualNetwork, not a {type(network).__name__}")
     seen = _embed(network, windows)
-    train, held_out = split(len(windows), settings.held_out, generator)
+    informed = network.informed(seen)
+    if bool(informed.any()):
+        seen, target = seen[informed], target[informed]
+    train, held_out = split(len(seen), settings.held_out, generator)
     if isinstance(network.head, nn.Linear):
         return _solve(network.head, seen, target, train, held_out, settings)
     return _descend(network.head, seen, target, train, held_out, settings, generator, progress)

@@ -47,6 +47,8 @@ class TuneSettings:
     all of these, so that much is learnt from few steps"""
     every: int = 1
     """iterations for each step of the streams"""
+    curriculum: bool = True
+    """whether streams start and stray less far at first; not for a policy that does its task already"""
     recorded: float = 0.0
     """share of the starts that are recorded windows of the target, histories and all"""
     observation_noise: float = 0.01
@@ -101,7 +103,7 @@ def tune(
         streams.now, streams.age = Scene.of(kept["now"]), kept["age"]
         past = Scene.of(kept["past"]) if "past" in kept else None
     else:
-        streams.start(generator)
+        streams.start(0.0 if settings.curriculum else 1.0, generator)
     policy.train()
     for iteration in range(len(losses), settings.iterations):
         scene = streams.now
@@ -120,7 +122,7 @@ def tune(
         nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
         optimiser.step()
         schedule.step()
-        done = iteration / settings.iterations
+        done = iteration / settings.iterations if settings.curriculum else 1.0
         if past is None:
             streams.advance(first, plan[:, 0].detach(), done, generator)
         elif (iteration + 1) % settings.every == 0:

@@ -83,9 +83,9 @@ class Streams:
         return self.task.show(self.observe(state), place)
 
     @torch.no_grad()
-    def start(self, generator: torch.Generator) -> None:
+    def start(self, progress: float, generator: torch.Generator) -> None:
         """Start all streams, at random ages, so that they do not end together."""
-        self.now = self._fresh(0.0, generator)
+        self.now = self._fresh(progress, generator)
         self.age = torch.randint(self.settings.longest, (self.settings.count,), generator=generator)
 
     @torch.no_grad()
@@ -106,11 +106,16 @@ class Streams:
         state, place = self.task.begin(count, progress, generator)
         history = History.start(self.show(state, place), len(self.world.system.actions))
         if windows is not None and recorded > 0:
+            places = windows.place.to(place)
             # A fall on record is beyond delta_div; starting from it would drown what can be learnt.
-            near = (~self.task.astray(windows.state, place, progress)).nonzero()[:, 0]
+            near = (~self.task.astray(windows.state, places[:, -1], progress)).nonzero()[:, 0]
             if len(near):
                 from_record = torch.rand(count, generator=generator) < recorded
                 rows = near[torch.randint(len(near), (count,), generator=generator)]
                 state = torch.where(from_record[:, None], windows.state[rows], state)
-                history = windows.history(rows).where(from_record, history)
+                past = windows.history(rows)
+                shown = self.task.show(past.observations.flatten(0, 1), places[rows].flatten(0, 1))
+                past = History(shown.unflatten(0, past.observations.shape[:2]), past.actions)
+                history = past.where(from_record, history)
+                place = torch.where(from_record[:, None], places[rows, -1], place)
         return Scene(self.world.start(state), history, place)

@@ -40,6 +40,8 @@ class Windows:
     """(N, n_state) s_{t+1}"""
     episode: Tensor
     """(N,) number of the episode"""
+    place: Tensor
+    """(N, LENGTH, n_place) where the rows that it shows were on their course; of width 0 where there is none"""
 
     @classmethod
     def cut(cls, episodes: Sequence[Episode], source: str, observe: Observe | None = None) -> Windows:
@@ -61,6 +63,7 @@ class Windows:
             action = torch.as_tensor(episode.action, dtype=dtype)
             observations.append(_seen(episode, number, state, source, observe))
             count = episode.samples
+            place = torch.zeros(len(state), 0) if episode.place is None else torch.as_tensor(episode.place)
             back = torch.arange(-LENGTH + 1, 1) + torch.arange(count)[:, None]
             padded = torch.cat((torch.zeros(LENGTH, action.shape[1], dtype=dtype), action))
             parts.append(
@@ -71,6 +74,7 @@ class Windows:
                     state[:count],
                     state[1 : count + 1],
                     torch.full((count,), number),
+                    place[back.clamp(min=0)],
                 )
             )
             first += len(state)

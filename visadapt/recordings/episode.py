@@ -32,11 +32,13 @@ class Episode:
     """(T, n_state), SI units"""
     frame: NDArray[np.uint8] | None = None
     """(T, H, W)"""
+    place: NDArray[np.floating] | None = None
+    """(T, n_place) where it was on its course, in the course's own numbers: policies are trained on from there"""
 
     def __post_init__(self) -> None:
         if self.state is None and self.frame is None:
             raise RecordingError("an episode needs states or frames")
-        for name, axes in (("time", 1), ("action", 2), ("state", 2), ("frame", 3)):
+        for name, axes in (("time", 1), ("action", 2), ("state", 2), ("frame", 3), ("place", 2)):
             values = getattr(self, name)
             if values is not None:
                 self._check(name, values, axes)

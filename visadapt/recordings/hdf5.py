@@ -1,10 +1,11 @@
-"""Recordings as HDF5: one group for each episode, and in it the datasets time, action, state and frame.
+"""Recordings as HDF5: one group for each episode, and in it the datasets time, action, state, frame and place.
 
     /                       attributes format, version, state_names (optional), action_names (optional)
     /episode_00000/time     (T,) s, floating point
     /episode_00000/action   (T, n_action), floating point
     /episode_00000/state    (T, n_state), floating point; state, frame, or both
     /episode_00000/frame    (T, H, W) uint8, gzip
+    /episode_00000/place    (T, n_place) floating point, where the target has a course
 
 All datasets carry a checksum (Fletcher-32), so that damaged bytes are an error and not data.
 """
@@ -107,7 +108,7 @@ def _group_name(number: int) -> str:
 
 
 def _write_episode(group: h5py.Group, episode: Episode) -> None:
-    for name in ("time", "action", "state"):
+    for name in ("time", "action", "state", "place"):
         values = getattr(episode, name)
         if values is not None:
             group.create_dataset(name, data=values, fletcher32=True)
@@ -137,7 +138,8 @@ def _read_episode(path: Path, file: h5py.File, number: int, frames: bool) -> Epi
     if state is None and not frames:
         raise RecordingError(f"{where} holds frames alone; states are needed")
     try:
-        return Episode(time, action, state, _read(where, group, "frame") if frames else None)
+        frame = _read(where, group, "frame") if frames else None
+        return Episode(time, action, state, frame, _read(where, group, "place"))
     except ValueError as error:
         raise RecordingError(f"{where}: {error}") from error
 
@@ -158,7 +160,7 @@ def _check_alike(path: Path, episodes: Sequence[Episode]) -> None:
     """All episodes hold the same things, of the same width."""
     if not episodes:
         raise RecordingError(f"{path}: a recording needs at least one episode")
-    for name in ("action", "state", "frame"):
+    for name in ("action", "state", "frame", "place"):
         first = _row_shape(getattr(episodes[0], name))
         for number, episode in enumerate(episodes):
             shape = _row_shape(getattr(episode, name))

@@ -24,9 +24,11 @@ class Observation:
     frame: Tensor | None = None
     """(B, H, W) uint8"""
     force: Tensor | None = None
-    """(B,) the disturbance in N, where the target knows it: for films only"""
+    """(B,), or of vehicles (B, 3), the disturbance in N, where the target knows it: for films only"""
     goal: Tensor | None = None
     """(B, n_goal) what the policy is to do, where that is not always the same"""
+    place: Tensor | None = None
+    """(B, n_place) where each is on its course, where there is one: the task's and the course's own numbers"""
 
 
 class Target(ABC):

@@ -74,6 +74,7 @@ class FlightTarget(Target):
         return Observation(
             measured,
             alive=state.isfinite().all(1) & (self.course.off(state, self._place) <= self.reach),
-            force=world.load(self._at)[:, 0],
+            force=world.load(self._at)[:, :3],
             goal=self.course.goal(self._place),
+            place=self._place,
         )

@@ -153,7 +153,8 @@ class RotorpyTarget(FlightTarget):
     def _observation(self) -> Observation:
         own = self._state
         state = torch.cat((own["x"], own["v"], own["q"].roll(1, 1), own["w"]), 1).to(torch.get_default_dtype())
-        return Observation(state, alive=state.isfinite().all(1), goal=self.course.goal(self._place))
+        alive = state.isfinite().all(1)
+        return Observation(state, alive, goal=self.course.goal(self._place), place=self._place)
 
 
 def _import(module: str, *needs: str) -> Any:
