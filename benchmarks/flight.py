@@ -5,10 +5,12 @@
 The quadrotor follows random references, the fixed wing flies through a point 50 m ahead. Each has one source policy
 (assets/, from train.flight_policies), and each seed adapts it: to a drag of 0.3 1/s with a residual that sees one
 state, to 2 cos(t + phase) N, a phase for each flight, with a residual that sees five; that force acts along x on the
-quadrotor, and across the way ahead, along y, on the wing (A.2.1). Scored on 100 flights
-that were not trained on, as it stands after every round.
+quadrotor, and across the way ahead, along y, on the wing (A.2.1). Scored on 100 flights that were not trained on, as it
+stands after every round.
 
-Writes results/flight.csv. Interrupt it anywhere; started again, it goes on.
+Writes results/flight.csv, and two pictures: assets/curve_flight.png, the misses over the samples, and
+assets/alternation.png, the losses of the first seed of the quadrotor under drag (the paper's figure 5). Interrupt it
+anywhere; started again, it goes on.
 """
 
 from __future__ import annotations
@@ -26,12 +28,14 @@ import tyro
 from torch import Tensor
 
 from train.flight_policies import made
+from train.scoring import curves
 from visadapt.console import Report
 from visadapt.effects import Effect, LinearDrag, PeriodicForce
 from visadapt.flights import Flight, FlightScore, kept_score
 from visadapt.learning.joint import Adapted
-from visadapt.policies import FlightPolicy
-from visadapt.results import miss_row, write_rows
+from visadapt.plots import Panel, plot_losses, plot_panels
+from visadapt.policies import FlightPolicy, Policy
+from visadapt.results import miss_row, read_rows, write_rows
 from visadapt.runs import open_run
 from visadapt.systems import FixedWing, Quadrotor, RigidBody, System
 from visadapt.targets.synthetic import DrawEffects, no_effects
@@ -60,6 +64,8 @@ EXPERIMENTS = {
     "quadrotor, 2 cos t": Experiment(Quadrotor, "force", 1000, 200),
     "fixed wing, 2 cos t": Experiment(FixedWing, "force", 2000, 400),
 }
+ALTERNATION = "quadrotor, drag"
+"""whose losses are drawn"""
 
 
 @dataclass(frozen=True)
@@ -99,8 +105,23 @@ def main(settings: Settings) -> None:
                 own = [each[key] for each in scores]
                 rows.append(miss_row(name, kind.name, OURS, "adapted", int(key), MEASURES[kind], own))
     write_rows(settings.out, rows)
+    _draw(settings)
     for row in rows:
         print(f"{row.experiment:20} {row.domain:8} {row.samples:5} samples  {row.mean:.4f} +- {row.std:.4f} m")
+
+
+def _draw(settings: Settings) -> None:
+    """The table's curves; and the losses of an adaptation, where it is one of those that were run."""
+    rows = read_rows(settings.out)
+    panels = []
+    for name in settings.experiments:
+        own = [row for row in rows if row["experiment"] == name]
+        panels.append(Panel(name, f"{MEASURES[EXPERIMENTS[name].vehicle]}, m", own))
+    plot_panels(settings.assets / "curve_flight.png", panels, columns=min(2, len(panels)))
+    if ALTERNATION in settings.experiments:
+        flight = vehicle(EXPERIMENTS[ALTERNATION], settings.references)
+        adapted = adapt(flight, ALTERNATION, settings.work, _source_policy(settings, flight), seed=0)
+        plot_losses(settings.assets / "alternation.png", curves(adapted))
 
 
 class SidePush(PeriodicForce):
@@ -137,8 +158,7 @@ def _scores(settings: Settings, name: str, seed: int) -> dict[str, FlightScore]:
     torch.set_num_threads(1)
     experiment = EXPERIMENTS[name]
     flight = vehicle(experiment, settings.references)
-    folder = _folder(settings.work, name, seed)
-    open_run(folder, {"seed": seed, "flights": settings.flights, **_plain(experiment), **asdict(flight.settings)})
+    folder = opened(flight, name, settings.work, seed, settings.flights)
     draw = hidden(experiment, float(flight.system.mass))
     policy = _source_policy(settings, flight)
     adapting = copy.deepcopy(policy)
@@ -154,20 +174,39 @@ def _scores(settings: Settings, name: str, seed: int) -> dict[str, FlightScore]:
     return found
 
 
+def opened(flight: Flight, name: str, work: Path, seed: int, flights: int) -> Path:
+    """The folder under `work` of a seed of the experiment `name`, whose policies are scored on `flights`."""
+    folder = _folder(work, name, seed)
+    own = {**asdict(EXPERIMENTS[name]), "vehicle": flight.system.name}
+    open_run(folder, {"seed": seed, "flights": flights, **own, **asdict(flight.settings)})
+    return folder
+
+
 def adapt(
-    flight: Flight, name: str, work: Path, policy: FlightPolicy, seed: int, report: Report | None = None
+    flight: Flight,
+    name: str,
+    work: Path,
+    policy: FlightPolicy,
+    seed: int,
+    report: Report | None = None,
+    explorer: Policy | None = None,
+    reach: float = math.inf,
 ) -> Adapted:
-    """Adapt `policy`, in place, to the target of the experiment `name`, going on from what is in `work`."""
+    """Adapt `policy`, in place, to the target of the experiment `name`, going on from what is in `work`.
+
+    With an `explorer` it is that policy that collects the data, in flights that end `reach` m off their course.
+    """
     experiment = EXPERIMENTS[name]
     return flight.adapt(
         policy,
-        flight.target(hidden(experiment, float(flight.system.mass)), test=False),
+        flight.target(hidden(experiment, float(flight.system.mass)), test=False, reach=reach),
         _folder(work, name, seed),
         experiment.budget,
         experiment.round_samples,
         seed,
         with_history=experiment.hidden == "force",
         report=report,
+        explorer=explorer,
     )
 
 
@@ -177,10 +216,6 @@ def _folder(work: Path, name: str, seed: int) -> Path:
 
 def _source_policy(settings: Settings, flight: Flight) -> FlightPolicy:
     return flight.pretrain(settings.assets / f"{flight.system.name}.safetensors", 0)
-
-
-def _plain(experiment: Experiment) -> dict[str, object]:
-    return {**asdict(experiment), "vehicle": experiment.vehicle.name}
 
 
 if __name__ == "__main__":

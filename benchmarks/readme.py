@@ -104,6 +104,22 @@ def residual(rows: Rows) -> list[list[str]]:
     )
 
 
+def collection(rows: Rows) -> list[list[str]]:
+    """Who collects: the mismatch in mm/s and the misses in mm, before, after the first and after the last round."""
+    own = [row for row in rows if row["experiment"].endswith(", data collection")]
+    table = [["drag 0.3 1/s", "delta in mm/s: before", "first round", "last", "off in mm: before", "first", "last"]]
+    for system, method in dict.fromkeys((row["system"], row["method"]) for row in own if row["domain"] == "adapted"):
+        line = [f"{system.replace('_', ' ')}, {method}"]
+        for unit in ("m/s", "m"):
+            told = [row for row in own if (row["system"], row["unit"]) == (system, unit)]
+            after = sorted((row for row in told if row["method"] == method), key=lambda row: int(row["samples"]))
+            for row in (*(row for row in told if row["domain"] == "target"), after[0], after[-1]):
+                samples = f" ({int(row['samples']):,})" if int(row["samples"]) else ""
+                line.append(f"{1000 * float(row['mean']):.2f} ± {1000 * float(row['std']):.2f}{samples}")
+        table.append(line)
+    return table
+
+
 def named(rows: Rows) -> list[list[str]]:
     """Named effects beside the residual, from very few samples, in m."""
     return _by_samples(
@@ -241,6 +257,7 @@ TABLES: dict[str, Callable[[Rows], list[list[str]]]] = {
     "pendulum": pendulum,
     "vehicles": vehicles,
     "residual": residual,
+    "collection": collection,
     "named": named,
     "rotorpy": rotorpy,
     "loops": loops,

@@ -70,6 +70,12 @@ class TestAlongReferences:
         wanted[0], wanted[1, 7] = 0.5, 2.0
         torch.testing.assert_close(course.misses(states, place), wanted)
 
+    def test_it_is_as_far_off_as_from_the_row_that_is_due_and_beyond_the_end_from_the_last(self, course):
+        state = course.on(torch.tensor([2, 5]), torch.tensor([7, ROWS - 1]))
+        state[:, POSITION] += torch.tensor([[0.0, 3.0, 4.0], [0.0, 0.0, -2.0]])
+        away = course.off(state, torch.tensor([[2, 7], [5, ROWS + 3]]))
+        torch.testing.assert_close(away, torch.tensor([5.0, 2.0]))
+
     def test_double_precision_stays_double(self):
         course = AlongReferences(waves(3, dtype=torch.float64))
         state, place = course.start(3, seeded())
@@ -112,6 +118,12 @@ class TestToTarget:
     def test_a_miss_is_the_least_distance_of_the_path_between_rows_too(self, points, miss):
         found = self.course.misses(flown(*points), self.target)
         torch.testing.assert_close(found, torch.tensor([[miss]]), rtol=1e-5, atol=2e-6)
+
+    def test_it_is_as_far_off_as_from_the_line_through_the_point_behind_it_too(self):
+        states = torch.zeros(3, 13)
+        states[:, POSITION] = torch.tensor([[5.0, 0.0, 0.0], [3.0, 4.0, 1.5], [60.0, 80.0, -6.0]])
+        away = ToTarget(0.05).off(states, torch.tensor([[30.0, 40.0, 0.0]]).expand(3, 3))
+        torch.testing.assert_close(away, torch.tensor([4.0, 1.5, 6.0]))
 
     def test_each_flight_has_its_own_target(self):
         states = flown((0.0, 0.0, 0.0), (100.0, 0.0, 0.0)).repeat(2, 1, 1)

@@ -4,12 +4,12 @@ import pytest
 import torch
 from torch import nn
 
-from tests.flying import PERIOD, drag, seeded, small_flight, waves
+from tests.flying import PERIOD, drag, seeded, small_flight, straight, waves
 from visadapt.checkpoints import CheckpointError
 from visadapt.courses import AlongReferences, ToTarget
 from visadapt.effects import ConstantForce
 from visadapt.flights import FAR, Training, fixed_wing, score
-from visadapt.policies import HORIZON, FollowPolicy, Policy
+from visadapt.policies import HORIZON, FollowPolicy, Policy, Wander
 from visadapt.rollout import run, see_goals
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION, VELOCITY
@@ -111,6 +111,16 @@ class TestTarget:
         action[1] = math.nan
         assert target.step(action).alive.tolist() == [True, False, True]
 
+    def test_given_a_reach_a_flight_ends_where_it_is_further_off(self):
+        course = AlongReferences(straight(rows=21))
+        near, far = (FlightTarget(course, Quadrotor(), PERIOD, push(6.0), reach=reach) for reach in (1.0, math.inf))
+        ended, whole = (run(target, Still(), see_goals, 2, 20, seeded()) for target in (near, far))
+        for one, other, which in zip(ended, whole, near.first[:, 0], strict=True):
+            away = torch.from_numpy(other.episode.state[:, POSITION]) - course.references.positions[which]
+            assert one.episode.samples == int((away.norm(dim=1) > 1.0).int().argmax())
+            assert not one.survived
+            assert other.survived
+
     def test_a_step_before_a_reset_is_an_error(self):
         with pytest.raises(TargetError, match="synthetic vehicle: step before reset"):
             a_target().step(torch.zeros(1, 4))
@@ -167,14 +177,16 @@ BRIEF = Training(4, 1e-3, batch=8)
 SMALL = {"source": BRIEF, "tuning": BRIEF, "recovering": BRIEF, "longest": 10}
 
 
-def adapted(folder, with_history=False, report=None, stops_at=None, draw=None):
+def adapted(folder, with_history=False, report=None, stops_at=None, draw=None, explorer=None):
     """30 samples in two rounds, in flights of at most 10."""
     flight = small_flight(rows=11, **SMALL)
     torch.manual_seed(0)
     policy = FollowPolicy(PERIOD)
     target = Counted(flight.train, Quadrotor(), PERIOD, draw or drag(0.3))
     target.stops_at = stops_at
-    found = flight.adapt(policy, target, folder, 30, 18, seed=1, with_history=with_history, report=report)
+    found = flight.adapt(
+        policy, target, folder, 30, 18, seed=1, with_history=with_history, report=report, explorer=explorer
+    )
     return policy, found, target
 
 
@@ -229,6 +241,15 @@ class TestAdapt:
         assert not torch.equal(policy.state_dict()["first.weight"], last["first.weight"])
         found.restore(policy, 30)
         assert torch.equal(policy.state_dict()["first.weight"], last["first.weight"])
+
+    def test_another_policy_may_collect_what_this_one_is_tuned_with(self, whole, tmp_path):
+        rest = torch.tensor([0.5, -0.2, 0.0, 0.3])
+        policy, found, target = adapted(tmp_path, explorer=Wander(13, rest, keep=0.5))
+        assert found.ledger.used == target.steps == 30
+        done = torch.cat([torch.from_numpy(each.action[: each.samples]) for each in found.episodes])
+        torch.testing.assert_close(done.mean(0), rest, rtol=0, atol=0.06)
+        assert [len(each.policy) for each in found.rounds] == [4, 4]
+        assert not torch.equal(policy.state_dict()["first.weight"], whole[0].state_dict()["first.weight"])
 
     def test_a_folder_of_a_residual_without_history_is_refused_with_one(self, whole):
         with pytest.raises(CheckpointError, match=r"round-01/residual\.safetensors: made for another architecture"):

@@ -4,7 +4,7 @@ import torch
 
 from tests.scenes import image_residual_network, observing, small_renderer, state_residual_network
 from visadapt.effects import ConstantForce, QuadraticDrag, Residual, ViscousFriction
-from visadapt.learning.grounding import GroundSettings, fit_named, gap, ground, rescale, split
+from visadapt.learning.grounding import GroundSettings, fit_named, gap, ground, left_over, rescale, split
 from visadapt.learning.windows import Windows
 from visadapt.networks import StateResidualNetwork
 from visadapt.recordings import Episode
@@ -70,6 +70,14 @@ class TestOnStates:
         np.testing.assert_allclose(gap(source, windows).numpy()[0], upright[1], atol=1e-6)
         pushed = World(CartPole(), [ConstantForce(force=NEWTONS)], integrator="euler").requires_grad_(False)
         np.testing.assert_allclose(gap(pushed, windows).numpy(), 0.0, atol=1e-6)
+
+    def test_what_is_left_over_is_the_error_of_a_world_with_the_residual(self):
+        windows = Windows.cut(recorded(0), "state")
+        residual = Residual(state_residual_network(False), torch.ones(4))
+        fit(residual, SOURCE, windows, GroundSettings(steps=50), torch.Generator().manual_seed(0))
+        left = left_over(residual, SOURCE, windows)
+        torch.testing.assert_close(left, gap_left(windows, residual), rtol=1e-4, atol=1e-6)
+        assert left.square().mean() < gap(SOURCE, windows).square().mean()
 
     def test_the_scale_is_the_root_mean_square_of_the_gap(self):
         residual = Residual(StateResidualNetwork(4), torch.ones(4))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from visadapt.plots import Round, plot_curve, plot_losses
+from visadapt.plots import Panel, Round, plot_curve, plot_losses, plot_panels
 
 
 def make_round(samples: int) -> Round:
@@ -36,6 +36,7 @@ def is_a_picture(path: Path) -> bool:
         [make_round(200)],
         [{"samples": 50, "grounding": [], "policy": [(0, 1.0)]}],
         [{"samples": 50, "grounding": [(0, 0.0, None)], "policy": [(0, float("nan"))]}],
+        [{"samples": 50, "grounding": [(0, 1.0, 1.2), (1, 0.1, 0.3)], "policy": [(i, 1.0) for i in range(50)]}] * 3,
     ],
 )
 def test_losses_are_plotted_whatever_a_round_lacks(tmp_path: Path, rounds: list[Round]):
@@ -53,11 +54,23 @@ def test_the_curve_takes_the_rows_of_a_table(tmp_path: Path, unadapted: str, fai
     assert is_a_picture(tmp_path / "curve.png")
 
 
+@pytest.mark.parametrize("columns", [1, 2])
+def test_panels_take_the_rows_of_a_table_failed_and_missing_ones_too(tmp_path: Path, columns: int):
+    wide = [make_row("adapted", n, mean) for n, mean in ((1000, 0.1), (50, "0.01"), (200, "inf"))]
+    other = [make_row("target", n, 0.3) | {"method": "another", "std": ""} for n in (50, 200, 1000)]
+    before = [make_row("target", 0, "nan"), make_row("source", 0, 0.06)]
+    panels = [Panel("left", "miss, m", [*before, *wide, *other]), Panel("right", "error, m/s", wide)]
+    plot_panels(tmp_path / "panels.png", panels, columns)
+    assert is_a_picture(tmp_path / "panels.png")
+
+
 def test_nothing_to_plot_is_said(tmp_path: Path):
     with pytest.raises(ValueError, match="no rounds"):
         plot_losses(tmp_path / "a.png", [])
     with pytest.raises(ValueError, match="no rows"):
         plot_curve(tmp_path / "a.png", [make_row("source", 0, 0.1)])
+    with pytest.raises(ValueError, match="no rows"):
+        plot_panels(tmp_path / "a.png", [Panel("left", "miss, m", [make_row("source", 0, 0.1)])])
     assert not list(tmp_path.iterdir())
 
 

@@ -13,7 +13,7 @@ from tests.scenes import (
 )
 from visadapt.effects import Residual
 from visadapt.history import LENGTH, History
-from visadapt.policies import HORIZON, ImagePolicy, StatePolicy
+from visadapt.policies import HORIZON, ImagePolicy, StatePolicy, Wander
 
 KINDS = ["image", "state", "history"]
 
@@ -139,3 +139,35 @@ class TestListening:
 def test_frames_of_another_size_are_refused():
     with pytest.raises(ValueError, match=r"frames of \(20, 24\) \(height, width\), got \(20, 23\)"):
         made("image")(History(torch.zeros(1, LENGTH, HEIGHT, WIDTH - 1), torch.zeros(1, LENGTH, 1)))
+
+
+class TestWander:
+    """Commands about 0.4 and -0.2 that keep 0.9 of what noise makes of them, as `rollout.run` adds it."""
+
+    rest = torch.tensor([0.4, -0.2])
+
+    def walked(self, steps, noise):
+        policy, generator = Wander(4, self.rest, keep=0.9), torch.Generator().manual_seed(0)
+        history = History.start(torch.zeros(500, 4), 2)
+        done = []
+        for _ in range(steps):
+            done.append(policy.act(history) + noise * torch.randn(500, 2, generator=generator))
+            history = history.acting(done[-1]).observing(torch.zeros(500, 4))
+        return torch.stack(done, 1)
+
+    def test_without_noise_it_rests(self):
+        torch.testing.assert_close(self.walked(4, 0.0), self.rest.expand(500, 4, 2))
+
+    def test_what_noise_brings_lasts_and_is_forgotten(self):
+        away = self.walked(60, 0.05) - self.rest
+        assert away.mean((0, 1)).abs().max() < 0.01
+        spread = 0.05 / (1 - 0.9**2) ** 0.5
+        torch.testing.assert_close(away[:, -1].std(0), torch.full((2,), spread), rtol=0.1, atol=0)
+        for later, kept in ((1, 0.9), (7, 0.9**7)):
+            together = (away[:, 30] * away[:, 30 + later]).mean(0) / away[:, 30].square().mean(0)
+            torch.testing.assert_close(together, torch.full((2,), kept), rtol=0, atol=0.12)
+
+    def test_a_plan_goes_back_to_rest(self):
+        history = History.start(torch.zeros(1, 4), 2).acting(self.rest[None] + 0.5)
+        plan = Wander(4, self.rest, keep=0.9)(history)
+        torch.testing.assert_close(plan[0, :, 1] + 0.2, 0.5 * 0.9 ** torch.arange(1, HORIZON + 1))

@@ -32,6 +32,10 @@ class Course(ABC):
     def misses(self, states: Tensor, place: Tensor) -> Tensor:
         """How far flights (B, steps + 1, 13) from a start at `place` were off, in m: (B, any); their mean counts."""
 
+    @abstractmethod
+    def off(self, states: Tensor, place: Tensor) -> Tensor:
+        """How far vehicles in states (B, 13) are from where, or from the line on which, they should be, in m (B,)."""
+
     def onward(self, place: Tensor) -> Tensor:
         """The places a step later."""
         return place
@@ -62,6 +66,10 @@ class AlongReferences(Course):
     def misses(self, states: Tensor, place: Tensor) -> Tensor:
         """The distance to the reference at every row but the first (the paper's average tracking error)."""
         return (states[..., POSITION] - self.references.positions[place[:, 0]]).norm(dim=-1)[:, 1:]
+
+    def off(self, states: Tensor, place: Tensor) -> Tensor:
+        rows = place[:, 1].clamp(max=self.last)
+        return (states[:, POSITION] - self.references.positions[place[:, 0], rows]).norm(dim=-1)
 
     def on(self, which: Tensor, row: Tensor) -> Tensor:
         """The quadrotor's states (B, 13) on the references `which` (B,) at rows (B,)."""
@@ -111,3 +119,9 @@ class ToTarget(Course):
         to = place[:, None] - start
         share = ((to * way).sum(-1) / way.square().sum(-1).clamp(min=1e-12)).clamp(0, 1)
         return (to - share[..., None] * way).norm(dim=-1).amin(1, keepdim=True)
+
+    def off(self, states: Tensor, place: Tensor) -> Tensor:
+        """The distance to the line from the start through the point."""
+        along = place / place.norm(dim=-1, keepdim=True)
+        flown = states[:, POSITION]
+        return (flown - (flown * along).sum(-1, keepdim=True) * along).norm(dim=-1)

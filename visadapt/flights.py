@@ -92,9 +92,15 @@ class Flight:
         self.policy = policy
         self.settings = settings
 
-    def target(self, draw_effects: DrawEffects = no_effects, test: bool = True) -> FlightTarget:
-        """The vehicle with hidden effects, on the courses to be scored on, or else on those to train on."""
-        return FlightTarget(self.test if test else self.train, self.system, self.source.period, draw_effects)
+    def target(
+        self, draw_effects: DrawEffects = no_effects, test: bool = True, reach: float = math.inf
+    ) -> FlightTarget:
+        """The vehicle with hidden effects, on the courses to be scored on, or else on those to train on.
+
+        A flight ends `reach` m off its course.
+        """
+        course = self.test if test else self.train
+        return FlightTarget(course, self.system, self.source.period, draw_effects, reach=reach)
 
     def pretrain(self, path: Path, seed: int, report: Report | None = None) -> FlightPolicy:
         """The policy of the source, trained there or read from `path`."""
@@ -124,6 +130,7 @@ class Flight:
         with_history: bool = False,
         named: Sequence[Effect] = (),
         report: Report | None = None,
+        explorer: Policy | None = None,
     ) -> Adapted:
         """Adapt `policy`, in place, to `target` with at most `budget` counted samples: Algorithm 1 in `folder`.
 
@@ -131,6 +138,7 @@ class Flight:
             with_history: whether the residual also reads what was left unexplained over the last periods, in which
                 a force that changes shows.
             named: effects that are guessed to act, with any parameters: these are fitted, beside the residual.
+            explorer: collects the data in place of `policy`.
         """
         torch.manual_seed(seed)
         own = self.settings
@@ -159,7 +167,8 @@ class Flight:
             feedforward=False,
             seed=seed,
         )
-        return adapt(policy, residual, source, target, _states, see_goals, settings, folder, report=report)
+        args = (policy, residual, source, target, _states, see_goals, settings, folder)
+        return adapt(*args, report=report, explorer=explorer)
 
 
 def quadrotor(train: AlongReferences, test: AlongReferences, system: Quadrotor | None = None) -> Flight:

@@ -1,10 +1,11 @@
-"""Pictures of numbers: the losses of the joint loop, and the cart's speed over the samples that were counted."""
+"""Pictures of numbers: the losses of the joint loop, and what was measured over the samples that were counted."""
 
 from __future__ import annotations
 
 import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, TypedDict
 
 import numpy as np
@@ -34,13 +35,17 @@ class Round(TypedDict):
 def plot_losses(path: str | os.PathLike[str], rounds: Sequence[Round]) -> None:
     """Both losses over the iterations of the joint loop, in the order in which they were run.
 
-    A round grounds the simulator first, then tunes the policy, so the two curves take turns.
+    A round grounds the simulator first, then tunes the policy, so the two curves take turns. A linear residual is
+    solved for: its loss falls in one step, drawn straight down to a dot.
     """
     if not rounds:
         raise ValueError("no rounds to plot")
     figure = Figure(figsize=(9.0, 5.4), dpi=150, layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
     start = 0.0
+    whole = sum(
+        _span([row[0] for row in each["grounding"]]) + _span([row[0] for row in each["policy"]]) for each in rounds
+    )
     for i, each in enumerate(rounds):
         first = i == 0
         for axes in (upper, lower):
@@ -57,7 +62,12 @@ def plot_losses(path: str | os.PathLike[str], rounds: Sequence[Round]) -> None:
         for column, colour, name in ((1, BLUE, "training data"), (2, ORANGE, "held out")):
             points = np.array([_floats(row[0], row[column]) for row in each["grounding"]]).reshape(-1, 2)
             label = name if first else None
-            upper.plot(start + points[:, 0], points[:, 1], color=colour, linewidth=1.4, label=label)
+            solved = len(points) == 2
+            if solved:  # beside each other, or one would hide the other
+                points[:, 0] = 0.008 * column * whole
+            dot = "o" if solved else None
+            x = start + points[:, 0]
+            upper.plot(x, points[:, 1], color=colour, linewidth=1.4, label=label, marker=dot, ms=4, markevery=[-1])
         start += _span([row[0] for row in each["grounding"]])
         points = np.array([_floats(*row) for row in each["policy"]]).reshape(-1, 2)
         lower.plot(start + points[:, 0], points[:, 1], color=TEAL, linewidth=1.4)
@@ -113,6 +123,62 @@ def plot_curve(
     axes.set_ylim(0, axes.get_ylim()[1] * 1.15)
     axes.legend(frameon=False, fontsize=9, loc="best")
     _save(figure, path)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One measure over counted samples."""
+
+    title: str
+    label: str
+    """of the measure, with its unit"""
+    rows: Sequence[Mapping[str, Any]]
+    """of a table under results/ (numbers may be strings): a line for each `method`, a band of `std` about its `mean`;
+    rows of no samples are levels, those of the `domain` target before adaptation, those of source for comparison"""
+
+
+def plot_panels(path: str | os.PathLike[str], panels: Sequence[Panel], columns: int = 1) -> None:
+    """Panels side by side, `columns` in a line, each logarithmic; a method has its colour in all of them."""
+    methods = dict.fromkeys(row["method"] for panel in panels for row in panel.rows if float(row["samples"]) > 0)
+    if not methods:
+        raise ValueError("no rows of counted samples to plot")
+    colours = {method: (TEAL, BLUE, INK)[k % 3] for k, method in enumerate(methods)}
+    lines = -(-len(panels) // columns)
+    figure = Figure(figsize=(4.8 * max(columns, 1.5), 0.6 + 3.0 * lines), dpi=150, layout="constrained")
+    grid = figure.subplots(lines, columns, squeeze=False)
+    for axes, panel in zip(grid.flat, panels, strict=True):
+        _draw_panel(axes, panel, colours)
+    told = {name: line for axes in grid.flat for line, name in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(told.values(), told, loc="outside lower center", ncols=len(told), frameon=False, fontsize=9)
+    _save(figure, path)
+
+
+def _draw_panel(axes: Axes, panel: Panel, colours: Mapping[str, str]) -> None:
+    before = [row for row in panel.rows if float(row["samples"]) == 0]
+    for domain, said, colour in (("target", "before adaptation", ORANGE), ("source", "in the source", MUTED)):
+        for row in [row for row in before if row["domain"] == domain]:
+            _level(axes, _number(row["mean"]), said, colour)
+    bands = []
+    counted = sorted((row for row in panel.rows if float(row["samples"]) > 0), key=lambda row: float(row["samples"]))
+    for method, colour in colours.items():
+        rows = [row for row in counted if row["method"] == method]
+        samples, mean, std = (np.array([_number(row[key]) for row in rows]) for key in ("samples", "mean", "std"))
+        mean[~np.isfinite(mean)] = np.nan
+        axes.plot(samples, mean, color=colour, linewidth=2, marker="o", markersize=5, label=method)
+        bands.append((samples, mean - std, mean + std))
+    _scale(axes)
+    bottom = axes.get_ylim()[0]
+    for (samples, low, high), colour in zip(bands, colours.values(), strict=True):
+        low = np.where(low > 0, low, bottom)  # there is no zero on a logarithmic axis
+        axes.fill_between(samples, low, high, color=colour, alpha=0.16, linewidth=0)
+    ticks = sorted({float(row["samples"]) for row in counted})
+    if ticks[-1] > 10 * ticks[0]:
+        axes.set_xscale("log")
+    axes.set_xticks(ticks, [f"{tick:,.0f}" for tick in ticks])
+    axes.set_xticks([], minor=True)
+    axes.set_xlabel("counted target samples", color=INK)
+    _dress(axes, panel.label)
+    axes.set_title(panel.title, color=INK, fontsize=10)
 
 
 def _draw_method(axes: Axes, method: str, rows: Sequence[Mapping[str, Any]], colour: str, offset: float) -> None:

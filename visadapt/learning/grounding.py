@@ -61,6 +61,13 @@ def gap(world: World, windows: Windows) -> Tensor:
         return windows.next_state - world.step(world.start(windows.state), windows.action).state
 
 
+def left_over(residual: Residual, source: World, windows: Windows) -> Tensor:
+    """What the residual leaves of the gap (N, n_state)."""
+    every = torch.arange(len(windows))
+    with torch.no_grad():
+        return gap(source, windows) - residual.delta(windows.history(every).acting(windows.action))
+
+
 def fit_named(source: World, windows: Windows) -> None:
     """Fit the parameters of the source's own effects to all windows so far, in place: least squares of one step.
 

@@ -110,6 +110,7 @@ def adapt(
     folder: Path,
     label: Label | None = None,
     report: Report | None = None,
+    explorer: Policy | None = None,
 ) -> Adapted:
     """Run Algorithm 1 in `folder`, going on from what is there.
 
@@ -119,6 +120,7 @@ def adapt(
         observe: what a camera would show of a simulated state: the learnt renderer, or the identity.
         see: what the policy is shown of the target.
         label: estimates the states from what a camera saw; without it, the states that the target tells are used.
+        explorer: the policy that collects the target's data, in place of the one that is tuned (Algorithm 1).
 
     Raises:
         TargetError: the target misbehaves. BudgetExceeded: a step more than the budget.
@@ -134,7 +136,9 @@ def adapt(
         here = _weights(folder, number).parent
         name = f"round {number + 1}/{settings.rounds}"
         wanted = min(settings.round_samples, ledger.left)
-        new = _collected(here / "recording.h5", policy, target, see, wanted, settings, _generator(settings, number, 0))
+        collector = policy if explorer is None else explorer
+        drawn = _generator(settings, number, 0)
+        new = _collected(here / "recording.h5", collector, target, see, wanted, settings, drawn)
         for episode in new:
             ledger.count(f"{name}: data", episode.samples)
         episodes += new if label is None else label(new)
@@ -173,7 +177,7 @@ def _collected(
     settings: AdaptSettings,
     generator: torch.Generator,
 ) -> list[Episode]:
-    """Episodes of `wanted` samples under the current policy, one after the other as on a machine."""
+    """Episodes of `wanted` samples under `policy`, one after the other as on a machine."""
     if path.exists():
         return read_recording(path)
     episodes: list[Episode] = []

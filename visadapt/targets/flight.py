@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -15,13 +17,15 @@ from visadapt.world import World, WorldState
 class FlightTarget(Target):
     """A vehicle with hidden effects, integrated by another method and more finely (1 ms) than any source.
 
-    A flight ends with its course, or where its state is no longer finite; however far it strays, it goes on.
+    A flight ends with its course, or where its state is no longer finite; however far it strays, it goes on, unless it
+    is given a reach.
 
     Args:
         course: where flights start and what a policy is told.
         system: its physics.
         period: s between actions.
         draw_effects: draws the hidden effects of a batch of flights.
+        reach: m off its course beyond which a flight ends.
     """
 
     def __init__(
@@ -31,12 +35,14 @@ class FlightTarget(Target):
         period: float,
         draw_effects: DrawEffects = no_effects,
         name: str = "synthetic vehicle",
+        reach: float = math.inf,
     ) -> None:
         self.course = course
         self.system = system
         self.period = period
         self.draw_effects = draw_effects
         self.name = name
+        self.reach = reach
         self.n_action = len(system.actions)
         self.first: Tensor
         """places at which the flights started"""
@@ -64,9 +70,10 @@ class FlightTarget(Target):
 
     def _observe(self, world: World) -> Observation:
         measured, self._at = world.measure(self._at, self._generator)
+        state = self._at.state
         return Observation(
             measured,
-            alive=self._at.state.isfinite().all(1),
+            alive=state.isfinite().all(1) & (self.course.off(state, self._place) <= self.reach),
             force=world.load(self._at)[:, :3],
             goal=self.course.goal(self._place),
             place=self._place,

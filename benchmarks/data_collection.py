@@ -1,0 +1,201 @@
+"""Who is to collect the target's data (the paper's figures 2 and 6): the policy that is tuned, or a random one.
+
+    python -m benchmarks.data_collection
+
+The experiments of `benchmarks.flight`, whose own adaptations are those with data of the current policy: where they are
+kept, they are read. The random policy wanders about hover or level flight, on the same courses; a flight that it leads
+5 m off ends, and all its samples count. Nothing else differs. After every round 100 flights of the policy as it then
+stands, on courses that were not trained on and of which nothing was learnt, tell how far it misses, and the dynamics
+mismatch delta (equation 6): the mean norm of the error in velocity of one step of the simulator, residual and all.
+
+Writes results/data_collection.csv and assets/data_collection.png. Interrupt it anywhere; started again, it goes on.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+
+from benchmarks.flight import EXPERIMENTS, MEASURES, SCORE_SEED, adapt, hidden, opened, vehicle
+from visadapt.courses import ToTarget
+from visadapt.effects import Residual
+from visadapt.flights import Flight, FlightScore, kept_score
+from visadapt.learning.grounding import gap, left_over
+from visadapt.learning.windows import Windows
+from visadapt.plots import Panel, plot_panels
+from visadapt.policies import FlightPolicy, Policy, Wander
+from visadapt.results import Row, miss_row, read_rows, write_rows
+from visadapt.rollout import run, see_goals
+from visadapt.runs import once
+from visadapt.systems import FixedWing, Quadrotor
+from visadapt.systems.rigid_body import VELOCITY
+
+REACH = 5.0
+"""m off its course at which a flight of another policy than the current one ends"""
+LASTING = 1.0
+"""s after which a random command is forgotten, but for a share of 1/e"""
+MISMATCH = "dynamics mismatch in velocity"
+
+
+def random_policy(flight: Flight) -> Policy:
+    """Commands that wander about hover, or about level flight."""
+    if isinstance(flight.system, Quadrotor):
+        rest = torch.tensor([float(flight.system.hover()), 0.0, 0.0, 0.0])
+    else:
+        assert isinstance(flight.system, FixedWing)
+        rest = flight.system.trim(torch.tensor([ToTarget.speed]))[1][0]
+    return Wander(len(flight.system.states), rest, math.exp(-flight.source.period / LASTING))
+
+
+CURRENT = "data of the current policy"
+EXPLORERS: dict[str, Callable[[Flight], Policy]] = {"data of a random policy": random_policy}
+"""Who else may collect."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is run, and where."""
+
+    seeds: int = 3
+    experiments: tuple[str, ...] = ("quadrotor, drag", "fixed wing, drag")
+    """of benchmarks.flight"""
+    flights: int = 100
+    """that each policy is scored on"""
+    jobs: int = 2
+    """seeds at once, one core each"""
+    references: Path = Path("data/quadrotor_references.npz")
+    """made where it is not there"""
+    assets: Path = Path("assets")
+    current: Path = Path("runs/flight")
+    """where benchmarks.flight keeps its adaptations"""
+    work: Path = Path("runs/data_collection")
+    out: Path = Path("results/data_collection.csv")
+    picture: Path = Path("assets/data_collection.png")
+
+
+@dataclass(frozen=True)
+class Stand:
+    """How a policy, and the simulator that it was tuned in, do on flights in the target."""
+
+    score: FlightScore
+    mismatch: float
+    """m/s"""
+
+
+def main(settings: Settings) -> None:
+    """Run what is missing, then write the table."""
+    methods = (CURRENT, *EXPLORERS)
+    before = {name: _before(settings, name) for name in settings.experiments}  # and references are made, for the jobs
+    jobs = [(name, by, seed) for seed in range(settings.seeds) for name in settings.experiments for by in methods]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(settings.jobs, mp_context=context) as pool:
+        found = dict(zip(jobs, pool.map(_stands, [settings] * len(jobs), *zip(*jobs, strict=True)), strict=True))
+    rows = []
+    for name in settings.experiments:
+        rows += _rows(name, "unadapted", "target", 0, [before[name]])
+        for by in methods:
+            seeds = [found[name, by, seed] for seed in range(settings.seeds)]
+            for samples in seeds[0]:
+                rows += _rows(name, by, "adapted", samples, [each[samples] for each in seeds])
+    write_rows(settings.out, rows)
+    _draw(settings)
+    for row in rows:
+        spread = f"{row.mean:.5f} +- {row.std:.5f} {row.unit}"
+        print(f"{row.experiment:18} {row.method:26} {row.samples:5} samples  {row.measure:30} {spread}")
+
+
+def _draw(settings: Settings) -> None:
+    """Mismatch above, miss below, an experiment in each column."""
+    panels = {}
+    rows = read_rows(settings.out)
+    for name in settings.experiments:
+        for measure, unit in ((MISMATCH, "m/s"), (MEASURES[EXPERIMENTS[name].vehicle], "m")):
+            own = [row for row in rows if row["experiment"] == told(name) and row["measure"] == measure]
+            panels[measure == MISMATCH, name] = Panel(name, f"{measure}, {unit}", own)
+    ordered = [panels[first, name] for first in (True, False) for name in settings.experiments]
+    plot_panels(settings.picture, ordered, columns=len(settings.experiments))
+
+
+def told(name: str) -> str:
+    """What the table calls an experiment here."""
+    return f"{name}, data collection"
+
+
+def _rows(name: str, method: str, domain: str, samples: int, seeds: list[Stand]) -> list[Row]:
+    """What the seeds of a method missed by, and their mismatch with its spread over them."""
+    kind = EXPERIMENTS[name].vehicle
+    missed = miss_row(told(name), kind.name, method, domain, samples, MEASURES[kind], [each.score for each in seeds])
+    mismatches = [each.mismatch for each in seeds]
+    mismatch = Row(
+        experiment=told(name),
+        system=kind.name,
+        method=method,
+        domain=domain,
+        samples=samples,
+        measure=MISMATCH,
+        unit="m/s",
+        mean=round(float(np.mean(mismatches)), 6),
+        std=round(float(np.std(mismatches)), 6),
+        episodes=missed.episodes,
+        failed=missed.failed,
+        seeds=len(seeds),
+    )
+    return [missed, mismatch]
+
+
+def _before(settings: Settings, name: str) -> Stand:
+    """The policy of the source, in the target."""
+    flight = vehicle(EXPERIMENTS[name], settings.references)
+    folder = opened(flight, name, settings.current, 0, settings.flights)
+    return _stand(settings, flight, name, folder, "target", _source_policy(settings, flight))
+
+
+def _stands(settings: Settings, name: str, by: str, seed: int) -> dict[int, Stand]:
+    """One seed with data collected `by` one of the methods, by samples."""
+    torch.set_num_threads(1)
+    flight = vehicle(EXPERIMENTS[name], settings.references)
+    explorer = EXPLORERS[by](flight) if by in EXPLORERS else None
+    work = settings.current if explorer is None else settings.work / by.replace(" ", "-")
+    folder = opened(flight, name, work, seed, settings.flights)
+    policy = _source_policy(settings, flight)
+    adapted = adapt(flight, name, work, policy, seed, explorer=explorer, reach=math.inf if explorer is None else REACH)
+    found = {}
+    for samples in [each.samples for each in adapted.rounds]:
+        adapted.restore(policy, samples)
+        found[samples] = _stand(settings, flight, name, folder, str(samples), policy)
+    return found
+
+
+def _stand(settings: Settings, flight: Flight, name: str, folder: Path, key: str, policy: FlightPolicy) -> Stand:
+    """How `policy` stands, kept in `folder` under `key`."""
+    target = flight.target(hidden(EXPERIMENTS[name], float(flight.system.mass)))
+    found = kept_score(folder / f"{key}.json", target, policy, SCORE_SEED, settings.flights)
+
+    def mismatch() -> dict[str, float]:
+        generator = torch.Generator().manual_seed(SCORE_SEED)
+        flown = run(target, policy, see_goals, settings.flights, target.course.steps, generator, strict=False)
+        windows = Windows.cut([each.episode for each in flown], "state")
+        return {"mean": float(_error(policy.residual, flight, windows)[:, VELOCITY].norm(dim=1).mean())}
+
+    return Stand(found, once(folder / f"mismatch-{key}.json", mismatch)["mean"])
+
+
+def _error(residual: Residual | None, flight: Flight, windows: Windows) -> torch.Tensor:
+    """Of one step of the simulator (N, n_state)."""
+    return gap(flight.source, windows) if residual is None else left_over(residual, flight.source, windows)
+
+
+def _source_policy(settings: Settings, flight: Flight) -> FlightPolicy:
+    return flight.pretrain(settings.assets / f"{flight.system.name}.safetensors", 0)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings, description=__doc__))
