@@ -104,7 +104,8 @@ class World(nn.Module):
         self.integrator = integrator
         self.substeps = substeps
         self.effects = nn.ModuleList(effects)
-        self._actuation = sorted((e for e in effects if isinstance(e, ActuationEffect)), key=place_in_chain)
+        chain = sorted((e for e in effects if isinstance(e, ActuationEffect)), key=place_in_chain)
+        self._actuation = [effect.acting_on(system) for effect in chain]
         self._sensing = sorted((e for e in effects if isinstance(e, SensingEffect)), key=place_in_chain)
         self._dynamics = [effect for effect in effects if isinstance(effect, DynamicsEffect)]
         self._residuals = [effect for effect in effects if isinstance(effect, Residual)]

@@ -71,6 +71,9 @@ class Family:
                 out.append(made)
         return out
 
+    def _chain(self, theta: Tensor) -> list[ActuationEffect]:
+        return [effect.acting_on(self.system) for effect in self._made(ActuationEffect, theta)]
+
     def commands(self, theta: Tensor) -> Tensor:
         """(R, W, T, S, n_action) what acts over the substeps, for parameters (R, P)."""
         rows = self.rows
@@ -78,7 +81,7 @@ class Family:
         episodes, length, width = rows.command.shape
         commands = rows.command[None, :, :, None].expand(len(theta), -1, -1, self.substeps, -1)
         commands = commands.reshape(len(theta) * episodes, length * self.substeps, width)
-        for effect in self._made(ActuationEffect, theta.repeat_interleave(episodes, 0)):
+        for effect in self._chain(theta.repeat_interleave(episodes, 0)):
             commands, _ = effect.apply_to(commands, effect.memory(commands, h), h)
         commands = commands.reshape(len(theta), episodes, length, self.substeps, width)
         index = rows.first[:, None] + torch.arange(rows.shape[1])
@@ -92,7 +95,7 @@ class Family:
         """
         rows = self.rows
         h = rows.period / self.substeps
-        chain = self._made(ActuationEffect, theta)
+        chain = self._chain(theta)
         out = actions[..., None, None].expand(-1, -1, -1, self.substeps, -1).clone()
         if not chain:
             return out

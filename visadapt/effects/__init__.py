@@ -9,7 +9,7 @@ from visadapt.effects.actuation import (
     ActuatorLag,
     ActuatorSaturation,
 )
-from visadapt.effects.aerial import LinearDrag, PeriodicWind, Wind
+from visadapt.effects.aerial import LinearDrag, PeriodicWind, RotorDrag, TranslationalLift, Wind
 from visadapt.effects.base import (
     EFFECTS,
     ActuationEffect,
@@ -36,6 +36,7 @@ from visadapt.effects.vehicle import (
     CenterOfMassOffset,
     GroundEffect,
     Inertia,
+    MotorLag,
     Payload,
     RotorEfficiency,
     ThrustGain,
@@ -72,6 +73,7 @@ __all__ = [
     "LinearDrag",
     "Mass",
     "MeasurementDelay",
+    "MotorLag",
     "Parameter",
     "Payload",
     "PeriodicForce",
@@ -82,6 +84,7 @@ __all__ = [
     "PositionOffset",
     "QuadraticDrag",
     "Residual",
+    "RotorDrag",
     "RotorEfficiency",
     "SensingEffect",
     "SensorScale",
@@ -89,6 +92,7 @@ __all__ = [
     "Stage",
     "ThrustGain",
     "TrackTilt",
+    "TranslationalLift",
     "TrimOffset",
     "ViscousFriction",
     "Wind",

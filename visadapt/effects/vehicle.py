@@ -7,14 +7,17 @@ multiply, and masses and offsets add.
 
 from __future__ import annotations
 
-from typing import ClassVar
+import copy
+from typing import ClassVar, Self
 
+import torch
 from torch import Tensor
 
 from visadapt.effects.aerial import VEHICLES, Vehicle, expect_vehicle
-from visadapt.effects.base import DynamicsEffect, Parameter, expect, with_parameters
+from visadapt.effects.base import ActuationEffect, DynamicsEffect, Parameter, expect, with_parameters
 from visadapt.effects.parameters import ParameterScale
 from visadapt.systems import Quadrotor, System
+from visadapt.systems.rigid_body import beside
 
 
 def with_thrust(vehicle: Vehicle, factor: Tensor) -> Vehicle:
@@ -39,6 +42,63 @@ class ThrustGain(DynamicsEffect):
 
     def alter(self, system: System) -> System:
         return with_thrust(expect_vehicle(system, self), self.scale)
+
+
+class MotorLag(ActuationEffect):
+    """Motors whose thrusts follow what is asked of them as first-order systems do: thrust and torques lag alike.
+
+    An actuator_lag is on the way to the flight controller; this lag is inside its rate loop, whose error w_asked - w
+    the torque then follows late. What acts is the command a = w + d that turns a vehicle as much without lag, d being
+    the lagging torque by inertia and gain. The w in it is that of a vehicle which nothing else turns: what something
+    else turns it by, the loop undoes at once.
+    """
+
+    name = "motor_lag"
+    equation = "time_constant dT/dt = T_asked - T; time_constant dd/dt = w_asked - w - d, dw/dt = gain d; all from 0"
+    source = (
+        "Faessler, Falanga and Scaramuzza (2017), Thrust mixing, saturation, and body-rate control for accurate "
+        "aggressive quadrotor flight"
+    )
+    table = (Parameter("time_constant", "s", 0.0, 0.3, 0.0),)
+    systems = (Quadrotor,)
+
+    gains: tuple[float | Tensor, ...] = ()
+    """1/s, of the loop around each motor's command: the thrust has none"""
+
+    def acting_on(self, system: System) -> Self:
+        own = expect(system, Quadrotor, self)
+        bound = copy.copy(self)
+        bound.gains = (0.0, own.roll_gain, own.roll_gain, own.yaw_gain)
+        return bound
+
+    def memory(self, commands: Tensor, substep: float) -> Tensor:
+        """w and d (B, 2, n_action); of a thrust, w is 0."""
+        return torch.zeros_like(commands[:, :1]).repeat(1, 2, 1)
+
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
+        ratio = self.value("time_constant", commands) / substep
+        gain = substep * beside(self.gains or (0.0,) * commands.shape[2], commands)
+        # As in actuator_lag: with exp(-1000) the limit is exact, and nothing divides by 0.
+        rate, gain = torch.broadcast_tensors(ratio.clamp_min(1e-3).reciprocal()[..., None], gain)
+        # What is left after a substep of (command - w, d), and so of (w, d); and what a command of 1 brings.
+        left = torch.stack((torch.zeros_like(gain), -gain, rate, -rate), -1).unflatten(-1, (2, 2)).matrix_exp()
+        signs = left.new_tensor(((1.0, -1.0), (-1.0, 1.0)))
+        kept = (signs * left).expand(len(commands), -1, -1, -1)
+        brought = left[..., 0] * left.new_tensor((-1.0, 1.0)) + left.new_tensor((1.0, 0.0))
+        after = commands[..., None] * (brought if brought.dim() == 2 else brought[:, None])
+        start = after[:, :1] + (kept @ memory.movedim(1, 2)[..., None])[:, None, ..., 0]
+        after = torch.cat((start, after[:, 1:]), 1)
+        # All prefixes of a linear recurrence in log2(S) rounds.
+        reach = 1
+        while reach < commands.shape[1]:
+            late = (kept[:, None] @ after[:, :-reach, ..., None])[..., 0]
+            after = torch.cat((after[:, :reach], after[:, reach:] + late), 1)
+            kept = kept @ kept
+            reach *= 2
+        before = torch.cat((memory[:, 1:], after[:, :-1, :, 1]), 1)
+        ratio = ratio if ratio.dim() == 0 else ratio[:, None, None]
+        # The mean of w + d over a substep: time_constant (w + d - command) is what d' and w' leave of it.
+        return commands + ratio * (before - after[..., 1]), after[:, -1].movedim(2, 1)
 
 
 class BatterySag(DynamicsEffect):
