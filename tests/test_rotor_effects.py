@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from visadapt.effects import LinearDrag, MotorLag, RotorDrag, TranslationalLift, Wind
+from visadapt.effects import Inertia, LinearDrag, MotorLag, RateDamping, RotorDrag, TranslationalLift, Wind
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import ATTITUDE, from_angles
 from visadapt.world import World
@@ -61,13 +61,22 @@ class TestDragAndLift:
         assert carried == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
 
 
-def lagging(commands, period, tau, gain=16.6, fine=2000):
+def test_damping_leaves_of_a_rate_what_the_loop_s_gain_holds_against_it():
+    world = World(Quadrotor(), [RateDamping(rate_x=4.0, rate_y=0.0, rate_z=2.0)], 0.1, substeps=4).requires_grad_(False)
+    at = world.start(moving())
+    for _ in range(40):
+        at = world.step(at, torch.tensor([[0.0, 0.6, 0.6, 0.6]], dtype=torch.float64))
+    shares = (at.state[0, 10:] / 0.3).tolist()
+    assert shares == pytest.approx([16.6 / 20.6, 1.0, 5.0 / 7.0], rel=1e-4)
+
+
+def lagging(commands, period, tau, gain=16.6, damping=0.0, fine=2000):
     """A rate as a share of what 1 asks for, at the end of each period, by Euler's method in very small steps."""
     rate = torque = 0.0
     h, rates = period / fine, []
     for command in commands:
         for _ in range(fine):
-            rate, torque = rate + h * gain * torque, torque + h * (command - rate - torque) / tau
+            rate, torque = rate + h * (gain * torque - damping * rate), torque + h * (command - rate - torque) / tau
         rates.append(rate)
     return rates
 
@@ -84,6 +93,16 @@ class TestMotorLag:
             at = world.step(at, torch.tensor([[0.0, command, 0.0, 0.0]], dtype=torch.float64))
             rates.append(float(at.state[0, 10]) / 0.5)
         assert rates == pytest.approx(lagging(self.COMMANDS, 0.1, tau), abs=0.01)
+
+    def test_the_loop_that_lags_is_that_of_the_inertia_and_the_damping_that_there_are(self):
+        alike = {"scale_x": 2.0, "scale_y": 1.0, "scale_z": 1.0}
+        effects = [Inertia(**alike), RateDamping(rate_x=5.0, rate_y=0.0, rate_z=0.0), MotorLag(time_constant=0.05)]
+        world = World(Quadrotor(), effects, 0.1, substeps=40).requires_grad_(False)
+        at, rates = world.start(moving()), []
+        for command in self.COMMANDS:
+            at = world.step(at, torch.tensor([[0.0, command, 0.0, 0.0]], dtype=torch.float64))
+            rates.append(float(at.state[0, 10]) / 0.5)
+        assert rates == pytest.approx(lagging(self.COMMANDS, 0.1, 0.05, 16.6 / 2, 5.0 / 2), abs=0.01)
 
     def test_a_step_of_the_thrust_comes_late_by_the_time_constant(self):
         system, tau = Quadrotor(gravity=1e-9), 0.05

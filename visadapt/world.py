@@ -104,8 +104,7 @@ class World(nn.Module):
         self.integrator = integrator
         self.substeps = substeps
         self.effects = nn.ModuleList(effects)
-        chain = sorted((e for e in effects if isinstance(e, ActuationEffect)), key=place_in_chain)
-        self._actuation = [effect.acting_on(system) for effect in chain]
+        self._actuation = sorted((e for e in effects if isinstance(e, ActuationEffect)), key=place_in_chain)
         self._sensing = sorted((e for e in effects if isinstance(e, SensingEffect)), key=place_in_chain)
         self._dynamics = [effect for effect in effects if isinstance(effect, DynamicsEffect)]
         self._residuals = [effect for effect in effects if isinstance(effect, Residual)]
@@ -131,12 +130,12 @@ class World(nn.Module):
         """
         h = self.period / self.substeps
         commands = action.clamp(-1, 1)[:, None].expand(-1, self.substeps, -1)
+        system = self.altered(at.state)
         memory = []
         for effect, remembered in zip(self._actuation, at.memory, strict=False):
-            commands, remembered = effect.apply_to(commands, remembered, h)
+            commands, remembered = effect.acting_on(system).apply_to(commands, remembered, h)
             memory.append(remembered)
         integrate = INTEGRATORS[self.integrator]
-        system = self.altered(at.state)
         time, state = at.time, at.state
         for k in range(self.substeps):
             command = commands[:, k]

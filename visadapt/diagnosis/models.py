@@ -72,7 +72,11 @@ class Family:
         return out
 
     def _chain(self, theta: Tensor) -> list[ActuationEffect]:
-        return [effect.acting_on(self.system) for effect in self._made(ActuationEffect, theta)]
+        """The actuation effects with what they take from the system that the others have altered."""
+        system = self.system
+        for effect in self._made(DynamicsEffect, theta):
+            system = effect.alter(system)
+        return [effect.acting_on(system) for effect in self._made(ActuationEffect, theta)]
 
     def commands(self, theta: Tensor) -> Tensor:
         """(R, W, T, S, n_action) what acts over the substeps, for parameters (R, P)."""

@@ -38,6 +38,7 @@ from visadapt.effects.vehicle import (
     Inertia,
     MotorLag,
     Payload,
+    RateDamping,
     RotorEfficiency,
     ThrustGain,
 )
@@ -83,6 +84,7 @@ __all__ = [
     "PoleMass",
     "PositionOffset",
     "QuadraticDrag",
+    "RateDamping",
     "Residual",
     "RotorDrag",
     "RotorEfficiency",

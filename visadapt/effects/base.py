@@ -98,7 +98,7 @@ class ActuationEffect(Effect):
     stage = Stage.ACTUATION
 
     def acting_on(self, system: System) -> Self:
-        """The effect with what it takes from the system's parameters; itself, where it takes nothing."""
+        """The effect with what it takes from the altered system's parameters; itself, where it takes nothing."""
         return self
 
     def memory(self, commands: Tensor, substep: float) -> Tensor:
