@@ -11,7 +11,7 @@ from benchmarks.blind_flight_onestep import flight_candidates, read_flights
 from datasets.blind_flight_control import PERIODS
 from datasets.blind_flights import NOISE
 from visadapt.effects import EFFECTS
-from visadapt.systems import SYSTEMS
+from visadapt.systems import SYSTEMS, FixedWing, Quadrotor
 from visadapt.world import World
 
 
@@ -21,10 +21,10 @@ def flown(path, name, effect=None, **parameters):
     effects = [EFFECTS[effect](**parameters).double()] if effect else []
     world = World(system, effects, period, substeps=3).requires_grad_(False)
     generator = torch.Generator().manual_seed(0)
-    middle = torch.zeros(2, 4, dtype=torch.float64)
-    if name == "fixed_wing":
+    state, middle = torch.zeros(2, 13, dtype=torch.float64), torch.zeros(2, 4, dtype=torch.float64)
+    if isinstance(system, FixedWing):
         state, middle = system.trim(torch.full((2,), 11.5, dtype=torch.float64))
-    else:
+    elif isinstance(system, Quadrotor):
         state = torch.eye(13, dtype=torch.float64)[[6, 6]]
         middle[:, 0] = system.hover()
     at = world.start(state)
