@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.blind_fitting import Fit
+from benchmarks.blind_fitting import Data, Fit
 from benchmarks.blind_onestep import Steps, Values
 from benchmarks.blind_scoring import REGION, Answer
 
@@ -40,16 +40,53 @@ UNITS: dict[str, dict[str, str]] = {
 }
 """units of every parameter by effect"""
 
-ALIKE = {
-    "actuator_bias": "constant_force",
-    "constant_force": "actuator_bias",
-    "actuator_delay": "measurement_delay",
-    "measurement_delay": "actuator_delay",
+FLIGHT_UNITS: dict[str, dict[str, str]] = {
+    **{name: UNITS[name] for name in UNITS if name.startswith("actuator_")},
+    **{name: UNITS[name] for name in ("constant_force", "periodic_force", "quadratic_drag")},
+    "linear_drag": {"coefficient": "N s/m"},
+    "wind": {**{f"velocity_{axis}": "m/s" for axis in "xyz"}, "coefficient": "N s/m"},
+    "periodic_wind": {
+        "amplitude": "m/s",
+        "frequency": "Hz",
+        "phase": "rad",
+        "direction": "rad",
+        "coefficient": "N s/m",
+    },
+    "thrust_gain": {"scale": "1"},
 }
-"""pairs that fit all data equally well"""
+FLIGHT: dict[str, dict[str, dict[str, str]]] = {
+    "quadrotor": {
+        **FLIGHT_UNITS,
+        "payload": {"mass": "kg"},
+        "battery_sag": {"rate": "1/s"},
+        "center_of_mass_offset": {"x": "m", "y": "m"},
+        "inertia": {f"scale_{axis}": "1" for axis in "xyz"},
+        "rotor_efficiency": {f"scale_{k}": "1" for k in (1, 2, 3, 4)},
+    },
+    "fixed_wing": {
+        **FLIGHT_UNITS,
+        **{name: {"scale": "1"} for name in ("mass", "lift_slope", "drag")},
+        "control_effectiveness": {f"scale_{name}": "1" for name in ("elevator", "aileron", "rudder")},
+        "trim_offset": dict.fromkeys(("elevator", "aileron", "rudder"), "rad"),
+    },
+}
+"""the same of the vehicles"""
+
+DELAYS = {"actuator_delay": "measurement_delay", "measurement_delay": "actuator_delay"}
+ALIKE: dict[str, dict[str, str]] = {
+    "cartpole": {"actuator_bias": "constant_force", "constant_force": "actuator_bias", **DELAYS},
+    "quadrotor": {"thrust_gain": "payload", "payload": "thrust_gain", **DELAYS},
+    "fixed_wing": DELAYS,
+}
+"""pairs that fit all data of a system equally well"""
 
 
-def answer_of(data: Steps, fits: Sequence[Fit], verdict: str) -> Answer:
+def units_of(system: str) -> dict[str, dict[str, str]]:
+    """Units of every parameter by effect."""
+    return FLIGHT.get(system, UNITS)
+
+
+def answer_of(data: Data, fits: Sequence[Fit], verdict: str) -> Answer:
     """The lowest BIC is the answer, its exponential the probabilities (up to a common factor); fits[0] is the source.
 
     `closed` is in-sample and one step ahead, since the methods know nothing else: of the root mean squared residual
@@ -67,7 +104,7 @@ def answer_of(data: Steps, fits: Sequence[Fit], verdict: str) -> Answer:
             verdict = "ambiguous"
     return {
         "schema": 1,
-        "system": "cartpole",
+        "system": data.system,
         "verdict": verdict,
         "where": {"regions": [region for cause in causes for region in _region(cause)]},
         "causes": causes,
@@ -85,7 +122,7 @@ def answer_of(data: Steps, fits: Sequence[Fit], verdict: str) -> Answer:
     }
 
 
-def cause_of(effect: str, values: Values, deviations: Values, data: Steps, probability: float) -> dict[str, Any]:
+def cause_of(effect: str, values: Values, deviations: Values, data: Data, probability: float) -> dict[str, Any]:
     """One cause; its intervals are 1.645 standard deviations to each side, without any where nothing was fitted."""
     own = {name.split(".")[1]: v for name, v in values.items() if name.startswith(f"{effect}.")}
     spread = {name.split(".")[1]: d for name, d in deviations.items() if name.startswith(f"{effect}.")}
@@ -98,15 +135,15 @@ def cause_of(effect: str, values: Values, deviations: Values, data: Steps, proba
         spread["amplitude"] = max(spread.get("cosine", 0.0), spread.get("sine", 0.0))
     elif effect == "spring":
         own["rest"] = own["pull"] / own["stiffness"] if own["stiffness"] else 0.0
-    elif effect == "dropout":
+    elif effect == "dropout" and isinstance(data, Steps):
         own["rate"], spread["rate"] = data.rate, float(np.sqrt(data.rate * (1 - data.rate) / data.commands.size))
-    elif effect == "frozen_zone":
+    elif effect == "frozen_zone" and isinstance(data, Steps):
         own["start"], own["end"] = data.zone or (0.0, 0.0)
     parameters: dict[str, Any] = {}
-    for name, unit in UNITS[effect].items():
+    for name, unit in units_of(data.system)[effect].items():
         interval = [own[name] - 1.645 * spread[name], own[name] + 1.645 * spread[name]] if name in spread else None
         parameters[name] = {"value": own[name], "unit": unit, "ci90": interval}
-    alike = [ALIKE[effect]] if effect in ALIKE else []
+    alike = [name for own_name, name in ALIKE[data.system].items() if own_name == effect]
     return {
         "effect": effect,
         "parameters": parameters,

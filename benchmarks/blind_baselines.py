@@ -6,6 +6,8 @@
 - refit: all parameters at once by one ridge least-squares step; names what exceeds three standard deviations.
 - pysindy: sparse regression of the residual forces on a library of features, by the package pysindy.
 - chance: guesses by the mix of the sets.
+
+Afternoon, greedy, refit and chance know the vehicles too.
 """
 
 from __future__ import annotations
@@ -19,30 +21,40 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.blind_answers import UNITS, answer_of, cause_of
-from benchmarks.blind_fitting import Candidate, Fit, candidates, chi_squared, fit
-from benchmarks.blind_onestep import NEUTRAL, PERIOD, Steps, Values, read_steps
+from benchmarks.blind_answers import answer_of, cause_of, units_of
+from benchmarks.blind_fitting import Candidate, Data, Fit, candidates, chi_squared, fit
+from benchmarks.blind_flight_onestep import flight_candidates, read_flights, system_of
+from benchmarks.blind_onestep import NEUTRAL, PERIOD, Values, read_steps
 from benchmarks.blind_scoring import Answer
 
 POOR = 1.5
 """chi-squared for each residual from which a fit is called poor"""
 SUSPECT = 3.0
 """standard deviations from which refit names a parameter"""
+MIX, FLIGHT_MIX = (0.2, 0.3, 0.2, 0.1, 0.2), (0.165, 0.67, 0.0, 0.0, 0.165)
+"""shares of recordings without effect, with one, two and three, and with a foreign one"""
 RIDGE = 1.0
 """prior precision of every parameter, in units of its 30 smallest steps"""
 
 
+def opened(path: Path) -> tuple[Data, list[Candidate]]:
+    """A recording, and the effects that may be in it."""
+    if (system := system_of(path)) != "cartpole":
+        return read_flights(path), flight_candidates(system)
+    data = read_steps(path)
+    return data, candidates(data)
+
+
 def afternoon(path: Path) -> Answer:
     """One effect at a time."""
-    data = read_steps(path)
-    fits = [fit(data, ()), *(fit(data, (candidate,)) for candidate in candidates(data))]
+    data, pool = opened(path)
+    fits = [fit(data, ()), *(fit(data, (candidate,)) for candidate in pool)]
     return _judged(data, fits)
 
 
 def greedy(path: Path) -> Answer:
     """One effect after the other, as long as BIC gains; all parameters are fitted anew each time."""
-    data = read_steps(path)
-    pool = candidates(data)
+    data, pool = opened(path)
     seen = [fit(data, ())]
     best = seen[0]
     for _ in range(3):
@@ -56,7 +68,7 @@ def greedy(path: Path) -> Answer:
     return _judged(data, seen)
 
 
-def _judged(data: Steps, fits: Sequence[Fit]) -> Answer:
+def _judged(data: Data, fits: Sequence[Fit]) -> Answer:
     """The set of the lowest BIC; none of them where even that fits poorly."""
     best = min(fits, key=lambda f: f.bic)
     if best.chi2 / data.size > POOR:
@@ -66,15 +78,16 @@ def _judged(data: Steps, fits: Sequence[Fit]) -> Answer:
 
 def refit(path: Path) -> Answer:
     """(J'J + ridge)^-1 J'r at the source, for all parameters that have a slope there; names what stands out."""
-    data = read_steps(path)
-    pool = [_without_alias(c) for c in candidates(data) if c.free and len(c.starts) <= 2 and c.effect not in _ALIASES]
+    data, every = opened(path)
+    aliases = _ALIASES[data.system]
+    pool = [_without_alias(c) for c in every if c.free and len(c.starts) <= 2 and c.effect not in aliases]
     # A saturation at 1 and regions without width have no slope at the source; dropouts have no parameter.
     free = [parameter for candidate in pool for parameter in candidate.free]
-    base = data.residual(dict(NEUTRAL))
+    base = data.residual(dict(data.neutral))
     keep = ~(data.rows_lost | data.angle_held)
     slopes = np.stack(
         [
-            ((data.residual({**NEUTRAL, p.name: NEUTRAL[p.name] + p.step}) - base)[:, keep] / p.step).ravel()
+            ((data.residual({**data.neutral, p.name: data.neutral[p.name] + p.step}) - base)[:, keep] / p.step).ravel()
             for p in free
         ],
         1,
@@ -83,20 +96,26 @@ def refit(path: Path) -> Answer:
     inverse = np.linalg.inv(slopes.T @ slopes + RIDGE * np.diag(scale**-2.0))
     change = -inverse @ (slopes.T @ base[:, keep].ravel())
     spread = np.sqrt(np.diag(inverse))
-    values: Values = dict(NEUTRAL) | {p.name: NEUTRAL[p.name] + float(d) for p, d in zip(free, change, strict=True)}
+    values: Values = dict(data.neutral) | {
+        p.name: data.neutral[p.name] + float(d) for p, d in zip(free, change, strict=True)
+    }
     deviations = {p.name: float(s) for p, s in zip(free, spread, strict=True)}
     outstanding = {p.name: abs(float(d / s)) for p, d, s in zip(free, change, spread, strict=True)}
     named = [c for c in pool if max(outstanding[p.name] for p in c.free) > SUSPECT]
     named.sort(key=lambda c: -max(outstanding[p.name] for p in c.free))
     chi2 = chi_squared(data, data.residual(values), ("dropout", "frozen_zone"))
-    fits = [Fit((), dict(NEUTRAL), chi_squared(data, base, ()), 0.0, {})]
+    fits = [Fit((), dict(data.neutral), chi_squared(data, base, ()), 0.0, {})]
     if named:
         fits.append(Fit(tuple(named), values, chi2, -1.0, deviations))
     return answer_of(data, fits, "identified" if named else "no_gap")
 
 
-_ALIASES = ("actuator_bias", "measurement_delay")
-"""have the very columns of constant_force and actuator_delay"""
+_ALIASES: dict[str, tuple[str, ...]] = {
+    "cartpole": ("actuator_bias", "measurement_delay"),
+    "quadrotor": ("payload", "wind"),
+    "fixed_wing": (),
+}
+"""have the very columns of constant_force and actuator_delay; of thrust_gain and, at the source, of linear_drag"""
 
 
 def _without_alias(candidate: Candidate) -> Candidate:
@@ -157,14 +176,15 @@ def chance(path: Path) -> Answer:
     rng = np.random.default_rng(
         int.from_bytes(hashlib.sha256(f"{path.parent.name}/{path.name}".encode()).digest()[:8], "big")
     )
-    effects = sorted(UNITS)
-    guess = int(rng.choice(5, p=(0.2, 0.3, 0.2, 0.1, 0.2)))
+    system = system_of(path)
+    effects = sorted(units_of(system))
+    guess = int(rng.choice(5, p=MIX if system == "cartpole" else FLIGHT_MIX))
     named = [str(n) for n in rng.choice(effects, guess, replace=False)] if guess < 4 else []
     rest = [[str(n)] for n in rng.choice(effects, 2, replace=False)]
     verdict = "unexplained" if guess == 4 else "identified" if named else "no_gap"
     return {
         "schema": 1,
-        "system": "cartpole",
+        "system": system,
         "verdict": verdict,
         "where": {"regions": []},
         "causes": [{"effect": name, "parameters": {}, "indistinguishable_from": []} for name in named],
@@ -181,3 +201,6 @@ BASELINES: dict[str, Callable[[Path], Answer]] = {
     "chance": chance,
 }
 """by name"""
+
+FLYING = ("afternoon", "greedy", "refit", "chance")
+"""those that know the vehicles"""

@@ -30,7 +30,8 @@ from typing import Any, Literal
 
 import tyro
 
-from benchmarks.blind_baselines import BASELINES
+from benchmarks.blind_baselines import BASELINES, FLYING
+from benchmarks.blind_flight_onestep import system_of
 from benchmarks.blind_scoring import Answer, Score, Truth, score
 from benchmarks.blind_tables import Row, confusion, label, read_table, tabulate, write_csv, write_table
 from datasets import blind_flights, blind_gaps
@@ -45,7 +46,7 @@ class Settings:
     """What is scored, and where things are kept."""
 
     system: System = "cartpole"
-    """what is recorded; of a vehicle there is one set, and the library alone diagnoses it"""
+    """what is recorded; of a vehicle there is one set"""
     count: int = 200
     """recordings of each set"""
     seed: int = 7
@@ -75,14 +76,8 @@ class Settings:
     @property
     def asked(self) -> tuple[str, ...]:
         """Diagnosers that know the system."""
-        return self.diagnosers if self.system == "cartpole" else ("ours",)
-
-
-def system_of(path: Path) -> str:
-    """The system that a recording is of, by the names of its commands."""
-    with path.open(encoding="utf-8") as file:
-        columns = set(file.readline().strip().split(","))
-    return next((name for name, actions in blind_flights.ACTIONS.items() if columns.issuperset(actions)), "cartpole")
+        flying = ("ours", *FLYING)
+        return tuple(name for name in self.diagnosers if self.system == "cartpole" or name in flying)
 
 
 def ours(path: Path) -> Answer:

@@ -4,13 +4,42 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from benchmarks.blind_onestep import NEUTRAL, Array, Steps, Values
+from benchmarks.blind_onestep import Array, Steps, Values
 
 HELD = ("dropout", "frozen_zone")
 """effects that show as exact repeats; nothing is fitted"""
+
+
+class Data(Protocol):
+    """A recording as one-step errors under any parameters: of a cart-pole or of a flight."""
+
+    @property
+    def system(self) -> str:
+        """Its name."""
+
+    @property
+    def neutral(self) -> Values:
+        """Every parameter where it does nothing."""
+
+    @property
+    def size(self) -> int:
+        """How many residuals there are."""
+
+    @property
+    def rows_lost(self) -> NDArray[np.bool_]:
+        """(n,) whether either row of a pair repeats the one before."""
+
+    @property
+    def angle_held(self) -> NDArray[np.bool_]:
+        """(n,) whether an angle of either does, and the position does not."""
+
+    def residual(self, p: Values) -> Array:
+        """(channels, n) in standard deviations of the noise."""
 
 
 @dataclass(frozen=True)
@@ -18,7 +47,7 @@ class Free:
     """A parameter that is fitted."""
 
     name: str
-    """in NEUTRAL"""
+    """in the recording's `neutral`"""
     low: float
     high: float
     step: float
@@ -36,7 +65,8 @@ class Candidate:
     """parameters that BIC counts, those on the grid included"""
 
 
-def _one(name: str, low: float, high: float, step: float, *starts: float) -> Candidate:
+def one(name: str, low: float, high: float, step: float, *starts: float) -> Candidate:
+    """An effect with one parameter, and where its fit starts."""
     effect = name.split(".")[0]
     return Candidate(effect, (Free(name, low, high, step),), tuple({name: start} for start in starts), 1)
 
@@ -50,14 +80,14 @@ def candidates(data: Steps) -> list[Candidate]:
     patches = [(a, b) for i, a in enumerate(places) for b in places[i + 1 :] if 0.15 <= b - a <= 0.8]
     periodic = tuple(Free(f"periodic_force.{name}", -10, 10, 0.01) for name in ("cosine", "sine", "offset"))
     return [
-        _one("actuator_gain.scale", 0.4, 2.0, 0.001, 1.0),
-        _one("actuator_bias.offset", -0.35, 0.35, 0.0001, 0.0),
-        _one("actuator_delay.delay", 0.0, 0.2, 0.0005, 0.005, 0.05),
-        _one("actuator_lag.time_constant", 0.0, 0.3, 0.0005, 0.005, 0.05),
-        _one("actuator_deadzone.width", 0.0, 0.6, 0.0005, 0.005, 0.05),
-        _one("actuator_saturation.limit", 0.02, 1.0, 0.001, 0.5, 0.25, 0.12),
-        _one("actuator_backlash.width", 0.0, 1.0, 0.0005, 0.01, 0.1),
-        _one("constant_force.force", -10, 10, 0.001, 0.0),
+        one("actuator_gain.scale", 0.4, 2.0, 0.001, 1.0),
+        one("actuator_bias.offset", -0.35, 0.35, 0.0001, 0.0),
+        one("actuator_delay.delay", 0.0, 0.2, 0.0005, 0.005, 0.05),
+        one("actuator_lag.time_constant", 0.0, 0.3, 0.0005, 0.005, 0.05),
+        one("actuator_deadzone.width", 0.0, 0.6, 0.0005, 0.005, 0.05),
+        one("actuator_saturation.limit", 0.02, 1.0, 0.001, 0.5, 0.25, 0.12),
+        one("actuator_backlash.width", 0.0, 1.0, 0.0005, 0.01, 0.1),
+        one("constant_force.force", -10, 10, 0.001, 0.0),
         Candidate(
             "periodic_force",
             (*periodic, Free("periodic_force.frequency", 0.05, 5.0, 0.001)),
@@ -70,9 +100,9 @@ def candidates(data: Steps) -> list[Candidate]:
             tuple({"gust.start": float(a), "gust.end": float(b)} for a, b in gusts),
             3,
         ),
-        _one("viscous_friction.coefficient", 0.0, 15.0, 0.001, 0.0),
-        _one("coulomb_friction.force", 0.0, 6.0, 0.001, 0.0),
-        _one("quadratic_drag.coefficient", 0.0, 20.0, 0.001, 0.0),
+        one("viscous_friction.coefficient", 0.0, 15.0, 0.001, 0.0),
+        one("coulomb_friction.force", 0.0, 6.0, 0.001, 0.0),
+        one("quadratic_drag.coefficient", 0.0, 20.0, 0.001, 0.0),
         Candidate(
             "friction_patch",
             (Free("friction_patch.coefficient", 0.0, 40.0, 0.01),),
@@ -82,15 +112,15 @@ def candidates(data: Steps) -> list[Candidate]:
         Candidate(
             "spring", (Free("spring.stiffness", 0.0, 50.0, 0.001), Free("spring.pull", -40, 40, 0.001)), ({},), 2
         ),
-        _one("pole_damping.coefficient", 0.0, 0.3, 0.0001, 0.0),
-        _one("track_tilt.angle", -0.3, 0.3, 0.0001, 0.0),
-        _one("cart_mass.scale", 0.4, 3.0, 0.001, 1.0),
-        _one("pole_mass.scale", 0.2, 5.0, 0.01, 1.0),
-        _one("pole_length.scale", 0.4, 2.5, 0.001, 1.0),
-        _one("angle_offset.offset", -0.2, 0.2, 0.0001, 0.0),
-        _one("measurement_delay.delay", 0.0, 0.2, 0.0005, 0.005, 0.05),
-        _one("sensor_scale.position", 0.5, 2.0, 0.001, 1.0),
-        _one("sensor_scale.angle", 0.5, 2.0, 0.001, 1.0),
+        one("pole_damping.coefficient", 0.0, 0.3, 0.0001, 0.0),
+        one("track_tilt.angle", -0.3, 0.3, 0.0001, 0.0),
+        one("cart_mass.scale", 0.4, 3.0, 0.001, 1.0),
+        one("pole_mass.scale", 0.2, 5.0, 0.01, 1.0),
+        one("pole_length.scale", 0.4, 2.5, 0.001, 1.0),
+        one("angle_offset.offset", -0.2, 0.2, 0.0001, 0.0),
+        one("measurement_delay.delay", 0.0, 0.2, 0.0005, 0.005, 0.05),
+        one("sensor_scale.position", 0.5, 2.0, 0.001, 1.0),
+        one("sensor_scale.angle", 0.5, 2.0, 0.001, 1.0),
         *(Candidate(effect, (), ({},), count) for effect, count in (("dropout", 1), ("frozen_zone", 2))),
     ]
 
@@ -101,7 +131,7 @@ class Fit:
 
     members: tuple[Candidate, ...]
     values: Values
-    """all of NEUTRAL"""
+    """of all effects"""
     chi2: float
     """sum of squared one-step residuals in standard deviations"""
     bic: float
@@ -115,7 +145,7 @@ class Fit:
         return [member.effect for member in self.members]
 
 
-def chi_squared(data: Steps, residual: Array, effects: Sequence[str]) -> float:
+def chi_squared(data: Data, residual: Array, effects: Sequence[str]) -> float:
     """Steps that an effect of the set holds count as their expectation."""
     out = np.zeros(residual.shape[1], bool)
     if "dropout" in effects:
@@ -125,12 +155,12 @@ def chi_squared(data: Steps, residual: Array, effects: Sequence[str]) -> float:
     return float((residual[:, ~out] ** 2).sum()) + len(residual) * int(out.sum())
 
 
-def fit(data: Steps, members: Sequence[Candidate], start: Values | None = None, thorough: bool = True) -> Fit:
+def fit(data: Data, members: Sequence[Candidate], start: Values | None = None, thorough: bool = True) -> Fit:
     """Gauss-Newton from every point of the last member's grid, all parameters together.
 
     A grid is first gone through with one step each, and the best three points are taken to the end.
     """
-    base = {**NEUTRAL, **(start or {})}
+    base = {**data.neutral, **(start or {})}
     starts = [{**base, **point} for point in members[-1].starts] if members else [base]
     if len(starts) > 3:
         rough = sorted((_descend(data, members, point, 1) for point in starts), key=lambda fit: fit.chi2)
@@ -138,7 +168,7 @@ def fit(data: Steps, members: Sequence[Candidate], start: Values | None = None, 
     return min((_descend(data, members, point, 10 if thorough else 3) for point in starts), key=lambda fit: fit.chi2)
 
 
-def _descend(data: Steps, members: Sequence[Candidate], start: Values, rounds: int) -> Fit:
+def _descend(data: Data, members: Sequence[Candidate], start: Values, rounds: int) -> Fit:
     free = [parameter for member in members for parameter in member.free]
     effects = [member.effect for member in members]
     values, inverse = dict(start), np.zeros((len(free), len(free)), np.float64)
@@ -176,7 +206,7 @@ def _descend(data: Steps, members: Sequence[Candidate], start: Values, rounds: i
     return Fit(tuple(members), values, best, bic, deviations)
 
 
-def _slope(data: Steps, values: Values, parameter: Free, residual: Array) -> Array:
+def _slope(data: Data, values: Values, parameter: Free, residual: Array) -> Array:
     """Forward difference, backward at the upper bound."""
     step = parameter.step if values[parameter.name] + parameter.step <= parameter.high else -parameter.step
     return (data.residual({**values, parameter.name: values[parameter.name] + step}) - residual) / step

@@ -87,6 +87,8 @@ class Steps:
     """of the state that are predicted: those measured, since the noise of a central difference is that of its rows"""
     scale: Array = field(init=False)
     """`deviations`, once"""
+    system: str = "cartpole"
+    neutral: Values = field(default_factory=lambda: dict(NEUTRAL))
 
     def __post_init__(self) -> None:
         self.scale = self.deviations
@@ -123,13 +125,13 @@ class Steps:
         return (self.after - predicted)[self.channels] / self.scale
 
 
-def actuate(commands: Array, p: Values) -> Array:
-    """Motor inputs (episodes, rows, SUBSTEPS) in units of the command.
+def actuate(commands: Array, p: Values, period: float = PERIOD, substeps: int = SUBSTEPS) -> Array:
+    """Motor inputs (episodes, rows, substeps) in units of the command.
 
     What is measured late is a state that moves as if commanded late: the two delays add up.
     """
-    u: Array = np.repeat(commands, SUBSTEPS, 1)
-    delay = (p["actuator_delay.delay"] + p["measurement_delay.delay"]) * SUBSTEPS / PERIOD
+    u: Array = np.repeat(commands, substeps, 1)
+    delay = (p["actuator_delay.delay"] + p["measurement_delay.delay"]) * substeps / period
     if delay > 0:
         whole, part = int(delay), delay % 1
         padded = np.pad(u, ((0, 0), (whole + 1, 0)))
@@ -143,14 +145,14 @@ def actuate(commands: Array, p: Values) -> Array:
     u = np.clip(u, -p["actuator_saturation.limit"], p["actuator_saturation.limit"])
     u = p["actuator_gain.scale"] * u + p["actuator_bias.offset"]
     if p["actuator_lag.time_constant"] > 1e-6:
-        ratio = PERIOD / SUBSTEPS / p["actuator_lag.time_constant"]
+        ratio = period / substeps / p["actuator_lag.time_constant"]
         keep = np.exp(-ratio)
         lagged, inputs, u = np.zeros(len(u)), u, np.empty_like(u)
         for k in range(u.shape[1]):
             # Its mean over the substep.
             u[:, k] = inputs[:, k] + (lagged - inputs[:, k]) * (1 - keep) / ratio
             lagged = inputs[:, k] + (lagged - inputs[:, k]) * keep
-    return u.reshape(*commands.shape, SUBSTEPS)
+    return u.reshape(*commands.shape, substeps)
 
 
 def advance(state: Array, inputs: Array, time: Array, p: Values) -> Array:

@@ -150,6 +150,39 @@ def rotorpy(rows: Rows) -> list[list[str]]:
     return table
 
 
+DIAGNOSED = {
+    "verdict": "verdict",
+    "most probable": "most probable effects",
+    "gap closed": "gap closed",
+    **{f"drag_{axis}": f"drag along {axis}, 1/s" for axis in "xyz"},
+    **{f"damping_{axis}": f"damping of turns about {axis}, 1/s" for axis in "xyz"},
+    "lift": "translational lift, 1/m",
+    "lag": "lag of the motors, s",
+    **{f"wind_{axis}": f"wind along {axis}, m/s" for axis in "xy"},
+}
+"""What `benchmarks.rotorpy_diagnosis` asks, and what the README calls it."""
+
+
+def rotorpy_diagnosis(rows: Rows) -> list[list[str]]:
+    """What the diagnosis says of rotorpy's multirotor, with 90 % intervals, and what rotorpy publishes."""
+    kinds = list(dict.fromkeys(row["air"] for row in rows))
+    found = {(row["air"], row["what"]): row for row in rows}
+    table = [["rotorpy's Crazyflie, diagnosed", *kinds, "published"]]
+    for what, told in DIAGNOSED.items():
+        own = [found[kind, what] for kind in kinds]
+        # In calm air, or in none, some of them are 0.
+        published = max((row["published"] for row in own), key=lambda value: float(value or 0), default="")
+        table.append([told, *map(_found, own), published])
+    return table
+
+
+def _found(row: dict[str, str]) -> str:
+    if row["what"] == "gap closed" and row["value"]:
+        return f"{100 * float(row['value']):.0f} %"
+    value = row["value"].replace("_", " ")
+    return f"{value} ({row['low']} to {row['high']})" if row["low"] else value
+
+
 LOOPS = {"2.6": "0.05", "3.4": "0.09", "4.1": "0.12", "4.6": "0.21", "5.0": "0.31"}
 """Speeds in m/s, and the paper's mean errors in m."""
 
@@ -198,12 +231,17 @@ def blind(rows: Rows, again: Rows) -> list[list[str]]:
 
 
 def blind_flights(rows: Rows) -> list[list[str]]:
-    """The sealed check of the diagnosis of the vehicles: the measures that there are."""
-    found = {(row["kind"], row["measure"]): row for row in rows}
-    vehicles = [name for name in ("quadrotor", "fixed_wing") if any(kind == name for kind, _ in found)]
-    table = [["sealed check", *(name.replace("_", " ") for name in vehicles)]]
+    """The sealed check of the diagnosis of the vehicles: every diagnoser, and the measures that there are."""
+    found = {(row["kind"], row["diagnoser"], row["measure"]): row for row in rows}
+    columns = [
+        (kind, name)
+        for kind in ("quadrotor", "fixed_wing")
+        for name in BLIND
+        if any(key[:2] == (kind, name) for key in found)
+    ]
+    table = [["sealed check", *(f"{kind.replace('_', ' ')}: {name}" for kind, name in columns)]]
     for measure, told in MEASURES.items():
-        cells = [found.get((name, measure)) for name in vehicles]
+        cells = [found.get((kind, name, measure)) for kind, name in columns]
         if any(cells):
             table.append([told, *(_share(row) for row in cells)])
     return table
@@ -270,12 +308,14 @@ def main() -> None:
     """Rewrite the tables of README.md."""
     every = [row for path in sorted(RESULTS.glob("*.csv")) for row in read_rows(path)]
     rows = [row for row in every if "experiment" in row]
-    diagnosed, again = (read_rows(RESULTS / f"{name}.csv") for name in ("blind_diagnosis", "blind_diagnosis_2029"))
+    names = ("blind_diagnosis", "blind_diagnosis_2029", "rotorpy_diagnosis")
+    diagnosed, again, crazyflie = (read_rows(RESULTS / f"{name}.csv") for name in names)
     readme = Path("README.md")
     text = readme.read_text()
     tables = {name: make(rows) for name, make in TABLES.items()} | {
         "blind": blind(diagnosed, again),
         "blind flights": blind_flights(diagnosed),
+        "rotorpy diagnosis": rotorpy_diagnosis(crazyflie),
     }
     for name, (header, *body) in tables.items():
         lines = ["| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *body)]

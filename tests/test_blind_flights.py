@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.blind_diagnosis import system_of
+from benchmarks.blind_flight_onestep import system_of
 from benchmarks.blind_scoring import LARGEST, SIZE
 from datasets.blind_flight_kinds import NAMED, NEUTRAL
 from datasets.blind_flight_plants import PLANTS, Motion

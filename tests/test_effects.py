@@ -268,6 +268,7 @@ def test_the_catalogue_is_complete():
         *("track_tilt", "cart_mass", "pole_mass", "pole_length", "angle_offset", "position_offset"),
         *("measurement_delay", "sensor_scale", "frozen_zone", "dropout"),
         *("linear_drag", "wind", "periodic_wind", "thrust_gain", "battery_sag", "ground_effect", "rotor_efficiency"),
+        *("rotor_drag", "translational_lift", "motor_lag", "rate_damping"),
         *("inertia", "payload", "center_of_mass_offset", "mass", "lift_slope", "drag", "control_effectiveness"),
         *("trim_offset",),
     }

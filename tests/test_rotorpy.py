@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.rotorpy_diagnosis import rows_of
 from tests.flying import PERIOD, seeded, straight, waves
-from train.rotorpy_quadrotor import explain
+from train.rotorpy_quadrotor import explain, published
 from visadapt.courses import AlongReferences
 from visadapt.recordings import Episode
 from visadapt.references import Reference
@@ -205,6 +206,36 @@ def test_what_explains_the_gap_is_what_rotorpy_has_in_its_parameters():
     assert found["lag"] == pytest.approx(0.05, abs=0.01)
     assert found["lift"] == pytest.approx(4 * 1.11e-3 / 0.044, rel=0.3)
     assert found["explained"] > 0.9
+
+
+@pytest.mark.usefixtures("rotorpy")
+@pytest.mark.parametrize(("axis", "name"), list(enumerate("xyz")))
+def test_a_turn_is_braked_as_published(axis, name):
+    """With motors that hardly lag: what air leaves of a rate that is asked for."""
+    commands = hovering(25)
+    commands[..., 1 + axis] = 0.2
+    target = RotorpyTarget(level(), air=STILL, changes={"tau_m": 0.011})
+    rates = fly(target, commands)[-1, 0, RATES]
+    gain = float(SOURCE.roll_gain)
+    expected = 0.2 * SOURCE.max_rate * gain / (gain + published(target)[f"damping_{name}"])
+    assert float(rates[axis]) == pytest.approx(expected, rel=0.03)
+
+
+def test_what_was_diagnosed_stands_beside_what_is_published():
+    """Drags add, by the mass; only a parameter that stands alone has its interval."""
+
+    def told(value):
+        return {"value": value, "ci90": [0.9 * value, 1.1 * value]}
+
+    drag = {f"coefficient_{axis}": told(value) for axis, value in zip("xyz", (0.022, 0.022, 0.066), strict=True)}
+    sizes = {"rotor_drag": drag, "wind": {"coefficient": told(0.011), "velocity_x": told(1.4), "velocity_y": told(0.1)}}
+    answer = {"verdict": "unexplained", "ranking": [{"effects": ["wind", "rotor_drag"]}], "gap": {"closed": 0.9}}
+    rows = {row["what"]: row for row in rows_of("steady wind", answer, sizes, {"drag_x": 0.755, "wind_x": 1.5})}
+    said = [rows[name]["value"] for name in ("verdict", "most probable", "gap closed")]
+    assert said == ["unexplained", "wind + rotor_drag", "0.9"]
+    assert [rows["drag_x"][key] for key in ("value", "low", "high", "published")] == ["0.75", "", "", "0.755"]
+    assert [rows["wind_x"][key] for key in ("value", "low", "high", "published")] == ["1.4", "1.26", "1.54", "1.5"]
+    assert [rows["lag"][key] for key in ("value", "low", "high", "published")] == ["", "", "", "0"]
 
 
 @pytest.mark.usefixtures("rotorpy")

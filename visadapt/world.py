@@ -130,12 +130,12 @@ class World(nn.Module):
         """
         h = self.period / self.substeps
         commands = action.clamp(-1, 1)[:, None].expand(-1, self.substeps, -1)
+        system = self.altered(at.state)
         memory = []
         for effect, remembered in zip(self._actuation, at.memory, strict=False):
-            commands, remembered = effect.apply_to(commands, remembered, h)
+            commands, remembered = effect.acting_on(system).apply_to(commands, remembered, h)
             memory.append(remembered)
         integrate = INTEGRATORS[self.integrator]
-        system = self.altered(at.state)
         time, state = at.time, at.state
         for k in range(self.substeps):
             command = commands[:, k]

@@ -71,6 +71,13 @@ class Family:
                 out.append(made)
         return out
 
+    def _chain(self, theta: Tensor) -> list[ActuationEffect]:
+        """The actuation effects with what they take from the system that the others have altered."""
+        system = self.system
+        for effect in self._made(DynamicsEffect, theta):
+            system = effect.alter(system)
+        return [effect.acting_on(system) for effect in self._made(ActuationEffect, theta)]
+
     def commands(self, theta: Tensor) -> Tensor:
         """(R, W, T, S, n_action) what acts over the substeps, for parameters (R, P)."""
         rows = self.rows
@@ -78,7 +85,7 @@ class Family:
         episodes, length, width = rows.command.shape
         commands = rows.command[None, :, :, None].expand(len(theta), -1, -1, self.substeps, -1)
         commands = commands.reshape(len(theta) * episodes, length * self.substeps, width)
-        for effect in self._made(ActuationEffect, theta.repeat_interleave(episodes, 0)):
+        for effect in self._chain(theta.repeat_interleave(episodes, 0)):
             commands, _ = effect.apply_to(commands, effect.memory(commands, h), h)
         commands = commands.reshape(len(theta), episodes, length, self.substeps, width)
         index = rows.first[:, None] + torch.arange(rows.shape[1])
@@ -92,7 +99,7 @@ class Family:
         """
         rows = self.rows
         h = rows.period / self.substeps
-        chain = self._made(ActuationEffect, theta)
+        chain = self._chain(theta)
         out = actions[..., None, None].expand(-1, -1, -1, self.substeps, -1).clone()
         if not chain:
             return out

@@ -9,7 +9,7 @@ from visadapt.effects.actuation import (
     ActuatorLag,
     ActuatorSaturation,
 )
-from visadapt.effects.aerial import LinearDrag, PeriodicWind, Wind
+from visadapt.effects.aerial import LinearDrag, PeriodicWind, RotorDrag, TranslationalLift, Wind
 from visadapt.effects.base import (
     EFFECTS,
     ActuationEffect,
@@ -36,7 +36,9 @@ from visadapt.effects.vehicle import (
     CenterOfMassOffset,
     GroundEffect,
     Inertia,
+    MotorLag,
     Payload,
+    RateDamping,
     RotorEfficiency,
     ThrustGain,
 )
@@ -72,6 +74,7 @@ __all__ = [
     "LinearDrag",
     "Mass",
     "MeasurementDelay",
+    "MotorLag",
     "Parameter",
     "Payload",
     "PeriodicForce",
@@ -81,7 +84,9 @@ __all__ = [
     "PoleMass",
     "PositionOffset",
     "QuadraticDrag",
+    "RateDamping",
     "Residual",
+    "RotorDrag",
     "RotorEfficiency",
     "SensingEffect",
     "SensorScale",
@@ -89,6 +94,7 @@ __all__ = [
     "Stage",
     "ThrustGain",
     "TrackTilt",
+    "TranslationalLift",
     "TrimOffset",
     "ViscousFriction",
     "Wind",

@@ -1,6 +1,6 @@
-"""Forces of the air on vehicles that fly: drag, and wind.
+"""Forces of the air on vehicles that fly: drag, what flows through rotors, and wind.
 
-Drag follows the velocity against the air, in world axes: where there is wind too, it acts on every drag. Drags add.
+All of them follow the velocity against the air: where there is wind too, it acts on every one. They add.
 """
 
 from __future__ import annotations
@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 from typing import TypeAlias
 
+import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from visadapt.effects.base import DynamicsEffect, Effect, Parameter, with_parameters
+from visadapt.effects.base import DynamicsEffect, Effect, Parameter, expect, with_parameters
 from visadapt.systems import FixedWing, Quadrotor, System
-from visadapt.systems.rigid_body import VELOCITY, beside
+from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, beside, rotation, times
 
 Vehicle: TypeAlias = Quadrotor | FixedWing
 VEHICLES: tuple[type[System], ...] = (Quadrotor, FixedWing)
@@ -59,6 +60,46 @@ class LinearDrag(AirDrag):
     equation = "F = -coefficient v, v the velocity against the air"
     source = "Faessler, Franchi and Scaramuzza (2017), Differential flatness of quadrotor dynamics; the paper, 3.2.1"
     table = (Parameter("coefficient", "N s/m", 0.0, 3.0, 0.0, linear=True),)
+
+
+class RotorDrag(DynamicsEffect):
+    """Drag of the rotors in proportion to the velocity against the air, another one along each axis of the body.
+
+    Level, blades that flap and bend drag; along their axis, air that flows in takes thrust. Where all three are the
+    same it is linear_drag.
+    """
+
+    name = "rotor_drag"
+    equation = "F = -R diag(coefficient_x, coefficient_y, coefficient_z) R^T v, v the velocity against the air"
+    source = (
+        "Faessler, Franchi and Scaramuzza (2018), Differential flatness of quadrotor dynamics subject to rotor drag"
+    )
+    table = tuple(Parameter(f"coefficient_{axis}", "N s/m", 0.0, 3.0, 0.0, linear=True) for axis in "xyz")
+    systems = (Quadrotor,)
+
+    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+        turned = rotation(state[:, ATTITUDE])
+        velocity = times(turned.mT, airspeed(state, expect(system, Quadrotor, self)))
+        coefficients = torch.stack([self.value(p.name, state) for p in self.table], -1)
+        return pad(-times(turned, coefficients * velocity), (0, 3))
+
+
+class TranslationalLift(DynamicsEffect):
+    """Thrust that air across the rotors adds: it brings them more air, so that they push it down less."""
+
+    name = "translational_lift"
+    equation = "T = T_asked + coefficient (v_x^2 + v_y^2), v the velocity against the air in body axes"
+    source = (
+        "Faessler, Franchi and Scaramuzza (2018), Differential flatness of quadrotor dynamics subject to rotor drag"
+    )
+    table = (Parameter("coefficient", "N s2/m2", 0.0, 1.0, 0.0, linear=True),)
+    systems = (Quadrotor,)
+
+    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+        turned = rotation(state[:, ATTITUDE])
+        velocity = times(turned.mT, airspeed(state, expect(system, Quadrotor, self)))
+        lift = self.value("coefficient", state) * velocity[:, :2].square().sum(1)
+        return pad(lift[:, None] * turned[:, :, 2], (0, 3))
 
 
 class Wind(AirDrag):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -96,6 +96,10 @@ class ActuationEffect(Effect):
     """Changes the command on its way to the physics."""
 
     stage = Stage.ACTUATION
+
+    def acting_on(self, system: System) -> Self:
+        """The effect with what it takes from the altered system's parameters; itself, where it takes nothing."""
+        return self
 
     def memory(self, commands: Tensor, substep: float) -> Tensor:
         """What the effect remembers at the start of an episode, (B, any, n_action).

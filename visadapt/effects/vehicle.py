@@ -7,14 +7,17 @@ multiply, and masses and offsets add.
 
 from __future__ import annotations
 
-from typing import ClassVar
+import copy
+from typing import ClassVar, Self
 
+import torch
 from torch import Tensor
 
 from visadapt.effects.aerial import VEHICLES, Vehicle, expect_vehicle
-from visadapt.effects.base import DynamicsEffect, Parameter, expect, with_parameters
+from visadapt.effects.base import ActuationEffect, DynamicsEffect, Parameter, expect, with_parameters
 from visadapt.effects.parameters import ParameterScale
 from visadapt.systems import Quadrotor, System
+from visadapt.systems.rigid_body import beside
 
 
 def with_thrust(vehicle: Vehicle, factor: Tensor) -> Vehicle:
@@ -39,6 +42,103 @@ class ThrustGain(DynamicsEffect):
 
     def alter(self, system: System) -> System:
         return with_thrust(expect_vehicle(system, self), self.scale)
+
+
+class MotorLag(ActuationEffect):
+    """Motors whose thrusts follow what is asked of them as first-order systems do: thrust and torques lag alike.
+
+    An actuator_lag is on the way to the flight controller; this lag is inside its rate loop, whose error w_asked - w
+    the torque then follows late. What acts is the command a = w + d that turns a vehicle as much without lag, d being
+    the lagging torque by inertia and gain. The w in it is that of a vehicle that is turned by its loop, with the
+    inertia that it has, and by rate_damping; what else turns it, the loop undoes at once.
+    """
+
+    name = "motor_lag"
+    equation = (
+        "time_constant dT/dt = T_asked - T; time_constant dd/dt = w_asked - w - d, dw/dt = gain d - damping w; "
+        "all from a command of 0"
+    )
+    source = (
+        "Faessler, Falanga and Scaramuzza (2017), Thrust mixing, saturation, and body-rate control for accurate "
+        "aggressive quadrotor flight"
+    )
+    table = (Parameter("time_constant", "s", 0.0, 0.3, 0.0),)
+    systems = (Quadrotor,)
+
+    loops: tuple[tuple[float | Tensor, ...], tuple[float | Tensor, ...]] | None = None
+    """1/s, gain and damping of the loop around each command: the thrust has none, and nor has any command by itself"""
+
+    def acting_on(self, system: System) -> Self:
+        own = expect(system, Quadrotor, self)
+        scales = (own.inertia_scale_x, own.inertia_scale_y, own.inertia_scale_z)
+        gains = zip((own.roll_gain, own.roll_gain, own.yaw_gain), scales, strict=True)
+        dampings = zip((own.damping_x, own.damping_y, own.damping_z), scales, strict=True)
+        bound = copy.copy(self)
+        bound.loops = (
+            (0.0, *(gain / scale for gain, scale in gains)),
+            (0.0, *(rate / scale for rate, scale in dampings)),
+        )
+        return bound
+
+    def memory(self, commands: Tensor, substep: float) -> Tensor:
+        """w and d (B, 2, n_action); of a thrust, w is 0."""
+        return torch.zeros_like(commands[:, :1]).repeat(1, 2, 1)
+
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
+        ratio = self.value("time_constant", commands) / substep
+        kept, brought = self._of_a_substep(ratio, substep, commands)
+        after = commands[..., None] * brought
+        start = after[:, :1] + (kept @ memory.movedim(1, 2)[:, None, ..., None])[..., 0]
+        after = torch.cat((start, after[:, 1:]), 1)
+        # All prefixes of a linear recurrence in log2(S) rounds.
+        reach = 1
+        while reach < commands.shape[1]:
+            late = (kept @ after[:, :-reach, ..., None])[..., 0]
+            after = torch.cat((after[:, :reach], after[:, reach:] + late), 1)
+            kept = kept @ kept
+            reach *= 2
+        before = torch.cat((memory[:, 1:], after[:, :-1, :, 1]), 1)
+        ratio = ratio if ratio.dim() == 0 else ratio[:, None, None]
+        # The mean of w + d over a substep, since time_constant dd/dt = command - (w + d).
+        return commands + ratio * (before - after[..., 1]), after[:, -1].movedim(2, 1)
+
+    def _of_a_substep(self, ratio: Tensor, substep: float, commands: Tensor) -> tuple[Tensor, Tensor]:
+        """What a substep leaves of (w, d), (B or 1, 1, n_action, 2, 2), and what a command of 1 brings, (..., 2)."""
+        none = (0.0,) * commands.shape[2]
+        gain, damping = (substep * beside(values, commands) for values in self.loops or (none, none))
+        # As in actuator_lag: with exp(-1000) the limit is exact, and nothing divides by 0.
+        rate = ratio.clamp_min(1e-3).reciprocal()[..., None]
+        rate, gain, damping = torch.broadcast_tensors(rate, gain, damping)
+        zero = torch.zeros_like(gain)
+        flow = torch.stack((-damping, gain, zero, -rate, -rate, rate, zero, zero, zero), -1)
+        whole = flow.unflatten(-1, (3, 3)).matrix_exp().reshape(-1, 1, commands.shape[2], 3, 3)
+        return whole[..., :2, :2], whole[..., :2, 2]
+
+
+class RateDamping(DynamicsEffect):
+    """Air that brakes every turn: an arm that goes down meets air from below, which adds to its rotor's thrust.
+
+    By moment of inertia, as flight dynamics has its derivatives L_p, M_q and N_r, so that vehicles of any size compare.
+    """
+
+    name = "rate_damping"
+    equation = "torque = -J_known diag(rate_x, rate_y, rate_z) w"
+    source = "Padfield (2007), Helicopter Flight Dynamics, chapter 4 (L_p, M_q and N_r)"
+    table = tuple(Parameter(f"rate_{axis}", "1/s", 0.0, 20.0, 0.0) for axis in "xyz")
+    systems = (Quadrotor,)
+
+    rate_x: Tensor
+    rate_y: Tensor
+    rate_z: Tensor
+
+    def alter(self, system: System) -> System:
+        own = expect(system, Quadrotor, self)
+        return with_parameters(
+            own,
+            damping_x=own.damping_x + self.rate_x,
+            damping_y=own.damping_y + self.rate_y,
+            damping_z=own.damping_z + self.rate_z,
+        )
 
 
 class BatterySag(DynamicsEffect):

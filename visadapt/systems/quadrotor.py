@@ -55,6 +55,12 @@ class Quadrotor(RigidBody):
     """the same about y"""
     inertia_scale_z: float | Tensor = 1.0
     """the same about z"""
+    damping_x: float | Tensor = 0.0
+    """1/s, torque of the air against a rate about x, by that rate and the inertia that the rate loops count on"""
+    damping_y: float | Tensor = 0.0
+    """the same about y"""
+    damping_z: float | Tensor = 0.0
+    """the same about z"""
     rotor_1: float | Tensor = 1.0
     """share of the thrust asked of it that the rotor in front on the left gives"""
     rotor_2: float | Tensor = 1.0
@@ -119,6 +125,9 @@ class Quadrotor(RigidBody):
             thrust, torque = self._given(thrust, torque)
         if _differ((self.centre_x, self.centre_y), 0.0):
             torque = torque + thrust[:, None] * beside((-self.centre_y, self.centre_x, 0.0), torque)
+        damping = (self.damping_x, self.damping_y, self.damping_z)
+        if _differ(damping, 0.0):
+            torque = torque - times(inertia, beside(damping, rates) * rates)
         force = torch.zeros_like(velocity)
         force[:, 2] = thrust
         return force, torque
@@ -142,7 +151,10 @@ class Quadrotor(RigidBody):
 
 _ANY = ("centre_x", "centre_y", "wind_x", "wind_y", "wind_z")
 """Parameters of either sign."""
-_FROM_ZERO = ("min_thrust", "payload", "rotor_1", "rotor_2", "rotor_3", "rotor_4")
+_FROM_ZERO = (
+    *("min_thrust", "payload", "rotor_1", "rotor_2", "rotor_3", "rotor_4"),
+    *("damping_x", "damping_y", "damping_z"),
+)
 """Parameters that may be 0."""
 _MIXER = ((1.0, 1.0, 1.0, 1.0), (1.0, -1.0, -1.0, 1.0), (-1.0, -1.0, 1.0, 1.0), (1.0, -1.0, 1.0, -1.0))
 """Signs with which rotors 1 to 4 add to the thrust and to the torques about x, y and z (Flightmare's allocation)."""

@@ -1,0 +1,201 @@
+"""What the diagnosis says of rotorpy's multirotor, beside what rotorpy publishes.
+
+    python -m benchmarks.rotorpy_diagnosis
+
+Needs the extra `rotorpy` (pip install 'visadapt[rotorpy]'). The policy of the source flies it in four kinds of air,
+ten flights of 100 samples each, with a little noise on its commands, as the counted samples of an adaptation have it.
+The states are given the measurement noise of the sealed check of flights (`datasets/blind_flights.py`). In order:
+
+    1. `visadapt.diagnose` with the source's parameters and the whole catalogue of the quadrotor: the verdict, the most
+       probable set, and the gap that it closes
+    2. the same search among the effects alone that rotorpy's model is made of (`KNOWN`): how large they are, since an
+       answer that something stays unexplained tells no sizes
+
+Recordings and answers are kept in `out`, so started again it goes on; recordings may also be given to
+`visadapt diagnose --system quadrotor --params <out>/source.toml`. Writes results/rotorpy_diagnosis.csv.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+from datasets import blind_flights, quadrotor_references
+from train.rotorpy_quadrotor import published
+from visadapt import diagnose
+from visadapt.console import reporting
+from visadapt.courses import AlongReferences
+from visadapt.diagnosis.causes import NINETY
+from visadapt.diagnosis.readings import Readings
+from visadapt.diagnosis.which import Search, posterior
+from visadapt.effects import MotorLag, RateDamping, RotorDrag, TranslationalLift, Wind
+from visadapt.files import replacing
+from visadapt.flights import quadrotor
+from visadapt.policies import FlightPolicy
+from visadapt.recordings import Episode, load_recording, write_recording
+from visadapt.rollout import run, see_goals
+from visadapt.runs import once, open_run
+from visadapt.targets import TargetError
+from visadapt.targets.rotorpy import BREEZE, SOURCE, Air, RotorpyTarget
+from visadapt.world import World
+
+FLIGHTS = 10
+EXPLORATION = 0.05
+"""deviation of the noise on commands"""
+STEADY = Air(steady=BREEZE.steady)
+KINDS: dict[str, Air | None] = {"no air": None, "still air": Air(), "steady wind": STEADY, "gusty wind": BREEZE}
+"""the air that is flown in; in none, motors and rate loop alone differ from the source"""
+
+KNOWN = (RotorDrag, RateDamping, TranslationalLift, MotorLag, Wind)
+"""what a reader of rotorpy's model would look for"""
+
+MASS = float(SOURCE.mass)
+FOUND: dict[str, tuple[str, float, tuple[tuple[str, str], ...]]] = {
+    **{
+        f"drag_{axis}": (
+            "1/s",
+            MASS,
+            (("rotor_drag", f"coefficient_{axis}"), ("wind", "coefficient")),
+        )
+        for axis in "xyz"
+    },
+    **{f"damping_{axis}": ("1/s", 1.0, (("rate_damping", f"rate_{axis}"),)) for axis in "xyz"},
+    "lift": ("1/m", MASS, (("translational_lift", "coefficient"),)),
+    "lag": ("s", 1.0, (("motor_lag", "time_constant"),)),
+    **{f"wind_{axis}": ("m/s", 1.0, (("wind", f"velocity_{axis}"),)) for axis in "xy"},
+}
+"""What rotorpy publishes, by `train.rotorpy_quadrotor`'s names: the unit, by what a parameter of ours is divided, and
+which effects and parameters stand for it. Drags add."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is flown and diagnosed, and where results go."""
+
+    kinds: tuple[str, ...] = tuple(KINDS)
+    seed: int = 7
+    """of flights and noise"""
+    references: Path = Path("data/quadrotor_references.npz")
+    """made where it is not there"""
+    policy: Path = Path("assets/quadrotor.safetensors")
+    out: Path = Path("runs/rotorpy_diagnosis")
+    results: Path = Path("results/rotorpy_diagnosis.csv")
+
+
+def main(settings: Settings) -> None:
+    """Fly, diagnose and write the table."""
+    torch.set_num_threads(1)
+    course = AlongReferences(quadrotor_references.ready(settings.references)[1])
+    policy = quadrotor(course, course, SOURCE).load(settings.policy)
+    open_run(settings.out, {"seed": settings.seed, "flights": FLIGHTS})
+    parameters = "".join(f"{name} = {value!r}\n" for name, value in asdict(SOURCE).items())
+    (settings.out / "source.toml").write_text(f"[parameters]\n{parameters}")
+    rows: list[dict[str, str]] = []
+    for kind in settings.kinds:
+        air = KINDS[kind]
+        target = RotorpyTarget(course, air or Air(), aero=air is not None)
+        path = settings.out / f"{kind.replace(' ', '-')}.h5"
+        if not path.exists():
+            record(target, policy, settings.seed, path)
+        answer = once(path.with_suffix(".json"), partial(asked, path))
+        sizes = once(path.with_suffix(".sizes.json"), partial(sized, path))
+        true = published(target)
+        rows += rows_of(kind, answer, sizes, true if air is not None else {"lag": true["lag"]})
+    write(settings.results, rows)
+    for row in rows:
+        print(f"{row['air']:12} {row['what']:12} {row['value']} {row['unit']}  rotorpy: {row['published']}")
+
+
+def record(target: RotorpyTarget, policy: FlightPolicy, seed: int, path: Path) -> None:
+    """Flights as sensors read them."""
+    policy.eval()
+    generator = torch.Generator().manual_seed(seed)
+    flown = run(target, policy, see_goals, FLIGHTS, target.course.steps, generator, EXPLORATION)
+    rng = np.random.default_rng(seed)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_recording(path, [_read(each.episode, rng) for each in flown], *_names())
+
+
+def _read(episode: Episode, rng: np.random.Generator) -> Episode:
+    assert episode.state is not None
+    noise = rng.normal(size=episode.state.shape) * blind_flights.NOISE
+    return replace(episode, state=(episode.state + noise).astype(np.float32))
+
+
+def _names() -> tuple[list[str], list[str]]:
+    return [variable.name for variable in SOURCE.states], [variable.name for variable in SOURCE.actions]
+
+
+def asked(path: Path) -> dict[str, Any]:
+    """What the command `visadapt diagnose` answers of a recording."""
+    recording = load_recording([path], SOURCE)
+    with reporting() as report:
+        return diagnose(recording, World(SOURCE, period=recording.period), progress=report).to_json()
+
+
+def sized(path: Path) -> dict[str, Any]:
+    """The most probable set of KNOWN: parameters by effect, each with its value and 90 % interval."""
+    recording = load_recording([path], SOURCE)
+    with torch.inference_mode():
+        search = Search(SOURCE, Readings.of(recording, SOURCE).rows, KNOWN)
+        search.run()
+        best = search.best
+        spread = torch.linalg.inv(posterior(best.effects, best.fits)[1]).diagonal().sqrt().tolist()
+    names = [(effect.name, parameter.name) for effect in best.effects for parameter in effect.table]
+    out: dict[str, Any] = {name: {} for name in best.names}
+    for (effect, name), value, deviation in zip(names, best.fits.theta[0].tolist(), spread, strict=True):
+        out[effect][name] = {"value": value, "ci90": [value - NINETY * deviation, value + NINETY * deviation]}
+    return out
+
+
+def rows_of(
+    kind: str, answer: Mapping[str, Any], sizes: Mapping[str, Any], true: Mapping[str, float]
+) -> list[dict[str, str]]:
+    """The answer, and each quantity that rotorpy publishes beside what was found."""
+    rows = [
+        _row(kind, "verdict", answer["verdict"]),
+        _row(kind, "most probable", " + ".join(answer["ranking"][0]["effects"])),
+        _row(kind, "gap closed", _number(answer["gap"]["closed"]), "1"),
+    ]
+    for what, (unit, divisor, places) in FOUND.items():
+        own = [sizes[effect][name] for effect, name in places if effect in sizes]
+        value = sum(one["value"] for one in own) / divisor if own else math.nan
+        # Only of a parameter that stands alone does its own interval tell.
+        low, high = (_number(end / divisor) for end in own[0]["ci90"]) if len(own) == 1 else ("", "")
+        found = _row(kind, what, _number(value), unit)
+        rows.append({**found, "low": low, "high": high, "published": _number(true.get(what, 0.0))})
+    return rows
+
+
+def _row(kind: str, what: str, value: str, unit: str = "") -> dict[str, str]:
+    return {"air": kind, "what": what, "value": value, "unit": unit, "low": "", "high": "", "published": ""}
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None or math.isnan(value) else f"{value:.4g}"
+
+
+def write(path: Path, rows: list[dict[str, str]]) -> None:
+    """The table, whole or not at all; 90 % intervals."""
+    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Settings, description=__doc__))
+    except (TargetError, ValueError, OSError) as error:
+        raise SystemExit(f"rotorpy_diagnosis: {error}") from error
+    except KeyboardInterrupt:
+        raise SystemExit("interrupted: run it again to go on") from None
