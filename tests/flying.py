@@ -6,7 +6,7 @@ import math
 import torch
 
 from visadapt.courses import AlongReferences
-from visadapt.effects import LinearDrag
+from visadapt.effects import ConstantForce, LinearDrag
 from visadapt.flights import quadrotor
 from visadapt.references import Reference
 
@@ -45,3 +45,8 @@ def small_flight(rows=21, **settings):
 def drag(rate):
     """Draws v' = ... - rate v for the quadrotor of 1 kg."""
     return lambda batch, generator: (LinearDrag(coefficient=rate),)
+
+
+def push(newtons):
+    """Draws a force along x."""
+    return lambda batch, generator: (ConstantForce(force=newtons),)

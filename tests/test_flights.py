@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from tests.flying import PERIOD, drag, seeded, small_flight, straight, waves
+from tests.flying import PERIOD, drag, push, seeded, small_flight, straight, waves
 from visadapt.checkpoints import CheckpointError
 from visadapt.courses import AlongReferences, ToTarget
 from visadapt.effects import ConstantForce
@@ -40,11 +40,6 @@ class Level(Still):
     def forward(self, history):
         command = FixedWing().trim(torch.tensor([ToTarget.speed]))[1]
         return command.repeat(len(history.observations), HORIZON, 1)
-
-
-def push(newtons):
-    """Draws a force along x."""
-    return lambda batch, generator: (ConstantForce(force=newtons),)
 
 
 def uncertain(batch, generator):

@@ -4,7 +4,7 @@ import math
 import pytest
 import torch
 
-from tests.flying import PERIOD, drag, seeded, straight, waves
+from tests.flying import PERIOD, push, seeded, straight, waves
 from tests.scenes import stir
 from visadapt.courses import AlongReferences, ToTarget
 from visadapt.effects import LinearDrag, Residual
@@ -231,29 +231,55 @@ class TestStreams:
         assert torch.equal(made.now.place[[0, 3, 4]], place[[0, 3, 4]])
         assert torch.equal(made.now.history.observations[:, -1, 13:], made.now.place)
 
-    def test_recorded_starts_go_on_from_where_the_flight_was_on_its_course_with_all_that_the_policy_was_shown(self):
+    def test_recorded_starts_are_as_far_off_another_reference_with_the_past_that_they_had(self):
+        """What the source leaves unexplained stays as it was recorded: without air a vehicle flies alike anywhere."""
         task = following(first_divergence=1.0)
-        target = FlightTarget(task.course, Quadrotor(), PERIOD, drag(0.3))
+        target = FlightTarget(task.course, Quadrotor(), PERIOD, push(2.0))
         torch.manual_seed(0)
         flown = run(target, FollowPolicy(PERIOD), see_goals, 2, 12, seeded(4))
         windows = Windows.cut([each.episode for each in flown], "state")
         made = Streams(self.WORLD, task, identity, windows, StreamSettings(40, 1000, 1.0))
         made.start(0.0, seeded(5))
-        seen = set()
+        network = FlightResidualNetwork(Quadrotor(), PERIOD, lambda s, a: self.WORLD.step(self.WORLD.start(s), a).state)
+
+        def unexplained(history):
+            return network.unexplained(network.predict, history.observations[..., :13], history.actions)
+
+        def off(state, place):
+            return state[..., : VELOCITY.stop] - task.course.on(*place.long().unbind(-1))[..., : VELOCITY.stop]
+
+        now, found = made.now, set()
+        every = windows.history(torch.arange(len(windows)))
         for b in range(40):
-            row = int((windows.state == made.now.at.state[b]).all(1).nonzero()[0])
-            number, t = int(windows.episode[row]), row % 12
-            seen.add(row)
-            assert made.now.place[b].tolist() == [int(target.first[number, 0]), t]
+            alike = (every.actions - now.history.actions[b]).abs().amax((1, 2)) == 0
+            alike &= (windows.state - now.at.state[b])[:, VELOCITY.stop :].abs().amax(1) == 0
+            row = int(alike.nonzero()[0])
+            found.add(row)
+            here, there = off(now.at.state[b : b + 1], now.place[b : b + 1]), windows.state[row : row + 1]
+            torch.testing.assert_close(here, off(there, windows.place[row : row + 1, -1]), rtol=0, atol=1e-5)
+            past = unexplained(windows.history(torch.tensor([row])))
+            torch.testing.assert_close(unexplained(now.history[b : b + 1]), past, rtol=0, atol=2e-3)
+        assert len(found) > 12
+        assert set(now.place[:, 0].tolist()) - set(target.first[:, 0].tolist())
+        assert torch.equal(now.history.observations[:, -1, :13], now.at.state)
+        assert torch.equal(now.history.observations[:, -1, 13:], task.course.goal(now.place))
+
+    def test_recorded_starts_of_a_wing_are_as_they_were_recorded_with_all_that_it_was_shown(self):
+        task = reaching()
+        target = FlightTarget(task.course, FixedWing(), 0.05, push(2.0))
+        torch.manual_seed(0)
+        flown = run(target, ReachPolicy(), see_goals, 2, 12, seeded(4))
+        windows = Windows.cut([each.episode for each in flown], "state")
+        made = Streams(World(FixedWing(), period=0.05), task, identity, windows, StreamSettings(20, 1000, 1.0))
+        made.start(0.0, seeded(5))
+        for b in range(20):
+            # Both flights begin in the same state: their points tell them apart.
+            there = (target.first[windows.episode] == made.now.place[b]).all(1)
+            row = int(((windows.state == made.now.at.state[b]).all(1) & there).nonzero()[0])
+            seen = windows.history(torch.tensor([row])).observations[0]
+            assert torch.equal(made.now.history.observations[b, :, :13], seen)
+            assert torch.equal(made.now.history.observations[b, :, 13:], made.now.place[b].expand(LENGTH, -1))
             assert torch.equal(made.now.history.actions[b], windows.past_actions[row])
-            for back in range(LENGTH):
-                shown = made.now.history.observations[b, LENGTH - 1 - back]
-                earlier = max(t - back, 0)
-                assert torch.equal(shown[:13], windows.state[row - t + earlier])
-                assert torch.equal(
-                    shown[13:], task.course.goal(target.first[number : number + 1] + torch.tensor([0, earlier]))[0]
-                )
-        assert len(seen) > 12
 
     def test_tuned_along_references_the_cost_of_a_plan_falls(self):
         torch.manual_seed(0)

@@ -11,6 +11,8 @@ from visadapt.courses import AlongReferences, ToTarget
 from visadapt.learning.tasks import Task, curriculum
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
 
+CANDIDATES = 64
+"""rows of other references among which that most alike is looked for"""
 NEAR = 0.01
 """A cost that is small: about that of a plan with 1 cm of error all along."""
 
@@ -103,6 +105,33 @@ class Follow(Task):
 
     def onward(self, place: Tensor) -> Tensor:
         return self.course.onward(place)
+
+    def elsewhere(
+        self, seen: Tensor, state: Tensor, place: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """As far off another reference, where that is flown most alike.
+
+        A vehicle that feels no air flies alike wherever it is and however fast: position and velocity change by as much
+        in all rows. Of CANDIDATES rows of references at random the one with the most similar velocity and acceleration
+        is taken, so that drag and tilt change little.
+        """
+        own, batch = self.course.references, len(seen)
+        which = torch.randint(len(own.positions), (batch, CANDIDATES), generator=generator)
+        row = torch.randint(place.shape[1] - 1, self.course.last, (batch, CANDIDATES), generator=generator)
+
+        def motion(which: Tensor, row: Tensor) -> Tensor:
+            return torch.cat((own.velocities[which, row], own.accelerations[which, row]), -1)
+
+        now = place[:, -1]
+        unlike = (motion(which, row) - motion(now[:, :1], now[:, 1:])).square().sum(-1)
+        best = unlike.argmin(1, keepdim=True)
+        chosen, until = which.gather(1, best)[:, 0], row.gather(1, best)[:, 0]
+        shift = torch.zeros_like(state)
+        for part, values in ((POSITION, own.positions), (VELOCITY, own.velocities)):
+            shift[:, part] = values[chosen, until] - values[now[:, 0], now[:, 1]]
+        back = torch.arange(1 - place.shape[1], 1)
+        there = torch.stack((chosen[:, None].expand(-1, len(back)), until[:, None] + back), -1)
+        return seen + shift[:, None], state + shift, there.to(place)
 
 
 @dataclass(frozen=True)

@@ -112,10 +112,10 @@ class Streams:
             if len(near):
                 from_record = torch.rand(count, generator=generator) < recorded
                 rows = near[torch.randint(len(near), (count,), generator=generator)]
-                state = torch.where(from_record[:, None], windows.state[rows], state)
                 past = windows.history(rows)
-                shown = self.task.show(past.observations.flatten(0, 1), places[rows].flatten(0, 1))
-                past = History(shown.unflatten(0, past.observations.shape[:2]), past.actions)
-                history = past.where(from_record, history)
-                place = torch.where(from_record[:, None], places[rows, -1], place)
+                seen, now, where = self.task.elsewhere(past.observations, windows.state[rows], places[rows], generator)
+                shown = self.task.show(seen.flatten(0, 1), where.flatten(0, 1)).unflatten(0, seen.shape[:2])
+                history = History(shown, past.actions).where(from_record, history)
+                place = torch.where(from_record[:, None], where[:, -1], place)
+                state = torch.where(from_record[:, None], now, state)
         return Scene(self.world.start(state), history, place)

@@ -37,6 +37,15 @@ class Task(ABC):
         """The places a step later."""
         return place
 
+    def elsewhere(
+        self, seen: Tensor, state: Tensor, place: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What was seen (B, LENGTH, ...) up to states (B, n_state), at places (B, LENGTH, ...), as if somewhere else.
+
+        A few hundred samples are of a few courses only; a task that knows others moves there what it can.
+        """
+        return seen, state, place
+
     def disturb(self, state: Tensor, generator: torch.Generator) -> Tensor:
         """States (B, n_state) with what chance does to them between steps."""
         return state
