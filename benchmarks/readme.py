@@ -77,7 +77,7 @@ VEHICLES = {
 
 def vehicles(rows: Rows) -> list[list[str]]:
     """The paper's vehicles beside ours, in m."""
-    head = ("source", "before", "after: first round", "after: last round", "flights that failed")
+    head = ("source", "before", "after: first round", "after: last round", "failed before, after")
     table = [["m", "paper: source, before, after (samples)", *head]]
     for name, (said, *papers) in VEHICLES.items():
         own = [row for row in rows if row["experiment"] == name]
@@ -89,8 +89,8 @@ def vehicles(rows: Rows) -> list[list[str]]:
                 f"{float(row['mean']):.4f} ± {float(row['std']):.4f}" + (f" ({int(row['samples']):,})" if k > 1 else "")
                 for k, row in enumerate(shown)
             ]
-            failed, flown = (sum(int(row[key]) for row in shown) for key in ("failed", "episodes"))
-            table.append([said, ", ".join(filter(None, papers)), *cells, f"{failed} of {flown:,}"])
+            failed = ", ".join(f"{row['failed']} of {row['episodes']}" for row in (before, adapted[-1]))
+            table.append([said, ", ".join(filter(None, papers)), *cells, failed])
     return table
 
 

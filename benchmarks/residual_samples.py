@@ -107,7 +107,7 @@ def _share(flight: Flight, method: str, train: Windows, samples: int, test: Wind
     )
     residual = Residual(network, torch.ones(len(flight.system.states)))
     few = _first(train, samples)
-    rescale(residual, flight.source, few)
+    rescale(residual, flight.source, few, flight.settings.ground.negligible)
     ground(residual, flight.source, few, flight.settings.ground, torch.Generator().manual_seed(seed))
     return _size(left_over(residual, flight.source, test)) / _size(gap(flight.source, test))
 

@@ -93,7 +93,7 @@ class TestOnStates:
         residual = Residual(StateResidualNetwork(4), torch.ones(4))
         windows = Windows.cut(recorded(1), "state")
         right = World(CartPole(), [ConstantForce(force=NEWTONS)]).requires_grad_(False)
-        rescale(residual, right, windows)
+        rescale(residual, right, windows, negligible=1e-2)
         change = np.sqrt(np.mean((windows.next_state - windows.state).numpy() ** 2, 0))
         np.testing.assert_allclose(residual.scale.numpy(), 1e-2 * change, rtol=1e-4)
 

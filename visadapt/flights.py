@@ -55,7 +55,7 @@ class FlightSettings:
     """the same, where the residual reads the past"""
     longest: int = 100
     """steps of a stream"""
-    ground: GroundSettings = field(default_factory=lambda: GroundSettings(ridge=0.1))
+    ground: GroundSettings = field(default_factory=lambda: GroundSettings(ridge=0.1, negligible=0.1))
 
 
 class Flight:

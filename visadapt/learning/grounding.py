@@ -23,16 +23,16 @@ from visadapt.world import World
 NAMED_STEPS = 8
 NUDGE = 1e-3
 """Iterations of the fit of named effects, and its finite difference as a share of a parameter's range."""
-NEGLIGIBLE = 1e-2
-"""of a state's change in a period"""
 
 
 @dataclass(frozen=True)
 class GroundSettings:
-    """How a residual is fitted; all but the first are for heads fitted by descent."""
+    """How a residual is fitted; all but the first two are for heads fitted by descent."""
 
     ridge: float = 10.0
     """weight of the squared coefficients of a linear head, in samples"""
+    negligible: float = 0.0
+    """share of a state's change in a period below which a gap is not heard as loudly as others"""
     steps: int = 2000
     """optimisation steps at most"""
     batch: int = 64
@@ -109,15 +109,15 @@ def _one_step_errors(
     return left, torch.stack(slopes, 1)
 
 
-def rescale(residual: Residual, source: World, windows: Windows) -> None:
+def rescale(residual: Residual, source: World, windows: Windows, negligible: float = 0.0) -> None:
     """Make the root mean square of the gap, state by state, the unit of the residual's corrections.
 
-    A gap under NEGLIGIBLE of what a state changes by in a period is that of integrators and rounding: in units of its
-    own it would be heard as loudly as the others, and far off what was recorded more loudly.
+    A gap that is less than the share `negligible` of what a state changes by in a period, that of integrators and
+    rounding say, has that share for its unit: in units of its own it would be heard as loudly as the others.
     """
     missing = gap(source, windows).square().mean(0).sqrt()
     change = (windows.next_state - windows.state).square().mean(0).sqrt()
-    residual.scale.copy_(torch.maximum(missing, NEGLIGIBLE * change).clamp(min=1e-9))
+    residual.scale.copy_(torch.maximum(missing, negligible * change).clamp(min=1e-9))
 
 
 def ground(

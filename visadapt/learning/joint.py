@@ -147,7 +147,7 @@ def adapt(
         def fit(progress: Progress | None, windows: Windows = windows, number: int = number) -> list[GroundLoss]:
             fit_named(source, windows)
             if number == 0:
-                rescale(residual, source, windows)
+                rescale(residual, source, windows, settings.ground.negligible)
             return ground(residual, source, windows, settings.ground, _generator(settings, number, 1), progress)
 
         grounding = _grounded(here / "residual.safetensors", fit, grounded, staged(report, f"{name}: ground"))
