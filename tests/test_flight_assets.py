@@ -9,7 +9,7 @@ import torch
 from datasets import quadrotor_references
 from tests.flying import drag
 from visadapt.courses import AlongReferences
-from visadapt.flights import fixed_wing, quadrotor, score
+from visadapt.flights import Training, fixed_wing, quadrotor, score
 from visadapt.references import Reference
 
 ASSETS = Path(__file__).parents[1] / "assets"
@@ -47,7 +47,7 @@ def test_200_samples_of_a_drag_lower_its_error_by_half_or_more(flight, tmp_path)
     policy = shipped(flight)
     dragged = flight.target(drag(0.3))
     before = score(dragged, policy, 0, 20)
-    flight.settings = dataclasses.replace(flight.settings, iterations=40, batch=64)
+    flight.settings = dataclasses.replace(flight.settings, tuning=Training(40, 1e-3, batch=64))
     adapted = flight.adapt(policy, flight.target(drag(0.3), test=False), tmp_path, 200, 200, seed=0)
     after = score(dragged, policy, 0, 20)
     assert adapted.ledger.used == 200

@@ -21,6 +21,8 @@ EXPECTED = 2.0
 FELT = 0.2
 """m/s2 and rad/s2: the same, of vehicles. Small, so that ridge regression trusts a rule by which the unexplained goes
 on, from its past, before velocities and attitudes that happened to go with it."""
+TOLD = 12
+"""What `FlightResidualNetwork.told` tells."""
 Predict = Callable[[Tensor, Tensor], Tensor]
 """States and actions to the states a period later."""
 KINEMATICS = 2 * LENGTH
@@ -240,6 +242,19 @@ class FlightResidualNetwork(ResidualNetwork):
             return super().informed(seen)
         past = seen[:, -6 * (LENGTH - 1) :].unflatten(1, (LENGTH - 1, 6))
         return past.diff(dim=1).any(2).all(1)
+
+    def told(self, history: History) -> Tensor:
+        """What pushes a vehicle and how that changes, (B, TOLD): unexplained accelerations, and their rates.
+
+        Of velocity and rates each, in units of EXPECTED and of EXPECTED a second; zeros where there is no history.
+        """
+        states = history.observations[..., : self.n_state]
+        if self.predict is None:
+            return states.new_zeros(len(states), TOLD)
+        past = self.unexplained(self.predict, states, history.actions).unflatten(1, (LENGTH - 1, -1))
+        past = past * (FELT / EXPECTED)
+        change = (past[:, -1] - past[:, 0]) / ((LENGTH - 2) * self.period)
+        return torch.cat((past[:, -1], change), 1)
 
     def unexplained(self, predict: Predict, states: Tensor, actions: Tensor) -> Tensor:
         """Changes of velocity and rates beyond the source's over the periods between states, (B, 6 (LENGTH - 1)).

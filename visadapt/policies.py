@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from visadapt.effects import Residual
 from visadapt.history import LENGTH, History
-from visadapt.networks import FEATURES, FrameEncoder, mlp
+from visadapt.networks import FEATURES, TOLD, FlightResidualNetwork, FrameEncoder, mlp
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY, RigidBody, rotation, times
 
 HORIZON = 10
@@ -118,10 +118,14 @@ class FlightPolicy(Policy):
         self.rest = mlp(width, width, width)
         self.out = nn.Linear(width, HORIZON * n_action)
         self.straight = nn.Linear(15 + n_aim, HORIZON * n_action, bias=False)
+        # The layers that hear what pushes come last, so that the others are drawn as they were without them.
+        self.hearing = nn.Linear(TOLD, width, bias=False)
+        self.answer = nn.Linear(TOLD, HORIZON * n_action, bias=False)
         _deafen(self.first, self.n_state)
         with torch.no_grad():
             self.out.weight.mul_(0.1)
-            self.straight.weight.zero_()
+            for layer in (self.straight, self.hearing, self.answer):
+                layer.weight.zero_()
 
     def aim(self, state: Tensor, goal: Tensor) -> Tensor:
         """What the goal (B, n_goal) is to a vehicle in a state (B, 13): (B, n_aim)."""
@@ -132,11 +136,20 @@ class FlightPolicy(Policy):
         state, goal = shown[:, : self.n_state], shown[:, self.n_state :]
         velocity, turned = state[:, VELOCITY], rotation(state[:, ATTITUDE])
         own = (velocity, times(turned.mT, velocity), turned[:, :, :2].flatten(1), state[:, RATES])
-        return torch.cat((*own, self.aim(state, goal)), 1)
+        return torch.cat((*own, self.aim(state, goal), self.told(history)), 1)
+
+    def told(self, history: History) -> Tensor:
+        """What pushes and how that changes, (B, TOLD): a plan of a second needs to know where a force is going."""
+        network = None if self.residual is None else self.residual.network
+        if not isinstance(network, FlightResidualNetwork):
+            return history.actions.new_zeros(len(history.actions), TOLD)
+        with torch.no_grad():
+            return network.told(history)
 
     def plan(self, features: Tensor, correction: Tensor) -> Tensor:
-        hidden = self.rest(self.first(torch.cat((features, correction), 1)).tanh()).tanh()
-        out: Tensor = self.out(hidden) + self.straight(features)
+        own, told = features[:, :-TOLD], features[:, -TOLD:]
+        hidden = self.rest((self.first(torch.cat((own, correction), 1)) + self.hearing(told)).tanh()).tanh()
+        out: Tensor = self.out(hidden) + self.straight(own) + self.answer(told)
         return out
 
 
