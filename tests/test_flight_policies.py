@@ -6,7 +6,7 @@ from tests.scenes import stir
 from visadapt.checkpoints import CheckpointError, load_network, save_network
 from visadapt.courses import AlongReferences, ToTarget
 from visadapt.effects import Residual
-from visadapt.history import History
+from visadapt.history import LENGTH, History
 from visadapt.networks import FlightResidualNetwork
 from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.rollout import see_goals
@@ -107,6 +107,20 @@ class TestPolicies:
         heard = policy(history)
         policy.residual = None
         assert (policy(history) - heard).abs().max() > 1e-3
+
+    def test_what_its_residual_tells_of_the_past_is_heard_once_it_has_learnt_to_listen(self, kind):
+        policy = made(kind, torch.float64)
+        source = World(Quadrotor(), period=PERIOD)
+        predict = lambda state, action: source.step(source.start(state), action).state  # noqa: E731
+        network = FlightResidualNetwork(Quadrotor(), PERIOD, predict).double()
+        policy.residual = Residual(network, torch.ones(13).double())
+        calm = a_history(kind)
+        pushed = History(calm.observations.clone(), calm.actions)
+        pushed.observations[:, :-1, 3] -= torch.linspace(0.4, 0.1, LENGTH - 1).double()
+        assert torch.equal(policy(pushed), policy(calm))
+        with torch.no_grad():
+            policy.answer.weight.fill_(0.1)
+        assert (policy(pushed) - policy(calm)).abs().min() > 1e-3
 
     def test_weights_come_back_from_a_file_as_they_were(self, kind, tmp_path):
         policy, history = stir(made(kind), 3), a_history(kind, torch.float32)

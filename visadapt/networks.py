@@ -246,6 +246,7 @@ class FlightResidualNetwork(ResidualNetwork):
     def told(self, history: History) -> Tensor:
         """What pushes a vehicle and how that changes, (B, TOLD): unexplained accelerations, and their rates.
 
+        The last action of the history is the one being executed, as for `forward`; it does not matter here.
         Of velocity and rates each, in units of EXPECTED and of EXPECTED a second; zeros where there is no history.
         """
         states = history.observations[..., : self.n_state]

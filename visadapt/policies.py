@@ -60,9 +60,12 @@ class Policy(nn.Module):
         if self.residual is None:
             return observations.new_zeros(len(observations), self.n_state)
         with torch.no_grad():
-            nothing = observations.new_zeros(len(observations), self.n_action)
-            out: Tensor = self.residual.network(history.acting(nothing))
+            out: Tensor = self.residual.network(history.acting(self._nothing(history)))
         return out
+
+    def _nothing(self, history: History) -> Tensor:
+        """An action (B, n_action) of zeros."""
+        return history.actions.new_zeros(len(history.actions), self.n_action)
 
 
 class ImagePolicy(Policy):
@@ -144,7 +147,7 @@ class FlightPolicy(Policy):
         if not isinstance(network, FlightResidualNetwork):
             return history.actions.new_zeros(len(history.actions), TOLD)
         with torch.no_grad():
-            return network.told(history)
+            return network.told(history.acting(self._nothing(history)))
 
     def plan(self, features: Tensor, correction: Tensor) -> Tensor:
         own, told = features[:, :-TOLD], features[:, -TOLD:]
