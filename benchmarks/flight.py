@@ -125,9 +125,8 @@ def _draw(settings: Settings) -> None:
 
 
 class SidePush(PeriodicForce):
-    """A push along y that comes and goes."""
+    """A push along y that comes and goes. It has no name of its own, and so is in no catalogue."""
 
-    name = "side_push"
     systems = (RigidBody,)
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:

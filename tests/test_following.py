@@ -359,7 +359,7 @@ class TestGradient:
         imagined = made()
         policy = imagined.policy
         weights = [weight for weight in policy.parameters() if weight.requires_grad]
-        assert len(weights) == 10
+        assert len(weights) == 12
         generator = seeded(7)
         ways = [1e-2 * torch.randn(weight.shape, generator=generator, dtype=torch.float64) for weight in weights]
         imagined.cost(policy(imagined.history)).backward()
