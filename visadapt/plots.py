@@ -146,8 +146,11 @@ def plot_panels(path: str | os.PathLike[str], panels: Sequence[Panel], columns: 
     lines = -(-len(panels) // columns)
     figure = Figure(figsize=(4.8 * max(columns, 1.5), 0.6 + 3.0 * lines), dpi=150, layout="constrained")
     grid = figure.subplots(lines, columns, squeeze=False)
-    for axes, panel in zip(grid.flat, panels, strict=True):
+    places = list(grid.flat)
+    for axes, panel in zip(places, panels, strict=False):
         _draw_panel(axes, panel, colours)
+    for spare in places[len(panels) :]:
+        figure.delaxes(spare)
     told = {name: line for axes in grid.flat for line, name in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(told.values(), told, loc="outside lower center", ncols=len(told), frameon=False, fontsize=9)
     _save(figure, path)
