@@ -54,7 +54,7 @@ def test_the_curve_takes_the_rows_of_a_table(tmp_path: Path, unadapted: str, fai
     assert is_a_picture(tmp_path / "curve.png")
 
 
-@pytest.mark.parametrize("columns", [1, 2])
+@pytest.mark.parametrize("columns", [1, 2, 3])
 def test_panels_take_the_rows_of_a_table_failed_and_missing_ones_too(tmp_path: Path, columns: int):
     wide = [make_row("adapted", n, mean) for n, mean in ((1000, 0.1), (50, "0.01"), (200, "inf"))]
     other = [make_row("target", n, 0.3) | {"method": "another", "std": ""} for n in (50, 200, 1000)]
