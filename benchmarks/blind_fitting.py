@@ -71,6 +71,20 @@ def one(name: str, low: float, high: float, step: float, *starts: float) -> Cand
     return Candidate(effect, (Free(name, low, high, step),), tuple({name: start} for start in starts), 1)
 
 
+def on_any(*limits: float) -> list[Candidate]:
+    """What may be wrong with the commands of any system, and a steady push; a saturation is looked for from `limits`."""
+    return [
+        one("actuator_gain.scale", 0.4, 2.0, 0.001, 1.0),
+        one("actuator_bias.offset", -0.35, 0.35, 0.0001, 0.0),
+        one("actuator_delay.delay", 0.0, 0.2, 0.0005, 0.005, 0.05),
+        one("actuator_lag.time_constant", 0.0, 0.3, 0.0005, 0.005, 0.05),
+        one("actuator_deadzone.width", 0.0, 0.6, 0.0005, 0.005, 0.05),
+        one("actuator_saturation.limit", 0.02, 1.0, 0.001, *limits),
+        one("actuator_backlash.width", 0.0, 1.0, 0.0005, 0.01, 0.1),
+        one("constant_force.force", -10, 10, 0.001, 0.0),
+    ]
+
+
 def candidates(data: Steps) -> list[Candidate]:
     """All effects of the catalogue that leave a trace, with a grid for places, times and frequencies."""
     longest = float(data.time.max())
@@ -80,14 +94,7 @@ def candidates(data: Steps) -> list[Candidate]:
     patches = [(a, b) for i, a in enumerate(places) for b in places[i + 1 :] if 0.15 <= b - a <= 0.8]
     periodic = tuple(Free(f"periodic_force.{name}", -10, 10, 0.01) for name in ("cosine", "sine", "offset"))
     return [
-        one("actuator_gain.scale", 0.4, 2.0, 0.001, 1.0),
-        one("actuator_bias.offset", -0.35, 0.35, 0.0001, 0.0),
-        one("actuator_delay.delay", 0.0, 0.2, 0.0005, 0.005, 0.05),
-        one("actuator_lag.time_constant", 0.0, 0.3, 0.0005, 0.005, 0.05),
-        one("actuator_deadzone.width", 0.0, 0.6, 0.0005, 0.005, 0.05),
-        one("actuator_saturation.limit", 0.02, 1.0, 0.001, 0.5, 0.25, 0.12),
-        one("actuator_backlash.width", 0.0, 1.0, 0.0005, 0.01, 0.1),
-        one("constant_force.force", -10, 10, 0.001, 0.0),
+        *on_any(0.5, 0.25, 0.12),
         Candidate(
             "periodic_force",
             (*periodic, Free("periodic_force.frequency", 0.05, 5.0, 0.001)),

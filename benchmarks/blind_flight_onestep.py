@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.blind_fitting import Candidate, Free, one
+from benchmarks.blind_fitting import Candidate, Free, on_any, one
 from benchmarks.blind_onestep import Array, Values, actuate
 from datasets import blind_flight_kinds
 from datasets.blind_flight_control import PERIODS
@@ -166,14 +166,7 @@ def flight_candidates(system: str) -> list[Candidate]:
     coefficients = tuple(Free(f"{name}.coefficient", 0.0, 3.0, 0.0001) for name in dragging)
     steady = tuple(Free(f"wind.velocity_{axis}", -10.0, 10.0, 0.001) for axis in "xyz")
     both = [
-        one("actuator_gain.scale", 0.4, 2.0, 0.001, 1.0),
-        one("actuator_bias.offset", -0.35, 0.35, 0.0001, 0.0),
-        one("actuator_delay.delay", 0.0, 0.2, 0.0005, 0.005, 0.05),
-        one("actuator_lag.time_constant", 0.0, 0.3, 0.0005, 0.005, 0.05),
-        one("actuator_deadzone.width", 0.0, 0.6, 0.0005, 0.005, 0.05),
-        one("actuator_saturation.limit", 0.02, 1.0, 0.001, 0.8, 0.4, 0.15),
-        one("actuator_backlash.width", 0.0, 1.0, 0.0005, 0.01, 0.1),
-        one("constant_force.force", -10, 10, 0.001, 0.0),
+        *on_any(0.8, 0.4, 0.15),
         Candidate(
             "periodic_force",
             (*force, Free("periodic_force.frequency", 0.05, 5.0, 0.0001)),

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 import tyro
 
-from benchmarks.flight import EXPERIMENTS, MEASURES, SCORE_SEED, adapt, hidden, opened, vehicle
+from benchmarks.flight import EXPERIMENTS, MEASURES, SCORE_SEED, adapt, hidden, opened, source_policy, vehicle
 from visadapt.courses import ToTarget
 from visadapt.effects import Residual
 from visadapt.flights import Flight, FlightScore, kept_score
@@ -155,7 +155,7 @@ def _before(settings: Settings, name: str) -> Stand:
     """The policy of the source, in the target."""
     flight = vehicle(EXPERIMENTS[name], settings.references)
     folder = opened(flight, name, settings.current, 0, settings.flights)
-    return _stand(settings, flight, name, folder, "target", _source_policy(settings, flight))
+    return _stand(settings, flight, name, folder, "target", source_policy(settings.assets, flight))
 
 
 def _stands(settings: Settings, name: str, by: str, seed: int) -> dict[int, Stand]:
@@ -165,7 +165,7 @@ def _stands(settings: Settings, name: str, by: str, seed: int) -> dict[int, Stan
     explorer = EXPLORERS[by](flight) if by in EXPLORERS else None
     work = settings.current if explorer is None else settings.work / by.replace(" ", "-")
     folder = opened(flight, name, work, seed, settings.flights)
-    policy = _source_policy(settings, flight)
+    policy = source_policy(settings.assets, flight)
     adapted = adapt(flight, name, work, policy, seed, explorer=explorer, reach=math.inf if explorer is None else REACH)
     found = {}
     for samples in [each.samples for each in adapted.rounds]:
@@ -191,10 +191,6 @@ def _stand(settings: Settings, flight: Flight, name: str, folder: Path, key: str
 def _error(residual: Residual | None, flight: Flight, windows: Windows) -> torch.Tensor:
     """Of one step of the simulator (N, n_state)."""
     return gap(flight.source, windows) if residual is None else left_over(residual, flight.source, windows)
-
-
-def _source_policy(settings: Settings, flight: Flight) -> FlightPolicy:
-    return flight.pretrain(settings.assets / f"{flight.system.name}.safetensors", 0)
 
 
 if __name__ == "__main__":

@@ -89,7 +89,7 @@ class Settings:
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
     for name in settings.experiments:  # before the jobs, which share references and source policies
-        _source_policy(settings, vehicle(EXPERIMENTS[name], settings.references))
+        source_policy(settings.assets, vehicle(EXPERIMENTS[name], settings.references))
     jobs = [(name, seed) for name in settings.experiments for seed in range(settings.seeds)]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(settings.jobs, mp_context=context) as pool:
@@ -120,7 +120,7 @@ def _draw(settings: Settings) -> None:
     plot_panels(settings.assets / "curve_flight.png", panels, columns=min(2, len(panels)))
     if ALTERNATION in settings.experiments:
         flight = vehicle(EXPERIMENTS[ALTERNATION], settings.references)
-        adapted = adapt(flight, ALTERNATION, settings.work, _source_policy(settings, flight), seed=0)
+        adapted = adapt(flight, ALTERNATION, settings.work, source_policy(settings.assets, flight), seed=0)
         plot_losses(settings.assets / "alternation.png", curves(adapted))
 
 
@@ -159,7 +159,7 @@ def _scores(settings: Settings, name: str, seed: int) -> dict[str, FlightScore]:
     flight = vehicle(experiment, settings.references)
     folder = opened(flight, name, settings.work, seed, settings.flights)
     draw = hidden(experiment, float(flight.system.mass))
-    policy = _source_policy(settings, flight)
+    policy = source_policy(settings.assets, flight)
     adapting = copy.deepcopy(policy)
     adapted = adapt(flight, name, settings.work, adapting, seed)
 
@@ -213,8 +213,9 @@ def _folder(work: Path, name: str, seed: int) -> Path:
     return work / name.replace(", ", "-").replace(" ", "-") / f"seed-{seed}"
 
 
-def _source_policy(settings: Settings, flight: Flight) -> FlightPolicy:
-    return flight.pretrain(settings.assets / f"{flight.system.name}.safetensors", 0)
+def source_policy(assets: Path, flight: Flight) -> FlightPolicy:
+    """The vehicle's policy of the source, which all seeds share."""
+    return flight.pretrain(assets / f"{flight.system.name}.safetensors", 0)
 
 
 if __name__ == "__main__":

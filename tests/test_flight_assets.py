@@ -11,7 +11,7 @@ from datasets import quadrotor_references
 from tests.flying import drag
 from visadapt.courses import AlongReferences
 from visadapt.effects import PeriodicForce
-from visadapt.flights import Training, fixed_wing, quadrotor, score
+from visadapt.flights import TrainSettings, fixed_wing, quadrotor, score
 from visadapt.references import Reference
 
 ASSETS = Path(__file__).parents[1] / "assets"
@@ -49,7 +49,7 @@ def test_200_samples_of_a_drag_lower_its_error_by_half_or_more(flight, tmp_path)
     policy = shipped(flight)
     dragged = flight.target(drag(0.3))
     before = score(dragged, policy, 0, 20)
-    flight.settings = dataclasses.replace(flight.settings, tuning=Training(40, 1e-3, batch=64))
+    flight.settings = dataclasses.replace(flight.settings, tuning=TrainSettings(40, 1e-3, batch=64))
     adapted = flight.adapt(policy, flight.target(drag(0.3), test=False), tmp_path, 200, 200, seed=0)
     after = score(dragged, policy, 0, 20)
     assert adapted.ledger.used == 200
@@ -66,7 +66,7 @@ def test_200_samples_of_a_force_that_changes_lower_its_error_by_half_or_more(fli
 
     policy = shipped(flight)
     before = score(flight.target(swaying), policy, 0, 20)
-    flight.settings = dataclasses.replace(flight.settings, recovering=Training(60, 2e-3, batch=64))
+    flight.settings = dataclasses.replace(flight.settings, recovering=TrainSettings(60, 2e-3, batch=64))
     flight.adapt(policy, flight.target(swaying, test=False), tmp_path, 200, 200, seed=0, with_history=True)
     after = score(flight.target(swaying), policy, 0, 20)
     assert after.mean < 0.5 * before.mean

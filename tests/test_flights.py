@@ -8,7 +8,7 @@ from tests.flying import PERIOD, drag, push, seeded, small_flight, straight, wav
 from visadapt.checkpoints import CheckpointError
 from visadapt.courses import AlongReferences, ToTarget
 from visadapt.effects import ConstantForce
-from visadapt.flights import FAR, Training, fixed_wing, score
+from visadapt.flights import FAR, TrainSettings, fixed_wing, score
 from visadapt.policies import HORIZON, FollowPolicy, Policy, Wander
 from visadapt.rollout import run, see_goals
 from visadapt.systems import FixedWing, Quadrotor
@@ -168,7 +168,7 @@ class TestScore:
         assert found.failed == int((aside > FAR).sum())
 
 
-BRIEF = Training(4, 1e-3, batch=8)
+BRIEF = TrainSettings(4, 1e-3, batch=8)
 SMALL = {"source": BRIEF, "tuning": BRIEF, "recovering": BRIEF, "longest": 10}
 
 

@@ -36,7 +36,7 @@ RECORDED = 0.8
 
 
 @dataclass(frozen=True)
-class Training:
+class TrainSettings:
     """How long and how fast a policy learns."""
 
     iterations: int
@@ -48,10 +48,10 @@ class Training:
 class FlightSettings:
     """How a vehicle's policy is trained."""
 
-    source: Training
-    tuning: Training
+    source: TrainSettings
+    tuning: TrainSettings
     """in each round of the adaptation"""
-    recovering: Training
+    recovering: TrainSettings
     """the same, where the residual reads the past"""
     longest: int = 100
     """steps of a stream"""
@@ -174,7 +174,7 @@ class Flight:
 def quadrotor(train: AlongReferences, test: AlongReferences, system: Quadrotor | None = None) -> Flight:
     """The quadrotor, Flightmare's or one's own, that follows references 0.1 s a row."""
     period = train.references.period
-    settings = FlightSettings(Training(4000, 4e-3), Training(200, 1e-3), Training(400, 2e-3, 128))
+    settings = FlightSettings(TrainSettings(4000, 4e-3), TrainSettings(200, 1e-3), TrainSettings(400, 2e-3, 128))
     follow, recover = Follow(train), Follow(train, RecoverCost(), diverged=3.0)
     return Flight(
         system or Quadrotor(), period, 2, train, test, follow, lambda: FollowPolicy(period), settings, recover
@@ -185,7 +185,9 @@ def fixed_wing(period: float = 0.05, system: FixedWing | None = None) -> Flight:
     """The fixed wing, Waldock's or one's own, that flies through points 50 m ahead."""
     system = system or FixedWing()
     course = ToTarget(period, system)
-    settings = FlightSettings(Training(3000, 3e-3, 128), Training(200, 3e-4, 128), Training(200, 3e-4, 128))
+    settings = FlightSettings(
+        TrainSettings(3000, 3e-3, 128), TrainSettings(200, 3e-4, 128), TrainSettings(200, 3e-4, 128)
+    )
     return Flight(system, period, 1, course, course, Reach(course), ReachPolicy, settings)
 
 

@@ -94,11 +94,8 @@ class Follow(Task):
         return self.cost_of(states, plan, self.course.ahead(place))
 
     def astray(self, state: Tensor, place: Tensor, progress: float) -> Tensor:
-        which, row = place.unbind(1)
-        there = self.course.references.positions[which, row.clamp(max=self.course.last)]
         limit = self.diverged * curriculum(self.first_divergence, progress)
-        away = (state[:, POSITION] - there).norm(dim=1)
-        return ~(away <= limit) | (row >= self.course.last)
+        return ~(self.course.off(state, place) <= limit) | (place[:, 1] >= self.course.last)
 
     def show(self, seen: Tensor, place: Tensor) -> Tensor:
         return torch.cat((seen, self.course.goal(place)), 1)
@@ -179,10 +176,7 @@ class Reach(Task):
 
     def astray(self, state: Tensor, place: Tensor, progress: float) -> Tensor:
         """Too far off, or past the point."""
-        line = place / place.norm(dim=1, keepdim=True)
-        along = (state[:, POSITION] * line).sum(1, keepdim=True)
-        off = (state[:, POSITION] - along * line).norm(dim=1)
-        return ~(off <= self.diverged) | (state[:, 0] >= place[:, 0])
+        return ~(self.course.off(state, place) <= self.diverged) | (state[:, 0] >= place[:, 0])
 
     def show(self, seen: Tensor, place: Tensor) -> Tensor:
         return torch.cat((seen, self.course.goal(place)), 1)
