@@ -21,14 +21,14 @@ import torch
 import tyro
 
 from renderers import DrawnCartPole
-from visadapt.evaluation import Evaluation, evaluate
-from visadapt.pixels import PixelTask
-from visadapt.plots import plot_curve
-from visadapt.results import read_rows, say, speed_row, write_rows
-from visadapt.rollout import see_frames
-from visadapt.runs import once, open_run
+from visadapt.evaluation.cartpole_score import Evaluation, evaluate
+from visadapt.evaluation.result_tables import read_rows, say, speed_row, write_rows
+from visadapt.films.plots import plot_curve
+from visadapt.setups.cartpole_frames import PixelTask
+from visadapt.storage.run_folder import once, open_run
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, no_effects, sine_force
+from visadapt.targets.rollout import see_frames
 from visadapt.world import World
 
 EXPERIMENT = "CartPole, pixels, 2(sin t + 1) N"
@@ -97,8 +97,8 @@ def main(settings: Settings) -> None:
 def _scores(settings: Settings, number: int | None, seed: int) -> dict[str, Evaluation]:
     """Scores of one job by samples: of the unadapted policy, or of one seed of a variant."""
     torch.set_num_threads(1)
-    scene = DrawnCartPole()
-    source, target = SyntheticTarget(no_effects, scene), SyntheticTarget(sine_force, scene)
+    stream = DrawnCartPole()
+    source, target = SyntheticTarget(no_effects, stream), SyntheticTarget(sine_force, stream)
     task = PixelTask.load_renderer(World(CartPole()), settings.assets / "renderer.safetensors")
     encoder, policy = task.load(settings.assets)
 

@@ -22,15 +22,15 @@ from pathlib import Path
 import torch
 import tyro
 
-from visadapt.evaluation import Evaluation, evaluate
-from visadapt.plots import plot_curve
+from visadapt.evaluation.cartpole_score import Evaluation, evaluate
+from visadapt.evaluation.result_tables import read_rows, say, speed_row, write_rows
+from visadapt.films.plots import plot_curve
 from visadapt.policies import StatePolicy
-from visadapt.results import read_rows, say, speed_row, write_rows
-from visadapt.rollout import see_states
-from visadapt.runs import once, open_run
-from visadapt.states import StateSettings, adapt_states, pretrain
+from visadapt.setups.cartpole_states import StateSettings, adapt_states, pretrain
+from visadapt.storage.run_folder import once, open_run
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, constant_force, sine_force
+from visadapt.targets.rollout import see_states
 from visadapt.world import World
 
 FORCE = 3.3

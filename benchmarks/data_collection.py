@@ -25,18 +25,18 @@ import torch
 import tyro
 
 from benchmarks.flight import EXPERIMENTS, MEASURES, SCORE_SEED, adapt, hidden, opened, source_policy, vehicle
-from visadapt.courses import ToTarget
 from visadapt.effects import Residual
-from visadapt.flights import Flight, FlightScore, kept_score
+from visadapt.evaluation.result_tables import Row, miss_row, read_rows, write_rows
+from visadapt.films.plots import Panel, plot_panels
 from visadapt.learning.grounding import gap, left_over
 from visadapt.learning.windows import Windows
-from visadapt.plots import Panel, plot_panels
-from visadapt.policies import FlightPolicy, Policy, Wander
-from visadapt.results import Row, miss_row, read_rows, write_rows
-from visadapt.rollout import run, see_goals
-from visadapt.runs import once
+from visadapt.policies import AutoregressivePolicy, FlightPolicy, Policy
+from visadapt.setups.flight import Flight, FlightScore, kept_score
+from visadapt.storage.run_folder import once
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import VELOCITY
+from visadapt.targets.rollout import run, see_goals
+from visadapt.tasks.courses import ToTarget
 
 REACH = 5.0
 """m off its course at which a flight of another policy than the current one ends"""
@@ -52,7 +52,7 @@ def random_policy(flight: Flight) -> Policy:
     else:
         assert isinstance(flight.system, FixedWing)
         rest = flight.system.trim(torch.tensor([ToTarget.speed]))[1][0]
-    return Wander(len(flight.system.states), rest, math.exp(-flight.source.period / LASTING))
+    return AutoregressivePolicy(len(flight.system.states), rest, math.exp(-flight.source.period / LASTING))
 
 
 CURRENT = "data of the current policy"

@@ -29,14 +29,14 @@ from torch import Tensor
 
 from train.flight_policies import made
 from train.scoring import curves
-from visadapt.console import Report
 from visadapt.effects import Effect, LinearDrag, PeriodicForce
-from visadapt.flights import Flight, FlightScore, kept_score
+from visadapt.evaluation.result_tables import miss_row, read_rows, write_rows
+from visadapt.films.plots import Panel, plot_losses, plot_panels
 from visadapt.learning.joint import Adapted
-from visadapt.plots import Panel, plot_losses, plot_panels
 from visadapt.policies import FlightPolicy, Policy
-from visadapt.results import miss_row, read_rows, write_rows
-from visadapt.runs import open_run
+from visadapt.progress import Report
+from visadapt.setups.flight import Flight, FlightScore, kept_score
+from visadapt.storage.run_folder import open_run
 from visadapt.systems import FixedWing, Quadrotor, RigidBody, System
 from visadapt.targets.synthetic import DrawEffects, no_effects
 

@@ -22,9 +22,9 @@ import tyro
 
 from benchmarks.flight import EXPERIMENTS, SCORE_SEED, hidden, vehicle
 from visadapt.effects import ConstantForce, Effect, LinearDrag, ThrustGain
-from visadapt.flights import FlightScore, kept_score
-from visadapt.results import miss_row, write_rows
-from visadapt.runs import open_run
+from visadapt.evaluation.result_tables import miss_row, write_rows
+from visadapt.setups.flight import FlightScore, kept_score
+from visadapt.storage.run_folder import open_run
 
 EXPERIMENT = EXPERIMENTS["quadrotor, drag"]
 BUDGETS = (20, 50, 100)

@@ -18,11 +18,11 @@ from pathlib import Path
 import torch
 import tyro
 
-from visadapt.courses import AlongReferences
-from visadapt.flights import quadrotor, score
-from visadapt.references import Reference, power_loop, smallest_loop
-from visadapt.results import Row, write_rows
+from visadapt.evaluation.result_tables import Row, write_rows
+from visadapt.setups.flight import quadrotor, score
 from visadapt.systems import Quadrotor
+from visadapt.tasks.courses import AlongReferences
+from visadapt.tasks.references import Reference, power_loop, smallest_loop
 
 SPEEDS = (2.6, 3.4, 4.1, 4.6, 5.0)
 """m/s, the paper's"""

@@ -11,8 +11,8 @@ from pathlib import Path
 from benchmarks.cartpole_pixels import EXPERIMENT as PIXELS
 from benchmarks.cartpole_pixels import OURS as FRAMES_ALONE
 from benchmarks.cartpole_states import CONSTANT, OURS, SINE
-from visadapt.files import replacing
-from visadapt.results import read_rows
+from visadapt.evaluation.result_tables import read_rows
+from visadapt.storage.atomic_files import replacing
 
 RESULTS = Path("results")
 CURVE = (50, 100, 200, 500, 1000)

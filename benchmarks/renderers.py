@@ -23,7 +23,7 @@ from rich.table import Table
 
 from renderers import DrawnCartPole, LayeredRenderer, MLPRenderer, RendererError, load_renderer
 from renderers.measure import measure
-from visadapt.results import Row, write_rows
+from visadapt.evaluation.result_tables import Row, write_rows
 
 Floats = NDArray[np.floating]
 
@@ -54,14 +54,14 @@ class Settings:
 
 def compare(settings: Settings) -> list[Row]:
     """All rows of the table."""
-    scene = DrawnCartPole()
+    stream = DrawnCartPole()
     rng = np.random.default_rng(settings.seed)
-    far = scene.camera.reach - scene.cart_width / 2
+    far = stream.camera.reach - stream.cart_width / 2
     x = rng.uniform(-far, far, settings.states)
     theta = rng.uniform(-settings.angle, settings.angle, settings.states)
-    drawn = scene(x, theta) / 255
-    rows = _read("drawn", drawn, x, theta, scene)
-    size = (scene.camera.height, scene.camera.width)
+    drawn = stream(x, theta) / 255
+    rows = _read("drawn", drawn, x, theta, stream)
+    size = (stream.camera.height, stream.camera.width)
     for method, path in (("layered (ours)", settings.layered), ("MLP (the paper's)", settings.mlp)):
         renderer = load_renderer(path, size)
         frames = render(renderer, x, theta)
@@ -70,7 +70,7 @@ def compare(settings: Settings) -> list[Row]:
         rows.append(
             _row(method, "image error over the frames' variance", "1", float(squared.mean()) / _variance(drawn), len(x))
         )
-        rows += _read(method, frames, x, theta, scene)
+        rows += _read(method, frames, x, theta, stream)
         rows += _times(method, renderer, settings)
     return rows
 
@@ -82,14 +82,14 @@ def render(renderer: LayeredRenderer | MLPRenderer, x: Floats, theta: Floats) ->
     return np.asarray(torch.cat([renderer(*part) for part in inputs]).numpy(), np.float32)
 
 
-def errors(frames: Floats, x: Floats, theta: Floats, scene: DrawnCartPole) -> tuple[Floats, Floats]:
+def errors(frames: Floats, x: Floats, theta: Floats, stream: DrawnCartPole) -> tuple[Floats, Floats]:
     """Position (B,) in m and angle (B,) in rad read from frames, less the truth; NaN where none can be read."""
-    seen_x, seen_theta = measure(frames, scene)
+    seen_x, seen_theta = measure(frames, stream)
     return seen_x - x, seen_theta - theta
 
 
-def _read(method: str, frames: Floats, x: Floats, theta: Floats, scene: DrawnCartPole) -> list[Row]:
-    position, angle = errors(frames, x, theta, scene)
+def _read(method: str, frames: Floats, x: Floats, theta: Floats, stream: DrawnCartPole) -> list[Row]:
+    position, angle = errors(frames, x, theta, stream)
     rows = []
     for name, unit, error in (("position", "cm", 100 * position), ("angle", "degree", np.degrees(angle))):
         known = np.abs(error[np.isfinite(error)])

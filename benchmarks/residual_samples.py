@@ -22,15 +22,15 @@ from torch import Tensor
 
 from benchmarks.flight import EXPERIMENTS, hidden, vehicle
 from visadapt.effects import Residual
-from visadapt.flights import Flight
+from visadapt.evaluation.result_tables import Row, read_rows, write_rows
+from visadapt.films.plots import Panel, plot_panels
 from visadapt.learning.grounding import gap, ground, left_over, rescale
 from visadapt.learning.windows import Windows
-from visadapt.networks import FlightResidualNetwork, ResidualNetwork, StateResidualNetwork
-from visadapt.plots import Panel, plot_panels
 from visadapt.policies import FlightPolicy
-from visadapt.results import Row, read_rows, write_rows
-from visadapt.rollout import run, see_goals
+from visadapt.policies.networks import FlightResidualNetwork, ResidualNetwork, StateResidualNetwork
+from visadapt.setups.flight import Flight
 from visadapt.systems.rigid_body import VELOCITY
+from visadapt.targets.rollout import run, see_goals
 
 EXPERIMENT = EXPERIMENTS["quadrotor, drag"]
 SAMPLES = (50, 100, 200, 500, 1000)

@@ -4,7 +4,7 @@
 
 Needs the extra `rotorpy` (pip install 'visadapt[rotorpy]'). The policy of the source flies it in four kinds of air,
 ten flights of 100 samples each, with a little noise on its commands, as the counted samples of an adaptation have it.
-The states are given the measurement noise of the sealed check of flights (`datasets/blind_flights.py`). In order:
+The states are given the measurement noise of the sealed check of flights (`datasets/blind/flights.py`). In order:
 
     1. `visadapt.diagnose` with the source's parameters and the whole catalogue of the quadrotor: the verdict, the most
        probable set, and the gap that it closes
@@ -29,23 +29,24 @@ import numpy as np
 import torch
 import tyro
 
-from datasets import blind_flights, quadrotor_references
+from datasets import quadrotor_references
+from datasets.blind import flights as blind_flights
 from train.rotorpy_quadrotor import published
 from visadapt import diagnose
-from visadapt.console import reporting
-from visadapt.courses import AlongReferences
-from visadapt.diagnosis.causes import NINETY
-from visadapt.diagnosis.readings import Readings
-from visadapt.diagnosis.which import Search, posterior
+from visadapt.diagnosis.search.causes import NINETY
+from visadapt.diagnosis.search.search import Search, posterior
+from visadapt.diagnosis.search.sensor_checks import Readings
 from visadapt.effects import MotorLag, RateDamping, RotorDrag, TranslationalLift, Wind
-from visadapt.files import replacing
-from visadapt.flights import quadrotor
 from visadapt.policies import FlightPolicy
+from visadapt.progress import reporting
 from visadapt.recordings import Episode, load_recording, write_recording
-from visadapt.rollout import run, see_goals
-from visadapt.runs import once, open_run
+from visadapt.setups.flight import quadrotor
+from visadapt.storage.atomic_files import replacing
+from visadapt.storage.run_folder import once, open_run
 from visadapt.targets import TargetError
+from visadapt.targets.rollout import run, see_goals
 from visadapt.targets.rotorpy import BREEZE, SOURCE, Air, RotorpyTarget
+from visadapt.tasks.courses import AlongReferences
 from visadapt.world import World
 
 FLIGHTS = 10

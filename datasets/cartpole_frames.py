@@ -19,7 +19,7 @@ import tyro
 from numpy.typing import NDArray
 
 from renderers import DrawnCartPole
-from visadapt.files import replacing
+from visadapt.storage.atomic_files import replacing
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@
 python -m datasets.quadrotor_references --help
 
 Each is a spline of degree 5 with uniform knots (four continuous derivatives), so its acceleration, jerk and snap say
-what it asks of the quadrotor (see `visadapt.flatness`). Its mean speed is drawn first, uniformly, and its start at
-rest or in motion; then shapes are drawn until one is feasible at that speed, so that hard speeds are not left out:
+what it asks of the quadrotor (see `visadapt.tasks.differential_flatness`). Its mean speed is drawn first, uniformly,
+and its start at rest or in motion; then shapes are drawn until one is feasible at that speed, so that hard speeds are
+not left out:
 
     number of segments    uniform over whole numbers
     steps between control points    normal, each axis with a scale that is uniform in [0, 1]
@@ -27,10 +28,10 @@ import torch
 import tyro
 from torch import Tensor
 
-from visadapt.files import replacing
-from visadapt.flatness import commands
-from visadapt.references import Reference
+from visadapt.storage.atomic_files import replacing
 from visadapt.systems import Quadrotor
+from visadapt.tasks.differential_flatness import commands
+from visadapt.tasks.references import Reference
 
 DEGREE = 5
 """of the splines"""

@@ -5,10 +5,10 @@ import math
 
 import torch
 
-from visadapt.courses import AlongReferences
 from visadapt.effects import ConstantForce, LinearDrag
-from visadapt.flights import quadrotor
-from visadapt.references import Reference
+from visadapt.setups.flight import quadrotor
+from visadapt.tasks.courses import AlongReferences
+from visadapt.tasks.references import Reference
 
 PERIOD = 0.1
 

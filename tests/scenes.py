@@ -4,7 +4,7 @@ import torch
 
 from renderers import LayeredRenderer
 from visadapt.learning.perception import PerceptionSettings, scale
-from visadapt.networks import ImageResidualNetwork, StateResidualNetwork
+from visadapt.policies.networks import ImageResidualNetwork, StateResidualNetwork
 from visadapt.systems import CartPole
 
 HEIGHT, WIDTH = 20, 24

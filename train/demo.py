@@ -25,16 +25,16 @@ import tyro
 from renderers import DrawnCartPole
 from train import renderer as renderer_training
 from train.scoring import curves, filmed, score
-from visadapt.console import reporting
-from visadapt.evaluation import EPISODES, Evaluation
-from visadapt.panels import Panel
-from visadapt.pixels import PixelSettings, PixelTask
-from visadapt.plots import plot_losses
-from visadapt.rollout import Run
-from visadapt.runs import once, open_run, write_json
+from visadapt.evaluation.cartpole_score import EPISODES, Evaluation
+from visadapt.films.cartpole_panel import Panel
+from visadapt.films.plots import plot_losses
+from visadapt.films.video import write_film, write_still
+from visadapt.progress import reporting
+from visadapt.setups.cartpole_frames import PixelSettings, PixelTask
+from visadapt.storage.run_folder import once, open_run, write_json
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, Target, TargetError, no_effects, sine_force
-from visadapt.video import write_film, write_still
+from visadapt.targets.rollout import Run
 from visadapt.world import World
 
 
@@ -65,8 +65,8 @@ def main(settings: Settings) -> None:
     training = PixelSettings()
     chosen = {key: value for key, value in asdict(settings).items() if key not in ("out", "assets")}
     about = open_run(out, {**chosen, "training": asdict(training)})
-    scene = DrawnCartPole()
-    source, target = SyntheticTarget(no_effects, scene), SyntheticTarget(sine_force, scene)
+    stream = DrawnCartPole()
+    source, target = SyntheticTarget(no_effects, stream), SyntheticTarget(sine_force, stream)
     renderer = _renderer(settings, out)
     with reporting() as report:
         task = PixelTask.load_renderer(World(CartPole()), renderer, training)
@@ -98,7 +98,7 @@ def main(settings: Settings) -> None:
             report,
         )
         look("after", f"Target, after {adapted.ledger.used:,} samples", target)
-        panels = [Panel.redrawn(title, shown, scene) for title, shown in films]
+        panels = [Panel.redrawn(title, shown, stream) for title, shown in films]
         write_still(out / "film.png", panels, t=3.0)
         write_film(
             out / "film.mp4", panels, target.period, lambda done, total: report("film", done, total, float("nan"))

@@ -24,12 +24,12 @@ import tyro
 
 from benchmarks.flight import EXPERIMENTS, adapt, hidden
 from train.flight_policies import made
-from visadapt.console import reporting
-from visadapt.flight_film import FlownPanel, write_flight_film, write_flight_still
-from visadapt.flights import Flight
+from visadapt.films.flight_film import FlownPanel, write_flight_film, write_flight_still
 from visadapt.policies import Policy
-from visadapt.rollout import run, see_goals
+from visadapt.progress import reporting
+from visadapt.setups.flight import Flight
 from visadapt.targets import TargetError
+from visadapt.targets.rollout import run, see_goals
 from visadapt.targets.synthetic import DrawEffects, no_effects
 
 NAMES = {

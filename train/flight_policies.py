@@ -16,11 +16,11 @@ import torch
 import tyro
 
 from datasets import quadrotor_references
-from visadapt.console import reporting
-from visadapt.courses import AlongReferences
-from visadapt.flights import Flight, fixed_wing, quadrotor, score
-from visadapt.rig import RigError, load_rig
+from visadapt.progress import reporting
+from visadapt.setups.flight import Flight, fixed_wing, quadrotor, score
 from visadapt.systems import FixedWing, Quadrotor
+from visadapt.systems.parameter_file import RigError, load_rig
+from visadapt.tasks.courses import AlongReferences
 
 
 @dataclass(frozen=True)

@@ -32,27 +32,27 @@ from torch import Tensor
 from renderers import LayeredRenderer, load_renderer, save_renderer
 from renderers.training import fit
 from train.scoring import curves, filmed, score
-from visadapt.console import Report, reporting, staged
-from visadapt.evaluation import EPISODES, Evaluation
-from visadapt.files import replacing
-from visadapt.learning.cost import Cost
+from visadapt.evaluation.cartpole_score import EPISODES, Evaluation
+from visadapt.evaluation.result_tables import Row, speed_row, write_rows
+from visadapt.films.cartpole_panel import Panel
+from visadapt.films.plots import plot_losses
+from visadapt.films.video import write_film, write_still
 from visadapt.learning.grounding import gap
 from visadapt.learning.perception import Paths, PerceptionSettings
 from visadapt.learning.policy import TuneSettings
-from visadapt.learning.tasks import Balance
 from visadapt.learning.windows import Windows
-from visadapt.panels import Panel
-from visadapt.pixels import PixelSettings, PixelTask
-from visadapt.plots import plot_losses
 from visadapt.policies import Policy
+from visadapt.progress import Report, reporting, staged
 from visadapt.recordings import Episode
-from visadapt.results import Row, speed_row, write_rows
-from visadapt.rollout import Run
-from visadapt.runs import once, open_run, write_json
+from visadapt.setups.cartpole_frames import PixelSettings, PixelTask
+from visadapt.storage.atomic_files import replacing
+from visadapt.storage.run_folder import once, open_run, write_json
 from visadapt.targets import Observation, SyntheticTarget, Target, TargetError
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.targets.inverted_pendulum import MAP, REACH, SOURCE, START, inverted_pendulum
-from visadapt.video import write_film, write_still
+from visadapt.targets.rollout import Run
+from visadapt.tasks.base import Balance
+from visadapt.tasks.cost import Cost
 from visadapt.world import World
 
 ANGLE_LIMIT = 0.2

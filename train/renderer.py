@@ -27,7 +27,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from datasets import cartpole_frames
 from renderers import Camera, DrawnCartPole, LayeredRenderer, MLPRenderer, save_renderer
 from renderers.training import fit
-from visadapt.files import replacing
+from visadapt.storage.atomic_files import replacing
 
 Renderer = LayeredRenderer | MLPRenderer
 Kind = Literal["layered", "mlp"]

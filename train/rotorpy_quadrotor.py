@@ -31,17 +31,17 @@ import tyro
 from torch import Tensor
 
 from datasets import quadrotor_references
-from visadapt.console import reporting
-from visadapt.courses import AlongReferences
-from visadapt.flights import FlightScore, kept_score, quadrotor
+from visadapt.evaluation.result_tables import Row, miss_row, write_rows
 from visadapt.policies import FlightPolicy
+from visadapt.progress import reporting
 from visadapt.recordings import Episode
-from visadapt.results import Row, miss_row, write_rows
-from visadapt.runs import once, open_run, write_json
+from visadapt.setups.flight import FlightScore, kept_score, quadrotor
+from visadapt.storage.run_folder import once, open_run, write_json
 from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, rotation, times
 from visadapt.targets import TargetError
 from visadapt.targets.flight import FlightTarget
 from visadapt.targets.rotorpy import BREEZE, SOURCE, RotorpyTarget
+from visadapt.tasks.courses import AlongReferences
 
 SCORE_SEED = 2026
 METHODS = {"ours, states": False, "ours, states with history": True}

@@ -6,12 +6,12 @@ from dataclasses import asdict
 
 import torch
 
-from visadapt.evaluation import STEPS, evaluate
+from visadapt.evaluation.cartpole_score import STEPS, evaluate
+from visadapt.films.plots import Round
 from visadapt.learning.joint import Adapted
-from visadapt.plots import Round
 from visadapt.policies import Policy
-from visadapt.rollout import Run, run, see_frames
 from visadapt.targets import Target
+from visadapt.targets.rollout import Run, run, see_frames
 
 FILM_SEED, SCORE_SEED = 12, 2026
 """Starts and phases of the film and of the final evaluation: never those of training, which counts from 0."""

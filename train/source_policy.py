@@ -14,9 +14,9 @@ from pathlib import Path
 
 import tyro
 
-from visadapt.console import reporting
-from visadapt.pixels import PixelSettings, PixelTask
-from visadapt.runs import open_run
+from visadapt.progress import reporting
+from visadapt.setups.cartpole_frames import PixelSettings, PixelTask
+from visadapt.storage.run_folder import open_run
 from visadapt.systems import CartPole
 from visadapt.world import World
 

@@ -28,18 +28,18 @@ import torch
 import tyro
 from torch import Tensor
 
-from visadapt.checkpoints import load_network
-from visadapt.console import reporting
-from visadapt.learning.cost import SettlingCost
-from visadapt.learning.policy import TuneSettings, learnt
-from visadapt.learning.tasks import SwingUp, within_a_turn
+from visadapt.evaluation.result_tables import Row, write_rows
+from visadapt.films.swing_up_film import SwingPanel, write_swing_film, write_swing_still
+from visadapt.learning.policy import TuneSettings, train_or_load
 from visadapt.policies import StatePolicy
-from visadapt.results import Row, write_rows
-from visadapt.rollout import run
-from visadapt.runs import once, open_run
-from visadapt.swing_film import SwingPanel, write_swing_film, write_swing_still
+from visadapt.progress import reporting
+from visadapt.storage.checkpoints import load_network
+from visadapt.storage.run_folder import once, open_run
 from visadapt.systems import CartPole
 from visadapt.targets import Observation, Start, SyntheticTarget
+from visadapt.targets.rollout import run
+from visadapt.tasks.base import SwingUp, within_a_turn
+from visadapt.tasks.cost import SettlingCost
 from visadapt.world import World
 
 SAMPLES = 20_000
@@ -54,7 +54,7 @@ TASK = SwingUp(
     SettlingCost(state=(20.0, 3.0, 10.0, 1.0), end=9.0),
     start_spread=ANYWHERE,
     kick=(0.0, 0.0, 0.0, 0.0),
-    diverged=(8.0, 30.0, 1e9, 40.0),
+    divergence=(8.0, 30.0, 1e9, 40.0),
     first_divergence=1.0,
 )
 """The paper's weights (A.1.3), x and the end of the plan apart. Without `end` no weight on x draws the cart back: the
@@ -177,7 +177,7 @@ def _seed(settings: Settings, seed: int) -> Score:
     policy = StatePolicy(n_state=4)
     generator = torch.Generator().manual_seed(seed)
     about = {"seed": seed, "samples": SAMPLES}
-    learnt(folder / POLICY, policy, World(CartPole()), _states, LEARN, generator, about)
+    train_or_load(folder / POLICY, policy, World(CartPole()), _states, LEARN, generator, about)
     return Score(**once(folder / "score.json", lambda: asdict(score(policy, settings.episodes))))
 
 

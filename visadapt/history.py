@@ -10,6 +10,9 @@ from torch import Tensor
 LENGTH = 5
 """Observations and actions kept (the paper, section 3.2.2)."""
 
+HORIZON = 10
+"""Actions planned at once, k in the paper; only the first is executed before planning again."""
+
 
 @dataclass(frozen=True)
 class History:

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, Residual, SensingEffect
 from visadapt.history import History
-from visadapt.integrators import INTEGRATORS
 from visadapt.systems import SYSTEMS, System
+from visadapt.systems.integrators import INTEGRATORS
 
 ACTUATION_CHAIN = (
     "actuator_delay",
@@ -73,7 +73,7 @@ class World(nn.Module):
         system: the source physics.
         effects: what separates the target from it.
         period: s between commands.
-        integrator: one of `visadapt.integrators.INTEGRATORS`.
+        integrator: one of `visadapt.systems.integrators.INTEGRATORS`.
         substeps: integration steps in a period.
 
     Raises:

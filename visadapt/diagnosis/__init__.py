@@ -1,7 +1,7 @@
 """Diagnosis: where a recording departs from the source, which effects cause it, and how far they close the gap."""
 
-from visadapt.diagnosis.diagnosing import diagnose
+from visadapt.diagnosis.diagnose import diagnose
 from visadapt.diagnosis.result import Diagnosis
-from visadapt.diagnosis.subjects import DIAGNOSABLE
+from visadapt.estimation.profiles import DIAGNOSABLE
 
 __all__ = ["DIAGNOSABLE", "Diagnosis", "diagnose"]

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from visadapt.console import Progress
 from visadapt.effects import Effect, Parameter, Residual
 from visadapt.learning.windows import Windows
-from visadapt.networks import ResidualNetwork
+from visadapt.policies.networks import ResidualNetwork
+from visadapt.progress import Progress
 from visadapt.world import World
 
 NAMED_STEPS = 8

@@ -14,17 +14,17 @@ from pathlib import Path
 
 import torch
 
-from visadapt.checkpoints import load_tree, load_weights, save_tree
-from visadapt.console import Progress, Report, staged
 from visadapt.effects import Residual
 from visadapt.learning.grounding import GroundLoss, GroundSettings, fit_named, ground, rescale
 from visadapt.learning.ledger import Ledger
-from visadapt.learning.policy import TuneSettings, oppose, tune
+from visadapt.learning.policy import TuneSettings, initialise_feedforward, tune
 from visadapt.learning.windows import Observe, Windows
 from visadapt.policies import Policy
+from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, read_recording, write_recording
-from visadapt.rollout import See, run
+from visadapt.storage.checkpoints import load_tree, load_weights, save_tree
 from visadapt.targets import Target, TargetError
+from visadapt.targets.rollout import See, run
 from visadapt.world import World
 
 Label = Callable[[list[Episode]], list[Episode]]
@@ -152,7 +152,7 @@ def adapt(
 
         grounding = _grounded(here / "residual.safetensors", fit, grounded, staged(report, f"{name}: ground"))
         if number == 0 and settings.feedforward:
-            oppose(policy, source, residual.scale)
+            initialise_feedforward(policy, source, residual.scale)
         losses = _tuned(here, policy, grounded, observe, settings, windows, number, staged(report, f"{name}: tune"))
         rounds.append(Round(ledger.used, grounding, losses))
     return Adapted(ledger, rounds, episodes, folder)

@@ -13,10 +13,10 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from visadapt.console import Progress
 from visadapt.history import LENGTH, History
-from visadapt.learning.resume import EVERY, Training
-from visadapt.networks import FrameEncoder
+from visadapt.policies.networks import FrameEncoder
+from visadapt.progress import Progress
+from visadapt.storage.training_state import EVERY, Training
 
 
 @dataclass(frozen=True)

@@ -17,14 +17,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from visadapt.checkpoints import load_network, save_network
-from visadapt.console import Progress
-from visadapt.history import History
-from visadapt.learning.resume import EVERY, Training
-from visadapt.learning.streams import Scene, Streams, StreamSettings
-from visadapt.learning.tasks import Task
+from visadapt.history import HORIZON, History
+from visadapt.learning.streams import Streams, StreamSettings, StreamState
 from visadapt.learning.windows import Observe, Windows
-from visadapt.policies import HORIZON, Policy
+from visadapt.policies import Policy
+from visadapt.progress import Progress
+from visadapt.storage.checkpoints import load_network, save_network
+from visadapt.storage.training_state import EVERY, Training
+from visadapt.tasks.base import Task
 from visadapt.world import World, WorldState
 
 
@@ -43,7 +43,7 @@ class TuneSettings:
     longest: int = 150
     """steps after which a stream starts anew"""
     streams: int | None = None
-    """streams, where they are not the batch itself: every scene that they come to is kept, and each batch drawn from
+    """streams, where they are not the batch itself: every stream that they come to is kept, and each batch drawn from
     all of these, so that much is learnt from few steps"""
     every: int = 1
     """iterations for each step of the streams"""
@@ -55,7 +55,7 @@ class TuneSettings:
     """standard deviation of white noise on what the policy sees"""
 
 
-def oppose(policy: Policy, source: World, scale: Tensor) -> None:
+def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None:
     """Let the feed-forward undo what the residual expects, as far as commands can: least squares about rest.
 
     `scale` (n_state,) is the residual's, in whose units the policy hears corrections.
@@ -96,25 +96,25 @@ def tune(
     task = settings.task
     running = StreamSettings(settings.streams or settings.batch, settings.longest, settings.recorded)
     streams = Streams(world, task, observe, windows, running)
-    past: Scene | None = None
+    past: StreamState | None = None
     losses: list[float] = []
     if checkpoint is not None and checkpoint.exists():
         losses, kept = training.resume(checkpoint)
-        streams.now, streams.age = Scene.of(kept["now"]), kept["age"]
-        past = Scene.of(kept["past"]) if "past" in kept else None
+        streams.now, streams.age = StreamState.of(kept["now"]), kept["age"]
+        past = StreamState.of(kept["past"]) if "past" in kept else None
     else:
         streams.start(0.0 if settings.curriculum else 1.0, generator)
     policy.train()
     for iteration in range(len(losses), settings.iterations):
-        scene = streams.now
+        stream = streams.now
         if settings.streams is not None:
-            past = past or scene
-            scene = past[torch.randint(len(past.place), (settings.batch,), generator=generator)]
-        history = scene.history
+            past = past or stream
+            stream = past[torch.randint(len(past.place), (settings.batch,), generator=generator)]
+        history = stream.history
         noise = settings.observation_noise * torch.randn(history.observations.shape, generator=generator)
         plan = policy(History(history.observations + noise.to(history.observations), history.actions))
-        states, first = imagine(world, partial(streams.show, place=scene.place), scene.at, history, plan)
-        loss = task.cost(states, plan, scene.at.state, scene.place).mean()
+        states, first = imagine(world, partial(streams.show, place=stream.place), stream.at, history, plan)
+        loss = task.cost(states, plan, stream.at.state, stream.place).mean()
         if not bool(loss.isfinite()):
             raise DivergedError(f"the policy's loss is {float(loss.detach())} at iteration {iteration}")
         optimiser.zero_grad()
@@ -138,7 +138,7 @@ def tune(
     return losses
 
 
-def learnt(
+def train_or_load(
     path: Path,
     policy: Policy,
     world: World,
@@ -162,10 +162,10 @@ def learnt(
 
 
 @torch.no_grad()
-def _step(world: World, policy: Policy, scene: Scene) -> tuple[WorldState, Tensor]:
+def _step(world: World, policy: Policy, stream: StreamState) -> tuple[WorldState, Tensor]:
     """The world a step on under the policy, and what it did."""
-    action = policy.act(scene.history)
-    return world.step(scene.at, action, scene.history), action
+    action = policy.act(stream.history)
+    return world.step(stream.at, action, stream.history), action
 
 
 def imagine(

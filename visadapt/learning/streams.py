@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from visadapt.history import History
-from visadapt.learning.tasks import Task
 from visadapt.learning.windows import Observe, Windows
+from visadapt.tasks.base import Task
 from visadapt.world import World, WorldState
 
 
 @dataclass(frozen=True)
-class Scene:
+class StreamState:
     """Where streams are: all that imagining on from there needs."""
 
     at: WorldState
@@ -23,17 +23,19 @@ class Scene:
     place: Tensor
     """(B, ...) the task's"""
 
-    def where(self, keep: Tensor, other: Scene) -> Scene:
-        """This scene in the rows where `keep` (B,) holds, `other` in the rest."""
+    def where(self, keep: Tensor, other: StreamState) -> StreamState:
+        """This stream in the rows where `keep` (B,) holds, `other` in the rest."""
         place = torch.where(keep.reshape(-1, *[1] * (self.place.dim() - 1)), self.place, other.place)
-        return Scene(self.at.where(keep, other.at), self.history.where(keep, other.history), place)
+        return StreamState(self.at.where(keep, other.at), self.history.where(keep, other.history), place)
 
-    def __getitem__(self, rows: Tensor) -> Scene:
-        return Scene(self.at[rows], self.history[rows], self.place[rows])
+    def __getitem__(self, rows: Tensor) -> StreamState:
+        return StreamState(self.at[rows], self.history[rows], self.place[rows])
 
-    def joined(self, other: Scene) -> Scene:
-        """This scene and, after it, another."""
-        return Scene(self.at.joined(other.at), self.history.joined(other.history), torch.cat((self.place, other.place)))
+    def joined(self, other: StreamState) -> StreamState:
+        """This stream and, after it, another."""
+        return StreamState(
+            self.at.joined(other.at), self.history.joined(other.history), torch.cat((self.place, other.place))
+        )
 
     def tree(self) -> dict[str, Any]:
         """All of it, to be kept in a file."""
@@ -75,7 +77,7 @@ class Streams:
         self.observe = observe
         self.windows = windows
         self.settings = settings
-        self.now: Scene
+        self.now: StreamState
         self.age: Tensor
 
     def show(self, state: Tensor, place: Tensor) -> Tensor:
@@ -92,30 +94,30 @@ class Streams:
     def advance(self, at: WorldState, action: Tensor, progress: float, generator: torch.Generator) -> None:
         """Take the step to `at` under `action`; restart what strayed. `progress` in [0, 1] drives the curriculum."""
         state = self.task.disturb(at.state, generator)
-        place = self.task.onward(self.now.place)
+        place = self.task.advance(self.now.place)
         history = self.now.history.acting(action).observing(self.show(state, place)).detach()
-        self.now = Scene(WorldState(at.time, state, at.memory).detach(), history, place)
+        self.now = StreamState(WorldState(at.time, state, at.memory).detach(), history, place)
         self.age += 1
-        keep = (self.age < self.settings.longest) & ~self.task.astray(state, place, progress)
+        keep = (self.age < self.settings.longest) & ~self.task.diverged(state, place, progress)
         if not bool(keep.all()):
             self.now = self.now.where(keep, self._fresh(progress, generator))
             self.age = torch.where(keep, self.age, 0)
 
-    def _fresh(self, progress: float, generator: torch.Generator) -> Scene:
+    def _fresh(self, progress: float, generator: torch.Generator) -> StreamState:
         count, recorded, windows = self.settings.count, self.settings.recorded, self.windows
         state, place = self.task.begin(count, progress, generator)
         history = History.start(self.show(state, place), len(self.world.system.actions))
         if windows is not None and recorded > 0:
             places = windows.place.to(place)
             # A fall on record is beyond delta_div; starting from it would drown what can be learnt.
-            near = (~self.task.astray(windows.state, places[:, -1], progress)).nonzero()[:, 0]
+            near = (~self.task.diverged(windows.state, places[:, -1], progress)).nonzero()[:, 0]
             if len(near):
                 from_record = torch.rand(count, generator=generator) < recorded
                 rows = near[torch.randint(len(near), (count,), generator=generator)]
                 past = windows.history(rows)
-                seen, now, where = self.task.elsewhere(past.observations, windows.state[rows], places[rows], generator)
+                seen, now, where = self.task.augment(past.observations, windows.state[rows], places[rows], generator)
                 shown = self.task.show(seen.flatten(0, 1), where.flatten(0, 1)).unflatten(0, seen.shape[:2])
                 history = History(shown, past.actions).where(from_record, history)
                 place = torch.where(from_record[:, None], where[:, -1], place)
                 state = torch.where(from_record[:, None], now, state)
-        return Scene(self.world.start(state), history, place)
+        return StreamState(self.world.start(state), history, place)

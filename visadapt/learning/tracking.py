@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from visadapt.effects import DynamicsEffect
+from visadapt.estimation.smoothing import Noise, Path, Problem, likeliest, smooth
 from visadapt.learning.poses import PoseFinder, Poses
-from visadapt.learning.smoothing import Noise, Path, Problem, likeliest, smooth
 from visadapt.recordings import Episode
 from visadapt.systems import System
 from visadapt.world import World

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from visadapt.files import replacing
 from visadapt.recordings.clock import Rows
 from visadapt.recordings.columns import FORCE, match
 from visadapt.recordings.episode import Episode, RecordingError
 from visadapt.recordings.table import Table
+from visadapt.storage.atomic_files import replacing
 from visadapt.systems import System
 
 

@@ -22,8 +22,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from visadapt.files import replacing
 from visadapt.recordings.episode import Episode, RecordingError
+from visadapt.storage.atomic_files import replacing
 
 FORMAT, VERSION = "visadapt recording", 1
 

@@ -7,10 +7,10 @@ import math
 import torch
 from torch import Tensor
 
-from visadapt.courses import Course
 from visadapt.systems import RigidBody
 from visadapt.targets.base import Observation, Target, TargetError
 from visadapt.targets.synthetic import DrawEffects, no_effects
+from visadapt.tasks.courses import Course
 from visadapt.world import World, WorldState
 
 
@@ -65,7 +65,7 @@ class FlightTarget(Target):
             raise TargetError(f"{self.name}: step before reset")
         with torch.no_grad():
             self._at = self._world.step(self._at, action)
-        self._place = self.course.onward(self._place)
+        self._place = self.course.advance(self._place)
         return self._observe(self._world)
 
     def _observe(self, world: World) -> Observation:

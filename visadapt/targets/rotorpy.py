@@ -15,11 +15,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from visadapt.courses import AlongReferences
 from visadapt.systems import Quadrotor
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY
 from visadapt.targets.base import Observation, TargetError
 from visadapt.targets.flight import FlightTarget
+from visadapt.tasks.courses import AlongReferences
 
 INSTALL = "pip install 'visadapt[rotorpy]'"
 TICK = 0.01
@@ -132,7 +132,7 @@ class RotorpyTarget(FlightTarget):
                 self._state = self._multirotors.step(self._state, control, TICK)
                 self._ticks += 1
                 self._blow()
-        self._place = self.course.onward(self._place)
+        self._place = self.course.advance(self._place)
         return self._observation()
 
     def _wind(self, batch: int, generator: torch.Generator) -> list[Any]:

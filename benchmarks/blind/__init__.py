@@ -1,0 +1,1 @@
+"""The sealed check of the diagnosis."""

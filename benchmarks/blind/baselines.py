@@ -1,0 +1,206 @@
+"""Diagnosers to compare with: each takes the path of a recording's CSV and answers with DESIGN.md's JSON (schema 1).
+
+- afternoon: what a careful engineer writes in an afternoon. One-step prediction error of source and one effect at a
+  time, least squares on the measured states, the noise known, BIC; a fit that stays poor is called unexplained.
+- greedy: forward selection by BIC on the same residuals, up to three effects.
+- refit: all parameters at once by one ridge least-squares step; names what exceeds three standard deviations.
+- pysindy: sparse regression of the residual forces on a library of features, by the package pysindy.
+- chance: guesses by the mix of the sets.
+
+Afternoon, greedy, refit and chance know the vehicles too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.blind.answers import answer_of, cause_of, units_of
+from benchmarks.blind.fitting import Candidate, Data, Fit, candidates, chi_squared, fit
+from benchmarks.blind.flight_onestep import flight_candidates, read_flights, system_of
+from benchmarks.blind.onestep import NEUTRAL, PERIOD, Values, read_steps
+from benchmarks.blind.scoring import Answer
+
+POOR = 1.5
+"""chi-squared for each residual from which a fit is called poor"""
+SUSPECT = 3.0
+"""standard deviations from which refit names a parameter"""
+MIX, FLIGHT_MIX = (0.2, 0.3, 0.2, 0.1, 0.2), (0.165, 0.67, 0.0, 0.0, 0.165)
+"""shares of recordings without effect, with one, two and three, and with a foreign one"""
+RIDGE = 1.0
+"""prior precision of every parameter, in units of its 30 smallest steps"""
+
+
+def opened(path: Path) -> tuple[Data, list[Candidate]]:
+    """A recording, and the effects that may be in it."""
+    if (system := system_of(path)) != "cartpole":
+        return read_flights(path), flight_candidates(system)
+    data = read_steps(path)
+    return data, candidates(data)
+
+
+def afternoon(path: Path) -> Answer:
+    """One effect at a time."""
+    data, pool = opened(path)
+    fits = [fit(data, ()), *(fit(data, (candidate,)) for candidate in pool)]
+    return _judged(data, fits)
+
+
+def greedy(path: Path) -> Answer:
+    """One effect after the other, as long as BIC gains; all parameters are fitted anew each time."""
+    data, pool = opened(path)
+    seen = [fit(data, ())]
+    best = seen[0]
+    for _ in range(3):
+        left = [c for c in pool if not any(c.free == m.free and c.effect == m.effect for m in best.members)]
+        tried = [fit(data, (*best.members, c), best.values, thorough=False) for c in left]
+        seen += tried
+        leader = min(tried, key=lambda f: f.bic)
+        if leader.bic >= best.bic:
+            break
+        best = leader
+    return _judged(data, seen)
+
+
+def _judged(data: Data, fits: Sequence[Fit]) -> Answer:
+    """The set of the lowest BIC; none of them where even that fits poorly."""
+    best = min(fits, key=lambda f: f.bic)
+    if best.chi2 / data.size > POOR:
+        return answer_of(data, fits, "unexplained")
+    return answer_of(data, fits, "identified" if best.members else "no_gap")
+
+
+def refit(path: Path) -> Answer:
+    """(J'J + ridge)^-1 J'r at the source, for all parameters that have a slope there; names what stands out."""
+    data, every = opened(path)
+    aliases = _ALIASES[data.system]
+    pool = [_without_alias(c) for c in every if c.free and len(c.starts) <= 2 and c.effect not in aliases]
+    # A saturation at 1 and regions without width have no slope at the source; dropouts have no parameter.
+    free = [parameter for candidate in pool for parameter in candidate.free]
+    base = data.residual(dict(data.neutral))
+    keep = ~(data.rows_lost | data.angle_held)
+    slopes = np.stack(
+        [
+            ((data.residual({**data.neutral, p.name: data.neutral[p.name] + p.step}) - base)[:, keep] / p.step).ravel()
+            for p in free
+        ],
+        1,
+    )
+    scale = np.array([30 * p.step for p in free])
+    inverse = np.linalg.inv(slopes.T @ slopes + RIDGE * np.diag(scale**-2.0))
+    change = -inverse @ (slopes.T @ base[:, keep].ravel())
+    spread = np.sqrt(np.diag(inverse))
+    values: Values = dict(data.neutral) | {
+        p.name: data.neutral[p.name] + float(d) for p, d in zip(free, change, strict=True)
+    }
+    deviations = {p.name: float(s) for p, s in zip(free, spread, strict=True)}
+    outstanding = {p.name: abs(float(d / s)) for p, d, s in zip(free, change, spread, strict=True)}
+    named = [c for c in pool if max(outstanding[p.name] for p in c.free) > SUSPECT]
+    named.sort(key=lambda c: -max(outstanding[p.name] for p in c.free))
+    chi2 = chi_squared(data, data.residual(values), ("dropout", "frozen_zone"))
+    fits = [Fit((), dict(data.neutral), chi_squared(data, base, ()), 0.0, {})]
+    if named:
+        fits.append(Fit(tuple(named), values, chi2, -1.0, deviations))
+    return answer_of(data, fits, "identified" if named else "no_gap")
+
+
+_ALIASES: dict[str, tuple[str, ...]] = {
+    "cartpole": ("actuator_bias", "measurement_delay"),
+    "quadrotor": ("payload", "wind"),
+    "fixed_wing": (),
+}
+"""have the very columns of constant_force and actuator_delay; of thrust_gain and, at the source, of linear_drag"""
+
+
+def _without_alias(candidate: Candidate) -> Candidate:
+    """A spring's pull is a constant force, too."""
+    return replace(candidate, free=tuple(p for p in candidate.free if p.name != "spring.pull"))
+
+
+def pysindy(path: Path) -> Answer:
+    """STLSQ on what the source leaves of the force on the cart and of the torque at the pivot, by finite differences.
+
+    F = (mc + mp) x'' + mp l (theta'' cos - theta'^2 sin) - 30 u, tau = mp l x'' cos + 4/3 mp l^2 theta'' - mp g l sin.
+    """
+    package = importlib.import_module("pysindy")
+    data = read_steps(path)
+    _, v, angle, rate = middle = 0.5 * (data.state + data.after)
+    acceleration, turning = (data.after - data.state)[[1, 3]] / PERIOD
+    command = data.commands[data.where]
+    force = 1.1 * acceleration + 0.05 * (turning * np.cos(angle) - rate**2 * np.sin(angle)) - 30 * command
+    torque = 0.05 * acceleration * np.cos(angle) + turning / 30 - 0.49 * np.sin(angle)
+    features = {
+        "constant_force.force": np.ones_like(v),
+        "viscous_friction.coefficient": -v,
+        "coulomb_friction.force": -np.sign(v),
+        "quadratic_drag.coefficient": -v * np.abs(v),
+        "spring.stiffness": -middle[0],
+        "actuator_gain.scale": 30 * command,
+    }
+    # In N, so that one threshold serves all.
+    sizes = {name: float(np.sqrt(np.mean(column**2))) for name, column in features.items()}
+    library = np.stack([column / sizes[name] for name, column in features.items()], 1)
+    # Four standard errors of a coefficient, since the noise is known.
+    few = 4 * np.sqrt(2 / len(v)) / PERIOD
+    limits = few * 1.1 * data.noise[1], few * data.noise[3] / 30
+    with warnings.catch_warnings():
+        # That nothing is left is an answer, too.
+        warnings.filterwarnings("ignore", "Sparsity parameter is too big")
+        pushes = package.STLSQ(threshold=limits[0], alpha=1e-3).fit(library, force[:, None]).coef_[0]
+        turning_sizes = np.array([np.sqrt(np.mean(rate**2)), np.sqrt(np.mean(angle**2))])
+        pole = np.stack((-rate, angle), 1) / turning_sizes
+        turns = package.STLSQ(threshold=limits[1], alpha=1e-3).fit(pole, torque[:, None]).coef_[0] / turning_sizes
+    values = dict(NEUTRAL)
+    for (name, size), coefficient in zip(sizes.items(), pushes, strict=True):
+        values[name] = NEUTRAL[name] + float(coefficient) / size
+    values["pole_damping.coefficient"] = float(turns[0])
+    active = [(abs(c), name.split(".")[0]) for name, c in zip(features, pushes, strict=True) if c != 0]
+    # A torque in proportion to the angle is what a longer or heavier pole leaves; the former is the likelier.
+    active += [(abs(c) * 20, n) for n, c in zip(("pole_damping", "pole_length"), turns, strict=True) if c != 0]
+    named = [effect for _, effect in sorted(active, reverse=True)]
+    answer = answer_of(data, [Fit((), dict(NEUTRAL), 1.0, 0.0, {})], "identified" if named else "no_gap")
+    answer["causes"] = [cause_of(effect, values, {}, data, 1.0) for effect in named]
+    answer["ranking"] = [{"effects": named, "probability": None, "gap_closed": None}]
+    answer["gap"] = {}
+    return answer
+
+
+def chance(path: Path) -> Answer:
+    """A guess that repeats for the same file name: nothing, something foreign, or one to three effects."""
+    rng = np.random.default_rng(
+        int.from_bytes(hashlib.sha256(f"{path.parent.name}/{path.name}".encode()).digest()[:8], "big")
+    )
+    system = system_of(path)
+    effects = sorted(units_of(system))
+    guess = int(rng.choice(5, p=MIX if system == "cartpole" else FLIGHT_MIX))
+    named = [str(n) for n in rng.choice(effects, guess, replace=False)] if guess < 4 else []
+    rest = [[str(n)] for n in rng.choice(effects, 2, replace=False)]
+    verdict = "unexplained" if guess == 4 else "identified" if named else "no_gap"
+    return {
+        "schema": 1,
+        "system": system,
+        "verdict": verdict,
+        "where": {"regions": []},
+        "causes": [{"effect": name, "parameters": {}, "indistinguishable_from": []} for name in named],
+        "ranking": [{"effects": named, "probability": 1 / len(effects)}, *({"effects": r} for r in rest)],
+        "gap": {},
+    }
+
+
+BASELINES: dict[str, Callable[[Path], Answer]] = {
+    "afternoon": afternoon,
+    "greedy": greedy,
+    "refit": refit,
+    "pysindy": pysindy,
+    "chance": chance,
+}
+"""by name"""
+
+FLYING = ("afternoon", "greedy", "refit", "chance")
+"""those that know the vehicles"""

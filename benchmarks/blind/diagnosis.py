@@ -1,0 +1,262 @@
+"""How well diagnosers name a hidden gap: blind recordings, sealed answers.
+
+    python -m benchmarks.blind.diagnosis --count 200 --seed 7 --jobs 2 --diagnosers ours afternoon greedy refit chance
+
+    python -m benchmarks.blind.diagnosis --system quadrotor --count 30 --seed 7
+
+Makes the recordings with datasets.blind.gaps, or datasets.blind.flights, where they are not there yet, hands every
+diagnoser the path of one CSV at a time, and opens the key only to score. Every answer is a line of a log, so an
+interrupted run goes on where it was; with --data a folder made elsewhere is scored. Writes results/blind_diagnosis.csv
+(one row per set, diagnoser and measure) and results/blind_confusion.csv; lines of diagnosers and sets that were not run
+this time stay.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import io
+import json
+import multiprocessing
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from benchmarks.blind.baselines import BASELINES, FLYING
+from benchmarks.blind.flight_onestep import system_of
+from benchmarks.blind.scoring import Answer, Score, Truth, score
+from benchmarks.blind.tables import Row, confusion, label, read_table, tabulate, write_csv, write_table
+from datasets.blind import flights as blind_flights
+from datasets.blind import gaps as blind_gaps
+
+Kind = Literal["easy", "hard", "quadrotor", "fixed_wing"]
+"""A set of the cart-pole, or the one of a vehicle."""
+System = Literal["cartpole", "quadrotor", "fixed_wing"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is scored, and where things are kept."""
+
+    system: System = "cartpole"
+    """what is recorded; of a vehicle there is one set"""
+    count: int = 200
+    """recordings of each set"""
+    seed: int = 7
+    """of the recordings"""
+    kinds: tuple[Kind, ...] = ("easy", "hard")
+    """which sets of the cart-pole"""
+    diagnosers: tuple[str, ...] = ("ours", *BASELINES)
+    """who is scored"""
+    jobs: int = 1
+    """recordings at once, one core each"""
+    data: Path | None = None
+    """folder of recordings made elsewhere, its key beside it as <folder>.key.json; --kinds then names its one set"""
+    work: Path = Path("runs/blind_diagnosis")
+    """folder for the answers"""
+    out: Path = Path("results/blind_diagnosis.csv")
+    """table to write"""
+    fresh: bool = False
+    """forget the answers in the log: for a diagnoser that has changed"""
+    wrong: int = 0
+    """list so many wrong answers of each diagnoser"""
+
+    @property
+    def sets(self) -> tuple[Kind, ...]:
+        """Those of the system."""
+        return self.kinds if self.system == "cartpole" else (self.system,)
+
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """Diagnosers that know the system."""
+        flying = ("ours", *FLYING)
+        return tuple(name for name in self.diagnosers if self.system == "cartpole" or name in flying)
+
+
+def ours(path: Path) -> Answer:
+    """What the command `visadapt diagnose` writes, run in this process."""
+    # By name, and here: a worker that runs a baseline need not load torch.
+    cli = importlib.import_module("visadapt.cli.main")
+    said = io.StringIO()
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "answer.json"
+        with redirect_stdout(said), redirect_stderr(said):
+            status = cli.main(["diagnose", str(path), "--system", system_of(path), "--json", str(out)])
+        if status != 0:
+            raise RuntimeError(f"exit status {status}: {said.getvalue().strip()}")
+        answer: Answer = json.loads(out.read_text(encoding="utf-8"))
+    return answer
+
+
+DIAGNOSERS: dict[str, Callable[[Path], Answer]] = {"ours": ours, **BASELINES}
+"""path of a CSV -> answer, by name"""
+
+
+FAILED: Answer = {"verdict": "failed", "causes": [], "ranking": []}
+"""in place of an answer that ended in an error: it is wrong whatever the truth"""
+
+
+class Skipped(Exception):
+    """A diagnoser that cannot run here, and why."""
+
+
+def diagnose_one(name: str, path: Path) -> dict[str, Any]:
+    """A line of the log: the answer, or the error in its place, and the seconds that it took."""
+    begun = time.perf_counter()
+    line: dict[str, Any] = {"file": path.name, "sha256": fingerprint(path)}
+    try:
+        line["answer"] = DIAGNOSERS[name](path)
+    except ModuleNotFoundError as error:
+        raise Skipped(f"{name}: skipped, {error}") from error
+    except Exception as error:
+        # One recording that breaks a diagnoser must not cost the others; it is counted as failed.
+        line["error"] = f"{type(error).__name__}: {error}"
+    line["seconds"] = round(time.perf_counter() - begun, 3)
+    return line
+
+
+def fingerprint(path: Path) -> str:
+    """Says whether a logged answer is about the recording that now has its name."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def read_log(path: Path) -> dict[str, dict[str, Any]]:
+    """The answers by file. An error is tried again; the last line may have been torn by an interrupt."""
+    lines: dict[str, dict[str, Any]] = {}
+    if path.exists():
+        for text in path.read_text(encoding="utf-8").splitlines():
+            try:
+                line = json.loads(text)
+            except json.JSONDecodeError:
+                continue
+            if "answer" in line:
+                lines[line["file"]] = line
+    return lines
+
+
+def run_one(name: str, recordings: list[Path], log: Path, jobs: int) -> dict[str, dict[str, Any]]:
+    """All answers of a diagnoser by file: those in the log, and new ones, which go to the log as they come."""
+    prints = {path.name: fingerprint(path) for path in recordings}
+    known = {file: line for file, line in read_log(log).items() if line["sha256"] == prints.get(file)}
+    left = [path for path in recordings if path.name not in known]
+    if left:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        # Written anew without a torn line, which would otherwise spoil the next one.
+        log.write_text("".join(json.dumps(line) + "\n" for line in known.values()), encoding="utf-8")
+        with log.open("a", encoding="utf-8") as file:
+            for line in _answers(name, left, jobs):
+                file.write(json.dumps(line) + "\n")
+                file.flush()
+                known[line["file"]] = line
+    return known
+
+
+def _answers(name: str, left: list[Path], jobs: int) -> Iterator[dict[str, Any]]:
+    if jobs == 1:
+        yield from (diagnose_one(name, path) for path in left)
+        return
+    # Threads of torch and BLAS would fight over the cores that the processes share; read when those are loaded.
+    os.environ["OMP_NUM_THREADS"] = "1"
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        futures = [pool.submit(diagnose_one, name, path) for path in left]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def recordings_of(settings: Settings, kind: Kind) -> Path:
+    """The folder of a set, made where it is not there or not whole."""
+    if settings.data is not None:
+        return settings.data
+    folder = Path("data/blind") / f"{kind}-{settings.count}-{settings.seed}"
+    if len(list(folder.glob("*.csv"))) != settings.count or not key_of(folder).exists():
+        if kind == "easy" or kind == "hard":
+            blind_gaps.main(blind_gaps.Settings(folder, kind, settings.count, settings.seed))
+        else:
+            blind_flights.main(blind_flights.Settings(folder, kind, settings.count, settings.seed))
+    return folder
+
+
+def key_of(folder: Path) -> Path:
+    """Where the answers to a folder lie."""
+    return folder.with_name(folder.name + ".key.json")
+
+
+def read_key(folder: Path) -> dict[str, Truth]:
+    """The answers by file."""
+    key = json.loads(key_of(folder).read_text(encoding="utf-8"))
+    return {recording["file"]: Truth.of(recording) for recording in key["recordings"]}
+
+
+def show_wrong(name: str, judged: list[tuple[str, Truth, Answer, Score]], most: int) -> None:
+    """List answers that miss what they should have said."""
+    right = {"none": "no_gap", "foreign": "unexplained"}
+    wrong = [j for j in judged if not (j[3].exact if j[3].exact is not None else j[3].verdict == right[j[3].kind])]
+    for file, truth, answer, _ in wrong[:most]:
+        parts = [
+            f"{effect} (strength {truth.strengths[effect]:.1f}, "
+            + ", ".join(f"{parameter} {value:.4g}" for parameter, value in parameters.items())
+            + ")"
+            for effect, parameters in truth.effects.items()
+        ]
+        print(f"  {name} {file}: {truth.kind}: {' + '.join(parts) or 'nothing'} | said {label(answer)}")
+
+
+def main(settings: Settings) -> None:
+    """Run, score, print and write."""
+    if unknown := set(settings.diagnosers) - DIAGNOSERS.keys():
+        raise SystemExit(f"no such diagnoser: {', '.join(sorted(unknown))}; there are {', '.join(DIAGNOSERS)}")
+    if settings.data is not None and len(settings.sets) != 1:
+        raise SystemExit("--data is one set: say which with --kinds easy or --kinds hard")
+    rows: list[Row] = []
+    taken: list[dict[str, str | int]] = []
+    for kind in settings.sets:
+        folder = recordings_of(settings, kind)
+        recordings = sorted(folder.glob("*.csv"))
+        for name in settings.asked:
+            log = settings.work / folder.name / f"{name}.jsonl"
+            if settings.fresh:
+                log.unlink(missing_ok=True)
+            try:
+                lines = run_one(name, recordings, log, settings.jobs)
+            except Skipped as reason:
+                print(reason)
+                continue
+            truths = read_key(folder)
+            answers = {path.name: lines[path.name].get("answer", FAILED) for path in recordings}
+            judged = [(file, truths[file], answer, score(truths[file], answer)) for file, answer in answers.items()]
+            seconds = [lines[path.name]["seconds"] for path in recordings]
+            own = tabulate(kind, name, [j[3] for j in judged], seconds)
+            taken += confusion(kind, name, [(j[1], j[2]) for j in judged])
+            rows += own
+            for row in own:
+                print(f"{kind} {name:10s} {row.measure:50s} {row.value:8.3f} [{row.low:.3f}, {row.high:.3f}] n={row.n}")
+            show_wrong(name, judged, settings.wrong)
+    write(settings.out, rows, taken)
+
+
+def write(out: Path, rows: list[Row], taken: list[dict[str, str | int]]) -> None:
+    """Both tables; lines of other sets and diagnosers stay."""
+    run = {(row.kind, row.diagnoser) for row in rows}
+
+    def others(path: Path) -> list[dict[str, Any]]:
+        return [line for line in read_table(path) if (line["kind"], line["diagnoser"]) not in run]
+
+    if rows:
+        write_table(out, rows, others(out))
+        beside = out.with_name("blind_confusion.csv")
+        write_csv(beside, ("kind", "diagnoser", "truth", "answer", "count"), [*others(beside), *taken])
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings, description=__doc__))

@@ -1,0 +1,1 @@
+"""Recordings with hidden effects, made by code apart from the library."""

@@ -1,0 +1,179 @@
+"""What can stand between a blind flight and the source: the catalogue's effects on vehicles, and foreign ones.
+
+Each kind draws its shape once and has one size, a positive number that its strength grows with.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from datasets.blind.kinds import Build, Draw, Kind, Shape
+
+BOTH, QUADROTOR, WING = ("quadrotor", "fixed_wing"), ("quadrotor",), ("fixed_wing",)
+
+NEUTRAL: dict[str, float] = {
+    **dict.fromkeys(
+        (
+            "actuator_bias.offset",
+            "actuator_delay.delay",
+            "actuator_lag.time_constant",
+            "actuator_deadzone.width",
+            "actuator_backlash.width",
+            "constant_force.force",
+            *(f"periodic_force.{name}" for name in ("amplitude", "frequency", "phase", "offset")),
+            "linear_drag.coefficient",
+            "quadratic_drag.coefficient",
+            *(f"wind.{name}" for name in ("velocity_x", "velocity_y", "velocity_z", "coefficient")),
+            *(f"periodic_wind.{name}" for name in ("amplitude", "frequency", "phase", "direction", "coefficient")),
+            "payload.mass",
+            "center_of_mass_offset.x",
+            "center_of_mass_offset.y",
+            "battery_sag.rate",
+            *(f"trim_offset.{name}" for name in ("elevator", "aileron", "rudder")),
+            "one_way_drag.coefficient",
+            "beating_force.amplitude",
+            "layer.force",
+            "thrust_curve.share",
+            "crossed_rates.share",
+            "crossed_surfaces.share",
+        ),
+        0.0,
+    ),
+    **dict.fromkeys(
+        (
+            "actuator_gain.scale",
+            "actuator_saturation.limit",
+            "thrust_gain.scale",
+            "mass.scale",
+            "lift_slope.scale",
+            "drag.scale",
+            *(f"inertia.scale_{axis}" for axis in "xyz"),
+            *(f"rotor_efficiency.scale_{k}" for k in (1, 2, 3, 4)),
+            *(f"control_effectiveness.scale_{name}" for name in ("elevator", "aileron", "rudder")),
+        ),
+        1.0,
+    ),
+}
+"""Every parameter of every effect, and its value where the effect is not there."""
+
+
+def _sign(rng: np.random.Generator, _: float = 0.0) -> Shape:
+    return {"sign": float(rng.choice((-1.0, 1.0)))}
+
+
+def _signed(parameter: str) -> Build:
+    return lambda size, shape: {parameter: shape["sign"] * size}
+
+
+def _plain(parameter: str) -> Build:
+    return lambda size, shape: {parameter: size}
+
+
+def _scale(size: float, shape: Shape) -> Shape:
+    return {"scale": float(np.exp(shape["sign"] * size))}
+
+
+def _directed(names: tuple[str, ...]) -> Draw:
+    """A direction in the space of some parameters."""
+
+    def draw(rng: np.random.Generator, _: float) -> Shape:
+        direction = rng.normal(size=len(names))
+        direction /= np.linalg.norm(direction)
+        return {name: float(value) for name, value in zip(names, direction, strict=True)}
+
+    return draw
+
+
+def _along(size: float, shape: Shape) -> Shape:
+    return {name: size * value for name, value in shape.items()}
+
+
+def _scales(size: float, shape: Shape) -> Shape:
+    return {name: float(np.exp(size * value)) for name, value in shape.items()}
+
+
+def _one_weak(names: tuple[str, ...]) -> Draw:
+    """One of several parts is weaker than the source's, the others are as they are."""
+    return lambda rng, _: {name: -float(k == 0) for k, name in enumerate(rng.permutation(names).tolist())}
+
+
+def _periodic(rng: np.random.Generator, _: float) -> Shape:
+    phase = float(rng.uniform(-np.pi, np.pi))
+    return {"frequency": float(np.exp(rng.uniform(np.log(0.25), np.log(2.0)))), "phase": phase}
+
+
+def _windy(least: float, most: float) -> Draw:
+    """A direction of the wind, and the drag by which it acts."""
+
+    def draw(rng: np.random.Generator, _: float) -> Shape:
+        direction = _directed(("velocity_x", "velocity_y", "velocity_z"))(rng, 0.0)
+        return direction | {"drag": float(rng.uniform(least, most))}
+
+    return draw
+
+
+def _wind(size: float, shape: Shape) -> Shape:
+    return {name: size * shape[name] for name in shape if name != "drag"} | {"coefficient": shape["drag"]}
+
+
+def _wavy(least: float, most: float) -> Draw:
+    """The same of a wind that comes and goes."""
+
+    def draw(rng: np.random.Generator, _: float) -> Shape:
+        direction, drag = float(rng.uniform(-np.pi / 2, np.pi / 2)), float(rng.uniform(least, most))
+        return _periodic(rng, 0.0) | {"direction": direction, "drag": drag}
+
+    return draw
+
+
+def _waves(size: float, shape: Shape) -> Shape:
+    return {"amplitude": size, "coefficient": shape["drag"]} | {n: v for n, v in shape.items() if n != "drag"}
+
+
+ROTORS = tuple(f"scale_{k}" for k in (1, 2, 3, 4))
+SURFACES = ("elevator", "aileron", "rudder")
+
+NAMED: tuple[tuple[Kind, tuple[str, ...]], ...] = (
+    (Kind("actuator_gain", "actuation", 0.01, 0.6, _scale, _sign), BOTH),
+    (Kind("actuator_bias", "actuation", 0.001, 0.2, _signed("offset"), _sign), BOTH),
+    # Whole steps of the integration.
+    (Kind("actuator_delay", "actuation", 0.005, 0.15, lambda s, _: {"delay": 0.005 * max(1, round(s / 0.005))}), BOTH),
+    (Kind("actuator_lag", "actuation", 0.005, 0.2, _plain("time_constant")), BOTH),
+    (Kind("actuator_deadzone", "actuation", 0.003, 0.2, _plain("width")), BOTH),
+    (Kind("actuator_saturation", "actuation", 0.3, 2.5, lambda s, _: {"limit": float(np.exp(-s))}), BOTH),
+    (Kind("actuator_backlash", "actuation", 0.005, 0.3, _plain("width")), BOTH),
+    (Kind("constant_force", "dynamics", 0.01, 3.0, _signed("force"), _sign), BOTH),
+    (Kind("periodic_force", "dynamics", 0.02, 4.0, lambda s, f: {"amplitude": s, "offset": 0.0, **f}, _periodic), BOTH),
+    (Kind("linear_drag", "dynamics", 0.01, 1.0, _plain("coefficient")), BOTH),
+    (Kind("quadratic_drag", "dynamics", 0.005, 1.0, _plain("coefficient")), BOTH),
+    # The wing feels the wind without a drag of its own.
+    (Kind("wind", "dynamics", 0.5, 5.0, _wind, _windy(0.1, 0.5)), QUADROTOR),
+    (Kind("wind", "dynamics", 0.05, 5.0, _wind, _windy(0.0, 0.0)), WING),
+    (Kind("periodic_wind", "dynamics", 0.5, 6.0, _waves, _wavy(0.1, 0.5)), QUADROTOR),
+    (Kind("periodic_wind", "dynamics", 0.05, 5.0, _waves, _wavy(0.0, 0.0)), WING),
+    (Kind("thrust_gain", "dynamics", 0.005, 0.3, _scale, _sign), BOTH),
+    (Kind("payload", "dynamics", 0.005, 0.35, _plain("mass")), QUADROTOR),
+    (Kind("center_of_mass_offset", "dynamics", 0.0003, 0.01, _along, _directed(("x", "y"))), QUADROTOR),
+    (Kind("inertia", "dynamics", 0.05, 0.9, _scales, _directed(("scale_x", "scale_y", "scale_z"))), QUADROTOR),
+    (Kind("battery_sag", "dynamics", 0.001, 0.04, _plain("rate")), QUADROTOR),
+    (Kind("rotor_efficiency", "dynamics", 0.005, 0.15, _scales, _one_weak(ROTORS)), QUADROTOR),
+    (Kind("mass", "dynamics", 0.01, 0.4, _scale, _sign), WING),
+    (Kind("lift_slope", "dynamics", 0.02, 0.7, _scale, _sign), WING),
+    (Kind("drag", "dynamics", 0.03, 1.2, _scale, _sign), WING),
+    (
+        Kind("control_effectiveness", "dynamics", 0.03, 1.2, _scales, _one_weak(tuple(f"scale_{s}" for s in SURFACES))),
+        WING,
+    ),
+    (Kind("trim_offset", "dynamics", 0.0005, 0.06, _along, _directed(SURFACES)), WING),
+)
+"""The catalogue's effects that the check draws from, and on which vehicle."""
+
+FOREIGN: tuple[tuple[Kind, tuple[str, ...]], ...] = (
+    (Kind("one_way_drag", "dynamics", 0.05, 3.0, _plain("coefficient")), BOTH),
+    (Kind("beating_force", "dynamics", 0.1, 6.0, _plain("amplitude")), BOTH),
+    (Kind("layer", "dynamics", 0.3, 20.0, _signed("force"), _sign), BOTH),
+    (Kind("thrust_curve", "dynamics", 0.02, 2.0, _plain("share")), BOTH),
+    (Kind("crossed_rates", "dynamics", 0.02, 1.0, _signed("share"), _sign), QUADROTOR),
+    (Kind("crossed_surfaces", "dynamics", 0.02, 1.0, _signed("share"), _sign), WING),
+)
+"""What no name of the catalogue stands for."""

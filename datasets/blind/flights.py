@@ -1,0 +1,240 @@
+"""Flights of a quadrotor or a fixed wing with a hidden gap to the source, for a sealed check of diagnosis.
+
+    python -m datasets.blind.flights --out data/blind_quadrotor --system quadrotor --count 30 --seed 7
+
+Writes one CSV a recording, and the key (effects, parameters, strengths) in a file apart, whose SHA-256 is printed
+before any recording is written. What diagnoses must never open the key. None of the library's physics is used.
+
+Sizes are set by strength: the root mean square, over rows and over the 13 readings, of what an effect does to half a
+second of prediction by the source from the true states, in units of the measurement noise.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import tyro
+
+from datasets.blind.flight_control import CONTROLLERS, PERIODS, Chain, Flyers, starts
+from datasets.blind.flight_kinds import FOREIGN, NAMED, NEUTRAL
+from datasets.blind.flight_plants import PLANTS, Array, Motion, step
+from datasets.blind.kinds import Kind, Shape
+from datasets.blind.sealing import names, place_of_key, seal
+
+System = Literal["quadrotor", "fixed_wing"]
+
+ROWS, EPISODES = 100, 10
+SUBSTEP = 0.005
+"""s, of the integration"""
+HORIZON = 0.5
+"""s of prediction that strengths are measured over"""
+NOISE = np.repeat((0.01, 0.02, 0.0025, 0.005), (3, 3, 4, 3))
+"""standard deviations: m, m/s, quaternion, rad/s"""
+STRENGTHS = (1.5, 15.0)
+"""weakest and strongest effect"""
+MIX = {"single": 0.67, "none": 0.165, "foreign": 0.165}
+"""share of the recordings"""
+STATES = ("x", "y", "z", "x_dot", "y_dot", "z_dot", "q_w", "q_x", "q_y", "q_z", "omega_x", "omega_y", "omega_z")
+ACTIONS = {
+    "quadrotor": ("thrust", "rate_x", "rate_y", "rate_z"),
+    "fixed_wing": ("thrust", "elevator", "aileron", "rudder"),
+}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is made, and where it is written."""
+
+    out: Path
+    """folder for the recordings"""
+    system: System = "quadrotor"
+    """which vehicle"""
+    count: int = 30
+    """how many recordings"""
+    seed: int = 0
+    """of everything that is drawn"""
+    key: Path | None = None
+    """file for the answers; by default beside the folder, <out>.key.json"""
+
+
+@dataclass
+class Draft:
+    """A recording in the making."""
+
+    rng: np.random.Generator
+    """its own random numbers"""
+    mixture: str
+    """single, none or foreign"""
+    kind: Kind | None = None
+    """the effect, if there is one"""
+    shape: Shape = field(default_factory=dict)
+    target: float = 0.0
+    """strength to reach"""
+    size: float = 0.0
+    strength: float = 0.0
+    """at that size"""
+    readings: Array | None = None
+    """(ROWS, EPISODES, 13)"""
+    commands: Array | None = None
+    """(ROWS, EPISODES, 4)"""
+
+    @property
+    def effects(self) -> dict[str, Shape]:
+        """Parameters by effect."""
+        return {} if self.kind is None else {self.kind.name: self.kind.build(self.size, self.shape)}
+
+
+@dataclass(frozen=True)
+class Flights:
+    """What came of N episodes."""
+
+    motions: list[Motion]
+    """ROWS"""
+    states: Array
+    """(ROWS, N, 13)"""
+    commands: Array
+    """(ROWS, N, 4)"""
+
+
+def make(settings: Settings) -> list[Draft]:
+    """Draw and fly all recordings."""
+    if settings.count < 1:
+        raise ValueError(f"count is {settings.count}, must be at least 1")
+    place = list(PLANTS).index(settings.system)
+    seeds = np.random.SeedSequence([settings.seed, place, 17]).spawn(settings.count + 1)
+    # Shares as even as the count allows, in an order that says nothing; kinds as even as that, too.
+    order = np.random.default_rng(seeds[0])
+    places = (np.arange(settings.count) + 0.5) / settings.count
+    mixtures = np.array(list(MIX))[np.searchsorted(np.cumsum(list(MIX.values())), places)]
+    order.shuffle(mixtures)
+    drafts = [Draft(np.random.default_rng(seed), str(m)) for seed, m in zip(seeds[1:], mixtures, strict=True)]
+    for mixture, kinds in (("single", NAMED), ("foreign", FOREIGN)):
+        own = [kind for kind, systems in kinds if settings.system in systems]
+        members = [draft for draft in drafts if draft.mixture == mixture]
+        chosen = np.concatenate([order.permutation(len(own)) for _ in range(-(-max(1, len(members)) // len(own)))])
+        for draft, k in zip(members, chosen, strict=False):
+            draft.kind, draft.shape = own[k], own[k].draw(draft.rng, ROWS * PERIODS[settings.system])
+            draft.target = float(np.exp(draft.rng.uniform(*np.log(STRENGTHS))))
+            draft.size = float(np.sqrt(own[k].low * own[k].high))
+    fly = CONTROLLERS[settings.system]([draft.rng for draft in drafts], ROWS, EPISODES)
+    _seek([draft for draft in drafts if draft.kind is not None], drafts, settings.system, fly)
+    flown = _flown(drafts, settings.system, fly, SUBSTEP)
+    for k, draft in enumerate(drafts):
+        own_columns = slice(k * EPISODES, (k + 1) * EPISODES)
+        noise = draft.rng.normal(size=(ROWS, EPISODES, 13)) * NOISE
+        draft.readings = flown.states[:, own_columns] + noise
+        draft.commands = flown.commands[:, own_columns]
+    return drafts
+
+
+def _seek(searched: list[Draft], drafts: list[Draft], system: System, fly: Flyers, rounds: int = 5) -> None:
+    """Bring strengths to their targets: sizes in proportion, within what is sensible."""
+    for _ in range(rounds):
+        flown = _flown(drafts, system, fly, 2 * SUBSTEP)
+        gaps = _gaps(flown, system).reshape(len(drafts), EPISODES)
+        for draft, own in zip(drafts, gaps, strict=True):
+            draft.strength = float(np.sqrt(np.mean(own)))
+        for draft in searched:
+            assert draft.kind is not None
+            if draft.strength > 0 and abs(np.log(draft.target / draft.strength)) > 0.1:
+                size = draft.size * draft.target / draft.strength
+                draft.size = float(np.clip(size, draft.size / 8, draft.size * 8).clip(draft.kind.low, draft.kind.high))
+
+
+def _flown(drafts: list[Draft], system: System, fly: Flyers, h: float) -> Flights:
+    parameters = {
+        name: np.repeat([_value(draft, name, neutral) for draft in drafts], EPISODES)
+        for name, neutral in NEUTRAL.items()
+    }
+    at, period = starts(system, fly), PERIODS[system]
+    chain = Chain(parameters, at.place.shape[0])
+    substeps = round(period / h)
+    motions: list[Motion] = []
+    states: list[Array] = []
+    commands: list[Array] = []
+    for row in range(ROWS):
+        motions.append(at)
+        states.append(as_states(at, states[-1][:, 6:10] if states else None))
+        command = fly.command(row, states[-1])
+        commands.append(command)
+        chain.push(command)
+        for k in range(substeps):
+            time = row * period + k * h
+            at = step(PLANTS[system], parameters, time, at, chain(time, h), h)
+    return Flights(motions, np.stack(states), np.stack(commands))
+
+
+def _value(draft: Draft, name: str, neutral: float) -> float:
+    effect, parameter = name.split(".")
+    return draft.effects.get(effect, {}).get(parameter, neutral)
+
+
+def _gaps(flown: Flights, system: System, every: int = 4) -> Array:
+    """(N,) mean square of what half a second of prediction by the source misses, in units of the noise."""
+    period = PERIODS[system]
+    horizon = round(HORIZON / period)
+    rows = range(0, ROWS - horizon, every)
+    count = flown.states.shape[1]
+    source = {name: np.full(len(rows) * count, value) for name, value in NEUTRAL.items()}
+    names = ("place", "velocity", "turned", "rates")
+    at = Motion(*(np.concatenate([getattr(flown.motions[row], name) for row in rows]) for name in names))
+    for k in range(horizon):
+        command = np.concatenate([flown.commands[row + k] for row in rows])
+        for _ in range(round(period / (5 * SUBSTEP))):
+            at = step(PLANTS[system], source, 0.0, at, command, 5 * SUBSTEP)
+    true = np.concatenate([flown.states[row + horizon] for row in rows])
+    error = (as_states(at, true[:, 6:10]) - true) / NOISE
+    return np.asarray(np.mean(error**2, axis=1).reshape(len(rows), count).mean(0))
+
+
+def as_states(at: Motion, near: Array | None) -> Array:
+    """States (N, 13); of the two quaternions of a rotation the one nearer to `near` (N, 4), or with w > 0."""
+    r = at.turned
+    w = np.sqrt(np.maximum(0.0, 1 + r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2])) / 2
+    if w.min() < 0.1:
+        raise RuntimeError("a vehicle turned over; another seed will do")
+    x, y, z = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
+    q = np.stack([w, x / (4 * w), y / (4 * w), z / (4 * w)], -1)
+    if near is not None:
+        q = q * np.where((q * near).sum(1) < 0, -1.0, 1.0)[:, None]
+    return np.concatenate([at.place, at.velocity, q, at.rates], 1)
+
+
+def key_text(settings: Settings, drafts: list[Draft]) -> str:
+    """The answers as JSON; the same settings give the same text."""
+    answers = []
+    for name, draft in zip(names(len(drafts)), drafts, strict=True):
+        effects = [
+            {"effect": effect, "parameters": parameters, "strength": round(draft.strength, 4)}
+            for effect, parameters in draft.effects.items()
+        ]
+        answers.append({"file": name, "kind": draft.mixture, "effects": effects})
+    head = {"kind": settings.system, "seed": settings.seed, "noise": NOISE.tolist()}
+    return json.dumps({**head, "recordings": answers}, indent=1) + "\n"
+
+
+def lines(draft: Draft, system: System) -> Iterator[str]:
+    """The CSV of a recording."""
+    assert draft.readings is not None
+    assert draft.commands is not None
+    yield ",".join(("episode", "time", *STATES, *ACTIONS[system]))
+    for episode in range(EPISODES):
+        for row in range(ROWS):
+            values = (*draft.readings[row, episode], *draft.commands[row, episode])
+            yield ",".join((str(episode), f"{row * PERIODS[system]:.2f}", *(f"{value:.7f}" for value in values)))
+
+
+def main(settings: Settings) -> None:
+    """Make the recordings, print the key's SHA-256, then write the key and the recordings."""
+    key = place_of_key(settings.out, settings.key)
+    drafts = make(settings)
+    seal(settings.out, key, key_text(settings, drafts), (lines(draft, settings.system) for draft in drafts))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings, description=__doc__))

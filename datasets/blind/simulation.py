@@ -1,0 +1,204 @@
+"""Runs many blind recordings at once: every episode of every one is a column of the same arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from datasets.blind.chain import NONE, Actuation, Sensing
+from datasets.blind.control import Controllers, Driver
+from datasets.blind.kinds import Shape
+from datasets.blind.plant import (
+    CART_DRY,
+    CART_FORCES,
+    MAX_FORCE,
+    PERIOD,
+    PIVOT_DRY,
+    PIVOT_TORQUES,
+    Array,
+    Load,
+    Parameters,
+    Plant,
+    Table,
+    nominal,
+    predict,
+)
+
+HORIZON = 10
+"""steps of prediction that an effect's strength is measured over (half a second)"""
+
+
+@dataclass
+class Case:
+    """One recording to be."""
+
+    driver: Driver
+    """controller, excitation and first states"""
+    effects: dict[str, Shape]
+    """parameters by name of the effect"""
+    noise: Array
+    """(rows, 4, episodes): m, m/s, rad, rad/s"""
+    lottery: Array
+    """(rows, episodes), uniform: which rows a dropout loses"""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and episodes."""
+        rows, episodes = self.lottery.shape
+        return rows, episodes
+
+
+@dataclass
+class Run:
+    """What came of a case: (rows, 4, episodes), commands (rows, episodes)."""
+
+    true: Array
+    """states"""
+    measured: Array
+    """readings with noise"""
+    clean: Array
+    """readings without it"""
+    commands: Array
+    """as the controller gave them"""
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Largest |x| (m) and |theta| (rad)."""
+        return float(np.abs(self.true[:, 0]).max()), float(np.abs(self.true[:, 2]).max())
+
+    def predicted_gap(self, deviations: Array, every: int = 2) -> float:
+        """Strength of an effect on commands or states.
+
+        Root mean square, over rows and over x and theta, of what half a second of prediction by the source from the
+        true states misses, in units of the measurement noise (`deviations`, m and rad).
+        """
+        rows = np.arange(0, len(self.true) - HORIZON, every)
+        start = self.true[rows].transpose(1, 0, 2).reshape(4, -1)
+        commands = np.stack([self.commands[rows + k].reshape(-1) for k in range(HORIZON)])
+        end = self.true[rows + HORIZON].transpose(1, 0, 2).reshape(4, -1)
+        return _strength((end - predict(start, commands))[[0, 2]], deviations)
+
+    def sensed_gap(self, deviations: Array) -> float:
+        """Strength of an effect on readings: what it changes in x and theta, in units of the noise."""
+        return _strength((self.clean - self.true)[:, [0, 2]].transpose(1, 0, 2).reshape(2, -1), deviations)
+
+
+def _strength(difference: Array, deviations: Array) -> float:
+    with np.errstate(over="ignore"):
+        return float(np.sqrt(np.mean((difference / deviations[:, None]) ** 2)))
+
+
+def simulate(cases: list[Case], velocities: bool, substeps: int) -> list[Run]:
+    """Run the cases in closed loop, `substeps` of the plant between commands.
+
+    A pole beyond 1 rad or a cart beyond 5 m stops where it is, which the caller sees from `Run.reach`.
+    """
+    columns = np.cumsum([0, *(case.shape[1] for case in cases)])
+    spans = [slice(int(a), int(b)) for a, b in pairwise(columns)]
+    n, rows, h = int(columns[-1]), max(case.shape[0] for case in cases), PERIOD / substeps
+    noise, lottery = np.zeros((rows, 4, n)), np.ones((rows, n))
+    for case, span in zip(cases, spans, strict=True):
+        noise[: case.shape[0], :, span], lottery[: case.shape[0], span] = case.noise, case.lottery
+    drive = Controllers([case.driver for case in cases], velocities)
+    chain = _chain(cases, spans, n)
+    plant = _plant(cases, spans, n, rows)
+    start = drive.start if plant.slosh is None else np.concatenate((drive.start, drive.start[:2]))
+    actuation, sensing = Actuation(chain, n), Sensing(chain, drive.start, h)
+    true, measured, clean = (np.empty((rows, 4, n)) for _ in range(3))
+    commands = np.empty((rows, n))
+    state = start
+    for row in range(rows):
+        time = row * PERIOD
+        true[row] = state[:4]
+        measured[row], clean[row] = sensing.read(time, state, noise[row], lottery[row])
+        commands[row] = drive(row, state[:4], measured[row])
+        actuation.push(commands[row])
+        for k in range(substeps):
+            t = time + k * h
+            after = plant.step(t, state, MAX_FORCE * actuation(t, h), h)
+            lost = (np.abs(after[2]) > 1.0) | (np.abs(after[0]) > 5.0)
+            state = np.where(lost, state * np.array([1.0, 0.0, 1.0, 0.0, 1.0, 0.0])[: len(state), None], after)
+            sensing.pass_by(state)
+    return [
+        Run(true[:rows, :, span], measured[:rows, :, span], clean[:rows, :, span], commands[:rows, span])
+        for rows, span in zip((case.shape[0] for case in cases), spans, strict=True)
+    ]
+
+
+def _chain(cases: list[Case], spans: list[slice], n: int) -> Parameters:
+    chain = {name: np.full(n, value) for name, value in NONE.items()}
+    for case, span in zip(cases, spans, strict=True):
+        for effect, parameters in case.effects.items():
+            for name, value in parameters.items():
+                if f"{effect}.{name}" in chain:
+                    chain[f"{effect}.{name}"][span] = value
+    return chain
+
+
+def _plant(cases: list[Case], spans: list[slice], n: int, rows: int) -> Plant:
+    plant = nominal(n)
+    slosh = (np.zeros(n), np.ones(n), np.zeros(n))
+    members: dict[str, list[tuple[NDArrayInt, Shape, int]]] = {}
+    for case, span in zip(cases, spans, strict=True):
+        for effect, parameters in case.effects.items():
+            if effect in MASSES:
+                getattr(plant, MASSES[effect])[span] *= parameters["scale"]
+            elif effect == "track_tilt":
+                plant.tilt[span] = parameters["angle"]
+            elif effect == "sloshing":
+                slosh[0][span], slosh[2][span] = parameters["mass"], parameters["damping"]
+                slosh[1][span] = 2 * np.pi * parameters["frequency"]
+            else:
+                members.setdefault(effect, []).append((np.arange(n)[span], parameters, case.shape[1]))
+    if slosh[0].any():
+        plant.slosh = slosh
+    tables: tuple[tuple[dict[str, Load], Table], ...] = (
+        (CART_FORCES, plant.forces),
+        (PIVOT_TORQUES, plant.torques),
+        (CART_DRY, plant.dry_forces),
+        (PIVOT_DRY, plant.dry_torques),
+    )
+    for laws, table in tables:
+        for effect in sorted(members.keys() & laws.keys()):
+            table.append((*_together(effect, members[effect], rows), laws[effect]))
+    return plant
+
+
+MASSES = {"cart_mass": "cart_mass", "pole_mass": "pole_mass", "pole_length": "half_length"}
+"""effects that scale a parameter of the plant"""
+
+NDArrayInt = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+
+
+def _together(effect: str, members: list[tuple[NDArrayInt, Shape, int]], rows: int) -> tuple[NDArrayInt, Parameters]:
+    """Columns and parameters, one value a column, of all cases that have this effect."""
+    index = np.concatenate([columns for columns, _, _ in members])
+    counts = [count for _, _, count in members]
+    parameters = {name: np.repeat([p[name] for _, p, _ in members], counts) for name in members[0][1]}
+    if "path_seed" in parameters:
+        paths = [_paths(effect, p, count, int(rows * PERIOD / 0.01)) for _, p, count in members]
+        parameters["path"] = np.concatenate(paths)
+    return index, parameters
+
+
+def _paths(effect: str, shape: Shape, episodes: int, samples: int) -> Array:
+    """Random force paths of unit size, (episodes, samples) every 10 ms; the same for any number of samples."""
+    paths = np.zeros((episodes, samples))
+    for episode in range(episodes):
+        rng = np.random.default_rng([int(shape["path_seed"]), episode])
+        if effect == "kicks":
+            # 30 ms long, of either sign, with exponential gaps.
+            time = 0.0
+            while (time := time + float(rng.exponential(shape["interval"]))) * 100 < samples:
+                paths[episode, int(time * 100) : int(time * 100) + 3] = rng.choice((-1.0, 1.0))
+        else:
+            # Ornstein-Uhlenbeck, started from its stationary law.
+            keep = np.exp(-0.01 / shape["correlation"])
+            steps = rng.standard_normal(samples)
+            value = steps[0]
+            for k in range(samples):
+                value = value if k == 0 else keep * value + np.sqrt(1 - keep**2) * steps[k]
+                paths[episode, k] = value
+    return paths

@@ -1,0 +1,94 @@
+"""The blind flights: their physics against the library's, which is other code; sealed, and told by their columns."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.blind.flight_onestep import system_of
+from benchmarks.blind.scoring import LARGEST, SIZE
+from datasets.blind.flight_kinds import NAMED, NEUTRAL
+from datasets.blind.flight_plants import PLANTS, Motion
+from datasets.blind.flights import ACTIONS, STATES, Settings, as_states, lines, main, make
+from visadapt.effects import EFFECTS, ActuationEffect
+from visadapt.systems import SYSTEMS
+from visadapt.systems.rigid_body import rotation
+from visadapt.world import World
+
+SYSTEM_NAMES = tuple(PLANTS)
+
+
+@pytest.mark.parametrize("system", SYSTEM_NAMES)
+def test_columns_are_the_library_s(system):
+    assert tuple(variable.name for variable in SYSTEMS[system].states) == STATES
+    assert tuple(variable.name for variable in SYSTEMS[system].actions) == ACTIONS[system]
+
+
+@pytest.mark.parametrize(
+    ("kind", "system"),
+    [(kind, system) for kind, systems in NAMED for system in systems],
+    ids=lambda x: getattr(x, "name", x),
+)
+def test_an_effect_is_the_catalogue_s(kind, system):
+    """The derivative of a random motion with the effect, by both codes."""
+    rng = np.random.default_rng(0)
+    parameters = kind.build(kind.high / 2, kind.draw(rng, 10.0))
+    effect = EFFECTS[kind.name](**parameters).double()
+    assert isinstance(SYSTEMS[system](), effect.systems)
+    if isinstance(effect, ActuationEffect):
+        return
+    generator = torch.Generator().manual_seed(1)
+    count = 6
+    state = torch.randn(count, 13, generator=generator, dtype=torch.float64)
+    state[:, 3] += 12.0
+    state[:, 6:10] = torch.nn.functional.normalize(0.3 * state[:, 6:10] + torch.tensor([1.0, 0, 0, 0]), dim=1)
+    command = torch.rand(count, 4, generator=generator, dtype=torch.float64) - 0.5
+    time = torch.full((count,), 0.7, dtype=torch.float64)
+    with torch.no_grad():
+        at = World(SYSTEMS[system](), [effect]).start(state)
+        world = World(SYSTEMS[system](), [effect])
+        at = type(at)(time, state, at.memory)
+        altered = world.system_at(at)
+        expected = altered.derivative(state, command, world.load(at))
+    p = {
+        name: np.full(
+            count, parameters.get(name.split(".")[1], neutral) if name.split(".")[0] == kind.name else neutral
+        )
+        for name, neutral in NEUTRAL.items()
+    }
+    motion = Motion(
+        state[:, :3].numpy(), state[:, 3:6].numpy(), rotation(state[:, 6:10]).numpy(), state[:, 10:].numpy()
+    )
+    found = PLANTS[system](p, 0.7, motion, command.numpy())
+    np.testing.assert_allclose(found.velocity, expected[:, 3:6].numpy(), atol=1e-5)
+    np.testing.assert_allclose(found.rates, expected[:, 10:].numpy(), atol=1e-5)
+    np.testing.assert_allclose(as_states(motion, None)[:, 6:10], state[:, 6:10].numpy(), atol=1e-5)
+
+
+@pytest.mark.parametrize(("kind", "systems"), NAMED, ids=lambda x: getattr(x, "name", ""))
+def test_every_named_effect_has_a_size_that_is_scored(kind, systems):
+    parameters = kind.build(kind.high, kind.draw(np.random.default_rng(0), 10.0))
+    names = LARGEST[kind.name][0] if kind.name in LARGEST else (SIZE[kind.name][0],)
+    assert set(names) <= parameters.keys() == {p.name for p in EFFECTS[kind.name].table}
+
+
+def test_a_set_is_sealed_and_the_same_again(tmp_path, capsys):
+    settings = Settings(tmp_path / "sealed", "fixed_wing", 3, seed=2)
+    main(settings)
+    assert "SHA-256" in capsys.readouterr().out
+    key = json.loads((tmp_path / "sealed.key.json").read_text())
+    files = sorted((tmp_path / "sealed").iterdir())
+    assert [file.name for file in files] == [recording["file"] for recording in key["recordings"]]
+    assert system_of(files[0]) == "fixed_wing"
+    again = "\n".join(lines(make(settings)[0], "fixed_wing")) + "\n"
+    assert files[0].read_text() == again
+    with pytest.raises(ValueError, match="must not lie"):
+        main(Settings(tmp_path, "quadrotor", 1, key=tmp_path / "key.json"))
+
+
+def test_a_cart_pole_s_recording_is_told_by_its_columns(tmp_path):
+    path = Path(tmp_path / "cart.csv")
+    path.write_text("episode,time,x,theta,command\n0,0,0,0,0\n")
+    assert system_of(path) == "cartpole"

@@ -1,0 +1,191 @@
+"""What a user asks of a diagnosis: the right name, size and verdict, on recordings made with the cause withheld."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tests.diagnosed import record
+from visadapt import diagnose
+from visadapt.diagnosis.search.sensor_checks import Readings
+from visadapt.effects import (
+    ActuatorBacklash,
+    ActuatorGain,
+    AngleOffset,
+    ConstantForce,
+    DynamicsEffect,
+    FrictionPatch,
+    Parameter,
+    ViscousFriction,
+)
+from visadapt.effects.forces import CartForce
+from visadapt.recordings import Episode
+from visadapt.systems import CartPole
+from visadapt.world import World
+
+SOURCE = World(CartPole())
+
+
+def names(result):
+    return {cause.effect for cause in result.causes}
+
+
+def held(recording, marks, columns):
+    """The recording with readings of some columns, where marked, those of the row before."""
+    episodes = []
+    for episode, own in zip(recording.episodes, marks, strict=True):
+        state = episode.state.copy()
+        for row in np.flatnonzero(own):
+            state[row, columns] = state[row - 1, columns]
+        episodes.append(Episode(episode.time, episode.action, state))
+    return dataclasses.replace(recording, episodes=tuple(episodes))
+
+
+def test_nothing_there_is_no_gap():
+    result = diagnose(record(), SOURCE)
+    assert result.verdict == "no_gap"
+    assert result.causes == ()
+    assert result.gap.before == pytest.approx(result.gap.floor, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [ViscousFriction(coefficient=0.8), AngleOffset(offset=0.02), ActuatorBacklash(width=0.05)],
+    ids=lambda effect: effect.name,
+)
+def test_one_effect_is_named_with_its_size(effect):
+    result = diagnose(record([effect]), SOURCE)
+    assert effect.name in names(result)
+    cause = next(c for c in result.causes if c.effect == effect.name)
+    ((name, estimate),) = cause.parameters.items()
+    truth = getattr(effect, name).item()
+    assert estimate.value == pytest.approx(truth, rel=0.2)
+    assert estimate.ci90[0] < estimate.value < estimate.ci90[1]
+    assert result.gap.closed > 0.9
+
+
+@pytest.fixture(scope="module")
+def pushed():
+    return diagnose(record([ConstantForce(force=0.5)]), SOURCE)
+
+
+def test_what_no_data_can_tell_apart_is_named_together(pushed):
+    result = pushed
+    assert result.verdict == "ambiguous"
+    assert {"constant_force", "actuator_bias"} <= names(result)
+    force, bias = (next(c for c in result.causes if c.effect == n) for n in ("constant_force", "actuator_bias"))
+    assert bias.effect in force.indistinguishable_from
+    assert force.parameters["force"].value == pytest.approx(0.5, rel=0.1)
+    assert bias.parameters["offset"].value == pytest.approx(0.5 / 30, rel=0.1)
+    assert "motor" in result.next_experiment
+
+
+def test_two_at_once_are_both_named():
+    result = diagnose(record([ViscousFriction(coefficient=1.5), ActuatorGain(scale=0.8)], episodes=6), SOURCE)
+    assert "viscous_friction" in names(result)
+    assert names(result) & {"actuator_gain", "cart_mass"}
+    assert sum(result.where.stages.values()) == pytest.approx(1)
+
+
+def test_a_patch_is_found_where_it_is():
+    result = diagnose(record([FrictionPatch(start=-0.1, end=0.15, coefficient=6.0)], episodes=6), SOURCE)
+    assert names(result) == {"friction_patch"}
+    region = result.where.regions[0]
+    assert region.variable == "x"
+    assert region.start == pytest.approx(-0.1, abs=0.03)
+    assert region.end == pytest.approx(0.15, abs=0.03)
+
+
+def test_an_effect_of_no_catalogue_is_unexplained():
+    class Cogging(CartForce):
+        table = (Parameter("force", "N", 0.0, 5.0, 0.0),)
+
+        def push(self, time, state, system):
+            return self.value("force", state) * (60 * state[:, 0]).sin()
+
+    result = diagnose(record([Cogging(force=1.0)]), SOURCE)
+    assert result.verdict == "unexplained"
+    assert result.causes == ()
+    assert "cart force" in result.next_experiment
+
+
+def test_lost_rows_are_counted():
+    generator = np.random.default_rng(0)
+    whole = record(episodes=6)
+    lost = [(generator.random(len(e.time)) < 0.1) & (np.arange(len(e.time)) > 0) for e in whole.episodes]
+    result = diagnose(held(whole, lost, [0, 1]), SOURCE)
+    assert names(result) == {"dropout"}
+    rate = sum(marks.sum() for marks in lost) / sum(len(marks) - 1 for marks in lost)
+    assert result.causes[0].parameters["rate"].value == pytest.approx(rate)
+    assert result.causes[0].parameters["rate"].ci90[0] < rate < result.causes[0].parameters["rate"].ci90[1]
+
+
+def test_a_sensor_that_stands_still_is_found_with_its_zone():
+    whole = record(episodes=6)
+    still = [(e.state[:, 1] > 0.02) & (e.state[:, 1] < 0.06) & (np.arange(len(e.time)) > 0) for e in whole.episodes]
+    result = diagnose(held(whole, still, [1]), SOURCE)
+    assert names(result) == {"frozen_zone"}
+    region = result.where.regions[0]
+    assert region.variable == "theta"
+    assert region.start == pytest.approx(0.02, abs=0.006)
+    assert region.end == pytest.approx(0.06, abs=0.006)
+
+
+def test_velocities_that_are_differences_are_left_out():
+    whole = record([ViscousFriction(coefficient=0.8)], measured=("x", "x_dot", "theta", "theta_dot"))
+    assert Readings.of(whole, CartPole()).warnings == ()
+    episodes = []
+    for episode in whole.episodes:
+        state = episode.state.copy()
+        for k in (1, 3):
+            state[:, k] = np.diff(state[:, k - 1], prepend=state[0, k - 1]) / 0.05
+        episodes.append(Episode(episode.time, episode.action, state))
+    readings = Readings.of(dataclasses.replace(whole, episodes=tuple(episodes)), CartPole())
+    assert [warning.split()[0] for warning in readings.warnings] == ["x_dot", "theta_dot"]
+    assert readings.rows.channels == (0, 2)
+
+
+def test_an_angle_of_the_other_sign_is_turned_round():
+    whole = record([ViscousFriction(coefficient=0.8)])
+    turned = tuple(Episode(e.time, e.action, e.state * np.array([1.0, -1.0])) for e in whole.episodes)
+    result = diagnose(dataclasses.replace(whole, episodes=turned), SOURCE)
+    assert any("the angle" in warning for warning in result.warnings)
+    assert names(result) == {"viscous_friction"}
+
+
+def test_an_effect_of_the_users_own_is_found():
+    class Magnet(DynamicsEffect):
+        table = (Parameter("torque", "N m", -1.0, 1.0, 0.0, linear=True),)
+        equation = "Q_theta = torque cos(3 theta)"
+
+        def load(self, time, state, system):
+            import torch
+
+            torque = self.value("torque", state) * (3 * state[:, 2] + 20 * state[:, 0]).cos()
+            return torch.stack((torch.zeros_like(torque), torque), -1)
+
+    Magnet.name = "magnet_of_ours"
+    result = diagnose(record([Magnet(torque=0.05)]), SOURCE, catalogue=[Magnet, ViscousFriction, ConstantForce])
+    assert names(result) == {"magnet_of_ours"}
+    assert result.causes[0].parameters["torque"].value == pytest.approx(0.05, rel=0.1)
+
+
+def test_the_same_again(pushed):
+    assert diagnose(record([ConstantForce(force=0.5)]), SOURCE).to_json() == pushed.to_json()
+
+
+def test_probabilities_add_up(pushed):
+    assert sum(ranked.probability for ranked in pushed.ranking) == pytest.approx(1)
+    assert all(0 <= cause.probability <= 1 for cause in pushed.causes)
+
+
+def test_a_world_with_effects_is_no_source():
+    with pytest.raises(ValueError, match="bare system"):
+        diagnose(record(), World(CartPole(), [ViscousFriction(coefficient=1.0)]))
+
+
+def test_error_grows_with_the_horizon(pushed):
+    growth = pushed.evidence.growth
+    assert growth is not None
+    assert growth.before[-1] > 3 * growth.before[0]
+    assert growth.after[-1] == pytest.approx(growth.floor[-1], rel=0.1)

@@ -1,0 +1,147 @@
+"""Diagnosis of a quadrotor and a fixed wing: the right name and size, on recordings made with the cause withheld."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from visadapt import diagnose
+from visadapt.cli.main import main
+from visadapt.diagnosis.search.catalogue import catalogue, searched
+from visadapt.diagnosis.search.sensor_checks import Readings
+from visadapt.effects import ActuatorDelay, ConstantForce, LiftSlope, LinearDrag, ThrustGain, Wind
+from visadapt.estimation.profiles import PROFILES, profile_of
+from visadapt.recordings import Episode, Recording
+from visadapt.systems import CartPole, FixedWing, Quadrotor
+from visadapt.world import World
+
+NOISE = torch.tensor([0.01] * 3 + [0.02] * 3 + [0.0025] * 4 + [0.005] * 3, dtype=torch.float64)
+PERIODS = {"quadrotor": 0.1, "fixed_wing": 0.05}
+
+
+def record(system, effects=(), episodes=5, rows=25, seed=0):
+    """Episodes with random steps around hovering, or level flight at 11.5 m/s; all 13 states."""
+    period = PERIODS[system.name]
+    generator = torch.Generator().manual_seed(seed)
+    world = World(system, [effect.double() for effect in effects], period=period, substeps=10)
+    state = torch.zeros(episodes, 13, dtype=torch.float64)
+    state[:, 6] = 1
+    middle = torch.zeros(episodes, 4, dtype=torch.float64)
+    if isinstance(system, FixedWing):
+        state, middle = system.trim(torch.full((episodes,), 11.5, dtype=torch.float64))
+    else:
+        middle[:, 0] = system.hover()
+    at = world.start(state)
+    states, actions = [], []
+    action = middle
+    with torch.no_grad():
+        for row in range(rows):
+            if row % 4 == 0:
+                action = (middle + 0.4 * torch.randn(episodes, 4, generator=generator, dtype=torch.float64)).clamp(
+                    -1, 1
+                )
+            states.append(at.state)
+            actions.append(action)
+            at = world.step(at, action)
+    clean = torch.stack(states, 1)
+    seen = (clean + NOISE * torch.randn(clean.shape, generator=generator, dtype=torch.float64)).numpy()
+    commands = torch.stack(actions, 1).numpy()
+    time = period * np.arange(rows)
+    return Recording(
+        tuple(Episode(time, commands[k], seen[k]) for k in range(episodes)),
+        tuple(variable.name for variable in system.states),
+        period,
+        tuple(f"episode {k}" for k in range(episodes)),
+    )
+
+
+def diagnosed(system, effects=(), candidates=None):
+    source = World(system, period=PERIODS[system.name])
+    return diagnose(record(system, effects), source, catalogue=candidates)
+
+
+def test_each_subject_s_columns_are_all_there():
+    for kind, profile in PROFILES.items():
+        n = len(kind.states)
+        assert len(profile.spread) == n
+        assert len(profile.columns) == len(kind.loads)
+        assert sorted(column for sensor in profile.sensors for column in sensor) == list(range(n))
+        names = {variable.name for variable in (*kind.states, *kind.actions)} | {"time"}
+        assert {*profile.places.values(), *profile.drawn} <= names
+
+
+def test_what_a_system_cannot_tell_another_may():
+    names = {kind: {e.name for e in searched(catalogue(kind()), profile_of(kind()))} for kind in (CartPole, Quadrotor)}
+    assert not {"constant_force", "actuator_bias"} <= names[CartPole]
+    assert {"constant_force", "actuator_bias"} <= names[Quadrotor]
+    assert not {"thrust_gain", "payload"} <= names[Quadrotor]
+
+
+def test_nothing_there_is_no_gap_on_a_quadrotor():
+    result = diagnosed(Quadrotor(), candidates=[LinearDrag, ThrustGain, ActuatorDelay])
+    assert result.verdict == "no_gap"
+    assert result.gap.before == pytest.approx(result.gap.floor, rel=0.1)
+
+
+def test_a_wind_is_found_by_steps_where_a_grid_would_be_too_large():
+    truth = {"velocity_x": 3.0, "velocity_y": -1.5, "velocity_z": 0.5, "coefficient": 0.4}
+    result = diagnosed(Quadrotor(), [Wind(**truth)], [LinearDrag, ConstantForce, Wind, ThrustGain])
+    assert [cause.effect for cause in result.causes] == ["wind"]
+    for name, estimate in result.causes[0].parameters.items():
+        half = (estimate.ci90[1] - estimate.ci90[0]) / 2
+        assert estimate.value == pytest.approx(truth[name], abs=3 * half)
+    assert result.gap.closed > 0.9
+
+
+def test_a_wing_s_lift_slope_is_named_with_its_size():
+    result = diagnosed(FixedWing(), [LiftSlope(scale=0.8)], [LinearDrag, ConstantForce, LiftSlope, ThrustGain])
+    assert [cause.effect for cause in result.causes] == ["lift_slope"]
+    estimate = result.causes[0].parameters["scale"]
+    assert estimate.value == pytest.approx(0.8, abs=1.5 * (estimate.ci90[1] - estimate.ci90[0]))
+    assert result.where.stages["dynamics"] == 1.0
+
+
+def test_the_command_reads_a_quadrotor_s_csv(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("visadapt.diagnosis.diagnose.all_effects", lambda system: [LinearDrag, ThrustGain])
+    recording = record(Quadrotor(), [LinearDrag(coefficient=0.5)], episodes=4)
+    columns = ["episode", "time", *recording.measured, *(variable.name for variable in Quadrotor.actions)]
+    lines = [",".join(columns)]
+    for number, episode in enumerate(recording.episodes):
+        for row in zip(episode.time, episode.state, episode.action, strict=True):
+            values = (row[0], *row[1], *row[2])
+            lines.append(",".join([str(number), *(f"{value:.6f}" for value in values)]))
+    path = tmp_path / "flight.csv"
+    path.write_text("\n".join(lines) + "\n")
+    rig = tmp_path / "rig.toml"
+    rig.write_text("[parameters]\nmass = 1.0\n")
+    out, page = tmp_path / "out.json", tmp_path / "out.html"
+    asked = ["--system", "quadrotor", "--params", str(rig), "--json", str(out), "--report", str(page)]
+    assert main(["diagnose", str(path), *asked]) == 0
+    assert "linear drag" in capsys.readouterr().out.lower()
+    answer = json.loads(out.read_text())
+    assert (answer["system"], answer["verdict"]) == ("quadrotor", "identified")
+    assert answer["causes"][0]["parameters"]["coefficient"]["value"] == pytest.approx(0.5, rel=0.1)
+    assert "force along x" in page.read_text()
+
+
+def test_a_quaternion_s_sign_has_no_meaning():
+    recording = record(Quadrotor(), episodes=2)
+    flipped = []
+    for episode in recording.episodes:
+        state = episode.state.copy()
+        state[7:15, 6:10] *= -1
+        flipped.append(Episode(episode.time, episode.action, state))
+    rows, again = (
+        Readings.of(each, Quadrotor()).rows
+        for each in (recording, dataclasses.replace(recording, episodes=tuple(flipped)))
+    )
+    torch.testing.assert_close(again.measured, rows.measured)
+
+
+def test_terms_for_a_policy_need_one_action():
+    with pytest.raises(ValueError, match="one action"):
+        diagnose(record(Quadrotor(), episodes=1), World(Quadrotor(), period=0.1), policy=lambda state: state[:, :4])

@@ -1,0 +1,324 @@
+import json
+import math
+import re
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from visadapt import diagnosis as package
+from visadapt.diagnosis.report.html import as_html, as_text, write_report
+from visadapt.diagnosis.report.text import estimate, interval, number, sentence
+from visadapt.diagnosis.result import (
+    VERDICTS,
+    Cause,
+    Diagnosis,
+    Estimate,
+    Evidence,
+    Gap,
+    Growth,
+    PolicyTerms,
+    Prediction,
+    Profile,
+    Ranked,
+    RecordingSummary,
+    Region,
+    Spectrum,
+    Where,
+)
+
+STATES = ("x", "x_dot", "theta", "theta_dot")
+SCHEMA = json.loads((Path(next(iter(package.__path__))) / "schema.json").read_text())
+MEASURE = "root mean square error of x, theta 0.5 s ahead, in units of the noise, on held-out episodes"
+SETTINGS = {"recording": "run.csv", "seed": "0", "versions": "visadapt 0.1.0"}
+
+
+def some_evidence(velocities=True):
+    rng = np.random.default_rng(0)
+    time = 1.2 + np.arange(41) * 0.05
+    truth = np.column_stack(
+        [0.3 * np.sin(2 * time), 0.6 * np.cos(2 * time), 0.05 * np.sin(5 * time), 0.25 * np.cos(5 * time)]
+    )
+    drift = 0.2 * (time - time[0])[:, None] ** 2 * [1, 2, 0.3, 0.6]
+    measured = truth + 0.01 * rng.normal(size=truth.shape)
+    if not velocities:
+        measured[:, [1, 3]] = np.nan
+    centres = np.linspace(-0.7, 0.7, 15)
+    bump = np.where((centres > 0.05) & (centres < 0.45), -2.0, 0.0)
+    error = np.full(15, 0.15)
+    seconds = np.linspace(0.05, 0.5, 10)
+    frequency = np.linspace(0.1, 10, 60)
+    return Evidence(
+        predictions=tuple(Prediction(episode, time, measured, truth + drift, truth) for episode in (3, 5, 8)),
+        profiles=(
+            Profile("x", "m", "force on the cart", "N", centres, bump, error, 0.1 * bump, error),
+            Profile("time", "s", "force on the cart", "N", centres + 1, 0.1 * bump, error, 0.1 * bump, error),
+        ),
+        growth=Growth(seconds, 1 + 8 * seconds**2, 1 + 0.3 * seconds, np.ones(10), 1 + 0.5 * seconds),
+        spectrum=Spectrum("force on the cart", "N2/Hz", frequency, 1 / frequency, 0.05 + 0 * frequency),
+        policy=PolicyTerms((0.12, 0.01), (2.5, 2.0), (0.04, 0.03), (0.3, 0.2)),
+    )
+
+
+PATCH = Cause(
+    "friction_patch",
+    {
+        "start": Estimate(0.1021, "m", (0.0913, 0.1121)),
+        "end": Estimate(0.402, "m", (0.391, 0.411)),
+        "coefficient": Estimate(7.83, "N s/m", (6.91, 8.77)),
+    },
+    probability=0.982,
+    gap_closed=0.61,
+)
+DELAY = Cause("actuator_delay", {"delay": Estimate(0.0312, "s", (0.0281, 0.0343))}, 0.94, 0.33)
+GAIN = Cause("actuator_gain", {"scale": Estimate(0.8, "1", (0.77, 0.83))}, 0.52, 0.93, ("cart_mass",))
+MASS = Cause("cart_mass", {"scale": Estimate(1.27, "1", (1.2, math.nan))}, 0.46, 0.93, ("actuator_gain",))
+REGION = Region("x", 0.1, 0.4, 0.8, 0.0004)
+
+
+def a_diagnosis(verdict, **changes):
+    """One that could be, for each verdict."""
+    common: dict = {
+        "system": "cartpole",
+        "recording": RecordingSummary(10, 1000, 0.05),
+        "where": Where(
+            {"actuation": 0.2, "dynamics": 0.8, "sensing": 0.0, "camera": 0.0},
+            {"x": 0.5, "x_dot": 0.2, "theta": 0.2, "theta_dot": 0.1},
+            (REGION,),
+        ),
+        "gap": Gap(MEASURE, 6.4, 1.21, 1.02, 1.4, 0.965),
+        "evidence": some_evidence(),
+        "next_experiment": "",
+    }
+    own: dict[str, dict] = {
+        "identified": {
+            "causes": (PATCH, DELAY),
+            "ranking": (
+                Ranked(("actuator_delay", "friction_patch"), 0.97, 0.965),
+                Ranked(("friction_patch",), 0.02, 0.6),
+            ),
+            "warnings": ("run3.csv, row 31 (line 32): rows are missing here; the episode was split",),
+        },
+        "ambiguous": {
+            "causes": (GAIN, MASS),
+            "ranking": (Ranked(("actuator_gain",), 0.52, 0.93), Ranked(("cart_mass",), 0.46, 0.93)),
+            "next_experiment": "Let the pole swing with the motor off for 10 s: its pull then moves "
+            "a heavier cart less, and a weaker motor does not matter.",
+        },
+        "unexplained": {
+            "causes": (),
+            "ranking": (Ranked(("coulomb_friction",), 0.6, 0.38), Ranked((), 0.0, 0.0)),
+            "gap": Gap(MEASURE, 6.4, 4.5, 1.02, 1.5, 0.35),
+            "next_experiment": "Drive slowly over x from 0.1 to 0.4 m in both directions.",
+        },
+        "no_gap": {
+            "causes": (),
+            "ranking": (Ranked((), 0.96, 0.0), Ranked(("viscous_friction",), 0.02, 0.01)),
+            "gap": Gap(MEASURE, 1.03, 1.03, 1.02, 1.04, math.nan),
+            "where": Where(
+                dict.fromkeys(("actuation", "dynamics", "sensing", "camera"), 0.0),
+                {"x": 0.5, "x_dot": math.nan, "theta": 0.5, "theta_dot": math.nan},
+            ),
+            "evidence": some_evidence(velocities=False),
+        },
+    }
+    return Diagnosis(**(common | {"verdict": verdict} | own[verdict] | changes))
+
+
+every_verdict = pytest.mark.parametrize("verdict", VERDICTS)
+
+
+class TestResult:
+    @every_verdict
+    def test_the_json_is_as_the_schema_says(self, verdict):
+        content = json.loads(json.dumps(a_diagnosis(verdict).to_json(), allow_nan=False))
+        jsonschema.Draft202012Validator(SCHEMA).validate(content)
+
+    def test_the_schema_is_one(self):
+        jsonschema.Draft202012Validator.check_schema(SCHEMA)
+
+    def test_keys_and_their_order_are_the_contract(self):
+        content = a_diagnosis("identified").to_json()
+        assert list(content) == [
+            "schema", "system", "recording", "verdict", "where", "causes", "ranking", "gap", "next_experiment",
+            "warnings",
+        ]  # fmt: skip
+        assert list(content["where"]) == ["stages", "states", "regions", "pixels"]
+        assert content["where"]["regions"] == [
+            {"variable": "x", "from": 0.1, "to": 0.4, "share": 0.8, "p_value": 0.0004}
+        ]
+        assert content["causes"][1] == {
+            "effect": "actuator_delay",
+            "parameters": {"delay": {"value": 0.0312, "unit": "s", "ci90": [0.0281, 0.0343]}},
+            "probability": 0.94,
+            "gap_closed": 0.33,
+            "indistinguishable_from": [],
+        }
+        assert list(content["gap"]) == ["measure", "before", "after", "floor", "black_box", "closed"]
+
+    def test_what_is_not_finite_is_null(self):
+        content = a_diagnosis("ambiguous").to_json()
+        assert content["causes"][1]["parameters"]["scale"]["ci90"] == [1.2, None]
+        assert a_diagnosis("no_gap").to_json()["where"]["states"]["x_dot"] is None
+
+    def test_numbers_of_numpy_are_plain(self):
+        gap = Gap(MEASURE, *np.array([6.4, 1.21, 1.02, 1.4, 0.965], np.float32))
+        recording = RecordingSummary(*np.array([3, 100, 1]))
+        json.dumps(a_diagnosis("identified", gap=gap, recording=recording).to_json(), allow_nan=False)
+
+    def test_shares_may_pass_one_by_a_rounding_error(self):
+        diagnosis = a_diagnosis("identified", causes=(replace(DELAY, probability=1.0000000000000002),))
+        assert diagnosis.to_json()["causes"][0]["probability"] == 1
+
+    def test_the_schema_refuses_causes_where_there_are_none(self):
+        content = a_diagnosis("identified").to_json() | {"verdict": "no_gap"}
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.Draft202012Validator(SCHEMA).validate(content)
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [({"verdict": "maybe"}, "'maybe'; there are identified"), ({"causes": ()}, "does not go with 0 causes")],
+    )
+    def test_what_does_not_go_together(self, changes, message):
+        with pytest.raises(ValueError, match=message):
+            replace(a_diagnosis("identified"), **changes)
+
+
+class TestWords:
+    @pytest.mark.parametrize(
+        ("verdict", "text"),
+        [
+            (
+                "identified",
+                "Friction patch (start 0.102 m, end 0.402 m, coefficient 7.8 N s/m) and actuator delay (delay "
+                "0.0312 s) close 96 % of the gap to the simulator.",
+            ),
+            (
+                "ambiguous",
+                "Either actuator gain (scale 0.800) or cart mass (scale 1.27) closes 96 % of the gap to the simulator; "
+                "this recording cannot tell which.",
+            ),
+            (
+                "unexplained",
+                "Something acts that no known effect explains: the best of them close 38 % of the gap, a black box "
+                "91 %; it shows most at x from 0.10 to 0.40 m.",
+            ),
+            (
+                "no_gap",
+                "No gap: the simulator predicts this recording as well as its noise allows (error 1.03, noise 1.02).",
+            ),
+        ],
+    )
+    def test_the_verdict_in_a_sentence(self, verdict, text):
+        assert sentence(a_diagnosis(verdict)) == text
+
+    @pytest.mark.parametrize(
+        ("ranking", "text"),
+        [
+            ((Ranked((), 0.9, 0.0),), "explains: none of them closes any of the gap; it shows"),
+            ((Ranked(("gust",), 0.9, 0.95),), "the best of them close 95 % of the gap, and what is left is not noise;"),
+        ],
+    )
+    def test_what_is_unexplained(self, ranking, text):
+        assert text in sentence(a_diagnosis("unexplained", ranking=ranking))
+
+    def test_one_cause_is_sure_and_two_are_open(self):
+        text = sentence(a_diagnosis("ambiguous", causes=(PATCH, GAIN, MASS)))
+        assert re.match(r"Friction patch \(.*\) and either actuator gain \(.*\) or cart mass \(.*\) close 96 %", text)
+
+    @pytest.mark.parametrize(
+        ("value", "text"),
+        [(0, "0"), (0.0123456, "0.0123"), (1234.5, "1234"), (2.5e-7, "2.50e-07"), (math.nan, "unknown")],
+    )
+    def test_numbers(self, value, text):
+        assert number(value) == text
+
+    def test_digits_follow_the_interval(self):
+        assert estimate(Estimate(2.12345, "N", (1.93, 2.31))) == "2.12 N"
+        assert interval(Estimate(2.12345, "N", (1.93, 2.31))) == "1.93 to 2.31 N"
+        assert interval(Estimate(2.12345, "1", (1.93, math.nan))) == "1.93 to open"
+        assert estimate(Estimate(213.4, "N", (150.0, 270.0))) == "210 N"
+
+    @every_verdict
+    def test_the_terminal_has_it_all(self, verdict):
+        diagnosis = a_diagnosis(verdict)
+        text = as_text(diagnosis)
+        assert text.startswith(f"{verdict}: {sentence(diagnosis)}\n")
+        for cause in diagnosis.causes:
+            assert cause.effect in text
+            assert all(f"{name} = " in text for name in cause.parameters)
+        for line in (diagnosis.next_experiment, *diagnosis.warnings):
+            assert line in text
+        for value in ("2.50", "0.0400", "0.520", "0.270"):  # L, the distance of commands, the bounds
+            assert value in text
+        assert "nan" not in text
+
+
+class Page(HTMLParser):
+    """What a page is made of: the tags that are open must close."""
+
+    VOID = ("meta", "link", "img", "br")
+
+    def __init__(self, text):
+        super().__init__()
+        self.open: list[str] = []
+        self.tags, self.attributes, self.words = [], [], []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += attrs
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += attrs
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+class TestPage:
+    @every_verdict
+    def test_is_whole_and_stands_alone(self, verdict):
+        diagnosis = a_diagnosis(verdict)
+        page = Page(as_html(diagnosis, SETTINGS))
+        assert "script" not in page.tags
+        links = [value for name, value in page.attributes if name in ("src", "href", "xlink:href")]
+        assert all(link.startswith("#") for link in links)
+        assert page.tags.count("svg") == 7
+        text = " ".join(" ".join(page.words).split())
+        for piece in (sentence(diagnosis), diagnosis.next_experiment, *diagnosis.warnings, *SETTINGS.values()):
+            assert piece in text
+        assert "nan" not in re.sub(r"<svg.*?</svg>", "", as_html(diagnosis, SETTINGS), flags=re.DOTALL).split()
+
+    def test_figures_are_images_in_the_page_s_colours(self):
+        for svg in re.findall(r"<svg.*?</svg>", as_html(a_diagnosis("identified"), SETTINGS), re.DOTALL):
+            assert ElementTree.fromstring(svg.replace("xlink:href", "href")).find("title").text
+            assert "var(--before)" in svg
+            assert not re.search(r"(?:fill|stroke): #", svg)
+
+    def test_without_evidence(self):
+        assert Page(as_html(a_diagnosis("identified", evidence=Evidence()), {})).tags.count("svg") == 0
+
+    def test_what_others_wrote_is_escaped(self):
+        page = as_html(a_diagnosis("identified", warnings=("<b>&.csv: odd",)), {"recording": "<i>.csv"})
+        assert "&lt;b&gt;&amp;.csv: odd" in page
+        assert "&lt;i&gt;.csv" in page
+
+    def test_the_same_diagnosis_gives_the_same_page(self):
+        assert as_html(a_diagnosis("identified"), SETTINGS) == as_html(a_diagnosis("identified"), SETTINGS)
+
+    def test_is_written(self, tmp_path):
+        path = tmp_path / "new" / "report.html"
+        write_report(path, a_diagnosis("identified"), SETTINGS)
+        assert path.read_text().startswith("<!doctype html>")

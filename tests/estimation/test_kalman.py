@@ -1,0 +1,100 @@
+"""The filter against the same Gaussian written out as one big vector."""
+
+import math
+
+import pytest
+import torch
+
+from visadapt.estimation.kalman import Linear, backward, forward, log_likelihood, respond
+
+N, T, STATES, CHANNELS, COLUMNS = 3, 7, 4, 2, 3
+
+
+@pytest.fixture
+def problem():
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    return Linear(
+        torch.eye(STATES, dtype=torch.float64) + 0.2 * draw(N, T - 1, STATES, STATES),
+        draw(N, T - 1, STATES, COLUMNS),
+        draw(N, T, CHANNELS, STATES),
+        draw(N, T, CHANNELS, COLUMNS),
+        draw(N, STATES, COLUMNS),
+        torch.tensor([1.0, 2.0, 0.5, 3.0], dtype=torch.float64),
+    )
+
+
+PROCESS = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64).expand(N, -1)
+MEASUREMENT = torch.tensor([0.5, 0.2], dtype=torch.float64).expand(N, -1)
+
+
+def dense(problem, n, column):
+    """Mean and covariance of all states, and the matrix, of system n, as one Gaussian."""
+    mean = [problem.start[n, :, column]]
+    maps = [torch.eye(STATES, dtype=torch.float64)]
+    sources = [torch.diag(problem.spread)]
+    rows = [[maps[0]]]
+    for t in range(T - 1):
+        a = problem.transition[n, t]
+        mean.append(a @ mean[-1] + problem.drive[n, t, :, column])
+        rows.append([a @ m for m in rows[-1]] + [torch.eye(STATES, dtype=torch.float64)])
+        sources.append(torch.diag(PROCESS[n]))
+    whole = torch.zeros(T * STATES, T * STATES, dtype=torch.float64)
+    for i, row in enumerate(rows):
+        for j, m in enumerate(row):
+            whole[i * STATES : (i + 1) * STATES, j * STATES : (j + 1) * STATES] = m
+    covariance = whole @ torch.block_diag(*sources) @ whole.T
+    return torch.cat(mean), covariance
+
+
+def test_likelihood_is_that_of_the_whole_gaussian(problem):
+    filtered = forward(problem, PROCESS, MEASUREMENT)
+    found = log_likelihood(filtered, torch.ones(N, T, CHANNELS))
+    for n in range(N):
+        mean, covariance = dense(problem, n, 0)
+        h = torch.block_diag(*problem.sensing[n])
+        s = h @ covariance @ h.T + torch.diag(MEASUREMENT[n].repeat(T))
+        error = problem.reading[n, :, :, 0].flatten() - h @ mean
+        expected = -0.5 * (error @ torch.linalg.solve(s, error) + torch.logdet(s) + len(error) * math.log(2 * math.pi))
+        torch.testing.assert_close(found[n], expected)
+
+
+def test_smoothed_states_are_the_conditional_mean_for_every_column(problem):
+    smoothed, _ = backward(problem, forward(problem, PROCESS, MEASUREMENT))
+    for n in range(N):
+        for column in range(COLUMNS):
+            mean, covariance = dense(problem, n, column)
+            h = torch.block_diag(*problem.sensing[n])
+            s = h @ covariance @ h.T + torch.diag(MEASUREMENT[n].repeat(T))
+            error = problem.reading[n, :, :, column].flatten() - h @ mean
+            expected = mean + covariance @ h.T @ torch.linalg.solve(s, error)
+            torch.testing.assert_close(smoothed[n, :, :, column].flatten(), expected)
+
+
+def test_smoothed_disturbances_carry_the_states_on(problem):
+    smoothed, adjoint = backward(problem, forward(problem, PROCESS, MEASUREMENT))
+    disturbance = -(PROCESS[:, None, :, None] * adjoint)[:, 1:]
+    carried = problem.transition @ smoothed[:, :-1] + problem.drive + disturbance
+    torch.testing.assert_close(carried, smoothed[:, 1:])
+
+
+def test_without_process_noise_the_smoothed_states_follow_the_model(problem):
+    smoothed, _ = backward(problem, forward(problem, torch.zeros(N, STATES).double(), MEASUREMENT))
+    torch.testing.assert_close(problem.transition @ smoothed[:, :-1] + problem.drive, smoothed[:, 1:])
+
+
+def test_inputs_pass_through_the_gains_like_columns(problem):
+    filtered = forward(problem, PROCESS, MEASUREMENT)
+    quiet = Linear(
+        problem.transition,
+        problem.drive,
+        problem.sensing,
+        problem.reading,
+        torch.zeros_like(problem.start),
+        problem.spread,
+    )
+    expected = forward(quiet, PROCESS, MEASUREMENT).innovation
+    torch.testing.assert_close(respond(problem, filtered, problem.drive, problem.reading), expected)

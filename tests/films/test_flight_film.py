@@ -1,0 +1,305 @@
+import dataclasses
+import math
+import resource
+import subprocess
+import sys
+from pathlib import Path
+from typing import cast
+
+import imageio.v3 as imageio
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from train.flight_film import NAMES
+from visadapt.films.canvas import RED, Canvas
+from visadapt.films.drawing3d import NEAR, Pen, PinholeCamera
+from visadapt.films.flight_film import FlownPanel, flight_still, write_flight_film, write_flight_still
+from visadapt.films.flight_views import CLOSE, VIOLET, Scales, draw_close_up
+from visadapt.films.vehicle_shapes import draw_vehicle, outline
+from visadapt.recordings import Episode
+from visadapt.systems import FixedWing, Quadrotor
+from visadapt.systems.rigid_body import from_angles, rotation
+from visadapt.targets.rollout import Run
+from visadapt.tasks.courses import AlongReferences, Course, ToTarget
+from visadapt.tasks.references import Reference
+
+SPEED = 1.5
+"""m/s of the reference, along x"""
+
+
+def along(seconds: float = 1.0) -> AlongReferences:
+    """A straight reference at a steady speed."""
+    time = torch.arange(round(seconds / 0.1) + 1) * 0.1
+    motion = torch.zeros(4, 1, len(time), 3)
+    motion[0, 0, :, 0], motion[1, 0, :, 0] = SPEED * time, SPEED
+    return AlongReferences(Reference.of(motion, 0.1))
+
+
+def following(
+    aside: tuple[float, float, float] = (0.0, 0.0, 0.0), rows: int = 11, survived: bool = True, **other
+) -> FlownPanel:
+    """A quadrotor that flies beside its reference all the way."""
+    course = along()
+    time = np.arange(rows) * 0.1
+    state = np.zeros((rows, 13))
+    state[:, 0], state[:, 3], state[:, 6] = SPEED * time, SPEED, 1.0
+    state[:, :3] += aside
+    run = Run(
+        Episode(time, np.zeros((rows, 4)), state), survived, np.tile(other.pop("force", (0.0, 0.0, 0.0)), (rows, 1))
+    )
+    return FlownPanel("a flight", run, Quadrotor(), course, torch.tensor([0, 0]), **other)
+
+
+def reaching(miss: float) -> FlownPanel:
+    """A fixed wing that passes its target at a distance, to the left."""
+    time = np.arange(140) * 0.05
+    state = np.zeros((140, 13))
+    state[:, 0], state[:, 1], state[:, 3], state[:, 6] = 11.5 * time, miss, 11.5, 1.0
+    run = Run(Episode(time, np.zeros((140, 4)), state), True, np.zeros(140))
+    return FlownPanel("a flight", run, FixedWing(), ToTarget(0.05), torch.tensor([50.0, 0.0, 0.0]))
+
+
+def count(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
+    return int((np.abs(picture.astype(int) - colour).max(-1) < 30).sum())
+
+
+def test_a_camera_sees_points_where_similar_triangles_put_them():
+    camera = PinholeCamera.towards(np.array([0.0, -10.0, 0.0]), np.zeros(3), 500.0, (400, 300))
+    seen, depth = camera.project(np.array([[0.0, 0, 0], [2, 0, 0], [0, 0, 1], [2, 10, 1]]))
+    np.testing.assert_allclose(seen, [[200, 150], [300, 150], [200, 100], [250, 125]], atol=1e-9)
+    np.testing.assert_allclose(depth, [10, 10, 10, 20])
+
+
+@pytest.mark.parametrize("down", [0.0, 0.3, -0.2])
+def test_the_horizon_is_where_endless_ground_is_seen(down: float):
+    camera = PinholeCamera.towards(np.zeros(3), np.array([1.0, 2.0, -down]), 500.0, (400, 300))
+    far = camera.project(1e9 * np.array([[1.0, 2.0, 0.0], [1.5, 1.5, 0.0]]))[0]
+    np.testing.assert_allclose(far[:, 1], camera.horizon, atol=1e-5)
+    assert camera.horizon == pytest.approx(150 - 500 * down / math.sqrt(5))
+
+
+def test_a_camera_around_points_sees_them_all_and_fills_its_picture():
+    points = np.random.default_rng(0).normal(size=(50, 3)) * (8, 1, 3)
+    seen = PinholeCamera.around(points, np.array([-0.5, -1, 0.6]), (200, 100), 10).project(points)[0]
+    assert (seen > 9.99).all()
+    assert (seen < (190.01, 90.01)).all()
+    gaps = np.array([seen.min(0), (200, 100) - seen.max(0)]) - 10
+    assert np.abs(gaps).min(1).max() < 1e-6
+
+
+def test_a_line_that_passes_the_camera_is_cut_there_and_not_mirrored():
+    canvas = Canvas(400, 300)
+    pen = Pen(canvas, PinholeCamera.towards(np.zeros(3), np.array([1.0, 0.0, 0.0]), 300.0, (400, 300)))
+    pen.line(np.array([[-5.0, -1, -0.5], [5.0, -1, -0.5]]), (0, 0, 0), 2)
+    rows, columns = np.nonzero(canvas.pixels[..., 0] < 128)
+    assert len(rows) > 100
+    assert columns.min() > 255  # to the right and below only, from 60 px and 30 px on outwards
+    assert rows.min() > 175
+    canvas = Canvas(400, 300)
+    Pen(canvas, pen.camera).line(np.array([[-5.0, -1, 0], [NEAR / 2, -1, 0]]), (0, 0, 0))
+    assert (canvas.pixels == 255).all()
+
+
+def test_positions_between_rows_go_through_the_rows_and_errors_are_the_course_s():
+    panel = following((0.0, 0.03, 0.04))
+    np.testing.assert_allclose(panel.position[::5], panel.states[:, :3], atol=1e-6)
+    np.testing.assert_allclose(panel.position[:, 0], SPEED * panel.times, atol=1e-6)
+    states = torch.from_numpy(panel.states)[None]
+    assert panel.score[-1] == pytest.approx(float(panel.course.misses(states, panel.place[None]).mean()), abs=1e-6)
+    assert panel.score[-1] == pytest.approx(0.05)
+    wing = reaching(0.2)
+    flown = torch.from_numpy(np.array(wing.run.episode.state))[None]
+    assert wing.worst == pytest.approx(float(wing.course.misses(flown, wing.place[None])))
+    assert wing.passed == pytest.approx(50 / 11.5, abs=0.051)
+    np.testing.assert_allclose(wing.nearest, (50, 0.2, 0), atol=1e-6)
+    assert wing.end == pytest.approx(wing.passed + 0.5, abs=0.051)
+
+
+def test_attitudes_between_rows_do_not_care_about_the_sign_of_a_quaternion():
+    panel = following()
+    turned = from_angles(torch.tensor([[0.1 * k, -0.3, 0.2] for k in range(11)]))
+    state = np.array(panel.run.episode.state)
+    state[:, 6:10] = turned * torch.tensor([1.0, -1.0]).repeat(6)[:11, None]
+    run = Run(dataclasses.replace(panel.run.episode, state=state), True, panel.run.force)
+    attitude = dataclasses.replace(panel, run=run).attitude
+    np.testing.assert_allclose(attitude[::5], rotation(turned), atol=1e-5)
+    middle = rotation(from_angles(torch.tensor([[0.05, -0.3, 0.2]])))[0]
+    np.testing.assert_allclose((attitude[2] + attitude[3]) / 2, middle, atol=0.02)
+
+
+@pytest.mark.parametrize("vehicle", [Quadrotor(), FixedWing()])
+@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (0.8, -0.4, 2.0)])
+def test_a_vehicle_is_drawn_where_it_is_as_it_is_turned(vehicle, angles: tuple[float, float, float]):
+    canvas, place = Canvas(480, 360), np.array([0.4, 1.0, -0.2])
+    camera = PinholeCamera.towards(np.array([-2.0, -4.0, 1.5]), np.zeros(3), 500.0, (480, 360))
+    turned = rotation(from_angles(torch.tensor([angles])))[0].double().numpy()
+    draw_vehicle(Pen(canvas, camera), vehicle, place, turned)
+    drawn = np.argwhere((canvas.pixels < 250).any(-1))[:, ::-1]
+    expected = camera.project(place + outline(vehicle) @ turned.T)[0]
+    np.testing.assert_allclose(drawn.min(0), expected.min(0), atol=4)
+    np.testing.assert_allclose(drawn.max(0), expected.max(0), atol=4)
+
+
+@pytest.mark.parametrize("aside", [(0.3, 0.0, 0.0), (-0.3, 0.0, 0.2), (0.0, 0.3, -0.3)])
+def test_the_error_is_drawn_from_the_reference_to_the_vehicle(aside: tuple[float, float, float]):
+    panel, canvas = following(aside), Canvas(480, 360)
+    draw_close_up(canvas, panel, 1, Scales.of([panel, following()]))
+    offset, ahead, focal = CLOSE[True]
+    goal = panel.goal[1]
+    camera = PinholeCamera.towards(goal + np.array(offset), goal + np.array(ahead), focal, (480, 360))
+    ends = camera.project(np.stack([goal, goal + np.array(aside)]))[0]
+    np.testing.assert_allclose(ends[0], (240, 180), atol=1e-6)
+    between = ends[0] + np.linspace(0.2, 0.8, 9)[:, None] * (ends[1] - ends[0])
+    near = [canvas.pixels[round(y) - 2 : round(y) + 2, round(x) - 2 : round(x) + 2] for x, y in between]
+    assert sum(count(part, RED) > 0 for part in near) >= 7  # the thrust's arrow may cover some
+
+
+def test_a_hidden_force_is_drawn_towards_where_it_pushes():
+    columns = []
+    for newtons in (2.0, -2.0):
+        panel = following(force=(newtons, 0.0, 0.0))
+        scene = flight_still([panel], 0.5)[60:420, 28:508].astype(int)
+        violet = np.abs(scene - VIOLET).max(-1) < 30
+        assert violet.sum() > 150
+        columns.append(np.nonzero(violet)[1].mean())
+    assert columns[0] > 260
+    assert columns[1] < 220
+    assert count(flight_still([following()], 0.5)[60:420], VIOLET) == 0
+
+
+def test_outlines_have_the_vehicles_sizes():
+    assert np.ptp(outline(FixedWing())[:, 1]) == pytest.approx(1.54)
+    rotors = outline(Quadrotor()).reshape(4, 24, 3).mean(1)
+    np.testing.assert_allclose(np.linalg.norm(rotors[:, :2], axis=1), 0.2, atol=1e-9)
+
+
+def test_a_film_is_decoded_as_it_was_drawn(tmp_path: Path):
+    panels = [following((0.0, 0.05, 0.0), rows=4)]
+    path = tmp_path / "new folder" / "film.mp4"
+    done: list[tuple[int, int]] = []
+    write_flight_film(path, panels, lambda now, total: done.append((now, total)))
+    reader = imageio_ffmpeg.read_frames(path)
+    meta = next(reader)
+    reader.close()
+    assert meta["codec"] == "h264"
+    assert meta["pix_fmt"].startswith("yuv420p")
+    assert meta["fps"] == 25
+    frames = imageio.imread(path, plugin="FFMPEG")
+    assert len(frames) == round((0.3 + 1.5) * 25) + 1
+    assert done[-1] == (len(frames), len(frames))
+    for i in (0, 20, len(frames) - 1):
+        drawn = flight_still(panels, i * 0.04)
+        assert frames[i].shape == drawn.shape
+        assert drawn.shape[0] % 2 == drawn.shape[1] % 2 == 0
+        assert np.abs(frames[i].astype(float) - drawn).mean() < 2
+    assert [entry.name for entry in path.parent.iterdir()] == ["film.mp4"]
+
+
+def test_a_still_is_a_picture_and_its_end_stands_still(tmp_path: Path):
+    panels = [following(), following((0.0, 0.05, 0.0))]
+    write_flight_still(tmp_path / "still.png", panels, 0.6)
+    with Image.open(tmp_path / "still.png") as picture:
+        assert np.array_equal(np.asarray(picture), flight_still(panels, 0.6))
+    assert np.array_equal(flight_still(panels, 1.0), flight_still(panels, 9.0))
+
+
+def test_flights_that_failed_are_marked_as_such_from_then_on():
+    state = np.array(following().run.episode.state)
+    state[6:, 1] = 2.0
+    strays = following()
+    strays = dataclasses.replace(
+        strays, run=Run(dataclasses.replace(strays.run.episode, state=state), True, np.zeros(11))
+    )
+    assert strays.failed == pytest.approx(0.56, abs=0.04)
+    lost = following(rows=7, survived=False)
+    assert lost.failed == pytest.approx(0.6)
+    for panel, before, after in ((strays, 0.4, 0.8), (lost, 0.5, 0.7)):
+        banner = slice(60, 120), slice(28, 508)
+        assert count(flight_still([following(), panel], before)[:, 544:][banner], RED) == 0
+        assert count(flight_still([following(), panel], after)[:, 544:][banner], RED) > 2000
+        assert count(flight_still([following(), panel], after)[banner], RED) == 0
+    missed, hit = reaching(1.3), reaching(0.01)
+    assert missed.failed == pytest.approx(missed.passed)
+    assert hit.failed is None
+    assert count(flight_still([missed, hit], 4.0)[60:120], RED) == 0
+    after_it = flight_still([missed, hit], 4.7)[60:120]
+    assert count(after_it[:, :510], RED) > 2000
+    assert count(after_it[:, 510:], RED) == 0
+
+
+def test_a_flight_that_strays_beyond_all_bounds_is_drawn_all_the_same():
+    panel = following()
+    state = np.array(panel.run.episode.state)
+    state[5:, :6] = 1e30
+    strayed = dataclasses.replace(
+        panel, run=Run(dataclasses.replace(panel.run.episode, state=state), False, np.full(11, 1e30))
+    )
+    for t in (0.45, 0.5, 1.0):
+        assert flight_still([strayed, panel], t).shape == flight_still([panel, panel], t).shape
+    assert Scales.of([strayed, panel]).far == Scales.of([panel]).far
+
+
+def test_an_earlier_flight_is_drawn_beside_the_later_one():
+    plain, earlier = following((0.0, 0.01, 0.0)), following((0.0, 0.05, 0.1))
+    alone = flight_still([plain], 0.8)
+    both = flight_still([dataclasses.replace(plain, earlier=earlier)], 0.8)
+    assert (alone != both).any(-1).sum() > 500
+
+
+def test_a_flight_of_one_row_is_a_picture():
+    assert flight_still([following(rows=1)], 0.0).ndim == 3
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: flight_still([], 0.0), "at least one panel"),
+        (lambda: flight_still([following(), reaching(0.1)], 0.0), "film them apart"),
+        (lambda: following(rows=12), "12 rows, its reference 11"),
+        (
+            lambda: dataclasses.replace(following(), course=cast(Course, object())),
+            "no picture is known of a course object",
+        ),
+        (
+            lambda: dataclasses.replace(
+                following(), run=Run(Episode(np.arange(3.0), np.zeros((3, 1)), np.zeros((3, 4))), True, np.zeros(3))
+            ),
+            "no states of a quadrotor",
+        ),
+    ],
+)
+def test_bad_input_is_one_clear_line(make, says: str):
+    with pytest.raises(ValueError, match=says) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="needs a limit on the size of files")
+def test_a_disk_that_fills_up_leaves_the_old_film(tmp_path: Path):
+    """A limit on the size of a file stands for a full disk: ffmpeg dies on it in the middle of writing."""
+    old = tmp_path / "film.mp4"
+    old.write_bytes(b"the film of yesterday")
+    code = (
+        "import resource, sys; from tests.films.test_flight_film import *\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
+        "try: write_flight_film(sys.argv[1], [following(rows=1)])\n"
+        "except OSError as error: print(error); sys.exit(7)\n"
+    )
+    root = Path(__file__).parents[2]
+    done = subprocess.run([sys.executable, "-c", code, str(old)], cwd=root, capture_output=True, text=True)
+    assert done.returncode == 7, done.stderr
+    assert "was not written" in done.stdout
+    assert len(done.stdout.strip().splitlines()) == 1
+    assert old.read_bytes() == b"the film of yesterday"
+    assert list(tmp_path.iterdir()) == [old]
+
+
+def test_what_can_be_filmed_is_what_the_benchmark_runs():
+    from benchmarks.flight import EXPERIMENTS
+
+    assert set(NAMES.values()) == set(EXPERIMENTS)
+    for (vehicle, hidden), name in NAMES.items():
+        assert (EXPERIMENTS[name].vehicle.name, EXPERIMENTS[name].hidden) == (vehicle, hidden)

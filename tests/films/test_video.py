@@ -1,0 +1,182 @@
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import imageio.v3 as imageio
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from PIL import Image
+
+from visadapt.films.canvas import RED
+from visadapt.films.cartpole_panel import Panel, Scales
+from visadapt.films.video import still, write_clip, write_film, write_still
+from visadapt.recordings import Episode
+from visadapt.targets.rollout import Run
+
+PERIOD = 0.05
+
+
+def make_run(rows: int = 21, survived: bool = True, last_angle: float = 0.0, last_place: float = 0.1) -> Run:
+    time = np.arange(rows) * PERIOD
+    state = np.stack([0.1 * np.sin(time), 0.1 * np.cos(time), 0.02 * np.cos(3 * time), 0.0 * time], -1)
+    state[-1, 0], state[-1, 2] = last_place, last_angle
+    frame = np.full((rows, 100, 120), 245, np.uint8)
+    episode = Episode(time, 0.3 * np.sin(4 * time)[:, None], state, frame)
+    return Run(episode, survived, 2 * (np.sin(time) + 1))
+
+
+def red_pixels(picture: np.ndarray) -> int:
+    return int((np.abs(picture.astype(int) - RED).max(-1) < 30).sum())
+
+
+def test_a_film_is_decoded_as_it_was_drawn(tmp_path: Path):
+    panels = [Panel.redrawn("source", make_run()), Panel.redrawn("target", make_run(9, False, 0.4))]
+    path = tmp_path / "new folder" / "film.mp4"
+    done: list[tuple[int, int]] = []
+    write_film(path, panels, PERIOD, lambda now, total: done.append((now, total)))
+    reader = imageio_ffmpeg.read_frames(path)
+    meta = next(reader)
+    reader.close()
+    assert meta["codec"] == "h264"
+    assert meta["pix_fmt"].startswith("yuv420p")
+    assert meta["fps"] == 1 / PERIOD
+    frames = imageio.imread(path, plugin="FFMPEG")
+    assert len(frames) == 21
+    assert done == [(i, 21) for i in range(1, 22)]
+    for i in (0, 10, 20):
+        drawn = still(panels, i * PERIOD)
+        assert frames[i].shape == drawn.shape
+        assert drawn.shape[0] % 2 == drawn.shape[1] % 2 == 0
+        assert np.abs(frames[i].astype(float) - drawn).mean() < 2
+    content = path.read_bytes()
+    assert content.index(b"moov") < content.index(b"mdat"), "a browser must be able to start before the end"
+    assert [entry.name for entry in path.parent.iterdir()] == ["film.mp4"]
+
+
+def test_the_end_of_an_episode_is_marked_and_the_scene_stands_still():
+    panel = Panel.redrawn("target", make_run(9, False, 0.4))
+    long = Panel.redrawn("source", make_run(21))
+    assert red_pixels(still([panel, long], 0.3)) == 0
+    after = still([panel, long], 0.5)
+    assert red_pixels(after) > 2000
+    half = after.shape[1] // 2
+    assert np.array_equal(after[:, :half], still([panel, long], 0.9)[:, :half])
+    assert red_pixels(after[:, half:]) == 0
+
+
+@pytest.mark.parametrize(
+    ("survived", "angle", "place", "verdict"),
+    [(True, 0.0, 0.1, ""), (False, -0.35, 0.1, "FELL"), (False, 0.1, 1.6, "LEFT THE FRAME")],
+)
+def test_the_verdict_says_how_an_episode_ended(survived: bool, angle: float, place: float, verdict: str):
+    assert Panel.redrawn("target", make_run(9, survived, angle, place)).verdict == verdict
+
+
+def test_the_limit_of_the_angle_decides_what_a_fall_is():
+    run = make_run(9, False, 0.25)
+    assert Panel.redrawn("target", run, angle_limit=0.2).verdict == "FELL"
+
+
+def test_the_force_is_drawn_at_the_cart_on_the_side_it_pushes_from():
+    run = make_run()
+    orange = [
+        still([Panel.redrawn("t", Run(run.episode, True, sign * run.force))], 0.5)[340:420, 28:508] for sign in (1, -1)
+    ]
+    cart = 28 + 239.5 + 160 * run.episode.state[10, 0] - 28
+    for picture, side in zip(orange, (1, -1), strict=True):
+        columns = np.nonzero((picture[..., 0] > 200) & (picture[..., 2] < 60))[1]
+        assert len(columns) > 200
+        assert side * (cart - columns.mean()) > 30
+
+
+@pytest.mark.parametrize("shape", [(100, 120), (100, 120, 3), (480, 480, 3), (37, 211)])
+def test_pictures_of_any_size_fill_the_same_panel(shape: tuple[int, ...]):
+    picture = np.full((21, *shape), 90, np.uint8)
+    panels = [Panel("a camera with a title too long for its panel " * 3, make_run(), picture, force_known=False)]
+    assert still(panels, 0.2).shape == still([Panel.redrawn("drawn", make_run())], 0.2).shape
+
+
+def test_an_episode_of_one_row_is_a_film_of_one_frame(tmp_path: Path):
+    write_film(tmp_path / "film.mp4", [Panel.redrawn("target", make_run(1))], PERIOD)
+    assert len(imageio.imread(tmp_path / "film.mp4", plugin="FFMPEG")) == 1
+
+
+def test_scales_are_shared_and_a_fall_does_not_squash_the_rest():
+    run = make_run()
+    run.episode.state[:, 1] *= 40
+    fallen = Panel.redrawn("fallen", Run(run.episode, False, run.force))
+    assert Scales.of([fallen]).speed >= 4
+    assert Scales.of([fallen, Panel.redrawn("upright", make_run())]).speed == 0.5
+
+
+def test_a_still_and_a_clip_are_pictures(tmp_path: Path):
+    panels = [Panel.redrawn("source", make_run())]
+    write_still(tmp_path / "still.png", panels, 0.3)
+    with Image.open(tmp_path / "still.png") as picture:
+        assert np.array_equal(np.asarray(picture), still(panels, 0.3))
+    write_clip(tmp_path / "clip.webp", panels, PERIOD, seconds=0.5, width=200)
+    with Image.open(tmp_path / "clip.webp") as clip:
+        assert clip.format == "WEBP"
+        assert clip.size[0] == 200
+        assert getattr(clip, "n_frames", 1) == 6
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda run: Panel("a", run, np.zeros((20, 10, 10), np.uint8)), "21 rows, its picture 20"),
+        (lambda run: Panel("a", run, np.zeros((21, 10, 10))), "must be uint8"),  # type: ignore[arg-type]
+        (lambda run: Panel("a", run, np.zeros((21, 10, 10, 4), np.uint8)), "must be uint8"),
+        (lambda run: Panel("a", run, np.zeros((21, 10, 10), np.uint8), np.zeros((21, 2))), "cart's places"),
+        (lambda run: still([], 0.0), "at least one panel"),
+        (lambda run: write_film("never.mp4", [], PERIOD), "at least one panel"),
+        (lambda run: write_film("never.mp4", [Panel.redrawn("a", run)], 0.0), "must be positive"),
+        (lambda run: write_clip("never.webp", [Panel.redrawn("a", run)], PERIOD, start=5.0), "ends at 1 s"),
+    ],
+)
+def test_bad_input_is_one_clear_line(make, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=says) as caught:
+        make(make_run())
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_without_states_is_refused():
+    frame = np.zeros((3, 10, 10), np.uint8)
+    run = Run(Episode(np.arange(3.0), np.zeros((3, 1)), None, frame), True, np.zeros(3))
+    with pytest.raises(ValueError, match="no states"):
+        Panel("a", run, frame)
+
+
+@pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="needs a limit on the size of files")
+def test_a_disk_that_fills_up_leaves_the_old_film(tmp_path: Path):
+    """A limit on the size of a file stands for a full disk: ffmpeg dies on it in the middle of writing."""
+    old = tmp_path / "film.mp4"
+    old.write_bytes(b"the film of yesterday")
+    code = (
+        "import resource, sys; from tests.films.test_video import *; panels = [Panel.redrawn('a', make_run(10))]\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
+        "try: write_film(sys.argv[1], panels, PERIOD)\n"
+        "except OSError as error: print(error); sys.exit(7)\n"
+    )
+    root = Path(__file__).parents[2]
+    done = subprocess.run([sys.executable, "-c", code, str(old)], cwd=root, capture_output=True, text=True)
+    assert done.returncode == 7, done.stderr
+    assert str(old) in done.stdout
+    assert "was not written" in done.stdout
+    assert len(done.stdout.strip().splitlines()) == 1
+    assert old.read_bytes() == b"the film of yesterday"
+    assert list(tmp_path.iterdir()) == [old]
+
+
+def test_an_ffmpeg_that_finds_the_disk_full_is_told_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    fake = tmp_path / "ffmpeg"
+    fake.write_text("#!/bin/sh\necho 'av_interleaved_write_frame(): No space left on device' >&2\nexit 228\n")
+    fake.chmod(0o755)
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(fake))
+    with pytest.raises(OSError, match=r"film\.mp4 was not written: disk full"):
+        write_film(tmp_path / "film.mp4", [Panel.redrawn("a", make_run(5))], PERIOD)
+    assert list(tmp_path.iterdir()) == [fake]

@@ -1,0 +1,245 @@
+import dataclasses
+
+import pytest
+import torch
+
+from tests.scenes import state_residual_network
+from visadapt.effects import Residual
+from visadapt.learning.grounding import GroundSettings
+from visadapt.learning.joint import AdaptSettings, adapt
+from visadapt.learning.ledger import BudgetExceeded, Ledger
+from visadapt.learning.policy import TuneSettings
+from visadapt.policies import StatePolicy
+from visadapt.policies.networks import StateResidualNetwork
+from visadapt.recordings import read_recording
+from visadapt.storage.checkpoints import CheckpointError
+from visadapt.systems import CartPole
+from visadapt.targets import SyntheticTarget, TargetError
+from visadapt.targets.rollout import see_states
+from visadapt.targets.synthetic import constant_force
+from visadapt.tasks.base import Balance
+from visadapt.tasks.cost import PAPER_CARTPOLE
+from visadapt.world import World
+
+TUNE = TuneSettings(
+    Balance(PAPER_CARTPOLE), iterations=105, batch=4, learning_rate=3e-3, observation_noise=0.0, recorded=0.5
+)
+GROUND = GroundSettings(steps=60, every=20)
+SMALL = AdaptSettings(TUNE, GROUND, budget=50, round_samples=30, observations="state", longest_episode=12, seed=1)
+QUICK = dataclasses.replace(SMALL, tune=dataclasses.replace(TUNE, iterations=3))
+
+
+class Counted(SyntheticTarget):
+    """A cart-pole under a constant force that counts the steps it takes, and stops the run, or breaks, at one."""
+
+    def __init__(self, stops_at=None, breaks_at=None, **more):
+        super().__init__(constant_force(1.0), **more)
+        self.steps = 0
+        self.stops_at = stops_at
+        self.breaks_at = breaks_at
+
+    def reset(self, batch, generator):
+        return self.broken(super().reset(batch, generator))
+
+    def step(self, action):
+        self.steps += len(action)
+        if self.steps == self.stops_at:
+            raise KeyboardInterrupt
+        return self.broken(super().step(action))
+
+    def broken(self, seen):
+        if self.breaks_at is not None and self.steps >= self.breaks_at:
+            return dataclasses.replace(seen, state=seen.state * float("nan"))
+        return seen
+
+
+def run(folder, settings, target=None, report=None, with_history=False):
+    torch.manual_seed(0)
+    policy = StatePolicy(4, with_history=with_history)
+    residual = Residual(state_residual_network(with_history), torch.ones(4))
+    source = World(CartPole(), integrator="euler")
+    adapted = adapt(
+        policy,
+        residual,
+        source,
+        target or Counted(),
+        lambda state: state,
+        see_states,
+        settings,
+        folder,
+        report=report,
+    )
+    return policy, adapted
+
+
+class TestLedger:
+    def test_it_counts_what_is_entered_and_refuses_what_would_overdraw_it(self):
+        ledger = Ledger(10)
+        ledger.count("data", 7)
+        with pytest.raises(BudgetExceeded, match="choosing: 4 target steps asked for, 3 of 10 are left"):
+            ledger.count("choosing", 4)
+        assert (ledger.used, ledger.left) == (7, 3)
+        ledger.count("choosing", 3)
+        assert ledger.entries == [("data", 7), ("choosing", 3)]
+        assert ledger.left == 0
+
+    @pytest.mark.parametrize(("budget", "size", "rounds"), [(50, 30, [30, 20]), (20, 20, [20]), (7, 3, [3, 3, 1])])
+    def test_it_counts_exactly_the_steps_that_the_target_took(self, tmp_path, budget, size, rounds):
+        target = Counted()
+        settings = dataclasses.replace(QUICK, budget=budget, round_samples=size)
+        _, adapted = run(tmp_path, settings, target)
+        assert adapted.ledger.used == target.steps == budget
+        assert sum(episode.samples for episode in adapted.episodes) == budget
+        for number, samples in enumerate(rounds, 1):
+            name = f"round {number}/{len(rounds)}: data"
+            assert sum(steps for purpose, steps in adapted.ledger.entries if purpose == name) == samples
+        assert [made.samples for made in adapted.rounds] == [sum(rounds[: k + 1]) for k in range(len(rounds))]
+
+    def test_episodes_that_fall_early_are_counted_in_full_and_followed_by_others(self, tmp_path):
+        target = Counted(angle_limit=0.12)
+        _, adapted = run(tmp_path, QUICK, target)
+        lengths = [episode.samples for episode in adapted.episodes]
+        assert min(lengths) < QUICK.longest_episode
+        assert sum(abs(episode.state[-1, 2]) > 0.12 for episode in adapted.episodes) >= 2
+        assert adapted.ledger.used == target.steps == sum(lengths) == 50
+
+    def test_a_folder_that_holds_more_samples_than_the_budget_is_refused(self, tmp_path):
+        run(tmp_path, QUICK)
+        with pytest.raises(BudgetExceeded, match="of 25 are left"):
+            run(tmp_path, dataclasses.replace(QUICK, budget=25, round_samples=25))
+
+
+class TestSettings:
+    def test_a_budget_smaller_than_a_round_is_one_clear_line(self):
+        with pytest.raises(ValueError, match=r"N = 20 .* B = 30 ") as caught:
+            AdaptSettings(TUNE, GROUND, budget=20, round_samples=30)
+        assert "\n" not in str(caught.value)
+
+    @pytest.mark.parametrize("size", [0, -5])
+    def test_a_round_needs_a_sample(self, size):
+        with pytest.raises(ValueError, match=f"B = {size}"):
+            AdaptSettings(TUNE, GROUND, budget=20, round_samples=size)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    policy, adapted = run(folder, SMALL)
+    return policy.state_dict(), adapted, folder
+
+
+def stopping(stage, after):
+    def report(name, done, total, loss):
+        if name == stage and done >= after:
+            raise KeyboardInterrupt
+
+    return report
+
+
+class TestInterruption:
+    @pytest.mark.parametrize(
+        ("stage", "after"),
+        [
+            ("data", 45),
+            ("round 1/2: ground", 40),
+            ("round 1/2: tune", 102),
+            ("round 2/2: ground", 0),
+            ("round 2/2: tune", 50),
+        ],
+    )
+    def test_started_again_it_ends_with_the_same_numbers(self, whole, tmp_path, stage, after):
+        weights, adapted, _ = whole
+        target = Counted(stops_at=after if stage == "data" else None)
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path, SMALL, target, stopping(stage, after))
+        policy, again = run(tmp_path, SMALL)
+        for key, value in weights.items():
+            assert torch.equal(value, policy.state_dict()[key]), key
+        assert again.ledger == adapted.ledger
+        assert again.rounds == adapted.rounds
+        for one, other in zip(adapted.episodes, again.episodes, strict=True):
+            assert (one.state == other.state).all()
+            assert (one.action == other.action).all()
+
+    def test_a_finished_run_is_read_and_neither_the_target_nor_training_is_touched(self, whole):
+        weights, adapted, folder = whole
+        target, calls = Counted(), []
+        policy, again = run(folder, SMALL, target, lambda *report: calls.append(report))
+        assert (target.steps, calls) == (0, [])
+        assert again.rounds == adapted.rounds
+        assert again.ledger == adapted.ledger
+        for key, value in weights.items():
+            assert torch.equal(value, policy.state_dict()[key]), key
+
+    def test_no_leftovers_lie_in_the_folder_of_a_finished_run(self, whole):
+        found = sorted(str(path.relative_to(whole[2])) for path in whole[2].rglob("*") if path.is_file())
+        files = ("policy.safetensors", "recording.h5", "residual.safetensors")
+        assert found == [f"round-{number:02d}/{name}" for number in (1, 2) for name in files]
+
+    def test_a_folder_of_other_networks_is_refused_by_name(self, tmp_path):
+        run(tmp_path, QUICK)
+        with pytest.raises(CheckpointError, match=r"round-01/residual\.safetensors: made for another architecture"):
+            run(tmp_path, QUICK, with_history=True)
+
+
+class TestLearning:
+    def test_the_residual_is_grounded_on_all_rounds_and_the_policy_is_tuned(self, whole):
+        weights, adapted, _ = whole
+        torch.manual_seed(0)
+        assert not torch.equal(weights["first.weight"], StatePolicy(4).first.weight)
+        assert [len(made.policy) for made in adapted.rounds] == [TUNE.iterations] * 2
+        # In units of the gap: 1 is what no residual gets.
+        assert adapted.rounds[0].grounding[0][2] == pytest.approx(1.0, abs=0.5)
+        assert min(held for _, _, held in adapted.rounds[1].grounding) < 0.5
+
+    @pytest.mark.parametrize("feedforward", [True, False])
+    def test_the_policy_begins_by_opposing_what_the_residual_expects_if_it_is_to(self, tmp_path, feedforward):
+        settings = dataclasses.replace(QUICK, tune=dataclasses.replace(QUICK.tune, learning_rate=0.0))
+        policy, _ = run(tmp_path, dataclasses.replace(settings, feedforward=feedforward))
+        assert bool(policy.feedforward.weight.any()) == feedforward
+
+    def test_each_round_and_each_seed_meets_the_target_in_other_states(self, whole, tmp_path):
+        _, adapted, _ = whole
+        _, other = run(tmp_path, dataclasses.replace(QUICK, seed=2))
+        starts = [tuple(episode.state[0]) for episode in [*adapted.episodes, *other.episodes]]
+        assert len(set(starts)) == len(starts)
+
+    def test_a_label_changes_what_is_learnt_from_and_not_what_is_recorded(self, tmp_path):
+        def label(episodes):
+            return [dataclasses.replace(episode, state=episode.state + 1.0) for episode in episodes]
+
+        torch.manual_seed(0)
+        policy = StatePolicy(4)
+        residual = Residual(StateResidualNetwork(4), torch.ones(4))
+        source = World(CartPole(), integrator="euler")
+        args = (source, Counted(), lambda state: state, see_states, QUICK, tmp_path)
+        adapted = adapt(policy, residual, *args, label=label)
+        recorded = [
+            episode for number in (1, 2) for episode in read_recording(tmp_path / f"round-0{number}/recording.h5")
+        ]
+        for episode, learnt_from in zip(recorded, adapted.episodes, strict=True):
+            assert abs(episode.state[0]).max() < 0.3
+            assert (learnt_from.state == episode.state + 1.0).all()
+
+
+class TestTargets:
+    @pytest.mark.parametrize("at", [1, 5])
+    def test_one_that_returns_nan_is_named_in_one_line_and_nothing_is_recorded(self, tmp_path, at):
+        with pytest.raises(TargetError, match=f"synthetic cart-pole: .* after step {at} is not finite") as caught:
+            run(tmp_path, QUICK, Counted(breaks_at=at))
+        assert "\n" not in str(caught.value)
+        assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+    def test_one_that_returns_nan_in_a_later_round_leaves_the_rounds_before(self, tmp_path):
+        with pytest.raises(TargetError, match="not finite"):
+            run(tmp_path, QUICK, Counted(breaks_at=35))
+        _, adapted = run(tmp_path, QUICK)
+        assert adapted.ledger.used == 50
+
+    def test_one_that_starts_with_nan(self, tmp_path):
+        with pytest.raises(TargetError, match="synthetic cart-pole: the first state is not finite"):
+            run(tmp_path, QUICK, Counted(breaks_at=0))
+
+    def test_one_whose_episodes_are_over_before_they_begin(self, tmp_path):
+        with pytest.raises(TargetError, match="over before its first step"):
+            run(tmp_path, QUICK, Counted(angle_limit=0.0))

@@ -1,0 +1,45 @@
+import pytest
+
+from visadapt.systems import CartPole
+from visadapt.systems.parameter_file import RigError, load_rig
+
+
+def rig(tmp_path, text):
+    path = tmp_path / "rig.toml"
+    path.write_text(text)
+    return load_rig(path, CartPole)
+
+
+def test_parameters_and_defaults(tmp_path):
+    assert rig(tmp_path, "[parameters]\ncart_mass = 0.23\nmax_force = 2\n") == CartPole(cart_mass=0.23, max_force=2.0)
+
+
+def test_an_empty_table_is_the_default(tmp_path):
+    assert rig(tmp_path, "[parameters]\n") == CartPole()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[parameters]\ncart_mas = 1\n", "unknown key 'cart_mas' in .parameters.; there are cart_mass, pole_mass"),
+        ("cart_mass = 1\n", "the table .parameters. is missing; it may hold cart_mass"),
+        ("parameters = 1\n", "the table .parameters. is missing"),
+        ("[parameters]\n[motor]\nkv = 1\n", "unknown key 'motor' outside .parameters."),
+        ("[parameters]\npole_mass = -0.1\n", "pole_mass must be positive, got -0.1"),
+        ("[parameters]\npole_mass = 0\n", "pole_mass must be positive, got 0"),
+        ("[parameters]\ngravity = nan\n", "gravity must be finite, got nan"),
+        ("[parameters]\ngravity = inf\n", "gravity must be finite, got inf"),
+        ("[parameters]\ngravity = '9.8'\n", "gravity must be a number in SI units, got '9.8'"),
+        ("[parameters]\ngravity = true\n", "gravity must be a number in SI units, got True"),
+        ("[parameters\n", "not TOML"),
+    ],
+)
+def test_one_line_names_file_and_key(tmp_path, text, message):
+    with pytest.raises(RigError, match=f"rig.toml: .*{message}") as caught:
+        rig(tmp_path, text)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file(tmp_path):
+    with pytest.raises(RigError, match=r"none.toml: cannot be read: No such file"):
+        load_rig(tmp_path / "none.toml", CartPole)

@@ -1,0 +1,158 @@
+"""The report's figures, as SVG whose colours are the page's own, light or dark."""
+
+from __future__ import annotations
+
+import html
+import io
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from visadapt.diagnosis.report.text import plain
+from visadapt.diagnosis.result import Growth, Prediction, Profile, Region, Spectrum
+from visadapt.systems import System
+
+INK, MUTED, LINE = "#1f2933", "#6e7a88", "#d8dde3"
+BEFORE, AFTER, BLACK_BOX = "#de7416", "#2f67c9", "#0e7a70"
+VARIABLES = {INK: "ink", MUTED: "muted", LINE: "line", BEFORE: "before", AFTER: "after", BLACK_BOX: "black-box"}
+"""The colours drawn with, and the page's CSS variables that take their place."""
+
+MOST_STATES = 5
+"""that are shown of a prediction"""
+
+WIDTH = 4.0
+"""inches: a phone's width at the size in which the text is set"""
+STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",  # text stays text
+    "svg.hashsalt": "visadapt",  # the same diagnosis gives the same page
+    "font.family": "sans-serif",
+    "font.size": 9,
+    "figure.facecolor": "none",  # the page is the background
+    "axes.facecolor": "none",
+    "axes.edgecolor": MUTED,
+    "axes.labelcolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": LINE,
+    "grid.linewidth": 0.7,
+    "text.color": INK,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+}
+
+
+def prediction(one: Prediction, system: type[System], corrected: bool) -> str:
+    """A held-out window: measured states, and as they were predicted from its start."""
+    shown = _telling(one, [index for index in range(len(system.states)) if np.isfinite(one.measured[:, index]).any()])
+    with matplotlib.rc_context(STYLE):
+        figure = Figure((WIDTH, 0.5 + 1.15 * len(shown)), layout="constrained")
+        rows: list[Axes] = list(figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0])
+        for axes, index in zip(rows, shown, strict=True):
+            variable = system.states[index]
+            axes.plot(one.time, one.source[:, index], color=BEFORE, linewidth=1.6, label="simulator")
+            if corrected:
+                axes.plot(one.time, one.corrected[:, index], color=AFTER, linewidth=1.6, label="with the causes")
+            axes.plot(one.time, one.measured[:, index], ".", color=INK, markersize=4, label="measured")
+            axes.set_ylabel(f"{variable.name} [{variable.unit}]")
+            axes.yaxis.set_major_locator(MaxNLocator(4))
+        rows[-1].set_xlabel(f"time in episode {one.episode} [s]")
+        _legend(figure, rows[0])
+        return _svg(figure, f"measured and predicted states, episode {one.episode}")
+
+
+def _telling(one: Prediction, measured: Sequence[int]) -> list[int]:
+    """Of the measured states those, MOST_STATES at most, from which the source departs most beside their noise."""
+    error = (one.source - one.measured)[:, measured]
+    departs = np.sqrt((error**2).mean(0) / (np.diff(error, axis=0) ** 2).mean(0).clip(1e-300))
+    return sorted(measured[k] for k in np.argsort(-departs)[:MOST_STATES])
+
+
+def profile(one: Profile, regions: Sequence[Region], corrected: bool) -> str:
+    """The mean residual over a variable, with bands of 90 %, and the regions that stand out shaded."""
+    with matplotlib.rc_context(STYLE):
+        figure, axes = _one_plot()
+        for stretch in regions:
+            if stretch.variable == one.variable:
+                axes.axvspan(stretch.start, stretch.end, color=LINE, alpha=0.7, zorder=0, linewidth=0)
+        axes.axhline(0, color=MUTED, linewidth=0.8)
+        _band(axes, one.centres, one.before, one.before_error, BEFORE, "simulator")
+        if corrected:
+            _band(axes, one.centres, one.after, one.after_error, AFTER, "with the causes")
+        axes.set_xlabel(_labelled(one.variable, one.variable_unit))
+        axes.set_ylabel(_labelled(one.quantity, one.quantity_unit))
+        _legend(figure, axes)
+        return _svg(figure, f"{one.quantity} left over, over {one.variable}")
+
+
+def growth(one: Growth, corrected: bool) -> str:
+    """The error over the horizon of prediction."""
+    with matplotlib.rc_context(STYLE):
+        figure, axes = _one_plot()
+        axes.plot(one.seconds, one.before, color=BEFORE, linewidth=1.8, label="simulator")
+        if corrected:
+            axes.plot(one.seconds, one.after, color=AFTER, linewidth=1.8, label="with the causes")
+        axes.plot(one.seconds, one.black_box, color=BLACK_BOX, linewidth=1.4, linestyle="--", label="black box")
+        axes.plot(one.seconds, one.floor, color=MUTED, linewidth=1.4, linestyle=":", label="noise")
+        axes.set_ylim(bottom=0)
+        axes.set_xlabel("predicted ahead [s]")
+        axes.set_ylabel("error")
+        _legend(figure, axes)
+        return _svg(figure, "error over the horizon of prediction")
+
+
+def spectrum(one: Spectrum, corrected: bool) -> str:
+    """The residual's power over frequency."""
+    with matplotlib.rc_context(STYLE):
+        figure, axes = _one_plot()
+        axes.semilogy(one.frequency, one.before, color=BEFORE, linewidth=1.6, label="simulator")
+        if corrected:
+            axes.semilogy(one.frequency, one.after, color=AFTER, linewidth=1.6, label="with the causes")
+        axes.set_xlabel("frequency [Hz]")
+        axes.set_ylabel(_labelled(one.quantity, one.unit))
+        _legend(figure, axes)
+        return _svg(figure, f"spectrum of the {one.quantity} left over")
+
+
+def _one_plot() -> tuple[Figure, Axes]:
+    figure = Figure((WIDTH, 2.7), layout="constrained")
+    return figure, figure.subplots()
+
+
+def _band(axes: Axes, x: np.ndarray, mean: np.ndarray, error: np.ndarray, colour: str, label: str) -> None:
+    axes.fill_between(x, mean - 1.645 * error, mean + 1.645 * error, color=colour, alpha=0.22, linewidth=0)
+    axes.plot(x, mean, color=colour, linewidth=1.6, marker="o", markersize=3, label=label)
+
+
+def _labelled(name: str, unit: str) -> str:
+    return plain(name) if unit in ("1", "") else f"{plain(name)} [{unit}]"
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(handles), handlelength=1.5, columnspacing=1.2)
+
+
+def _svg(figure: Figure, title: str) -> str:
+    """The figure as an element of an HTML page, described by `title`."""
+    text = io.StringIO()
+    figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    svg = text.getvalue()
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
+    # The page says how wide.
+    view = re.search(r'viewBox="[^"]*"', svg)
+    assert view is not None
+    svg = f'<svg role="img" {view[0]}><title>{html.escape(title)}</title>{svg[svg.index(">") + 1 :]}'
+    for colour, name in VARIABLES.items():
+        svg = svg.replace(colour, f"var(--{name})")
+    return svg

@@ -1,0 +1,92 @@
+"""The report of a diagnosis: one self-contained HTML page, and text for the terminal."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import jinja2
+
+from visadapt.diagnosis.report import figures, text
+from visadapt.diagnosis.report.text import as_text
+from visadapt.diagnosis.result import Diagnosis
+from visadapt.effects import EFFECTS
+from visadapt.storage.atomic_files import replacing
+from visadapt.systems import SYSTEMS
+
+__all__ = ["as_html", "as_text", "write_report"]
+
+MOST_WINDOWS, MOST_PROFILES = 3, 3
+"""More figures would hide the telling ones."""
+
+
+def write_report(path: str | os.PathLike[str], diagnosis: Diagnosis, settings: Mapping[str, str]) -> None:
+    """Write the page; it appears under its name once it is whole.
+
+    Args:
+        path: of the page.
+        diagnosis: what it tells.
+        settings: what the diagnosis depends on (files, seed, versions), for the foot.
+
+    Raises:
+        DiskFullError: the disk is full; what stood at `path` before stays.
+    """
+    page = as_html(diagnosis, settings)
+    with replacing(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def as_html(diagnosis: Diagnosis, settings: Mapping[str, str]) -> str:
+    """The page: no script, nothing fetched; light or dark as the reader's machine is."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("visadapt.diagnosis.report", "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+    )
+    environment.filters |= {
+        "plain": text.plain,
+        "number": text.number,
+        "percent": text.percent,
+        "estimate": text.estimate,
+        "interval": text.interval,
+        "effects": text.effects,
+        "either": lambda names: text.listed(names, "or"),
+        "region": lambda region: text.region(region, diagnosis.system),
+    }
+    gaps = _gaps(diagnosis)
+    return environment.get_template("page.html").render(
+        diagnosis=diagnosis,
+        sentence=text.sentence(diagnosis),
+        gaps=gaps,
+        largest=max((value for _, value, _ in gaps if math.isfinite(value)), default=0.0),
+        equations={name: effect.equation for name, effect in EFFECTS.items()},
+        figures=_figures(diagnosis),
+        corrected=text.corrected(diagnosis),
+        policy=text.policy_terms(diagnosis),
+        settings=settings,
+    )
+
+
+def _gaps(diagnosis: Diagnosis) -> list[tuple[str, float, str]]:
+    """What the bars show: name, error, CSS class."""
+    gap = diagnosis.gap
+    rows = [("simulator", gap.before, "before")]
+    if gap.after != gap.before:
+        rows.append((text.corrected(diagnosis), gap.after, "after"))
+    return [*rows, ("with a black box", gap.black_box, "black-box"), ("measurement noise", gap.floor, "floor")]
+
+
+def _figures(diagnosis: Diagnosis) -> dict[str, Any]:
+    evidence, system = diagnosis.evidence, SYSTEMS[diagnosis.system]
+    corrected = bool(diagnosis.causes)
+    return {
+        "predictions": [figures.prediction(one, system, corrected) for one in evidence.predictions[:MOST_WINDOWS]],
+        "profiles": [
+            figures.profile(one, diagnosis.where.regions, corrected) for one in evidence.profiles[:MOST_PROFILES]
+        ],
+        "growth": figures.growth(evidence.growth, corrected) if evidence.growth else "",
+        "spectrum": figures.spectrum(evidence.spectrum, corrected) if evidence.spectrum else "",
+    }

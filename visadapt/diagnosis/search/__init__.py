@@ -1,0 +1,1 @@
+"""Which effects a recording speaks for, and where."""

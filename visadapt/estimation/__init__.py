@@ -1,0 +1,1 @@
+"""States, noise and parameters from measurements: linearisation, Kalman filter and smoother, likelihood."""

@@ -1,0 +1,107 @@
+"""The tables under results/: one row per measure, the same columns everywhere (DESIGN.md)."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from visadapt.evaluation.cartpole_score import Evaluation
+from visadapt.setups.flight import FlightScore
+from visadapt.storage.atomic_files import replacing
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row. `samples` are counted target samples; None does not apply.
+
+    `failed` episodes are counted apart: never in a mean of speeds, always in a mean of misses.
+    """
+
+    experiment: str
+    system: str
+    method: str
+    domain: str
+    """source, target or adapted"""
+    samples: int | None
+    measure: str
+    unit: str
+    mean: float
+    std: float | None
+    episodes: int | None
+    failed: int
+    seeds: int | None
+
+
+def speed_row(
+    experiment: str, method: str, domain: str, samples: int, scores: Sequence[Evaluation], system: str = "cartpole"
+) -> Row:
+    """Mean cart speed over the surviving episodes of all seeds (one Evaluation each), with its spread over them."""
+    weights = np.array([score.survived for score in scores], float)
+    means = np.array([score.mean_speed or 0.0 for score in scores])
+    spreads = np.array([score.std_speed or 0.0 for score in scores])
+    total = weights.sum()
+    mean = float((weights * means).sum() / total) if total else float("nan")
+    variance = float((weights * (spreads**2 + (means - mean) ** 2)).sum() / total) if total else float("nan")
+    episodes = sum(score.episodes for score in scores)
+    return Row(
+        experiment=experiment,
+        system=system,
+        method=method,
+        domain=domain,
+        samples=samples,
+        measure="mean cart speed",
+        unit="m/s",
+        mean=round(mean, 4),
+        std=round(variance**0.5, 4),
+        episodes=episodes,
+        failed=episodes - int(total),
+        seeds=len(scores),
+    )
+
+
+def miss_row(
+    experiment: str, system: str, method: str, domain: str, samples: int, measure: str, scores: Sequence[FlightScore]
+) -> Row:
+    """How far flights miss, over those of all seeds (one FlightScore each); one that failed is in the mean."""
+    means = np.array([score.mean for score in scores])
+    whole = bool(np.isfinite(means).all())
+    variance = np.mean([score.std**2 for score in scores]) + means.var() if whole else np.inf
+    return Row(
+        experiment=experiment,
+        system=system,
+        method=method,
+        domain=domain,
+        samples=samples,
+        measure=measure,
+        unit="m",
+        mean=round(float(means.mean()), 5),
+        std=round(float(np.sqrt(variance)), 5),
+        episodes=sum(score.flights for score in scores),
+        failed=sum(score.failed for score in scores),
+        seeds=len(scores),
+    )
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Write the rows as CSV, whole or not at all."""
+    with replacing(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(Row)], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(asdict(row) for row in rows)
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV as they stand there."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def say(row: Row) -> None:
+    """Print a row of speeds."""
+    episodes = row.episodes or 0
+    up = f"{episodes - row.failed} of {episodes} up"
+    print(f"{row.domain:8} {row.samples:5} samples  {row.mean:.3f} +- {row.std:.3f} {row.unit}, {up}  ({row.method})")

@@ -1,0 +1,1 @@
+"""Films and plots of what was run."""

@@ -1,0 +1,69 @@
+"""Policies: what the last observations and actions say to the next HORIZON actions at once, in [-1, 1].
+
+A policy may listen to a residual: the correction that the residual expects, were nothing done now, joins the
+policy's features. It is a function of the same observations and actions, so nothing privileged enters; but the
+policy need not learn to see again what grounding has learnt to see, and adapts in far fewer iterations.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from visadapt.effects import Residual
+from visadapt.history import HORIZON, History
+
+
+class Policy(nn.Module):
+    """Base of policies; subclasses give features, and the layers that turn them into a plan.
+
+    The correction enters in two ways, both of no weight at first: among the features, and straight into the plan as
+    a feed-forward, since what is known to push can be pushed against. `learning.policy.initialise_feedforward` gives
+    the feed-forward its weights once there is a residual; tuning changes all of them.
+    """
+
+    def __init__(self, n_state: int, n_action: int) -> None:
+        super().__init__()
+        self.n_state = n_state
+        self.n_action = n_action
+        self.feedforward = nn.Linear(n_state, HORIZON * n_action, bias=False)
+        nn.init.zeros_(self.feedforward.weight)
+        self.residual: Residual | None = None
+
+    def features(self, history: History) -> Tensor:
+        """What the policy itself makes of a history, (B, F)."""
+        raise NotImplementedError
+
+    def plan(self, features: Tensor, correction: Tensor) -> Tensor:
+        """Commands (B, HORIZON * n_action) before the last tanh, from features and the correction (B, n_state)."""
+        raise NotImplementedError
+
+    def forward(self, history: History) -> Tensor:
+        """Planned actions (B, HORIZON, n_action)."""
+        correction = self.correction(history)
+        out = (self.plan(self.features(history), correction) + self.feedforward(correction)).tanh()
+        return out.unflatten(-1, (HORIZON, self.n_action))
+
+    def act(self, history: History) -> Tensor:
+        """The action (B, n_action) to execute now."""
+        plan: Tensor = self(history)
+        return plan[:, 0]
+
+    def correction(self, history: History) -> Tensor:
+        """What the residual expects if nothing is done, (B, n_state) in units of its scale; 0 without one."""
+        observations = history.observations
+        if self.residual is None:
+            return observations.new_zeros(len(observations), self.n_state)
+        with torch.no_grad():
+            out: Tensor = self.residual.network(history.acting(self._nothing(history)))
+        return out
+
+    def _nothing(self, history: History) -> Tensor:
+        """An action (B, n_action) of zeros."""
+        return history.actions.new_zeros(len(history.actions), self.n_action)
+
+
+def ignore_correction(layer: nn.Linear, n_state: int) -> None:
+    """Begin with no weight on the correction: a residual changes nothing until the policy is tuned with it."""
+    with torch.no_grad():
+        layer.weight[:, -n_state:] = 0.0

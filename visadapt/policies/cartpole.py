@@ -1,0 +1,50 @@
+"""Policies of the cart-pole: on frames, and on states."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from visadapt.history import HORIZON, LENGTH, History
+from visadapt.policies.base import Policy, ignore_correction
+from visadapt.policies.networks import FEATURES, FrameEncoder, mlp
+
+
+class ImagePolicy(Policy):
+    """A 4-layer CNN on the last 5 frames and 5 actions (the paper, section 3.2.3)."""
+
+    def __init__(self, background: Tensor, contrast: float, n_state: int = 4, n_action: int = 1) -> None:
+        super().__init__(n_state, n_action)
+        self.encoder = FrameEncoder(background, contrast, n_action)
+        self.hidden = nn.Linear(FEATURES + n_state, 64)
+        self.out = nn.Linear(64, HORIZON * n_action)
+        ignore_correction(self.hidden, n_state)
+
+    def features(self, history: History) -> Tensor:
+        out: Tensor = self.encoder(history)
+        return out
+
+    def plan(self, features: Tensor, correction: Tensor) -> Tensor:
+        out: Tensor = self.out(self.hidden(torch.cat((features, correction), 1)).relu())
+        return out
+
+
+class StatePolicy(Policy):
+    """The paper's MLP for balancing, 32-64-64-32-10, tanh (A.1.3), on the state, or on 5 states and actions."""
+
+    def __init__(self, n_state: int, n_action: int = 1, with_history: bool = False) -> None:
+        super().__init__(n_state, n_action)
+        self.with_history = with_history
+        inputs = LENGTH * (n_state + n_action) if with_history else n_state
+        self.first = nn.Linear(inputs + n_state, 32)
+        self.rest = mlp(32, 64, 64, 32, HORIZON * n_action)
+        ignore_correction(self.first, n_state)
+
+    def features(self, history: History) -> Tensor:
+        if self.with_history:
+            return torch.cat((history.observations.flatten(1), history.actions.flatten(1)), 1)
+        return history.observations[:, -1]
+
+    def plan(self, features: Tensor, correction: Tensor) -> Tensor:
+        out: Tensor = self.rest(self.first(torch.cat((features, correction), 1)).tanh())
+        return out

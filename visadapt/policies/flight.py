@@ -1,0 +1,89 @@
+"""Policies of rigid bodies: along a reference, and through a point."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from visadapt.history import HORIZON, History
+from visadapt.policies.base import Policy, ignore_correction
+from visadapt.policies.networks import TOLD, FlightResidualNetwork, mlp
+from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY, RigidBody, rotation, times
+
+
+class FlightPolicy(Policy):
+    """A policy for a rigid body that is shown its state (13) and, after it, its goal; after A.1.1 and A.1.2.
+
+    Like the paper's it reads velocities in world and body axes, two columns of the rotation matrix and the rates, and
+    what a subclass makes of the goal. A linear path past the hidden layers carries what feedback does near the goal.
+    """
+
+    def __init__(self, n_aim: int, n_action: int = 4, width: int = 128) -> None:
+        super().__init__(len(RigidBody.states), n_action)
+        self.first = nn.Linear(15 + n_aim + self.n_state, width)
+        self.rest = mlp(width, width, width)
+        self.out = nn.Linear(width, HORIZON * n_action)
+        self.straight = nn.Linear(15 + n_aim, HORIZON * n_action, bias=False)
+        # The layers that hear what pushes come last, so that the others are drawn as they were without them.
+        self.hearing = nn.Linear(TOLD, width, bias=False)
+        self.answer = nn.Linear(TOLD, HORIZON * n_action, bias=False)
+        ignore_correction(self.first, self.n_state)
+        with torch.no_grad():
+            self.out.weight.mul_(0.1)
+            for layer in (self.straight, self.hearing, self.answer):
+                layer.weight.zero_()
+
+    def aim(self, state: Tensor, goal: Tensor) -> Tensor:
+        """What the goal (B, n_goal) is to a vehicle in a state (B, 13): (B, n_aim)."""
+        raise NotImplementedError
+
+    def features(self, history: History) -> Tensor:
+        shown = history.observations[:, -1]
+        state, goal = shown[:, : self.n_state], shown[:, self.n_state :]
+        velocity, turned = state[:, VELOCITY], rotation(state[:, ATTITUDE])
+        own = (velocity, times(turned.mT, velocity), turned[:, :, :2].flatten(1), state[:, RATES])
+        return torch.cat((*own, self.aim(state, goal), self.told(history)), 1)
+
+    def told(self, history: History) -> Tensor:
+        """What pushes and how that changes, (B, TOLD): a plan of a second needs to know where a force is going."""
+        network = None if self.residual is None else self.residual.network
+        if not isinstance(network, FlightResidualNetwork):
+            return history.actions.new_zeros(len(history.actions), TOLD)
+        with torch.no_grad():
+            return network.told(history.acting(self._nothing(history)))
+
+    def plan(self, features: Tensor, correction: Tensor) -> Tensor:
+        own, told = features[:, :-TOLD], features[:, -TOLD:]
+        hidden = self.rest((self.first(torch.cat((own, correction), 1)) + self.hearing(told)).tanh()).tanh()
+        out: Tensor = self.out(hidden) + self.straight(own) + self.answer(told)
+        return out
+
+
+class FollowPolicy(FlightPolicy):
+    """Follows a reference, whose next HORIZON positions and velocities (6 each), `period` s apart, are its goal."""
+
+    def __init__(self, period: float) -> None:
+        super().__init__(6 * HORIZON)
+        self.period = period
+
+    def aim(self, state: Tensor, goal: Tensor) -> Tensor:
+        """What is left of the reference after going on at the present velocity."""
+        reference, velocity = goal.unflatten(1, (HORIZON, 6)), state[:, None, VELOCITY]
+        steps = torch.arange(1, HORIZON + 1).to(state)[:, None]
+        away = reference[..., :3] - state[:, None, POSITION] - self.period * steps * velocity
+        return torch.cat((away, reference[..., 3:] - velocity), -1).flatten(1)
+
+
+class ReachPolicy(FlightPolicy):
+    """Flies a fixed wing through a point (3), its goal."""
+
+    def __init__(self) -> None:
+        super().__init__(10)
+
+    def aim(self, state: Tensor, goal: Tensor) -> Tensor:
+        """The distance, the direction to the point in body axes, and how far the path points aside, near and far."""
+        to, velocity = goal - state[:, POSITION], state[:, VELOCITY]
+        distance = to.norm(dim=1, keepdim=True).clamp_min(1.0)
+        way, path = to / distance, velocity / velocity.norm(dim=1, keepdim=True).clamp_min(1.0)
+        aside = 10 * (way - path)
+        return torch.cat((distance / 50, times(rotation(state[:, ATTITUDE]).mT, way), aside, aside / distance), 1)

@@ -1,0 +1,1 @@
+"""The pieces of one control problem put together: source, task, policy, residual."""

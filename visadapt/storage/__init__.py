@@ -1,0 +1,1 @@
+"""Atomic files, checkpoints, run folders."""

@@ -1,0 +1,106 @@
+"""Checkpoints: weights and training states as safetensors, never pickled.
+
+A tree of dicts, lists, tuples, tensors and plain values is one file: the tensors by name, the rest as JSON in the
+file's header.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from visadapt.storage.atomic_files import replacing
+
+TREE = "visadapt.tree"
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be read or does not fit; the message says which file, which key and what is wrong."""
+
+
+def save_tree(path: Path, tree: Any) -> None:
+    """Write a tree to `path`, whole or not at all."""
+    tensors: dict[str, Tensor] = {}
+    skeleton = _strip(tree, tensors)
+    with replacing(path) as temporary:
+        save_file(tensors, temporary, {TREE: json.dumps(skeleton)})
+
+
+def load_tree(path: Path) -> Any:
+    """Read a tree; raises CheckpointError where the file is missing, torn, or of another kind."""
+    if not path.is_file():
+        raise CheckpointError(f"{path}: there is no such checkpoint")
+    try:
+        with safe_open(path, framework="pt") as file:
+            skeleton = json.loads((file.metadata() or {})[TREE])
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{path}: not a whole safetensors file ({error})") from error
+    except KeyError:
+        raise CheckpointError(f"{path}: a safetensors file, but not one that visadapt wrote") from None
+    return _restore(skeleton, tensors)
+
+
+def load_weights(module: nn.Module, weights: Mapping[str, Tensor], origin: Path) -> None:
+    """Load weights into a module; raises CheckpointError naming the first misfit, both shapes and dtypes."""
+    own = module.state_dict()
+    for key, value in own.items():
+        if key not in weights:
+            raise CheckpointError(f"{origin}: made for another architecture: {key} is missing")
+        if weights[key].shape != value.shape or weights[key].dtype != value.dtype:
+            raise CheckpointError(
+                f"{origin}: made for another architecture: {key} is {tuple(weights[key].shape)} "
+                f"{weights[key].dtype}, this network needs {tuple(value.shape)} {value.dtype}"
+            )
+    extra = sorted(weights.keys() - own.keys())
+    if extra:
+        raise CheckpointError(f"{origin}: made for another architecture: {extra[0]} is not in this network")
+    module.load_state_dict(dict(weights))
+
+
+def save_network(path: Path, network: nn.Module, settings: Mapping[str, Any]) -> None:
+    """Write a network's weights and buffers (its normalisers among them) with the settings it was trained under."""
+    save_tree(path, {"class": type(network).__name__, "settings": dict(settings), "weights": network.state_dict()})
+
+
+def load_network(path: Path, network: nn.Module) -> dict[str, Any]:
+    """Load what `save_network` wrote into a network of the same class; returns the settings."""
+    tree = load_tree(path)
+    if not isinstance(tree, dict) or tree.keys() != {"class", "settings", "weights"}:
+        raise CheckpointError(f"{path}: a checkpoint, but not of a network")
+    if tree["class"] != type(network).__name__:
+        raise CheckpointError(f"{path}: holds a {tree['class']}, a {type(network).__name__} is needed")
+    load_weights(network, tree["weights"], path)
+    settings: dict[str, Any] = tree["settings"]
+    return settings
+
+
+def _strip(node: Any, tensors: dict[str, Tensor]) -> Any:
+    if isinstance(node, Tensor):
+        name = str(len(tensors))
+        tensors[name] = node.detach().contiguous().clone()
+        return {"tensor": name}
+    if isinstance(node, Mapping):
+        return {"dict": [[key, _strip(value, tensors)] for key, value in node.items()]}
+    if isinstance(node, (list, tuple)):
+        return {"list": [_strip(value, tensors) for value in node]}
+    if node is None or isinstance(node, (bool, int, float, str)):
+        return {"value": node}
+    raise TypeError(f"a checkpoint holds tensors, dicts, lists and plain values, not {type(node).__name__}")
+
+
+def _restore(node: Any, tensors: dict[str, Tensor]) -> Any:
+    ((kind, content),) = node.items()
+    if kind == "tensor":
+        return tensors[content]
+    if kind == "dict":
+        return {key: _restore(value, tensors) for key, value in content}
+    if kind == "list":
+        return [_restore(value, tensors) for value in content]
+    return content

@@ -1,0 +1,82 @@
+"""A run's folder: its settings, seeds and versions beside its results, and stages that are done only once."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+from collections.abc import Callable, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from visadapt.storage.atomic_files import replacing
+
+PACKAGES = ("visadapt", "torch", "numpy", "opencv-python-headless", "gymnasium", "mujoco")
+
+
+class RunError(ValueError):
+    """A folder that a run cannot be continued in; the message is one line that says why."""
+
+
+def open_run(folder: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Begin a run in `folder`, or go on with the one that is there; returns its settings and versions.
+
+    Raises:
+        RunError: the folder holds a run with other settings.
+    """
+    path = folder / "settings.json"
+    wanted = json.loads(json.dumps(_finite(settings), default=str))
+    if path.exists():
+        found = read_json(path)["settings"]
+        if found != wanted:
+            differing = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
+            raise RunError(
+                f"{folder} holds a run with other settings ({', '.join(differing)}): remove it or name another folder"
+            )
+        return read_json(path)
+    write_json(path, {"settings": wanted, "versions": versions()})
+    return read_json(path)
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that results depend on, as far as they are installed."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def once(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What `make` gives as JSON in `path`, made only where it is not there yet."""
+    if not path.exists():
+        write_json(path, make())
+    return read_json(path)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object; raises RunError where the file is torn."""
+    try:
+        content: dict[str, Any] = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise RunError(f"{path}: not whole JSON ({error}): remove it and run again") from error
+    return content
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON object, whole or not at all; what is not finite is written as null, as strict readers ask."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, float):
+        return content if math.isfinite(content) else None
+    if isinstance(content, Mapping):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    return content
