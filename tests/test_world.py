@@ -5,6 +5,7 @@ from torch.func import functional_call
 
 from tests.worlds import Mass, columns, run
 from visadapt.effects import (
+    EFFECTS,
     ActuatorDelay,
     AngleOffset,
     CartMass,
@@ -241,3 +242,66 @@ def test_an_effect_of_another_system_is_refused():
         World(Quadrotor(), [Spring(stiffness=1.0, rest=0.0)])
     with pytest.raises(TypeError, match="rotor_efficiency acts on a quadrotor, not on a cartpole"):
         World(CartPole(), [RotorEfficiency(scale_1=1.0, scale_2=1.0, scale_3=1.0, scale_4=1.0)])
+
+
+REMEMBERING = {
+    "actuator_delay": {"delay": 0.07},
+    "actuator_lag": {"time_constant": 0.08},
+    "actuator_backlash": {"width": 0.2},
+    "actuator_bias": {"offset": 0.1},
+    "measurement_delay": {"delay": 0.08},
+    "frozen_zone": {"start": -0.1, "end": 0.1},
+    "gust": {"start": 0.2, "end": 0.5, "force": 3.0},
+    "periodic_force": {"amplitude": 2.0, "frequency": 0.8, "phase": 0.3, "offset": 1.0},
+}
+
+
+@pytest.mark.parametrize(
+    "chosen", [*([name] for name in REMEMBERING), list(REMEMBERING)], ids=lambda c: "+".join(c)[:40]
+)
+def test_an_episode_goes_on_from_any_of_its_rows_as_if_it_had_never_stopped(chosen):
+    state, actions = inputs(steps=12)
+    world = World(CartPole(), [EFFECTS[name](**REMEMBERING[name]) for name in chosen], substeps=3)
+
+    def measure(at):
+        measured, at = world.measure(at)
+        return measured, at
+
+    measured, at = measure(world.start(state))
+    went, read = [at], [measured]
+    for action in actions:
+        measured, at = measure(world.step(at, action))
+        went.append(at)
+        read.append(measured)
+    # Each row of the batch goes on from another row of its episode.
+    begin = [3, 7, 10]
+    time = torch.tensor([went[k].time[b] for b, k in enumerate(begin)], dtype=torch.float64)
+    there = torch.stack([went[k].state[b] for b, k in enumerate(begin)])
+    states = torch.stack([each.state for each in went], 1)
+    measured, at = measure(world.start(there, time, actions.movedim(0, 1), states))
+    for ahead in range(3):
+        rows = [k + ahead for k in begin]
+        torch.testing.assert_close(at.state, torch.stack([went[k].state[b] for b, k in enumerate(rows)]))
+        torch.testing.assert_close(measured, torch.stack([read[k][b] for b, k in enumerate(rows)]))
+        if ahead < 2:
+            measured, at = measure(world.step(at, torch.stack([actions[k][b] for b, k in enumerate(rows)])))
+
+
+def test_a_batch_steps_under_a_batch_of_parameter_values_and_the_gradient_reaches_them():
+    state, actions = inputs(batch=1)
+    world = World(CartPole(), [ViscousFriction(coefficient=0.0), ActuatorDelay(delay=0.0), AngleOffset(offset=0.0)])
+    assert [parameter.name for parameter in world.table] == ["coefficient", "delay", "offset"]
+    values = torch.tensor([[0.5, 0.02, 0.0], [2.0, 0.06, 0.01]], dtype=torch.float64, requires_grad=True)
+    batch = world.with_values(values)
+    at = batch.start(state.expand(2, -1))
+    for action in actions:
+        at = batch.step(at, action.expand(2, -1))
+    read, _ = batch.measure(at)
+    for row in range(2):
+        alone = world.with_values(values[row])
+        here = alone.start(state)
+        for action in actions:
+            here = alone.step(here, action)
+        torch.testing.assert_close(read[row], alone.measure(here)[0][0])
+    (gradient,) = torch.autograd.grad(read.sum(), values)
+    assert bool((gradient.abs() > 0).all())

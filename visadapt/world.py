@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
-from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, Residual, SensingEffect
+from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, Parameter, Residual, SensingEffect
 from visadapt.history import History
 from visadapt.systems import SYSTEMS, System
 from visadapt.systems.integrators import INTEGRATORS
@@ -104,53 +105,103 @@ class World(nn.Module):
         self.integrator = integrator
         self.substeps = substeps
         self.effects = nn.ModuleList(effects)
-        self._actuation = sorted((e for e in effects if isinstance(e, ActuationEffect)), key=place_in_chain)
-        self._sensing = sorted((e for e in effects if isinstance(e, SensingEffect)), key=place_in_chain)
-        self._dynamics = [effect for effect in effects if isinstance(effect, DynamicsEffect)]
-        self._residuals = [effect for effect in effects if isinstance(effect, Residual)]
+        self._arrange()
 
     @property
     def has_residual(self) -> bool:
         """Whether a step needs the history of observations and actions."""
         return bool(self._residuals)
 
-    def start(self, state: Tensor) -> WorldState:
-        """The world at the start of an episode in the state (B, n_state)."""
-        commands = torch.zeros(
-            len(state), self.substeps, len(self.system.actions), device=state.device, dtype=state.dtype
-        )
-        acting = tuple(effect.memory(commands, self.period / self.substeps) for effect in self._actuation)
-        sensing = tuple(effect.memory(state, self.period) for effect in self._sensing)
-        return WorldState(torch.zeros_like(state[:, 0]), state, acting + sensing)
+    @property
+    def table(self) -> list[Parameter]:
+        """The parameters of all effects, in the order of the effects."""
+        return [parameter for effect in self._named for parameter in effect.table]
+
+    def with_values(self, values: Tensor) -> World:
+        """The same world with other values of the parameters of its effects.
+
+        Args:
+            values: (P,) in the order of `table`, or (B, P) with a row for each row of the batch that is stepped.
+                A gradient flows back to them.
+        """
+        made = copy.copy(self)
+        effects, first = [], 0
+        for effect in self._named:
+            effects.append(effect.with_values(values[..., first : first + len(effect.table)]))
+            first += len(effect.table)
+        made._modules = {"effects": nn.ModuleList(effects)}
+        made._arrange()
+        return made
+
+    def start(
+        self,
+        state: Tensor,
+        time: Tensor | None = None,
+        commands: Tensor | None = None,
+        states: Tensor | None = None,
+    ) -> WorldState:
+        """The world in the state (B, n_state), at the start of an episode or within one; its row is not read yet.
+
+        Args:
+            time: (B,) s since the episode began; 0 without it.
+            commands: (B, T, n_action) that were given since the episode began, at least to `time`: from these the
+                actuation effects fill their memory. What comes after `time` is not used.
+            states: (B, T, n_state) that the episode went through: from these the sensing effects fill theirs. Without
+                them these remember `state` alone.
+        """
+        clock = torch.zeros_like(state[:, 0]) if time is None else time
+        if commands is None:
+            return WorldState(clock, state, self._at_rest(state))
+        rows = torch.arange(len(state), device=state.device), (clock / self.period).round().long()
+        return WorldState(clock, state, tuple(memory[rows] for memory in self.memories(state, commands, states)))
+
+    def memories(self, state: Tensor, commands: Tensor, states: Tensor | None = None) -> tuple[Tensor, ...]:
+        """What effects remember at every row of B episodes, before that row is read: (B, T + 1, any, any) each.
+
+        Args: as those of `start`; `commands` and `states` begin where the episodes do.
+        """
+        first = state if states is None else states[:, 0]
+        acting, sensing = self._split(self._at_rest(first))
+        rows = [(*acting, *sensing)]
+        if not any(memory.numel() for memory in rows[0]):
+            return tuple(memory[:, None].expand(-1, commands.shape[1] + 1, -1, -1) for memory in rows[0])
+        generator = torch.Generator(first.device).manual_seed(0)  # which readings were lost is not known
+        system = self.altered(first)
+        for t in range(commands.shape[1]):
+            _, acting = self._act(commands[:, t, None], acting, system)
+            if states is not None:
+                _, sensing = self._read(states[:, min(t, states.shape[1] - 1)], sensing, generator)
+            rows.append((*acting, *sensing))
+        return tuple(torch.stack(memory, 1) for memory in zip(*rows, strict=True))
+
+    def actuate(self, commands: Tensor) -> Tensor:
+        """What acts (B, T, substeps, n_action) of the commands (B, T, n_action) of episodes, from their beginning."""
+        episodes, length, width = commands.shape
+        like = commands.new_zeros(episodes, len(self.system.states))
+        acting, _ = self._act(commands, self._split(self._at_rest(like))[0], self.altered(like))
+        return acting.reshape(episodes, length, self.substeps, width)
 
     def step(self, at: WorldState, action: Tensor, history: History | None = None) -> WorldState:
         """One period on, with `action` (B, n_action) in [-1, 1] held over it.
 
         `history` is what the observer has seen up to now; a world with a residual needs it, and no other reads it.
         """
-        h = self.period / self.substeps
-        commands = action.clamp(-1, 1)[:, None].expand(-1, self.substeps, -1)
+        acting, sensing = self._split(at.memory)
         system = self.altered(at.state)
-        memory = []
-        for effect, remembered in zip(self._actuation, at.memory, strict=False):
-            commands, remembered = effect.acting_on(system).apply_to(commands, remembered, h)
-            memory.append(remembered)
-        integrate = INTEGRATORS[self.integrator]
-        time, state = at.time, at.state
-        for k in range(self.substeps):
-            command = commands[:, k]
-
-            def derivative(t: Tensor, s: Tensor, u: Tensor = command) -> Tensor:
-                now = self._varied(system, t, s)
-                return now.derivative(s, u, self._load(t, s, now))
-
-            state = integrate(derivative, time, state, h)
-            time = time + h
+        commands, acting = self._act(action[:, None], acting, system)
+        state = self._integrate(system, at.time, at.state, commands)
         for residual in self._residuals:
             if history is None:
                 raise ValueError("a world with a residual needs the history of observations and actions")
             state = state + residual.delta(history.acting(action)).to(state)
-        return WorldState(time, state, (*memory, *at.memory[len(memory) :]))
+        return WorldState(at.time + self.period, state, (*acting, *sensing))
+
+    def integrate(self, time: Tensor, state: Tensor, commands: Tensor) -> Tensor:
+        """The state (B, n_state) a period after `time` (B,) where `commands` (B, substeps, n_action) act.
+
+        The physics alone: `actuate` says what acts of the commands that were given.
+        """
+        return self._integrate(self.altered(state), time, state, commands)
 
     def measure(self, at: WorldState, generator: torch.Generator | None = None) -> tuple[Tensor, WorldState]:
         """What sensors read (B, n_state) of the row `at`, and the world with that row read.
@@ -158,12 +209,13 @@ class World(nn.Module):
         A row is read once: after `start`, then after each `step`. Without sensing effects the reading is the state.
         `generator` is needed by random effects alone.
         """
-        first = len(self._actuation)
-        measured = at.state
-        memory = list(at.memory)
-        for k, effect in enumerate(self._sensing, first):
-            measured, memory[k] = effect.apply_to(measured, memory[k], self.period, generator)
-        return measured, replace(at, memory=tuple(memory))
+        acting, sensing = self._split(at.memory)
+        measured, sensing = self._read(at.state, sensing, generator)
+        return measured, replace(at, memory=(*acting, *sensing))
+
+    def reading(self, state: Tensor) -> Tensor:
+        """What sensors read (B, n_state) of states, each as if it were the first row of an episode."""
+        return self._read(state, self._split(self._at_rest(state))[1], None)[0]
 
     def load(self, at: WorldState) -> Tensor:
         """Sum of the loads (B, n_load) of all effects at an instant."""
@@ -179,6 +231,58 @@ class World(nn.Module):
         for effect in self._dynamics:
             system = effect.alter(system)
         return system if system is self.system else system.to(like)
+
+    def _arrange(self) -> None:
+        """Sort the effects by what they act on, in the order in which they act."""
+        effects = list(self.effects)
+        self._named = [effect for effect in effects if isinstance(effect, Effect)]
+        self._actuation = sorted((e for e in effects if isinstance(e, ActuationEffect)), key=place_in_chain)
+        self._sensing = sorted((e for e in effects if isinstance(e, SensingEffect)), key=place_in_chain)
+        self._dynamics = [effect for effect in effects if isinstance(effect, DynamicsEffect)]
+        self._residuals = [effect for effect in effects if isinstance(effect, Residual)]
+
+    def _at_rest(self, state: Tensor) -> tuple[Tensor, ...]:
+        """What effects remember at the start of an episode in the state (B, n_state)."""
+        commands = state.new_zeros(len(state), self.substeps, len(self.system.actions))
+        acting = tuple(effect.memory(commands, self.period / self.substeps) for effect in self._actuation)
+        return acting + tuple(effect.memory(state, self.period) for effect in self._sensing)
+
+    def _split(self, memory: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """What the actuation effects remember, and what the sensing effects do."""
+        return memory[: len(self._actuation)], memory[len(self._actuation) :]
+
+    def _act(self, commands: Tensor, memory: tuple[Tensor, ...], system: System) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """What acts (B, T substeps, n_action) of commands (B, T, n_action), and the new memory."""
+        acting = commands.clamp(-1, 1).repeat_interleave(self.substeps, 1)
+        remembered = []
+        for effect, own in zip(self._actuation, memory, strict=True):
+            acting, own = effect.acting_on(system).apply_to(acting, own, self.period / self.substeps)
+            remembered.append(own)
+        return acting, tuple(remembered)
+
+    def _integrate(self, system: System, time: Tensor, state: Tensor, commands: Tensor) -> Tensor:
+        h = self.period / self.substeps
+        integrate = INTEGRATORS[self.integrator]
+        for k in range(self.substeps):
+            command = commands[:, k]
+
+            def derivative(t: Tensor, s: Tensor, u: Tensor = command) -> Tensor:
+                now = self._varied(system, t, s)
+                return now.derivative(s, u, self._load(t, s, now))
+
+            state = integrate(derivative, time, state, h)
+            time = time + h
+        return state
+
+    def _read(
+        self, state: Tensor, memory: tuple[Tensor, ...], generator: torch.Generator | None
+    ) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """What sensors read of states (B, n_state), and the new memory."""
+        remembered = []
+        for effect, own in zip(self._sensing, memory, strict=True):
+            state, own = effect.apply_to(state, own, self.period, generator)
+            remembered.append(own)
+        return state, tuple(remembered)
 
     def _varied(self, system: System, time: Tensor, state: Tensor) -> System:
         for effect in self._dynamics:

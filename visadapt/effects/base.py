@@ -7,6 +7,7 @@ Subclasses register themselves by name, so adding an effect is adding a class.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, ClassVar, Self, TypeVar
@@ -79,6 +80,14 @@ class Effect(nn.Module):
             )
         for key, value in values.items():
             self.register_parameter(key, nn.Parameter(torch.as_tensor(value, dtype=torch.get_default_dtype())))
+
+    def with_values(self, values: Tensor) -> Self:
+        """The same effect with other parameters: (P,) in the order of `table`, or (B, P), a row for each batch row."""
+        made = copy.copy(self)
+        made._parameters = {}  # plain tensors in their place, so that a gradient flows back to `values`
+        for column, parameter in enumerate(self.table):
+            made.__dict__[parameter.name] = values[..., column]
+        return made
 
     def value(self, name: str, like: Tensor) -> Tensor:
         """The parameter `name` with the device and dtype of `like`."""
