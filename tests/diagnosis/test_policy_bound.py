@@ -162,16 +162,21 @@ class TestWhatThePolicyIsGiven:
     def test_another_command_meets_what_the_motor_remembers(self, effect):
         rows = Readings.of(record(rows=150, episodes=2), CartPole()).rows  # two windows each
         theta = torch.tensor([next(effect.parameters()).item()], dtype=torch.float64)
-        family = CandidateModel(CartPole(), [type(effect)], rows)
-        given = rows.command[rows.episode[:, None], rows.first[:, None] + torch.arange(rows.shape[1]), 0]
-        tried = torch.stack((given, given + 0.3), -1)
-        acting = family.instead(theta, tried)
-        torch.testing.assert_close(acting[:, :, 0], family.commands(theta[None])[0])
+        model = CandidateModel(CartPole(), [type(effect)], rows)
         window, row = 1, 20
+        state = torch.zeros(*rows.shape, 4, dtype=torch.float64)
+        begun = model.started(theta, state)[torch.tensor([window * rows.shape[1] + row])]
+        given = rows.command[rows.episode[window], rows.first[window] + row][None]
+
+        def acts(of, command):
+            acting = of.commands(theta[None])[0][window, row][None]
+            return of.at(theta).integrate(begun.time, begun.state, acting), of.at(theta).step(begun, command).state
+
+        torch.testing.assert_close(*acts(model, given))
         changed = rows.command.clone()
         changed[rows.episode[window], rows.first[window] + row] += 0.3
         other = CandidateModel(CartPole(), [type(effect)], dataclasses.replace(rows, command=changed))
-        torch.testing.assert_close(acting[window, row, 1], other.commands(theta[None])[0][window, row])
+        torch.testing.assert_close(*acts(other, given + 0.3))
 
 
 class TestWholeDiagnosis:

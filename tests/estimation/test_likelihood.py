@@ -17,14 +17,14 @@ def rubbing():
 
 
 def test_linearisation_predicts_small_steps(rubbing):
-    family = CandidateModel(CartPole(), [ViscousFriction, SensorScale, ActuatorDelay, CartMass], rubbing)
+    model = CandidateModel(CartPole(), [ViscousFriction, SensorScale, ActuatorDelay, CartMass], rubbing)
     theta = torch.tensor([0.5, 1.1, 0.9, 0.03, 1.2], dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
     state = 0.2 * torch.randn(*rubbing.shape, 4, generator=generator, dtype=torch.float64)
-    at = linearise(family, theta, state)
+    at = linearise(model, theta, state)
     step = 1e-4 * torch.randn(*state.shape, generator=generator, dtype=torch.float64)
     turn = 1e-4 * torch.randn(len(theta), generator=generator, dtype=torch.float64)
-    there = linearise(family, theta + turn, state + step)
+    there = linearise(model, theta + turn, state + step)
     change = (at.transition @ step[:, :-1, :, None])[..., 0] + at.by_parameter @ turn
     torch.testing.assert_close(there.following - at.following, change, atol=2e-7, rtol=0)
     seen = (at.sensing @ step[..., None])[..., 0] + at.sensing_by_parameter @ turn
@@ -45,18 +45,16 @@ def test_information_is_the_curvature_of_the_likelihood(rubbing):
     search = Search(CartPole(), rubbing, [ViscousFriction])
     best = search.fit([((ViscousFriction,), search.single(ViscousFriction).fits)], CAREFUL)[0].fits
     step = float(best.information[0, 0, 0].rsqrt())
-    family = CandidateModel(CartPole(), [ViscousFriction], rubbing)
+    model = CandidateModel(CartPole(), [ViscousFriction], rubbing)
     losses = []
     for side in (-step, step):
         # A range of no width holds the parameter where it is while the states settle.
-        family.low = family.high = best.theta[0] + side
+        model.low = model.high = best.theta[0] + side
         from visadapt.estimation.likelihood import fit  # the one place that needs the bare fit
 
         held = best.of(torch.tensor([0]))
         object.__setattr__(held, "theta", best.theta + side)
-        losses.append(
-            float(best.likelihood[0] - fit([family], held, torch.ones(1, rubbing.shape[0]), 10).likelihood[0])
-        )
+        losses.append(float(best.likelihood[0] - fit([model], held, torch.ones(1, rubbing.shape[0]), 10).likelihood[0]))
     assert sum(losses) / 2 == pytest.approx(0.5, rel=0.1)
 
 

@@ -95,7 +95,7 @@ def policy_terms(policy: StatesToActions, system: System, rows: Segments, best: 
     """
     corrected = CandidateModel(system, best.effects, rows)
     known = _known(corrected, best)
-    histories, there = _histories(corrected.sense(best.fits.theta[0], known.state.flatten(0, 1)), rows)
+    histories, there = _histories(corrected.at(best.fits.theta[0]).reading(known.state.flatten(0, 1)), rows)
     acted = actions(policy, histories).reshape(known.variance.shape)
     before = Steps.of(CandidateModel(system, (), rows), best.fits.theta[0, :0], known.state, acted, there)
     after = Steps.of(corrected, best.fits.theta[0], known.state, acted, there)
@@ -104,17 +104,17 @@ def policy_terms(policy: StatesToActions, system: System, rows: Segments, best: 
     return PolicyTerms(*pairs)
 
 
-def _known(family: CandidateModel, best: ScoredModel) -> Known:
+def _known(model: CandidateModel, best: ScoredModel) -> Known:
     fits = best.fits
-    problem = linear_problem([family], fits)
-    process, noise = variances(family, fits.log_process, fits.log_noise)
+    problem = linear_problem([model], fits)
+    process, noise = variances(model, fits.log_process, fits.log_noise)
     smoothed, adjoint = backward(problem.data(), forward(problem.data(), process, noise))
     beside = -(process[:, None] * adjoint[..., 0])[:, 1:]
     by_parameter = problem.drive[..., 1:]
     covariance = torch.linalg.inv(posterior(best.effects, fits)[1])
     variance = ((by_parameter @ covariance) * by_parameter).sum((-1, -2))
     state = (fits.state[0] + smoothed[..., 0])[:, :-1]
-    angle = family.system.index("theta")
+    angle = model.system.index("theta")
     state[..., angle] = torch.atan2(state[..., angle].sin(), state[..., angle].cos())
     return Known(state, beside, variance)
 
@@ -147,13 +147,12 @@ class Steps:
     """(N, n) nu"""
 
     @classmethod
-    def of(cls, family: CandidateModel, theta: Tensor, state: Tensor, acted: Tensor, there: Tensor) -> Steps:
+    def of(cls, model: CandidateModel, theta: Tensor, state: Tensor, acted: Tensor, there: Tensor) -> Steps:
         """With parameters (P,) from states (W, T - 1, n) where they are `there`, under actions (W, T - 1)."""
-        tried = torch.cat((acted[..., None], _grid().expand(*acted.shape, -1)), -1)
-        commands = family.instead(theta, tried)[there]
-        now, time = state[there], family.rows.time[:, :-1][there]
-        each = [x.repeat_interleave(1 + GRID, 0) for x in (time, now)]
-        reached = family.step(theta, commands.flatten(0, 1), *each).reshape(len(now), 1 + GRID, -1)
+        tried = torch.cat((acted[..., None], _grid().expand(*acted.shape, -1)), -1)[there]
+        now = state[there]
+        begun = model.started(theta, state)[there.flatten()][torch.arange(len(now)).repeat_interleave(1 + GRID)]
+        reached = model.at(theta).step(begun, tried.flatten()[:, None]).state.reshape(len(now), 1 + GRID, -1)
         return cls(reached[:, 0], acted[there], reached[:, 1:], (1 - 1 / HORIZON) * now)
 
     def terms(self, machine: Tensor, variance: Tensor) -> tuple[float, float, float, float]:

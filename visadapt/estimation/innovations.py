@@ -14,15 +14,15 @@ class Innovations:
     """Innovations over their deviations, N readings in all; what the set's own parameters can explain is taken out.
 
     Args:
-        family: the set.
+        model: the set.
         fits: its fit, of one set alone.
     """
 
-    def __init__(self, family: CandidateModel, fits: FitState) -> None:
-        rows = family.rows
+    def __init__(self, model: CandidateModel, fits: FitState) -> None:
+        rows = model.rows
         self.rows = rows
-        self._problem = linear_problem([family], fits)
-        self._filtered = forward(self._problem, *variances(family, fits.log_process, fits.log_noise))
+        self._problem = linear_problem([model], fits)
+        self._filtered = forward(self._problem, *variances(model, fits.log_process, fits.log_noise))
         white = self._white(self._filtered.innovation)
         self._known, _ = torch.linalg.qr(white[:, 1:])
         self.error: Tensor = self._projected(white[:, :1])[:, 0]

@@ -84,24 +84,24 @@ def rough(rows: Segments, system: System) -> Tensor:
     return out * rows.inside[..., None]
 
 
-def linear_problem(families: Sequence[CandidateModel], fits: FitState) -> Linear:
-    """The models, one after the other, along the states of `fits`."""
-    rows = families[0].rows
-    origin = rough(rows, families[0].system)[:, 0]
+def linear_problem(models: Sequence[CandidateModel], fits: FitState) -> Linear:
+    """The count, one after the other, along the states of `fits`."""
+    rows = models[0].rows
+    origin = rough(rows, models[0].system)[:, 0]
     used = rows.used[..., None]
     inside = rows.inside[:, 1:, None, None]
     windows, length, n = fits.state.shape[1:]
     columns = 1 + fits.theta.shape[1]
     identity = torch.eye(n, dtype=torch.float64)
     transition, sensing = [], []
-    drive = torch.zeros(len(families), windows, length - 1, n, columns, dtype=torch.float64)
-    reading = torch.zeros(len(families), windows, length, len(rows.channels), columns, dtype=torch.float64)
-    start = torch.zeros(len(families), windows, n, columns, dtype=torch.float64)
-    for c, family in enumerate(families):
-        count = len(family.table)
-        lin = linearise(family, fits.theta[c, :count], fits.state[c])
-        if family.profile.refresh > 1:
-            family.slopes = lin.transition, lin.sensing
+    drive = torch.zeros(len(models), windows, length - 1, n, columns, dtype=torch.float64)
+    reading = torch.zeros(len(models), windows, length, len(rows.channels), columns, dtype=torch.float64)
+    start = torch.zeros(len(models), windows, n, columns, dtype=torch.float64)
+    for c, model in enumerate(models):
+        count = len(model.table)
+        lin = linearise(model, fits.theta[c, :count], fits.state[c])
+        if model.profile.refresh > 1:
+            model.slopes = lin.transition, lin.sensing
         transition.append(torch.where(inside > 0, lin.transition, identity))
         sensing.append(lin.sensing * used)
         drive[c, ..., 0] = lin.following - fits.state[c, :, 1:]
@@ -115,23 +115,23 @@ def linear_problem(families: Sequence[CandidateModel], fits: FitState) -> Linear
         torch.cat(sensing),
         (reading * used).flatten(0, 1),
         start.flatten(0, 1),
-        torch.tensor(families[0].profile.spread, dtype=torch.float64),
+        torch.tensor(models[0].profile.spread, dtype=torch.float64),
     )
 
 
-def variances(family: CandidateModel, log_process: Tensor, log_noise: Tensor) -> tuple[Tensor, Tensor]:
+def variances(model: CandidateModel, log_process: Tensor, log_noise: Tensor) -> tuple[Tensor, Tensor]:
     """Process (C W, n) and measurement (C W, m) variances for the filter."""
-    windows = family.rows.shape[0]
-    process = torch.full((len(log_process), len(family.system.states)), SMOOTH**2, dtype=torch.float64)
-    for k, group in enumerate(family.profile.driven):
+    windows = model.rows.shape[0]
+    process = torch.full((len(log_process), len(model.system.states)), SMOOTH**2, dtype=torch.float64)
+    for k, group in enumerate(model.profile.driven):
         process[:, list(group)] = log_process[:, k, None].exp()
     return process.repeat_interleave(windows, 0), log_noise.exp().repeat_interleave(windows, 0)
 
 
-def noise_groups(family: CandidateModel) -> Tensor:
+def noise_groups(model: CandidateModel) -> Tensor:
     """(G + S, G + m) which variances, of process noise by group and of channels, are one: 1 where it is this one."""
-    groups, channels = len(family.profile.driven), family.rows.channels
-    sensors = [[float(c in kind) for c in channels] for kind in family.profile.sensors]
+    groups, channels = len(model.profile.driven), model.rows.channels
+    sensors = [[float(c in kind) for c in channels] for kind in model.profile.sensors]
     seen = torch.tensor([row for row in sensors if any(row)], dtype=torch.float64)
     return torch.block_diag(torch.eye(groups, dtype=torch.float64), seen)
 
@@ -157,28 +157,28 @@ class Slope:
     """(C, W, T, n, 1 + K) change of the states, and with each parameter"""
 
 
-def slope(families: Sequence[CandidateModel], fits: FitState, counts: Tensor) -> Slope:
+def slope(models: Sequence[CandidateModel], fits: FitState, counts: Tensor) -> Slope:
     """Likelihood, gradient and Fisher information at `fits`."""
-    models, windows = counts.shape
+    count, windows = counts.shape
     logs = torch.cat((fits.log_process, fits.log_noise), 1)
-    problem = linear_problem(families, fits)
-    used = families[0].rows.used.repeat(models, 1, 1) * counts.reshape(-1, 1, 1)
-    here = forward(problem, *variances(families[0], fits.log_process, fits.log_noise))
-    likelihood = log_likelihood(here, used).reshape(models, windows).sum(-1)
-    white = (here.white * used[..., None]).reshape(models, -1, here.innovation.shape[-1])
+    problem = linear_problem(models, fits)
+    used = models[0].rows.used.repeat(count, 1, 1) * counts.reshape(-1, 1, 1)
+    here = forward(problem, *variances(models[0], fits.log_process, fits.log_noise))
+    likelihood = log_likelihood(here, used).reshape(count, windows).sum(-1)
+    white = (here.white * used[..., None]).reshape(count, -1, here.innovation.shape[-1])
     error, columns = white[..., :1], white[..., 1:]
     # The noise's turn: the data's column alone, filtered with each variance a little larger.
-    alike = noise_groups(families[0])
+    alike = noise_groups(models[0])
     varied = (logs + LOG_STEP * alike[:, None]).flatten(0, 1).split((fits.log_process.shape[1], used.shape[-1]), 1)
-    swayed = forward(_repeated(problem.data(), len(alike)), *variances(families[0], *varied))
-    gains = log_likelihood(swayed, used.repeat(len(alike), 1, 1)).reshape(-1, models, windows).sum(-1) - likelihood
+    swayed = forward(_repeated(problem.data(), len(alike)), *variances(models[0], *varied))
+    gains = log_likelihood(swayed, used.repeat(len(alike), 1, 1)).reshape(-1, count, windows).sum(-1) - likelihood
 
     def by_noise(there: Tensor, now: Tensor) -> Tensor:
         change = (there.reshape(-1, *now.shape) - now) / LOG_STEP * used
-        return change.reshape(len(alike), models, -1).permute(1, 2, 0)
+        return change.reshape(len(alike), count, -1).permute(1, 2, 0)
 
     sways = by_noise(swayed.variance.log(), here.variance.log())
-    shifts = by_noise(swayed.innovation[..., 0], here.innovation[..., 0]) / here.variance.sqrt().reshape(models, -1, 1)
+    shifts = by_noise(swayed.innovation[..., 0], here.innovation[..., 0]) / here.variance.sqrt().reshape(count, -1, 1)
     smoothed, _ = backward(problem, here)
     return Slope(
         likelihood,
@@ -211,27 +211,27 @@ class Bounds:
 
 
 def fit(
-    families: Sequence[CandidateModel], start: FitState, counts: Tensor, iterations: int, still: bool = False
+    models: Sequence[CandidateModel], start: FitState, counts: Tensor, iterations: int, still: bool = False
 ) -> FitState:
     """Fit from `start`; `counts` (C, W) is 1 for the windows that count; `still` allows no process noise."""
     if still:
         start = replace(start, log_process=torch.full_like(start.log_process, QUIET))
     low, high = torch.zeros_like(start.theta), torch.zeros_like(start.theta)
-    for c, family in enumerate(families):
-        low[c, : len(family.table)], high[c, : len(family.table)] = family.low, family.high
-    steps = torch.tensor(families[0].rows.step, dtype=torch.float64)
+    for c, model in enumerate(models):
+        low[c, : len(model.table)], high[c, : len(model.table)] = model.low, model.high
+    steps = torch.tensor(models[0].rows.step, dtype=torch.float64)
     bounds = Bounds(low, high, (steps.square() / 12 + TINY).log())
-    damping = torch.full((len(families),), 1e-3, dtype=torch.float64)
-    stale = torch.zeros(len(families), dtype=torch.long)
-    live = torch.arange(len(families))
+    damping = torch.full((len(models),), 1e-3, dtype=torch.float64)
+    stale = torch.zeros(len(models), dtype=torch.long)
+    live = torch.arange(len(models))
     here = best = start
     at: Slope | None = None
-    refresh = families[0].profile.refresh
+    refresh = models[0].profile.refresh
     for iteration in range(iterations):
         if (iteration + 1) % refresh == 0:
-            for family in families:
-                family.slopes = None
-        now = slope([families[k] for k in live.tolist()], here.of(live), counts[live])
+            for model in models:
+                model.slopes = None
+        now = slope([models[k] for k in live.tolist()], here.of(live), counts[live])
         tried = replace(here.of(live), likelihood=now.likelihood, information=now.information)
         if at is None:
             best, at = tried, now
@@ -246,7 +246,7 @@ def fit(
             live = live[(stale[live] < 2) & (damping[live] < STUCK)]
             if not len(live):
                 break
-        here = _step(best, at, damping, bounds, noise_groups(families[0]))
+        here = _step(best, at, damping, bounds, noise_groups(models[0]))
         if still:
             here = replace(here, log_process=start.log_process)
     return best
@@ -276,7 +276,7 @@ def _step(fits: FitState, at: Slope, damping: Tensor, bounds: Bounds, alike: Ten
 
 
 def _put(into: Chosen, places: Tensor, values: Chosen, which: Tensor) -> Chosen:
-    """`into` with the models at `places` replaced by those of `values` that `which` marks."""
+    """`into` with the count at `places` replaced by those of `values` that `which` marks."""
     out = {}
     for field in fields(into):
         tensor = getattr(into, field.name).clone()

@@ -43,6 +43,11 @@ class Segments:
         """(W, T)"""
         return self.inside.shape[0], self.inside.shape[1]
 
+    @property
+    def index(self) -> Tensor:
+        """(W, T) row of the episode; beyond a window's end it goes on."""
+        return self.first[:, None] + torch.arange(self.shape[1])
+
     def of(self, windows: Tensor) -> Segments:
         """Only these windows."""
         every = ("measured", "used", "inside", "time", "first", "episode")

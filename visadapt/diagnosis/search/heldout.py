@@ -80,54 +80,54 @@ def held_out(
     """Each set, fitted without each fold and predicting it; with a black box beside it, if one is asked for."""
     out = folds(rows, profile_of(system).folds)
     count = len(out)
-    families = [CandidateModel(system, effects, rows, COARSE) for effects, _ in sets for _ in range(count)]
+    models = [CandidateModel(system, effects, rows, COARSE) for effects, _ in sets for _ in range(count)]
     starts = joined([fits for _, fits in sets for _ in range(count)])
     counts = (1 - out).repeat(len(sets), 1) if count > 1 else torch.ones(len(sets), rows.shape[0], dtype=out.dtype)
-    fitted = fit(families, starts, counts, REFIT)
+    fitted = fit(models, starts, counts, REFIT)
     parts = []
-    for k, family in enumerate(families):
+    for k, model in enumerate(models):
         own = fitted.of(torch.tensor([k]))
-        own = replace(own, theta=own.theta[:, : len(family.table)])
-        extra = unexplained.black_box(family, own, counts[k]) if black_box else None
-        parts.append(ahead(family, own, extra))
+        own = replace(own, theta=own.theta[:, : len(model.table)])
+        extra = unexplained.black_box(model, own, counts[k]) if black_box else None
+        parts.append(ahead(model, own, extra))
     return [_merged(parts[k * count : (k + 1) * count], out.argmax(0)) for k in range(len(sets))]
 
 
-def ahead(family: CandidateModel, fits: FitState, extra: Tensor | None = None) -> RolloutErrors:
+def ahead(model: CandidateModel, fits: FitState, extra: Tensor | None = None) -> RolloutErrors:
     """What one fitted set, with what a black box may add to its states (W, T - 1, n), predicts from every row."""
-    rows = family.rows
+    rows = model.rows
     windows, length = rows.shape
     horizon = max(1, round(AHEAD / rows.period))
     extra = torch.zeros_like(fits.state[0, :, 1:]) if extra is None else extra
-    problem = linear_problem([family], fits)
+    problem = linear_problem([model], fits)
     problem = replace(problem.data(), drive=problem.drive[..., :1] + extra[..., None])
-    smoothed, _ = backward(problem, forward(problem, *variances(family, fits.log_process, fits.log_noise)))
-    predicted = _run_on(family, fits.theta[0], fits.state[0] + smoothed[..., 0], horizon, extra)
+    smoothed, _ = backward(problem, forward(problem, *variances(model, fits.log_process, fits.log_noise)))
+    predicted = _run_on(model, fits.theta[0], fits.state[0] + smoothed[..., 0], horizon, extra)
     shape = (horizon + 1, windows, length, len(rows.channels))
     error, there = torch.zeros(shape, dtype=torch.float64), torch.zeros(shape, dtype=torch.float64)
     for h in range(horizon + 1):
         ends = predicted[:, : length - h, h]
-        read = family.measure(fits.theta.expand(windows * (length - h), -1), ends.flatten(0, 1))
+        read = model.measure(fits.theta[0], ends.flatten(0, 1))
         error[h, :, h:] = read.reshape(windows, length - h, -1) - rows.measured[:, h:]
         there[h, :, h:] = rows.used[:, h:]
     return RolloutErrors(error * there, there, predicted)
 
 
-def _run_on(family: CandidateModel, theta: Tensor, state: Tensor, horizon: int, extra: Tensor) -> Tensor:
+def _run_on(model: CandidateModel, theta: Tensor, state: Tensor, horizon: int, extra: Tensor) -> Tensor:
     """(W, T, horizon + 1, n) the simulator from every row on, under the commands that were given."""
-    rows = family.rows
+    rows = model.rows
     windows, length = rows.shape
     # Beyond a window's end nothing is measured, so whatever stands there will do.
     beyond = torch.zeros(windows, horizon + 1, extra.shape[-1], dtype=extra.dtype)
     extra = torch.cat((extra, beyond), 1)
-    commands = family.commands(theta[None])[0]
+    commands = model.commands(theta[None])[0]
     commands = torch.cat((commands, commands[:, -1:].expand(-1, horizon, -1, -1)), 1)
-    each = theta.expand(windows * length, -1)
+    world = model.at(theta)
     out = [state]
     for h in range(horizon):
         time = (rows.time + h * rows.period).flatten()
         here = commands[:, h : h + length].flatten(0, 1)
-        after = family.step(each, here, time, out[-1].flatten(0, 1)).reshape(state.shape) + extra[:, h : h + length]
+        after = world.integrate(time, out[-1].flatten(0, 1), here).reshape(state.shape) + extra[:, h : h + length]
         out.append(after.nan_to_num(FAR, FAR, -FAR).clamp(-FAR, FAR))
     return torch.stack(out, 2)
 

@@ -47,21 +47,21 @@ class Disturbance:
         return (square / mean.clamp(min=1e-300)).mean(-1)
 
 
-def disturbance(family: CandidateModel, fits: FitState, log_process: Tensor) -> Disturbance:
+def disturbance(model: CandidateModel, fits: FitState, log_process: Tensor) -> Disturbance:
     """The loads that bring the set of `fits` to follow the recording, with process noise (1, 2) allowed to them."""
     fits = replace(fits, log_process=log_process)
-    driven = family.profile.columns
-    rows = family.rows
-    problem = linear_problem([family], fits)
-    process, noise = variances(family, fits.log_process, fits.log_noise)
+    driven = model.profile.columns
+    rows = model.rows
+    problem = linear_problem([model], fits)
+    process, noise = variances(model, fits.log_process, fits.log_noise)
     _, adjoint = backward(problem, forward(problem, process, noise))
     added = -(process[:, None] * adjoint[..., 0])[:, 1:, driven]
-    by_load = loads_of(family, fits)[:, :, driven]
+    by_load = loads_of(model, fits)[:, :, driven]
     # Each velocity answers to a load of its own; beyond a window's end they answer to nothing.
     there = rows.inside[:, 1:]
     by_load = torch.where(there[..., None, None] > 0, by_load, torch.eye(len(driven), dtype=by_load.dtype))
     load = torch.linalg.solve(by_load, added[..., None])[..., 0] * there[..., None]
-    variables = {name: place[:, :-1] for name, place in variables_of(family, fits.state[0]).items()}
+    variables = {name: place[:, :-1] for name, place in variables_of(model, fits.state[0]).items()}
     variables["episode"] = rows.episode[:, None].double().expand_as(there)
     return Disturbance(load, there, variables)
 

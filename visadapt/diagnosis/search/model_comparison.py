@@ -79,11 +79,11 @@ def compare(search: Search) -> ModelComparison:
     order = sorted(range(len(close)), key=lambda k: -scores[k])
     weighed = [Weighed(close[k], scores[k], mass[k]) for k in order]
     best = weighed[0].fitted
-    family = CandidateModel(search.system, best.effects, search.rows)
+    model = CandidateModel(search.system, best.effects, search.rows)
     classes = {effect: _class(weighed, effect) for effect in best.effects}
     gained = float(best.fits.likelihood[0] - search.source.fits.likelihood[0])
     return ModelComparison(
-        weighed, left[order[0]], functions(family, best.fits), classes, gained, search.profile.function
+        weighed, left[order[0]], functions(model, best.fits), classes, gained, search.profile.function
     )
 
 

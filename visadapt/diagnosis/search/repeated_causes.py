@@ -76,10 +76,10 @@ def _marks(readings: Readings, whole: bool) -> Tensor:
 
 def _cost(readings: Readings, search: Search, comparison: ModelComparison, whole: bool) -> float:
     best = comparison.best
-    family = CandidateModel(search.system, best.effects, readings.raw)
+    model = CandidateModel(search.system, best.effects, readings.raw)
     state = best.fits.state[0]
-    theta = best.fits.theta.expand(state[..., 0].numel(), -1)
-    error = readings.raw.measured - family.measure(theta, state.flatten(0, 1)).reshape(readings.raw.measured.shape)
+    measured = readings.raw.measured
+    error = measured - model.measure(best.fits.theta[0], state.flatten(0, 1)).reshape(measured.shape)
     square = (error.square() / best.fits.log_noise[0].exp()).sum(-1)
     return float(0.5 * square[_marks(readings, whole)].sum())
 

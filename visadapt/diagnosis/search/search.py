@@ -207,8 +207,8 @@ class Search:
 
     def leftover(self, sets: Sequence[ScoredModel]) -> list[float]:
         """Log likelihood that process noise adds to each set: how much it leaves unexplained."""
-        families = [CandidateModel(self.system, f.effects, self.rows) for f in sets]
-        quiet = fit(families, joined([f.fits for f in sets]), self._counts(len(sets)), QUICK[0], still=True)
+        models = [CandidateModel(self.system, f.effects, self.rows) for f in sets]
+        quiet = fit(models, joined([f.fits for f in sets]), self._counts(len(sets)), QUICK[0], still=True)
         return [max(0.0, float(f.fits.likelihood[0] - q)) for f, q in zip(sets, quiet.likelihood, strict=True)]
 
     def fit(self, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int]) -> list[ScoredModel]:
@@ -216,15 +216,15 @@ class Search:
         if not starts:
             return []
         iterations, care = effort
-        families = [CandidateModel(self.system, effects, self.rows, care) for effects, _ in starts]
-        for family in families:
-            family.slopes = self._slopes
-        out = fit(families, joined([fits for _, fits in starts]), self._counts(len(starts)), iterations)
+        models = [CandidateModel(self.system, effects, self.rows, care) for effects, _ in starts]
+        for model in models:
+            model.slopes = self._slopes
+        out = fit(models, joined([fits for _, fits in starts]), self._counts(len(starts)), iterations)
         if self._slopes is None:
-            self._slopes = families[0].slopes
+            self._slopes = models[0].slopes
         results = []
         for k, (effects, _) in enumerate(starts):
-            own = _apart(out.of(torch.tensor([k])), len(families[k].table))
+            own = _apart(out.of(torch.tensor([k])), len(models[k].table))
             fitted = ScoredModel(effects, own, evidence(effects, own, len(self.catalogue)))
             key = frozenset(fitted.names)
             if key not in self.fitted or self.fitted[key].evidence < fitted.evidence:
@@ -232,8 +232,8 @@ class Search:
             results.append(self.fitted[key])
         return results
 
-    def _counts(self, models: int) -> Tensor:
-        return torch.ones(models, self.rows.shape[0], dtype=torch.float64)
+    def _counts(self, count: int) -> Tensor:
+        return torch.ones(count, self.rows.shape[0], dtype=torch.float64)
 
 
 def widths(effects: Effects) -> Tensor:

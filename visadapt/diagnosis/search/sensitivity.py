@@ -72,7 +72,7 @@ class View:
     def _changes(self, effect: type[Effect], tried: Tensor) -> Tensor:
         """How the innovations change (N, M) with the effect at parameters (M, P)."""
         rows, fits = self.rows, self.fits
-        family = CandidateModel(self.system, [*self.effects, effect], rows, GLANCE)
+        model = CandidateModel(self.system, [*self.effects, effect], rows, GLANCE)
         own = tried.shape[1]
         neutral = torch.tensor([0.0 if p.neutral is None else p.neutral for p in effect.table], dtype=torch.float64)
         tried = torch.cat((neutral[None], tried))
@@ -83,7 +83,7 @@ class View:
                 theta[0, j - own] = tried[1, j]
         windows, length = rows.shape
         count, n = len(theta), fits.state.shape[-1]
-        commands = family.commands(theta)[:, :, :-1].flatten(0, 2)
+        commands = model.commands(theta)[:, :, :-1].flatten(0, 2)
 
         def spread(x: Tensor) -> Tensor:
             return x[None].expand(count, *x.shape).reshape(-1, *x.shape[2:])
@@ -92,8 +92,8 @@ class View:
             return theta[:, None].expand(-1, windows * used, -1).flatten(0, 1)
 
         state = fits.state[0]
-        after = family.step(each(length - 1), commands, spread(rows.time[:, :-1]), spread(state[:, :-1]))
-        seen = family.measure(each(length), spread(state))
+        after = model.at(each(length - 1)).integrate(spread(rows.time[:, :-1]), spread(state[:, :-1]), commands)
+        seen = model.measure(each(length), spread(state))
         after = after.reshape(count, windows, length - 1, n)
         seen = seen.reshape(count, windows, length, -1)
         drive = (after[1:] - after[:1]).movedim(0, -1) * rows.inside[:, 1:, None, None]

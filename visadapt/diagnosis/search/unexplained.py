@@ -81,10 +81,10 @@ class Block:
     """(W, T, m, BUMPS)"""
 
 
-def functions(family: CandidateModel, fits: FitState) -> list[Function]:
+def functions(model: CandidateModel, fits: FitState) -> list[Function]:
     """Every function of the black box beside a fitted set, the most evident first."""
-    blocks = _blocks(family, fits)
-    innovations = Innovations(family, fits)
+    blocks = _blocks(model, fits)
+    innovations = Innovations(model, fits)
     out = []
     for block, answer in zip(blocks, _answers(innovations, blocks), strict=True):
         weights, evidence = _regression(answer, innovations.error)
@@ -93,14 +93,14 @@ def functions(family: CandidateModel, fits: FitState) -> list[Function]:
     return sorted(out, key=lambda function: -function.evidence)
 
 
-def black_box(family: CandidateModel, fits: FitState, counts: Tensor) -> Tensor:
+def black_box(model: CandidateModel, fits: FitState, counts: Tensor) -> Tensor:
     """What loads learnt from the windows that count (W,) add to the states a period on, in all (W, T - 1, n).
 
     One function after the other, the most evident first, each fitted to what those before it leave.
     """
-    blocks = [block for block in _blocks(family, fits) if not bool(block.reading.any())]
-    innovations = Innovations(family, fits)
-    counted = (family.rows.used * counts[:, None, None]).flatten()
+    blocks = [block for block in _blocks(model, fits) if not bool(block.reading.any())]
+    innovations = Innovations(model, fits)
+    counted = (model.rows.used * counts[:, None, None]).flatten()
     answers = [answer * counted[:, None] for answer in _answers(innovations, blocks)]
     left = innovations.error * counted
     drive = torch.zeros_like(blocks[0].drive[..., 0])
@@ -120,11 +120,11 @@ def _answers(innovations: Innovations, blocks: Sequence[Block]) -> tuple[Tensor,
     return innovations.answer(drive, reading).split(BUMPS, 1)
 
 
-def _blocks(family: CandidateModel, fits: FitState) -> list[Block]:
-    rows, system = family.rows, family.system
+def _blocks(model: CandidateModel, fits: FitState) -> list[Block]:
+    rows, system = model.rows, model.system
     state = fits.state[0]
-    loads = loads_of(family, fits)
-    variables = variables_of(family, state)
+    loads = loads_of(model, fits)
+    variables = variables_of(model, state)
     still = torch.zeros(*state[:, 1:].shape, BUMPS, dtype=torch.float64)
     silent = torch.zeros(*rows.used.shape, BUMPS, dtype=torch.float64)
     out = []
@@ -132,7 +132,7 @@ def _blocks(family: CandidateModel, fits: FitState) -> list[Block]:
         centres, bumps = _bumps(place, _ends(place, rows.inside > 0))
         inner = bumps[:, :-1] * rows.inside[:, 1:, None]
         for k, load in enumerate(system.loads):
-            for factor in family.profile.factors.get(load.name, (None,)):
+            for factor in model.profile.factors.get(load.name, (None,)):
                 by = 1.0 if factor is None else variables[factor][:, :-1, None]
                 drive = loads[..., k, None] * (by * inner)[:, :, None]
                 out.append(Block(load.name, name, factor, centres, drive, silent))
@@ -145,23 +145,23 @@ def _blocks(family: CandidateModel, fits: FitState) -> list[Block]:
     return out
 
 
-def variables_of(family: CandidateModel, state: Tensor) -> dict[str, Tensor]:
+def variables_of(model: CandidateModel, state: Tensor) -> dict[str, Tensor]:
     """(W, T) of every variable."""
-    rows = family.rows
-    index = rows.first[:, None] + torch.arange(rows.shape[1])
+    rows = model.rows
+    index = rows.index
     command = rows.command[rows.episode[:, None], index]
     before = rows.command[rows.episode[:, None], (index - 1).clamp(min=0)] * (index > 0)[..., None]
-    out = {variable.name: state[..., k] for k, variable in enumerate(family.system.states)}
-    for k, action in enumerate(family.system.actions):
+    out = {variable.name: state[..., k] for k, variable in enumerate(model.system.states)}
+    for k, action in enumerate(model.system.actions):
         out |= {action.name: command[..., k], f"{PREVIOUS}{action.name}": before[..., k]}
     return {**out, "time": rows.time}
 
 
-def loads_of(family: CandidateModel, fits: FitState) -> Tensor:
+def loads_of(model: CandidateModel, fits: FitState) -> Tensor:
     """What a unit of each load, held for a period, adds to the states, (W, T - 1, n, loads)."""
-    count = len(family.system.loads)
-    pushed = CandidateModel(family.system, [*family.effects, push(type(family.system))], family.rows)
-    theta = torch.cat((fits.theta[0, : len(family.table)], torch.zeros(count, dtype=torch.float64)))
+    count = len(model.system.loads)
+    pushed = CandidateModel(model.system, [*model.effects, push(type(model.system))], model.rows)
+    theta = torch.cat((fits.theta[0, : len(model.table)], torch.zeros(count, dtype=torch.float64)))
     return linearise(pushed, theta, fits.state[0]).by_parameter[..., -count:]
 
 

@@ -1,0 +1,125 @@
+"""The tangents of a world's step and of its readings, along states, parameters and commands.
+
+By finite differences, all of them in one batch: World steps rows of a batch independently, and each row may have
+parameters of its own. In float64 the error is about 1e-8 of a state.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from visadapt.effects import Parameter
+from visadapt.world import World
+
+STATE_STEP = 1e-6
+"""Finite difference of a state, in its SI unit, and of a command."""
+
+PARAMETER_STEP = 1e-6
+"""Finite difference of a parameter, as a share of the range in which it is searched."""
+
+PHASE_MARGIN = 4 * math.pi
+"""rad by which a phase may leave its range during a fit, since the angle that fits may lie a turn further."""
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """A function of N states and of P parameters, with its first derivatives."""
+
+    value: Tensor
+    """(N, m)"""
+    by_state: Tensor
+    """(N, m, n); of no columns where it was not asked for"""
+    by_parameter: Tensor
+    """(N, m, P)"""
+    by_command: Tensor
+    """(N, m, n_action); of no columns where it was not asked for"""
+
+
+def search_range(table: Sequence[Parameter]) -> tuple[Tensor, Tensor]:
+    """Lowest and highest values (P,) that a fit may give the parameters."""
+    margin = torch.tensor([PHASE_MARGIN * (p.name == "phase") for p in table], dtype=torch.float64)
+    low = torch.tensor([p.low for p in table], dtype=torch.float64)
+    high = torch.tensor([p.high for p in table], dtype=torch.float64)
+    return low - margin, high + margin
+
+
+def parameter_steps(table: Sequence[Parameter], values: Tensor) -> Tensor:
+    """Finite differences (..., P) of parameters (..., P), directed inwards so that none leaves its range."""
+    low, high = search_range(table)
+    step = PARAMETER_STEP * (high - low)
+    return torch.where(values + step > high, -step, step)
+
+
+def linearise_step(
+    world: World,
+    values: Tensor,
+    time: Tensor,
+    state: Tensor,
+    acting: Tensor,
+    by_state: bool = True,
+    by_command: bool = False,
+) -> Tangent:
+    """The state a period on, from N states, and its tangent.
+
+    Args:
+        world: its effects' own values are not used.
+        values: (P,) of the effects' parameters, or (N, P) with a row for each state.
+        time: (N,) s since the episodes began.
+        state: (N, n) in float64.
+        acting: what acts over the substeps, (N, substeps, n_action); or (1 + P, N, substeps, n_action) where the
+            parameters change that: first under `values`, then with each parameter moved by `parameter_steps`.
+        by_state, by_command: whether these derivatives are wanted. A command is what acts, held over the period.
+    """
+    width = acting.shape[-1]
+    given = acting if acting.dim() == 4 else acting[None].expand(1 + values.shape[-1], *acting.shape)
+
+    def step(rows: Tensor, there: Tensor, moved: Sequence[int], pushed: Tensor) -> Tensor:
+        commands = given[list(moved)] + STATE_STEP * pushed[:, None, None]
+        return world.with_values(rows).integrate(time.repeat(len(moved)), there, commands.flatten(0, 1))
+
+    return _tangent(step, world, values, state, by_state, width if by_command else 0, width)
+
+
+def linearise_reading(world: World, values: Tensor, state: Tensor, by_state: bool = True) -> Tangent:
+    """What sensors read (N, n) of N states, and its tangent. Arguments as those of `linearise_step`."""
+
+    def read(rows: Tensor, there: Tensor, moved: Sequence[int], pushed: Tensor) -> Tensor:
+        return world.with_values(rows).reading(there)
+
+    return _tangent(read, world, values, state, by_state, 0, len(world.system.actions))
+
+
+def _tangent(
+    function: Callable[[Tensor, Tensor, Sequence[int], Tensor], Tensor],
+    world: World,
+    values: Tensor,
+    state: Tensor,
+    by_state: bool,
+    commands: int,
+    width: int,
+) -> Tangent:
+    """Evaluate the base, then it with each state, each parameter and each command moved, as one batch."""
+    (count, n), parameters = state.shape, values.shape[-1]
+    states = n if by_state else 0
+    replicas = 1 + states + parameters + commands
+    own = values.expand(count, parameters)
+    steps = parameter_steps(world.table, own)
+    rows, there = own.repeat(replicas, 1, 1), state.repeat(replicas, 1, 1)
+    pushed = state.new_zeros(replicas, width)
+    moved = [0] * replicas
+    for i in range(states):
+        there[1 + i, :, i] += STATE_STEP
+    for k in range(parameters):
+        rows[1 + states + k, :, k] += steps[:, k]
+        moved[1 + states + k] = 1 + k
+    for k in range(commands):
+        pushed[1 + states + parameters + k, k] = 1
+    out = function(rows.flatten(0, 1), there.flatten(0, 1), moved, pushed).reshape(replicas, count, -1)
+    change = (out[1:] - out[:1]).movedim(0, -1)
+    by = change.split((states, parameters, commands), -1)
+    return Tangent(out[0], by[0] / STATE_STEP, by[1] / steps[:, None], by[2] / STATE_STEP)
