@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from visadapt.estimation.kalman import Linear, backward, forward, log_likelihood, respond
+from visadapt.estimation.kalman import Linear, backward, forward, log_likelihood, respond, smoothed_covariance
 
 N, T, STATES, CHANNELS, COLUMNS = 3, 7, 4, 2, 3
 
@@ -51,7 +51,7 @@ def dense(problem, n, column):
 
 
 def test_likelihood_is_that_of_the_whole_gaussian(problem):
-    filtered = forward(problem, PROCESS, MEASUREMENT)
+    filtered = forward(problem, torch.diag_embed(PROCESS), MEASUREMENT)
     found = log_likelihood(filtered, torch.ones(N, T, CHANNELS))
     for n in range(N):
         mean, covariance = dense(problem, n, 0)
@@ -63,7 +63,7 @@ def test_likelihood_is_that_of_the_whole_gaussian(problem):
 
 
 def test_smoothed_states_are_the_conditional_mean_for_every_column(problem):
-    smoothed, _ = backward(problem, forward(problem, PROCESS, MEASUREMENT))
+    smoothed, _ = backward(problem, forward(problem, torch.diag_embed(PROCESS), MEASUREMENT))
     for n in range(N):
         for column in range(COLUMNS):
             mean, covariance = dense(problem, n, column)
@@ -74,20 +74,32 @@ def test_smoothed_states_are_the_conditional_mean_for_every_column(problem):
             torch.testing.assert_close(smoothed[n, :, :, column].flatten(), expected)
 
 
+def test_the_covariance_of_smoothed_states_is_the_conditional_one(problem):
+    found = smoothed_covariance(problem, forward(problem, torch.diag_embed(PROCESS), MEASUREMENT))
+    for n in range(N):
+        _, covariance = dense(problem, n, 0)
+        h = torch.block_diag(*problem.sensing[n])
+        s = h @ covariance @ h.T + torch.diag(MEASUREMENT[n].repeat(T))
+        expected = covariance - covariance @ h.T @ torch.linalg.solve(s, h @ covariance)
+        for t in range(T):
+            rows = slice(t * STATES, (t + 1) * STATES)
+            torch.testing.assert_close(found[n, t], expected[rows, rows])
+
+
 def test_smoothed_disturbances_carry_the_states_on(problem):
-    smoothed, adjoint = backward(problem, forward(problem, PROCESS, MEASUREMENT))
+    smoothed, adjoint = backward(problem, forward(problem, torch.diag_embed(PROCESS), MEASUREMENT))
     disturbance = -(PROCESS[:, None, :, None] * adjoint)[:, 1:]
     carried = problem.transition @ smoothed[:, :-1] + problem.drive + disturbance
     torch.testing.assert_close(carried, smoothed[:, 1:])
 
 
 def test_without_process_noise_the_smoothed_states_follow_the_model(problem):
-    smoothed, _ = backward(problem, forward(problem, torch.zeros(N, STATES).double(), MEASUREMENT))
+    smoothed, _ = backward(problem, forward(problem, torch.zeros(N, STATES, STATES).double(), MEASUREMENT))
     torch.testing.assert_close(problem.transition @ smoothed[:, :-1] + problem.drive, smoothed[:, 1:])
 
 
 def test_inputs_pass_through_the_gains_like_columns(problem):
-    filtered = forward(problem, PROCESS, MEASUREMENT)
+    filtered = forward(problem, torch.diag_embed(PROCESS), MEASUREMENT)
     quiet = Linear(
         problem.transition,
         problem.drive,
@@ -96,5 +108,5 @@ def test_inputs_pass_through_the_gains_like_columns(problem):
         torch.zeros_like(problem.start),
         problem.spread,
     )
-    expected = forward(quiet, PROCESS, MEASUREMENT).innovation
+    expected = forward(quiet, torch.diag_embed(PROCESS), MEASUREMENT).innovation
     torch.testing.assert_close(respond(problem, filtered, problem.drive, problem.reading), expected)

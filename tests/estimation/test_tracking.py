@@ -1,5 +1,4 @@
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -8,7 +7,6 @@ import torch
 from renderers import Camera, DrawnCartPole
 from renderers.drawn import AXLE, CART, POLE, SKY, TRACK
 from visadapt.effects import EFFECTS, ConstantForce
-from visadapt.estimation.smoothing import Noise, Problem, likeliest, smooth
 from visadapt.learning.poses import PoseFinder
 from visadapt.learning.tracking import Tracker, TrackingError, TrackingWarning, estimate_states
 from visadapt.recordings import Episode
@@ -222,56 +220,3 @@ class TestWhatCannotBeTracked:
 
     def test_no_effect_is_added_to_the_catalogue(self):
         assert not [name for name, effect in EFFECTS.items() if "tracking" in effect.__module__]
-
-
-def wander(drift, measurement, rows=40, seed=0):
-    """A coordinate that integrates a load that walks at random, as a problem of the smoother, and its true path."""
-    generator = torch.Generator().manual_seed(seed)
-    step = torch.tensor([[1.0, 0.1], [0.0, 1.0]], dtype=torch.float64)
-    places = [torch.zeros(2, dtype=torch.float64)]
-    for _ in range(rows - 1):
-        places.append(step @ places[-1] + torch.tensor([0.0, drift]) * torch.randn(1, generator=generator))
-    path = torch.stack(places)
-    value = path[:, :1] + 0.01 * measurement * torch.randn(rows, 1, generator=generator)
-    return path, Problem(
-        transition=step.expand(rows - 1, 2, 2),
-        offset=torch.zeros(rows - 1, 2, dtype=torch.float64),
-        observed=[0],
-        value=value,
-        noise=torch.full((rows, 1, 1), 1e-4, dtype=torch.float64),
-        used=torch.arange(rows) != 11,
-        drift=torch.tensor([[[0.0, 0.0], [0.0, 1.0]]], dtype=torch.float64),
-        start=torch.eye(2, dtype=torch.float64),
-    )
-
-
-class TestSmoother:
-    def test_it_is_the_least_squares_solution(self):
-        """Against the same problem written as one big Gaussian over the first row and all the drifts."""
-        _, problem = wander(0.3, 1.0)
-        rows = len(problem.value)
-        columns = [torch.eye(2, rows + 1, dtype=torch.float64)]
-        for t, step in enumerate(problem.transition):
-            ahead = step @ columns[-1]
-            ahead[1, 2 + t] += 1
-            columns.append(ahead)
-        maps = torch.stack(columns)
-        prior = torch.cat((torch.ones(2), torch.full((rows - 1,), 0.3))).double().square()
-        seen, noise = maps[:, 0][problem.used], 4.0 * 1e-4
-        precision = torch.diag(1 / prior) + seen.T @ seen / noise
-        covariance = torch.linalg.inv(precision)
-        mean = covariance @ seen.T @ problem.value[problem.used, 0] / noise
-        path = smooth(problem, Noise(torch.tensor([0.3]).double(), torch.tensor(2.0).double()))
-        torch.testing.assert_close(path.mean, maps @ mean, rtol=1e-6, atol=1e-8)
-        torch.testing.assert_close(path.covariance, maps @ covariance @ maps.transpose(1, 2), rtol=1e-6, atol=1e-9)
-
-    def test_the_likeliest_noise_is_near_the_true_one(self):
-        problems = [wander(0.3, 2.0, seed=seed)[1] for seed in range(6)]
-        noise = likeliest(problems)
-        # The search stops at a grid of a fifth of a decade.
-        assert 0.15 < float(noise.drift) < 0.6
-        assert 1.6 < float(noise.measurement) < 2.5
-
-    def test_more_load_noise_is_told_from_less(self):
-        found = [float(likeliest([wander(drift, 1.0)[1]]).drift) for drift in (0.01, 0.1, 1.0)]
-        assert all(less < more for less, more in pairwise(found))

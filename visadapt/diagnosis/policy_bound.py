@@ -109,7 +109,7 @@ def _known(model: CandidateModel, best: ScoredModel) -> Known:
     problem = linear_problem([model], fits)
     process, noise = variances(model, fits.log_process, fits.log_noise)
     smoothed, adjoint = backward(problem.data(), forward(problem.data(), process, noise))
-    beside = -(process[:, None] * adjoint[..., 0])[:, 1:]
+    beside = -(adjoint[..., 0] @ process)[:, 1:]
     by_parameter = problem.drive[..., 1:]
     covariance = torch.linalg.inv(posterior(best.effects, fits)[1])
     variance = ((by_parameter @ covariance) * by_parameter).sum((-1, -2))

@@ -1,6 +1,6 @@
 """Likelihood and smoothed states of a linear system that is driven by columns of inputs, many systems at once.
 
-    x_{t+1} = A_t x_t + c_t + w_t,   w_t ~ N(0, diag(q))        x_0 ~ N(0, diag(p))
+    x_{t+1} = A_t x_t + c_t + w_t,   w_t ~ N(0, Q)              x_0 ~ N(0, diag(p))
     r_t     = H_t x_t + v_t,         v_t ~ N(0, diag(s))
 
 Kalman (1960, J. Basic Eng. 82(1)) forwards, with a Cholesky factor of the innovations' covariance, so that a channel's
@@ -64,11 +64,10 @@ class Filtered:
 
 
 def forward(problem: Linear, process: Tensor, noise: Tensor) -> Filtered:
-    """Filter with process variances q (N, n) and measurement variances s (N, m)."""
+    """Filter with process covariances Q (N, n, n) and measurement variances s (N, m)."""
     rows = problem.reading.shape[1]
     mean = problem.start
     covariance = torch.diag_embed(problem.spread.expand(len(mean), -1))
-    added = torch.diag_embed(process)
     n = covariance.shape[-1]
     disturbed = torch.diag_embed(noise)
     predicted, covariances, roots, crosses, innovations, variances = [], [], [], [], [], []
@@ -76,7 +75,7 @@ def forward(problem: Linear, process: Tensor, noise: Tensor) -> Filtered:
         if t:
             a = problem.transition[:, t - 1]
             mean = torch.baddbmm(problem.drive[:, t - 1], a, mean)
-            covariance = torch.baddbmm(added, torch.bmm(a, covariance), a.mT)
+            covariance = torch.baddbmm(process, torch.bmm(a, covariance), a.mT)
         predicted.append(mean)
         covariances.append(covariance)
         sensing = problem.sensing[:, t]
@@ -113,7 +112,7 @@ def respond(problem: Linear, filtered: Filtered, drive: Tensor, reading: Tensor)
 
 
 def backward(problem: Linear, filtered: Filtered) -> tuple[Tensor, Tensor]:
-    """Smoothed states (N, T, n, M), and adjoints (N, T, n, M): minus q times them is the smoothed w before row t."""
+    """Smoothed states (N, T, n, M), and adjoints (N, T, n, M): minus Q times them is the smoothed w before row t."""
     white = filtered.white
     adjoint = torch.zeros_like(problem.start)
     states, adjoints = [], []
@@ -126,6 +125,23 @@ def backward(problem: Linear, filtered: Filtered) -> tuple[Tensor, Tensor]:
         if t:
             adjoint = torch.bmm(problem.transition[:, t - 1].mT, adjoint)
     return torch.stack(states[::-1], 1), torch.stack(adjoints[::-1], 1)
+
+
+def smoothed_covariance(problem: Linear, filtered: Filtered) -> Tensor:
+    """(N, T, n, n) of the smoothed states: P - P L P, with L the covariance of the adjoints (Bryson and Frazier)."""
+    spread = torch.zeros_like(filtered.covariance[0])
+    identity = torch.eye(spread.shape[-1], dtype=spread.dtype)
+    out = []
+    for t in reversed(range(len(filtered.covariance))):
+        white = torch.linalg.solve_triangular(filtered.root[t], problem.sensing[:, t], upper=False)
+        kept = identity - torch.bmm(filtered.cross[t].mT, white)
+        spread = torch.bmm(white.mT, white) + kept.mT @ spread @ kept
+        covariance = filtered.covariance[t]
+        out.append(covariance - covariance @ spread @ covariance)
+        if t:
+            step = problem.transition[:, t - 1]
+            spread = step.mT @ spread @ step
+    return torch.stack(out[::-1], 1)
 
 
 def log_likelihood(filtered: Filtered, used: Tensor) -> Tensor:

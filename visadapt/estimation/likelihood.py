@@ -120,12 +120,12 @@ def linear_problem(models: Sequence[CandidateModel], fits: FitState) -> Linear:
 
 
 def variances(model: CandidateModel, log_process: Tensor, log_noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Process (C W, n) and measurement (C W, m) variances for the filter."""
+    """Process covariances (C W, n, n) and measurement variances (C W, m) for the filter."""
     windows = model.rows.shape[0]
     process = torch.full((len(log_process), len(model.system.states)), SMOOTH**2, dtype=torch.float64)
     for k, group in enumerate(model.profile.driven):
         process[:, list(group)] = log_process[:, k, None].exp()
-    return process.repeat_interleave(windows, 0), log_noise.exp().repeat_interleave(windows, 0)
+    return torch.diag_embed(process).repeat_interleave(windows, 0), log_noise.exp().repeat_interleave(windows, 0)
 
 
 def noise_groups(model: CandidateModel) -> Tensor:

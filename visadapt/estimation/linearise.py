@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
 
-from visadapt.effects import Parameter
+from visadapt.effects import DynamicsEffect, Parameter
+from visadapt.systems import System
 from visadapt.world import World
 
 STATE_STEP = 1e-6
@@ -38,6 +40,20 @@ class Tangent:
     """(N, m, P)"""
     by_command: Tensor
     """(N, m, n_action); of no columns where it was not asked for"""
+
+
+@cache
+def load_effect(system: type[System]) -> type[DynamicsEffect]:
+    """A load of its own on each degree of freedom, to differentiate by. Without a name, it is in no catalogue."""
+
+    class Load(DynamicsEffect):
+        table = tuple(Parameter(load.name, load.unit, -1.0, 1.0, 0.0) for load in system.loads)
+
+        def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+            rows = [self.value(load.name, state).expand(len(state)) for load in system.loads]
+            return torch.stack(rows, -1)
+
+    return Load
 
 
 def search_range(table: Sequence[Parameter]) -> tuple[Tensor, Tensor]:
@@ -119,7 +135,8 @@ def _tangent(
         moved[1 + states + k] = 1 + k
     for k in range(commands):
         pushed[1 + states + parameters + k, k] = 1
-    out = function(rows.flatten(0, 1), there.flatten(0, 1), moved, pushed).reshape(replicas, count, -1)
+    out = function(rows.flatten(0, 1), there.flatten(0, 1), moved, pushed)
+    out = out.reshape(replicas, count, out.shape[-1])
     change = (out[1:] - out[:1]).movedim(0, -1)
     by = change.split((states, parameters, commands), -1)
     return Tangent(out[0], by[0] / STATE_STEP, by[1] / steps[:, None], by[2] / STATE_STEP)

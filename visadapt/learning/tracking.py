@@ -11,7 +11,7 @@ The one-step gap of the smoothed states, s_{t+1} - f(s_t, a_t), is the smoothed 
 grounding can learn from. q, q_e and c are those of the largest likelihood (Schweppe 1965, IEEE Trans. Inf. Theory
 11(1)) under a wide prior, which decides where an episode is too short to. A load that changes within a period is
 seen in the places alone, so its part of the velocities stays uncertain. The smoother is the extended Kalman
-filter and the recursion of Rauch, Tung and Striebel (1965, AIAA Journal 3(8)), run again around its own result: the
+filter and the recursion of Bryson and Frazier (1963), run again around its own result: the
 Gauss-Newton iteration for the most probable path (Bell 1994, SIAM J. Optim. 4(3)).
 """
 
@@ -26,11 +26,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from visadapt.effects import DynamicsEffect
-from visadapt.estimation.smoothing import Noise, Path, Problem, likeliest, smooth
+from visadapt.estimation.kalman import Linear, backward, smoothed_covariance
+from visadapt.estimation.linearise import linearise_step, load_effect
+from visadapt.estimation.noise import Noise, UnknownNoise, most_probable_noise
 from visadapt.learning.poses import PoseFinder, Poses
 from visadapt.recordings import Episode
-from visadapt.systems import System
 from visadapt.world import World
 
 SHOCK = 0.03
@@ -92,6 +92,9 @@ class Tracker:
         self._seen = [system.index("x"), system.index("theta")]
         self._rates = [system.index("x_dot"), system.index("theta_dot")]
         across = system.states[self._seen[0]]
+        load = load_effect(type(system))
+        nothing = load(**{parameter.name: 0.0 for parameter in load.table})
+        self._pushed = World(system, (nothing,), world.period, world.integrator, world.substeps)
         self.poses = PoseFinder(renderer, max(-across.low, across.high) if reach is None else reach, lean)
 
     def track(self, episodes: Sequence[Episode]) -> list[Track]:
@@ -110,13 +113,18 @@ class Tracker:
         paths = [self._first_guess(poses) for poses in found]
         noise: Noise | None = None
         for turn in range(SMOOTHINGS):
-            problems = [self._linearise(*parts) for parts in zip(found, commands, paths, strict=True)]
+            problems = [self._problem(*parts) for parts in zip(found, commands, paths, strict=True)]
             if turn < 2:
-                noise = likeliest(problems, noise)
+                noise = most_probable_noise(problems, noise)
             assert noise is not None
-            smoothed = [smooth(problem, noise) for problem in problems]
-            paths = [path.mean for path in smoothed]
-        return [self._track(*parts) for parts in zip(episodes, found, smoothed, strict=True)]
+            filtered = [problem.filtered(noise) for problem in problems]
+            paths = [
+                backward(problem.system, each)[0][0, ..., 0] for problem, each in zip(problems, filtered, strict=True)
+            ]
+        spread = [
+            smoothed_covariance(problem.system, each)[0] for problem, each in zip(problems, filtered, strict=True)
+        ]
+        return [self._track(*parts) for parts in zip(episodes, found, paths, spread, strict=True)]
 
     def _see(self, number: int, episode: Episode) -> Poses:
         if episode.frame is None:
@@ -155,34 +163,34 @@ class Tracker:
             guess[:, self._rates] = torch.from_numpy(np.gradient(seen, axis=0) / self.world.period)
         return guess
 
-    def _linearise(self, poses: Poses, command: Tensor, path: Tensor) -> Problem:
-        """The problem with the physics replaced by their tangents along the path (T, n_state + n_load)."""
-        n = path.shape[1]
-        before = path[:-1].clone().requires_grad_()
-        after = self._step(before, command)
-        # Rows do not know each other, so one sweep back gives an entry's derivatives for all of them.
-        sweeps = [torch.autograd.grad(after[:, k].sum(), before, retain_graph=True)[0] for k in range(n)]
-        transition = torch.stack(sweeps, 1)
-        offset = after.detach() - (transition @ path[:-1, :, None])[..., 0]
+    def _problem(self, poses: Poses, command: Tensor, path: Tensor) -> UnknownNoise:
+        """The physics replaced by their tangents along the path (T, n_state + n_load); readings of unit variance."""
+        states, n = len(self.world.system.states), path.shape[1]
+        before = path[:-1]
+        acting = command.clamp(-1, 1)[:, None].expand(-1, self.world.substeps, -1)
+        tangent = linearise_step(
+            self._pushed, before[:, states:], torch.zeros(len(before)).to(path), before[:, :states], acting
+        )
+        transition = torch.eye(n, dtype=path.dtype).repeat(len(before), 1, 1)
+        transition[:, :states] = torch.cat((tangent.by_state, tangent.by_parameter), 2)
+        after = torch.cat((tangent.value, before[:, states:]), 1)
+        offset = after - (transition @ before[..., None])[..., 0]
         unit, drift = self._drifts()
         wide = torch.tensor([(v.high - v.low) / 2 for v in self.world.system.states], dtype=path.dtype)
-        return Problem(
-            transition=transition,
-            offset=offset,
-            observed=self._seen,
-            value=poses.place,
-            noise=poses.covariance,
-            used=poses.explained,
-            drift=drift,
-            start=torch.diag(torch.cat((wide, ACCELERATION * unit)).square()),
+        used = poses.explained[:, None].to(path)
+        seen = used[..., None] * torch.eye(n, dtype=path.dtype)[self._seen]
+        root = torch.linalg.cholesky(torch.where(used[..., None] > 0, poses.covariance, torch.eye(2).to(path)))
+        system = Linear(
+            transition=transition[None],
+            drive=offset[None, ..., None],
+            sensing=torch.linalg.solve_triangular(root, seen, upper=False)[None],
+            reading=torch.linalg.solve_triangular(root, (used * poses.place.nan_to_num())[..., None], upper=False)[
+                None
+            ],
+            start=path.new_zeros(1, n, 1),
+            spread=torch.cat((wide, ACCELERATION * unit)).square(),
         )
-
-    def _step(self, at: Tensor, command: Tensor) -> Tensor:
-        """One period of the source physics under the loads that the rows (B, n_state + n_load) end with."""
-        source, n = self.world, len(self.world.system.states)
-        load = at[:, n:]
-        world = World(source.system, (_Load(load),), source.period, source.integrator, source.substeps)
-        return torch.cat((world.step(world.start(at[:, :n]), command).state, load), 1)
+        return UnknownNoise(system, used.expand(-1, len(self._seen))[None], drift)
 
     def _drifts(self) -> tuple[Tensor, Tensor]:
         """Loads (n_load,) that accelerate cart and pole, each its own, by 1 m/s2 and 1 rad/s2 in the upright rest.
@@ -208,12 +216,12 @@ class Tracker:
         drift[-1] = both.outer(both) + late.outer(late)
         return unit, drift
 
-    def _track(self, episode: Episode, poses: Poses, path: Path) -> Track:
+    def _track(self, episode: Episode, poses: Poses, path: Tensor, covariance: Tensor) -> Track:
         n = len(self.world.system.states)
         kind = episode.action.dtype
-        deviation = path.covariance.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()
+        deviation = covariance.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()
         return Track(
-            episode=replace(episode, state=path.mean[:, :n].numpy().astype(kind)),
+            episode=replace(episode, state=path[:, :n].numpy().astype(kind)),
             deviation=deviation[:, :n].numpy().astype(kind),
             misfit=poses.misfit.numpy(),
             explained=poses.explained.numpy(),
@@ -234,14 +242,3 @@ def _longest(missed: Tensor) -> int:
     """Most rows (T,) missed one after the other."""
     used = torch.cat((torch.tensor([-1]), (~missed).nonzero()[:, 0], torch.tensor([len(missed)])))
     return int(used.diff().max()) - 1
-
-
-class _Load(DynamicsEffect):
-    """A load for each row (B, n_load). It has no name, so that it is in no catalogue."""
-
-    def __init__(self, rows: Tensor) -> None:
-        super().__init__()
-        self.rows = rows
-
-    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        return self.rows

@@ -55,7 +55,7 @@ def disturbance(model: CandidateModel, fits: FitState, log_process: Tensor) -> D
     problem = linear_problem([model], fits)
     process, noise = variances(model, fits.log_process, fits.log_noise)
     _, adjoint = backward(problem, forward(problem, process, noise))
-    added = -(process[:, None] * adjoint[..., 0])[:, 1:, driven]
+    added = -(adjoint[..., 0] @ process)[:, 1:, driven]
     by_load = loads_of(model, fits)[:, :, driven]
     # Each velocity answers to a load of its own; beyond a window's end they answer to nothing.
     there = rows.inside[:, 1:]

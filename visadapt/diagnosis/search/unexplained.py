@@ -11,17 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import torch
 from torch import Tensor
 
-from visadapt.effects import DynamicsEffect
-from visadapt.effects.base import Parameter
 from visadapt.estimation.candidate import CandidateModel, linearise
 from visadapt.estimation.innovations import Innovations
 from visadapt.estimation.likelihood import FitState
-from visadapt.systems import System
+from visadapt.estimation.linearise import load_effect
 
 BUMPS = 10
 """Bumps of a function."""
@@ -34,19 +31,6 @@ PREVIOUS = "previous_"
 
 SIZES = (0.03, 0.3, 3.0, 30.0)
 """Prior deviations that are tried of what the bumps together change of the innovations, in deviations of these."""
-
-
-@cache
-def push(system: type[System]) -> type[DynamicsEffect]:
-    """A load of its own on each degree of freedom, to differentiate by; not in the catalogue, as it has no name."""
-
-    class Push(DynamicsEffect):
-        table = tuple(Parameter(load.name, load.unit, -1.0, 1.0, 0.0) for load in system.loads)
-
-        def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-            return torch.stack([self.value(load.name, state) for load in system.loads], -1)
-
-    return Push
 
 
 @dataclass(frozen=True)
@@ -160,7 +144,7 @@ def variables_of(model: CandidateModel, state: Tensor) -> dict[str, Tensor]:
 def loads_of(model: CandidateModel, fits: FitState) -> Tensor:
     """What a unit of each load, held for a period, adds to the states, (W, T - 1, n, loads)."""
     count = len(model.system.loads)
-    pushed = CandidateModel(model.system, [*model.effects, push(type(model.system))], model.rows)
+    pushed = CandidateModel(model.system, [*model.effects, load_effect(type(model.system))], model.rows)
     theta = torch.cat((fits.theta[0, : len(model.table)], torch.zeros(count, dtype=torch.float64)))
     return linearise(pushed, theta, fits.state[0]).by_parameter[..., -count:]
 
