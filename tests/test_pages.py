@@ -122,6 +122,12 @@ def test_commands_take_the_options_that_pages_give(module, options):
         assert not options
 
 
+def test_every_room_is_described():
+    rooms = {path.parent.relative_to(ROOT).as_posix() for path in (ROOT / "visadapt").glob("*/*.py")}
+    page = text_of("architecture.md")
+    assert not [room for room in rooms if f"| `{room}` |" not in page]
+
+
 def test_every_key_of_the_json_is_described():
     page = text_of("diagnosis.md")
     schema = json.loads((Path(visadapt.diagnosis.__file__).parent / "schema.json").read_text())
