@@ -65,7 +65,7 @@ def _blind(name: str, options: str, minutes: int, table: str = "blind_diagnosis.
 
 COMMANDS = (
     Command("renderers", "renderers.csv", ("benchmarks.renderers",), 1),
-    Command("power_loop", "power_loop.csv", ("benchmarks.power_loop",), 1),
+    Command("power_loop", "power_loop.csv", ("benchmarks.power_loop",), 10),
     Command("residual_samples", "residual_samples.csv", ("benchmarks.residual_samples",), 5),
     Command("cartpole_states", "cartpole_states.csv", ("benchmarks.cartpole_states",), 10, work="--work"),
     Command("swing_up", "swing_up.csv", ("train.swing_up",), 20, work="--work"),
