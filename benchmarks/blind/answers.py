@@ -1,4 +1,4 @@
-"""The baselines' fits as answers in DESIGN.md's JSON (schema 1)."""
+"""The baselines' fits as answers in the JSON of docs/diagnosis.md."""
 
 from __future__ import annotations
 

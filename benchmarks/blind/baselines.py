@@ -1,4 +1,4 @@
-"""Diagnosers to compare with: each takes the path of a recording's CSV and answers with DESIGN.md's JSON (schema 1).
+"""Diagnosers to compare with: each takes the path of a recording's CSV and answers with the JSON of docs/diagnosis.md.
 
 - afternoon: what a careful engineer writes in an afternoon. One-step prediction error of source and one effect at a
   time, least squares on the measured states, the noise known, BIC; a fit that stays poor is called unexplained.

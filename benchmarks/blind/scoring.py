@@ -1,4 +1,4 @@
-"""What a diagnosis of a blind recording is worth: answers (DESIGN.md's JSON, schema 1) against the sealed key.
+"""What a diagnosis of a blind recording is worth: answers (the JSON of docs/diagnosis.md) against the sealed key.
 
 An answer names classes. With verdict `identified` each cause is one by itself; with `ambiguous` causes that are listed
 as indistinguishable from one another form one class, of which one member is meant. A true effect is found where a

@@ -33,7 +33,7 @@ class Row:
     """easy or hard, of the cart-pole, or a vehicle"""
     diagnoser: str
     measure: str
-    """what is counted; the README says how"""
+    """what is counted, as docs/results.md describes"""
     value: float
     low: float
     """Wilson's 95 % for shares; the quartiles for medians; empty otherwise"""

@@ -121,8 +121,8 @@ class Sensing:
         """Reading (4, n), and the same with the noise taken off again where it is not held from an earlier row.
 
         While the true angle is inside a frozen zone, the angle's reading holds, and with `holds_rate` the angular
-        velocity's too (DESIGN.md leaves that open); a dropout holds the whole row. `lottery` (n,) is uniform on
-        [0, 1). The first row of an episode has nothing to hold and is read as it is.
+        velocity's too (the effect's definition allows either); a dropout holds the whole row. `lottery` (n,) is
+        uniform on [0, 1). The first row of an episode has nothing to hold and is read as it is.
         """
         p, clean = self.p, self.noiseless(t, state)
         step = p["angle_quantisation.step"]

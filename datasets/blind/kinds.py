@@ -1,7 +1,7 @@
 """What can stand between a blind recording and the source: the catalogue's effects and foreign ones.
 
 Each kind draws its shape (direction, places, times, frequencies) once and has one size, a positive number that its
-strength grows with. Names and parameters of the named kinds are DESIGN.md's.
+strength grows with. Names and parameters of the named kinds are those of docs/effects.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The tables under results/: one row per measure, the same columns everywhere (DESIGN.md)."""
+"""The tables under results/: one row per measure, the same columns everywhere (docs/architecture.md)."""
 
 from __future__ import annotations
 

@@ -1,0 +1,185 @@
+"""Writes what the pages take from elsewhere into README.md and docs/*.md: `python -m benchmarks.pages`.
+
+Each table stands between the lines `<!-- table: NAME -->` and `<!-- end -->`. Tables of results come from the CSVs
+under results/; in docs/results.md each is followed by the command that writes its CSV, and the date and commit at which
+git last saw that CSV change. The effects of docs/effects.md come from the registry.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks import tables_adaptation as adaptation
+from benchmarks import tables_diagnosis as diagnosis
+from benchmarks.all import COMMANDS
+from visadapt.effects import EFFECTS, Effect, Stage
+from visadapt.evaluation.result_tables import read_rows
+from visadapt.storage.atomic_files import replacing
+from visadapt.systems import SYSTEMS
+
+PAGES = (Path("README.md"), *sorted(Path("docs").glob("*.md")))
+"""Relative to the repository's root."""
+
+RESULTS_PAGE = "results.md"
+"""The page that states command, date and commit of each table."""
+
+BLOCK = re.compile(r"<!-- table: (?P<name>[^>]+) -->\n.*?<!-- end -->", re.DOTALL)
+
+CHANGED = re.compile(r"last changed on [\d-]+ in commit \w+|not committed yet")
+"""Date and commit of a CSV: they change with each commit of it, after the page is written."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of results and the commands that write its CSVs."""
+
+    make: Callable[..., adaptation.Lines]
+    """takes the rows of each CSV, in the order in which the commands first name them"""
+    commands: tuple[str, ...]
+    """names in `benchmarks.all.COMMANDS`"""
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The CSVs in results/."""
+        return tuple(dict.fromkeys(BY_NAME[name].table for name in self.commands))
+
+
+BY_NAME = {command.name: command for command in COMMANDS}
+
+TABLES = {
+    "headline": Table(adaptation.headline, ("cartpole_pixels", "cartpole_states", "flight", "rotorpy", "blind_hard")),
+    "cartpole": Table(adaptation.cartpole, ("cartpole_pixels", "cartpole_states")),
+    "curve": Table(adaptation.curve, ("cartpole_pixels", "cartpole_states")),
+    "grounding": Table(adaptation.grounding, ("cartpole_pixels",)),
+    "pendulum": Table(adaptation.pendulum, ("inverted_pendulum",)),
+    "vehicles": Table(adaptation.vehicles, ("flight",)),
+    "residual": Table(adaptation.residual, ("residual_samples",)),
+    "collection": Table(adaptation.collection, ("data_collection",)),
+    "named": Table(adaptation.named, ("named_effects",)),
+    "rotorpy": Table(adaptation.rotorpy, ("rotorpy",)),
+    "loops": Table(adaptation.loops, ("power_loop",)),
+    "swing": Table(adaptation.swing, ("swing_up",)),
+    "renderers": Table(adaptation.renderers, ("renderers",)),
+    "blind": Table(diagnosis.blind, ("blind_hard", "blind_easy", "blind_2029")),
+    "blind flights": Table(diagnosis.blind_flights, ("blind_quadrotor", "blind_fixed_wing")),
+    "rotorpy diagnosis": Table(diagnosis.crazyflie, ("rotorpy_diagnosis",)),
+}
+"""By name in the pages."""
+
+
+def main() -> None:
+    """Rewrite the pages in place."""
+    for page in PAGES:
+        text = filled(page)
+        if text != page.read_text():
+            with replacing(page) as temporary:
+                temporary.write_text(text)
+            print(f"{page}: rewritten")
+
+
+def filled(page: Path) -> str:
+    """The page's text with every block made anew.
+
+    Raises:
+        KeyError: a block of a name that there is no table of.
+    """
+
+    def block(match: re.Match[str]) -> str:
+        name = match["name"]
+        body = GENERATED[name]() if name in GENERATED else results_table(name, page.name == RESULTS_PAGE)
+        return f"<!-- table: {name} -->\n{body}\n<!-- end -->"
+
+    return BLOCK.sub(block, page.read_text())
+
+
+def results_table(name: str, with_origin: bool) -> str:
+    """A table of results, and where asked for the commands, dates and commits of its CSVs."""
+    table = TABLES[name]
+    lines = markdown(table.make(*(read_rows(Path("results") / file) for file in table.files)))
+    return lines + "\n\n" + "\n".join(origins(table)) if with_origin else lines
+
+
+def origins(table: Table) -> list[str]:
+    """One line for each CSV: when it last changed, and what writes it."""
+    lines = []
+    for file in table.files:
+        commands = [f"`{BY_NAME[name].shown}`" for name in table.commands if BY_NAME[name].table == file]
+        lines.append(f"- `results/{file}`, {changed(Path('results') / file)}: {', '.join(commands)}")
+    return lines
+
+
+def changed(path: Path) -> str:
+    """The date and commit at which git last saw a file change."""
+    if _git("status", "--porcelain", "--", str(path)):
+        return "not committed yet"
+    return "last changed on " + _git("log", "-1", "--format=%cs in commit %h", "--", str(path))
+
+
+def _git(*arguments: str) -> str:
+    return subprocess.run(["git", *arguments], capture_output=True, text=True, check=True).stdout.strip()
+
+
+def markdown(lines: adaptation.Lines) -> str:
+    """A table, its header first."""
+    header, *body = lines
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *body))
+
+
+def commands() -> str:
+    """Every command of `benchmarks.all`, its CSV and its minutes."""
+    rows = [["name", "writes", "minutes, 2 cores", "needs", "command"]]
+    for command in COMMANDS:
+        needs = f"extra `{command.extra}`" if command.extra else ""
+        table = f"`results/{command.table}`"
+        rows.append([f"`{command.name}`", table, f"about {command.minutes}", needs, f"`{command.shown}`"])
+    return markdown(rows)
+
+
+def columns() -> str:
+    """What a recording of each system holds."""
+    rows = [["system", "states", "commands in [-1, 1]"]]
+    for name, system in sorted(SYSTEMS.items()):
+        states, actions = (
+            ", ".join(f"`{one.name}` {'' if one.unit == '1' else one.unit}".strip() for one in variables)
+            for variables in (system.states, system.actions)
+        )
+        rows.append([f"`{name}`", states, actions])
+    return markdown(rows)
+
+
+def catalogue() -> str:
+    """Every registered effect of the library, by stage."""
+    parts = []
+    for stage in Stage:
+        own = [
+            effect for effect in EFFECTS.values() if effect.stage == stage and effect.__module__.startswith("visadapt.")
+        ]
+        if own:
+            rows = [["effect", "acts on", "equation and source", "parameters", "passive data cannot tell it from"]]
+            rows += [_effect(effect) for effect in sorted(own, key=lambda effect: effect.name)]
+            parts.append(f"## {str(stage).capitalize()}\n\n{markdown(rows)}")
+    return "\n\n".join(parts)
+
+
+def _effect(effect: type[Effect]) -> list[str]:
+    systems = ", ".join(sorted(name for name, system in SYSTEMS.items() if issubclass(system, effect.systems)))
+    parameters = "; ".join(
+        f"`{one.name}`{'' if one.unit == '1' else f' {one.unit}'}, {one.low:g} to {one.high:g}"
+        + ("" if one.neutral is None else f", none at {one.neutral:g}")
+        for one in effect.table
+    )
+    about = f"{effect.equation} ({effect.source})".replace("|", "\\|")
+    others = ", ".join(f"`{name}`" for name in effect.indistinguishable_from)
+    return [f"`{effect.name}`", systems, about, parameters, others]
+
+
+GENERATED = {"commands": commands, "columns": columns, "effects": catalogue}
+"""Blocks that come from code, not from results."""
+
+
+if __name__ == "__main__":
+    main()

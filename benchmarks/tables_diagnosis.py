@@ -1,0 +1,91 @@
+"""The pages' tables of the diagnosis: each function takes the rows of its CSVs and gives the lines of a table."""
+
+from __future__ import annotations
+
+from benchmarks.tables_adaptation import Lines, Rows
+
+DIAGNOSERS = ("ours", "afternoon", "greedy", "refit", "pysindy", "chance")
+"""Order of the columns."""
+
+MEASURES = {
+    "single: among the named": "single effects named",
+    "single: named, nothing else": "and nothing else",
+    "pair: both named": "pairs, both named",
+    "triple: all named": "triples, all named",
+    "none: no_gap": "nothing hidden, called no_gap",
+    "foreign: unexplained": "foreign effects, called unexplained",
+    "parameter error, relative": "median parameter error",
+    "coverage of 90 % intervals": "coverage of the 90 % intervals",
+    "closed where identified, median": "gap closed where identified, median",
+    "region overlap, median": "region of a patch, gust or frozen zone: overlap, median",
+    "seconds": "time for one recording, median",
+}
+"""Measures of the sealed check, and their names in the tables."""
+
+CRAZYFLIE = {
+    "verdict": "verdict",
+    "most probable": "most probable effects",
+    "gap closed": "gap closed",
+    **{f"drag_{axis}": f"drag along {axis}, 1/s" for axis in "xyz"},
+    **{f"damping_{axis}": f"damping of turns about {axis}, 1/s" for axis in "xyz"},
+    "lift": "translational lift, 1/m",
+    "lag": "lag of the motors, s",
+    **{f"wind_{axis}": f"wind along {axis}, m/s" for axis in "xy"},
+}
+"""Quantities of `benchmarks.rotorpy_diagnosis`, and their names in the table."""
+
+
+def blind(first: Rows, second: Rows) -> Lines:
+    """Cart-poles: every diagnoser on both sets of the first draw, and ours on the hard set of a second one."""
+    again = {row["measure"]: row for row in second if (row["kind"], row["diagnoser"]) == ("hard", "ours")}
+    header, *lines = _check(first, ("easy", "hard"))
+    return [[*header, "hard, second draw: ours"], *([*line, _cell(again.get(key))] for key, *line in lines)]
+
+
+def blind_flights(rows: Rows) -> Lines:
+    """Vehicles: every diagnoser, without the measures that no vehicle has."""
+    header, *lines = _check(rows, ("quadrotor", "fixed_wing"))
+    return [header, *(line for _, *line in lines if any(line[1:]))]
+
+
+def crazyflie(rows: Rows) -> Lines:
+    """The diagnosis of rotorpy's multirotor with 90 % intervals, and what rotorpy publishes."""
+    airs = list(dict.fromkeys(row["air"] for row in rows))
+    found = {(row["air"], row["what"]): row for row in rows}
+    lines = [["rotorpy's Crazyflie, diagnosed", *airs, "published"]]
+    for quantity, name in CRAZYFLIE.items():
+        own = [found[air, quantity] for air in airs]
+        # In calm air, or in none, some of them are 0.
+        published = max((row["published"] for row in own), key=lambda value: float(value or 0))
+        lines.append([name, *map(_estimate, own), published])
+    return lines
+
+
+def _check(rows: Rows, kinds: tuple[str, ...]) -> Lines:
+    """The header, and one line a measure: its key, its name, and a cell for every diagnoser on every set."""
+    found = {(row["kind"], row["diagnoser"], row["measure"]): row for row in rows}
+    run = {key[:2] for key in found}
+    columns = [(kind, name) for kind in kinds for name in DIAGNOSERS if (kind, name) in run]
+    header = ["sealed check", *(f"{kind.replace('_', ' ')}: {name}" for kind, name in columns)]
+    return [
+        header,
+        *([key, name, *(_cell(found.get((*column, key))) for column in columns)] for key, name in MEASURES.items()),
+    ]
+
+
+def _cell(row: dict[str, str] | None) -> str:
+    if row is None:
+        return ""
+    value, low, high = (float(row[name] or "nan") for name in ("value", "low", "high"))
+    if row["measure"] == "seconds":
+        return f"{value:.1f} s"
+    if "median" in row["measure"] or "error" in row["measure"]:
+        return f"{100 * value:.1f} %"
+    return f"{100 * value:.0f} % ({100 * low:.0f} to {100 * high:.0f}) of {row['n']}"
+
+
+def _estimate(row: dict[str, str]) -> str:
+    if row["what"] == "gap closed" and row["value"]:
+        return f"{100 * float(row['value']):.0f} %"
+    value = row["value"].replace("_", " ")
+    return f"{value} ({row['low']} to {row['high']})" if row["low"] else value

@@ -1,0 +1,165 @@
+"""README.md and docs/ say what results/, the registry and the code say, and link to what is there."""
+
+import ast
+import importlib
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import torch
+import tyro
+
+import visadapt.diagnosis
+from benchmarks.all import COMMANDS
+from benchmarks.pages import BLOCK, CHANGED, GENERATED, PAGES, TABLES, filled
+from visadapt.effects import EFFECTS
+from visadapt.systems import CartPole
+from visadapt.systems.parameter_file import load_rig
+from visadapt.targets.env_map import EnvMap
+
+ROOT = Path(__file__).parents[1]
+NAMES = [page.name for page in PAGES]
+MODULES = re.compile(r"(?:`|^ {4})python -m ([\w.]+)([^`#\n]*)", re.MULTILINE)
+
+
+@pytest.fixture(autouse=True)
+def _at_the_root(monkeypatch):
+    monkeypatch.chdir(ROOT)
+
+
+def text_of(name):
+    return next(page for page in PAGES if page.name == name).read_text()
+
+
+def anchors(text):
+    """The links to a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.+)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_every_page_is_there():
+    assert {"README.md", "results.md", "diagnosis.md", "own_rig.md", "effects.md", "architecture.md"} <= set(NAMES)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_what_a_page_shows_is_what_the_script_writes(page):
+    shown, made = (CHANGED.sub("", text) for text in (page.read_text(), filled(page)))
+    assert shown == made, f"{page} differs from results/ or the registry: python -m benchmarks.pages"
+
+
+def test_every_table_is_on_a_page():
+    there = {match["name"] for page in PAGES for match in BLOCK.finditer(page.read_text())}
+    assert there == {*TABLES, *GENERATED}
+
+
+def test_a_changed_number_is_put_right(tmp_path):
+    page = tmp_path / "README.md"
+    page.write_text(text_of("README.md").replace("0.058", "0.028"))
+    assert filled(page) == text_of("README.md") != page.read_text()
+
+
+def test_every_effect_of_the_library_is_in_the_catalogue():
+    page = text_of("effects.md")
+    missing = [
+        name for name, effect in EFFECTS.items() if effect.__module__.startswith("visadapt.") and name not in page
+    ]
+    assert not missing
+
+
+def test_results_state_command_date_and_commit_of_every_csv():
+    page = text_of("results.md")
+    for command in COMMANDS:
+        lines = [line for line in page.splitlines() if line.startswith(f"- `results/{command.table}`")]
+        assert any(f"`{command.shown}`" in line for line in lines), command.name
+        assert all(CHANGED.search(line) for line in lines)
+
+
+def test_the_readme_has_at_most_150_lines():
+    assert len(text_of("README.md").splitlines()) <= 150
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_links_and_pictures_exist(page):
+    text = page.read_text()
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if link.startswith("http"):
+            continue
+        path, _, anchor = link.partition("#")
+        there = (page.parent / path).resolve() if path else page.resolve()
+        assert there.exists(), f"{page}: {link}"
+        if anchor:
+            assert anchor in anchors(there.read_text()), f"{page}: {link}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_files_named_in_a_page_exist(page):
+    for name in re.findall(
+        r"`((?:visadapt|renderers|datasets|train|benchmarks|tests|assets|results)/[\w/.]+)`", page.read_text()
+    ):
+        assert (ROOT / name).exists(), f"{page}: {name}"
+
+
+def commands_in_pages():
+    found = {match.groups() for page in PAGES for match in MODULES.finditer(page.read_text())}
+    found |= {(command.arguments[0], shlex.join(command.arguments[1:])) for command in COMMANDS}
+    return sorted((module, options.strip()) for module, options in found)
+
+
+@pytest.mark.parametrize(("module", "options"), commands_in_pages())
+def test_commands_take_the_options_that_pages_give(module, options):
+    script = importlib.import_module(module)
+    parts = ast.parse(Path(script.__file__).read_text()).body
+    assert any(isinstance(part, ast.If) and "__main__" in ast.unparse(part.test) for part in parts)
+    if hasattr(script, "Settings"):
+        with pytest.raises(SystemExit) as ended:
+            tyro.cli(script.Settings, args=[*shlex.split(options), "--help"])
+        assert ended.value.code == 0
+        if "..." not in options:
+            tyro.cli(script.Settings, args=shlex.split(options))
+    else:
+        assert not options
+
+
+def test_every_room_is_described():
+    rooms = {path.parent.relative_to(ROOT).as_posix() for path in (ROOT / "visadapt").glob("*/*.py")}
+    page = text_of("architecture.md")
+    assert not [room for room in rooms if f"| `{room}` |" not in page]
+
+
+def test_every_key_of_the_json_is_described():
+    page = text_of("diagnosis.md")
+    schema = json.loads((Path(visadapt.diagnosis.__file__).parent / "schema.json").read_text())
+    keys = set()
+
+    def collect(part):
+        for key, inner in part.get("properties", {}).items():
+            keys.add(key)
+            collect(inner)
+        for inner in (part.get("items"), part.get("additionalProperties")):
+            if isinstance(inner, dict):
+                collect(inner)
+
+    collect({"properties": schema["properties"]})
+    missing = sorted(key for key in keys if not re.search(rf"`(?:[\w\[\].]+\.)?{key}`", page))
+    assert not missing
+    assert f"Version {schema['properties']['schema']['const']}." in page
+
+
+def test_the_effect_of_ones_own_works():
+    code = text_of("own_rig.md").split("<!-- check: effect -->\n```python\n", 1)[1].split("```", 1)[0]
+    scope: dict = {}
+    exec(compile(code, "magnet.py", "exec"), scope)
+    EFFECTS.pop("magnet")
+    at = torch.tensor([[0.15, 0, 0, 0], [0.2, 0, 0, 0], [0.25, 0, 0, 0]])
+    force = scope["Magnet"](strength=10.0).load(torch.zeros(3), at, CartPole())[:, 0]
+    assert force.sign().tolist() == [1, 0, -1]
+
+
+def test_the_rig_and_the_map_of_the_page_load(tmp_path):
+    rig, mapping = re.findall(r"```toml\n(.*?)```", text_of("own_rig.md"), re.DOTALL)
+    (tmp_path / "rig.toml").write_text(rig)
+    assert load_rig(tmp_path / "rig.toml", CartPole).cart_mass == 0.23
+    (tmp_path / "map.toml").write_text(mapping)
+    EnvMap.load(tmp_path / "map.toml").check("the page's map", CartPole, n_observation=4, n_action=1)
