@@ -11,10 +11,11 @@ import torch
 
 from visadapt import diagnose
 from visadapt.cli.main import main
-from visadapt.diagnosis.search.catalogue import catalogue, searched
+from visadapt.diagnosis.search.catalogue import searched
 from visadapt.diagnosis.search.sensor_checks import Readings
 from visadapt.effects import ActuatorDelay, ConstantForce, LiftSlope, LinearDrag, ThrustGain, Wind
-from visadapt.estimation.profiles import PROFILES, profile_of
+from visadapt.effects.catalogue import catalogue
+from visadapt.estimation.profiles import PROFILES
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole, FixedWing, Quadrotor
 from visadapt.world import World
@@ -75,7 +76,7 @@ def test_each_subject_s_columns_are_all_there():
 
 
 def test_what_a_system_cannot_tell_another_may():
-    names = {kind: {e.name for e in searched(catalogue(kind()), profile_of(kind()))} for kind in (CartPole, Quadrotor)}
+    names = {kind: {e.name for e in searched(catalogue(kind()), kind())} for kind in (CartPole, Quadrotor)}
     assert not {"constant_force", "actuator_bias"} <= names[CartPole]
     assert {"constant_force", "actuator_bias"} <= names[Quadrotor]
     assert not {"thrust_gain", "payload"} <= names[Quadrotor]

@@ -10,20 +10,11 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
-from visadapt.effects import (
-    ActuationEffect,
-    CoulombFriction,
-    DynamicsEffect,
-    Effect,
-    FrictionPatch,
-    Gust,
-    SensingEffect,
-)
+from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, Role, SensingEffect
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
 from visadapt.systems.integrators import rk4
-from visadapt.world import place_in_chain
 
 Made = TypeVar("Made", bound=Effect)
 
@@ -46,15 +37,15 @@ class CandidateModel:
         self.profile = profile_of(system)
         self.effects = tuple(effects)
         self.rows = rows
-        abrupt = any(issubclass(e, ActuationEffect | CoulombFriction | FrictionPatch | Gust) for e in effects)
+        abrupt = any(effect.abrupt for effect in effects)
         smooth = 1 if effort == GLANCE else math.ceil(rows.period / self.profile.smooth_step)
         self.substeps = max(smooth, self.profile.substeps[effort] if abrupt else 1)
         self.table = [parameter for effect in effects for parameter in effect.table]
-        turns = torch.tensor([TURNS * (p.name == "phase") for p in self.table], dtype=torch.float64)
+        turns = torch.tensor([TURNS * (p.role is Role.PHASE) for p in self.table], dtype=torch.float64)
         self.low = torch.tensor([p.low for p in self.table], dtype=torch.float64) - turns
         self.high = torch.tensor([p.high for p in self.table], dtype=torch.float64) + turns
-        chain = sorted((e for e in effects if issubclass(e, ActuationEffect)), key=place_in_chain)
-        sensors = sorted((e for e in effects if issubclass(e, SensingEffect)), key=place_in_chain)
+        chain = sorted((e for e in effects if issubclass(e, ActuationEffect)), key=lambda effect: effect.order)
+        sensors = sorted((e for e in effects if issubclass(e, SensingEffect)), key=lambda effect: effect.order)
         self.slopes: tuple[Tensor, Tensor] | None = None
         """transition (W, T - 1, n, n) and sensing (W, T, m, n) of an earlier linearisation that are near enough"""
         self._order = [*chain, *(e for e in effects if issubclass(e, DynamicsEffect)), *sensors]
