@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 
 import numpy as np
@@ -107,7 +108,9 @@ def test_a_wing_s_lift_slope_is_named_with_its_size():
 
 
 def test_the_command_reads_a_quadrotor_s_csv(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("visadapt.diagnosis.diagnose.all_effects", lambda system: [LinearDrag, ThrustGain])
+    # Not by its dotted name, which is that of the function.
+    module = importlib.import_module("visadapt.diagnosis.diagnose")
+    monkeypatch.setattr(module, "all_effects", lambda system: [LinearDrag, ThrustGain])
     recording = record(Quadrotor(), [LinearDrag(coefficient=0.5)], episodes=4)
     columns = ["episode", "time", *recording.measured, *(variable.name for variable in Quadrotor.actions)]
     lines = [",".join(columns)]
