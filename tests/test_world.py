@@ -6,10 +6,15 @@ from torch.func import functional_call
 from tests.worlds import Mass, columns, run
 from visadapt.effects import (
     EFFECTS,
+    ActuatorBias,
     ActuatorDelay,
+    ActuatorGain,
+    ActuatorLag,
     AngleOffset,
     CartMass,
     ConstantForce,
+    Dropout,
+    Effect,
     MeasurementDelay,
     Residual,
     RotorEfficiency,
@@ -18,7 +23,7 @@ from visadapt.effects import (
 )
 from visadapt.history import History
 from visadapt.systems import CartPole, Quadrotor
-from visadapt.world import ACTUATION_CHAIN, SENSING_CHAIN, World, place_in_chain
+from visadapt.world import World
 
 
 class Linear(nn.Module):
@@ -165,10 +170,30 @@ class TestMeasuring:
         torch.testing.assert_close(mixed, torch.where(keep[:, None], kept, restarted))
         assert torch.equal(world.measure(old)[0], kept)
 
-    def test_effects_of_a_stage_have_their_place_and_others_come_last(self):
-        assert place_in_chain(ActuatorDelay) == 0
-        assert place_in_chain(MeasurementDelay(delay=0.0)) < place_in_chain(AngleOffset)
-        assert place_in_chain(ConstantForce) == len(ACTUATION_CHAIN + SENSING_CHAIN)
+    def test_effects_of_a_stage_act_in_their_order_whatever_that_of_the_list(self):
+        gain, bias, late = ActuatorGain(scale=2.0), ActuatorBias(offset=0.1), MeasurementDelay(delay=0.02)
+        offset, lost = AngleOffset(offset=0.1), Dropout(rate=1.0)
+        state, actions = inputs()
+        seen = []
+        for effects in ([gain, bias, late, offset, lost], [lost, bias, offset, gain, late]):
+            world = World(CartPole(), effects)
+            measured, at = world.measure(world.start(state), torch.Generator())
+            at = world.step(at, 0.3 * actions[0])
+            seen.append((at.state, measured, world.measure(at, torch.Generator())[0]))
+        for one, other in zip(*seen, strict=True):
+            assert torch.equal(one, other)
+        # 2 u + 0.1, not 2 (u + 0.1).
+        alone = World(CartPole()).step(World(CartPole()).start(state), 0.6 * actions[0] + 0.1)
+        torch.testing.assert_close(seen[0][0], alone.state)
+
+    def test_an_effect_that_states_no_order_acts_last(self):
+        class Doubled(ActuatorGain):
+            order = Effect.order
+
+        world = World(CartPole(), [Doubled(scale=2.0), ActuatorBias(offset=0.1), ActuatorLag(time_constant=0.0)])
+        state, actions = inputs()
+        alone = World(CartPole()).step(World(CartPole()).start(state), 2 * (0.3 * actions[0] + 0.1))
+        torch.testing.assert_close(world.step(world.start(state), 0.3 * actions[0]).state, alone.state)
 
 
 def test_the_load_of_an_instant_is_that_of_all_effects_on_the_altered_system():

@@ -14,28 +14,6 @@ from visadapt.history import History
 from visadapt.systems import SYSTEMS, System
 from visadapt.systems.integrators import INTEGRATORS
 
-ACTUATION_CHAIN = (
-    "actuator_delay",
-    "actuator_backlash",
-    "actuator_deadzone",
-    "actuator_saturation",
-    "actuator_gain",
-    "actuator_bias",
-    "actuator_lag",
-)
-"""The order in which actuation effects act; any other comes last."""
-
-SENSING_CHAIN = (
-    # First: it interpolates the true motion, and what follows then sees the state as it was.
-    "measurement_delay",
-    "frozen_zone",
-    "sensor_scale",
-    "angle_offset",
-    "position_offset",
-    "dropout",
-)
-"""The order in which sensing effects act; any other comes last."""
-
 
 @dataclass(frozen=True)
 class WorldState:
@@ -236,8 +214,10 @@ class World(nn.Module):
         """Sort the effects by what they act on, in the order in which they act."""
         effects = list(self.effects)
         self._named = [effect for effect in effects if isinstance(effect, Effect)]
-        self._actuation = sorted((e for e in effects if isinstance(e, ActuationEffect)), key=place_in_chain)
-        self._sensing = sorted((e for e in effects if isinstance(e, SensingEffect)), key=place_in_chain)
+        self._actuation = sorted(
+            (e for e in effects if isinstance(e, ActuationEffect)), key=lambda effect: effect.order
+        )
+        self._sensing = sorted((e for e in effects if isinstance(e, SensingEffect)), key=lambda effect: effect.order)
         self._dynamics = [effect for effect in effects if isinstance(effect, DynamicsEffect)]
         self._residuals = [effect for effect in effects if isinstance(effect, Residual)]
 
@@ -294,9 +274,3 @@ class World(nn.Module):
         for effect in self._dynamics:
             load = load + effect.load(time, state, system)
         return load
-
-
-def place_in_chain(effect: Effect | type[Effect]) -> int:
-    """Where an actuation or sensing effect acts among the others of its stage: the sorting key."""
-    chain = ACTUATION_CHAIN + SENSING_CHAIN
-    return chain.index(effect.name) if effect.name in chain else len(chain)

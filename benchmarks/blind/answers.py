@@ -9,81 +9,10 @@ import numpy as np
 
 from benchmarks.blind.fitting import Data, Fit
 from benchmarks.blind.onestep import Steps, Values
-from benchmarks.blind.scoring import REGION, Answer
-
-UNITS: dict[str, dict[str, str]] = {
-    "actuator_gain": {"scale": "1"},
-    "actuator_bias": {"offset": "1"},
-    "actuator_delay": {"delay": "s"},
-    "actuator_lag": {"time_constant": "s"},
-    "actuator_deadzone": {"width": "1"},
-    "actuator_saturation": {"limit": "1"},
-    "actuator_backlash": {"width": "1"},
-    "constant_force": {"force": "N"},
-    "periodic_force": {"amplitude": "N", "frequency": "Hz", "phase": "rad", "offset": "N"},
-    "gust": {"start": "s", "end": "s", "force": "N"},
-    "viscous_friction": {"coefficient": "N s/m"},
-    "coulomb_friction": {"force": "N"},
-    "quadratic_drag": {"coefficient": "N s2/m2"},
-    "friction_patch": {"start": "m", "end": "m", "coefficient": "N s/m"},
-    "spring": {"stiffness": "N/m", "rest": "m"},
-    "pole_damping": {"coefficient": "N m s/rad"},
-    "track_tilt": {"angle": "rad"},
-    "cart_mass": {"scale": "1"},
-    "pole_mass": {"scale": "1"},
-    "pole_length": {"scale": "1"},
-    "angle_offset": {"offset": "rad"},
-    "measurement_delay": {"delay": "s"},
-    "sensor_scale": {"position": "1", "angle": "1"},
-    "frozen_zone": {"start": "rad", "end": "rad"},
-    "dropout": {"rate": "1"},
-}
-"""units of every parameter by effect"""
-
-FLIGHT_UNITS: dict[str, dict[str, str]] = {
-    **{name: UNITS[name] for name in UNITS if name.startswith("actuator_")},
-    **{name: UNITS[name] for name in ("constant_force", "periodic_force", "quadratic_drag")},
-    "linear_drag": {"coefficient": "N s/m"},
-    "wind": {**{f"velocity_{axis}": "m/s" for axis in "xyz"}, "coefficient": "N s/m"},
-    "periodic_wind": {
-        "amplitude": "m/s",
-        "frequency": "Hz",
-        "phase": "rad",
-        "direction": "rad",
-        "coefficient": "N s/m",
-    },
-    "thrust_gain": {"scale": "1"},
-}
-FLIGHT: dict[str, dict[str, dict[str, str]]] = {
-    "quadrotor": {
-        **FLIGHT_UNITS,
-        "payload": {"mass": "kg"},
-        "battery_sag": {"rate": "1/s"},
-        "center_of_mass_offset": {"x": "m", "y": "m"},
-        "inertia": {f"scale_{axis}": "1" for axis in "xyz"},
-        "rotor_efficiency": {f"scale_{k}": "1" for k in (1, 2, 3, 4)},
-    },
-    "fixed_wing": {
-        **FLIGHT_UNITS,
-        **{name: {"scale": "1"} for name in ("mass", "lift_slope", "drag")},
-        "control_effectiveness": {f"scale_{name}": "1" for name in ("elevator", "aileron", "rudder")},
-        "trim_offset": dict.fromkeys(("elevator", "aileron", "rudder"), "rad"),
-    },
-}
-"""the same of the vehicles"""
-
-DELAYS = {"actuator_delay": "measurement_delay", "measurement_delay": "actuator_delay"}
-ALIKE: dict[str, dict[str, str]] = {
-    "cartpole": {"actuator_bias": "constant_force", "constant_force": "actuator_bias", **DELAYS},
-    "quadrotor": {"thrust_gain": "payload", "payload": "thrust_gain", **DELAYS},
-    "fixed_wing": DELAYS,
-}
-"""pairs that fit all data of a system equally well"""
-
-
-def units_of(system: str) -> dict[str, dict[str, str]]:
-    """Units of every parameter by effect."""
-    return FLIGHT.get(system, UNITS)
+from benchmarks.blind.scoring import Answer, region_of
+from visadapt.effects import EFFECTS
+from visadapt.effects.catalogue import catalogue, twins
+from visadapt.systems import SYSTEMS
 
 
 def answer_of(data: Data, fits: Sequence[Fit], verdict: str) -> Answer:
@@ -140,10 +69,12 @@ def cause_of(effect: str, values: Values, deviations: Values, data: Data, probab
     elif effect == "frozen_zone" and isinstance(data, Steps):
         own["start"], own["end"] = data.zone or (0.0, 0.0)
     parameters: dict[str, Any] = {}
-    for name, unit in units_of(data.system)[effect].items():
+    for parameter in EFFECTS[effect].table:
+        name = parameter.name
         interval = [own[name] - 1.645 * spread[name], own[name] + 1.645 * spread[name]] if name in spread else None
-        parameters[name] = {"value": own[name], "unit": unit, "ci90": interval}
-    alike = [name for own_name, name in ALIKE[data.system].items() if own_name == effect]
+        parameters[name] = {"value": own[name], "unit": parameter.unit, "ci90": interval}
+    system = SYSTEMS[data.system]()
+    alike = [twin.name for twin in twins(EFFECTS[effect], catalogue(system), system)]
     return {
         "effect": effect,
         "parameters": parameters,
@@ -154,7 +85,9 @@ def cause_of(effect: str, values: Values, deviations: Values, data: Data, probab
 
 
 def _region(cause: dict[str, Any]) -> list[dict[str, Any]]:
-    if cause["effect"] not in REGION:
+    region = region_of(cause["effect"])
+    if region is None:
         return []
-    start, end = (cause["parameters"][name]["value"] for name in ("start", "end"))
-    return [{"variable": REGION[cause["effect"]], "from": start, "to": end, "share": 1.0, "p_value": None}]
+    variable, *edges = region
+    start, end = (cause["parameters"][name]["value"] for name in edges)
+    return [{"variable": variable, "from": start, "to": end, "share": 1.0, "p_value": None}]

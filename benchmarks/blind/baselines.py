@@ -21,11 +21,13 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.blind.answers import answer_of, cause_of, units_of
+from benchmarks.blind.answers import answer_of, cause_of
 from benchmarks.blind.fitting import Candidate, Data, Fit, candidates, chi_squared, fit
 from benchmarks.blind.flight_onestep import flight_candidates, read_flights, system_of
 from benchmarks.blind.onestep import NEUTRAL, PERIOD, Values, read_steps
 from benchmarks.blind.scoring import Answer
+from datasets.blind import flight_kinds
+from datasets.blind.kinds import NAMED
 
 POOR = 1.5
 """chi-squared for each residual from which a fit is called poor"""
@@ -43,6 +45,12 @@ def opened(path: Path) -> tuple[Data, list[Candidate]]:
         return read_flights(path), flight_candidates(system)
     data = read_steps(path)
     return data, candidates(data)
+
+
+def core(system: str) -> list[str]:
+    """The names of the effects that a set's core is drawn from, sorted: those that the baselines know."""
+    kinds = NAMED if system == "cartpole" else flight_kinds.named("core", system)
+    return sorted(kind.name for kind in kinds)
 
 
 def afternoon(path: Path) -> Answer:
@@ -177,7 +185,7 @@ def chance(path: Path) -> Answer:
         int.from_bytes(hashlib.sha256(f"{path.parent.name}/{path.name}".encode()).digest()[:8], "big")
     )
     system = system_of(path)
-    effects = sorted(units_of(system))
+    effects = core(system)
     guess = int(rng.choice(5, p=MIX if system == "cartpole" else FLIGHT_MIX))
     named = [str(n) for n in rng.choice(effects, guess, replace=False)] if guess < 4 else []
     rest = [[str(n)] for n in rng.choice(effects, 2, replace=False)]

@@ -36,6 +36,7 @@ from benchmarks.blind.scoring import Answer, Score, Truth, score
 from benchmarks.blind.tables import Row, confusion, label, read_table, tabulate, write_csv, write_table
 from datasets.blind import flights as blind_flights
 from datasets.blind import gaps as blind_gaps
+from datasets.blind.kinds import Effects
 
 Kind = Literal["easy", "hard", "quadrotor", "fixed_wing"]
 """A set of the cart-pole, or the one of a vehicle."""
@@ -54,6 +55,8 @@ class Settings:
     """of the recordings"""
     kinds: tuple[Kind, ...] = ("easy", "hard")
     """which sets of the cart-pole"""
+    effects: Effects = "core"
+    """what the recordings are drawn from: the core of the catalogue, the rest of it, or all"""
     diagnosers: tuple[str, ...] = ("ours", *BASELINES)
     """who is scored"""
     jobs: int = 1
@@ -76,9 +79,13 @@ class Settings:
 
     @property
     def asked(self) -> tuple[str, ...]:
-        """Diagnosers that know the system."""
-        flying = ("ours", *FLYING)
-        return tuple(name for name in self.diagnosers if self.system == "cartpole" or name in flying)
+        """Diagnosers that know the system and the effects: the baselines know the core alone."""
+        known = DIAGNOSERS if self.system == "cartpole" else ("ours", *FLYING)
+        return tuple(name for name in self.diagnosers if name in (known if self.effects == "core" else ("ours",)))
+
+    def label(self, kind: Kind) -> str:
+        """The name of a set in tables and folders."""
+        return kind if self.effects == "core" else f"{kind}-{self.effects}"
 
 
 def ours(path: Path) -> Answer:
@@ -178,12 +185,14 @@ def recordings_of(settings: Settings, kind: Kind) -> Path:
     """The folder of a set, made where it is not there or not whole."""
     if settings.data is not None:
         return settings.data
-    folder = Path("data/blind") / f"{kind}-{settings.count}-{settings.seed}"
+    folder = Path("data/blind") / f"{settings.label(kind)}-{settings.count}-{settings.seed}"
     if len(list(folder.glob("*.csv"))) != settings.count or not key_of(folder).exists():
         if kind == "easy" or kind == "hard":
-            blind_gaps.main(blind_gaps.Settings(folder, kind, settings.count, settings.seed))
+            blind_gaps.main(blind_gaps.Settings(folder, kind, settings.count, settings.seed, effects=settings.effects))
         else:
-            blind_flights.main(blind_flights.Settings(folder, kind, settings.count, settings.seed))
+            blind_flights.main(
+                blind_flights.Settings(folder, kind, settings.count, settings.seed, effects=settings.effects)
+            )
     return folder
 
 
@@ -236,8 +245,8 @@ def main(settings: Settings) -> None:
             answers = {path.name: lines[path.name].get("answer", FAILED) for path in recordings}
             judged = [(file, truths[file], answer, score(truths[file], answer)) for file, answer in answers.items()]
             seconds = [lines[path.name]["seconds"] for path in recordings]
-            own = tabulate(kind, name, [j[3] for j in judged], seconds)
-            taken += confusion(kind, name, [(j[1], j[2]) for j in judged])
+            own = tabulate(settings.label(kind), name, [j[3] for j in judged], seconds)
+            taken += confusion(settings.label(kind), name, [(j[1], j[2]) for j in judged])
             rows += own
             for row in own:
                 print(f"{kind} {name:10s} {row.measure:50s} {row.value:8.3f} [{row.low:.3f}, {row.high:.3f}] n={row.n}")

@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 
 from benchmarks.blind.onestep import Array, Steps, Values
 
-HELD = ("dropout", "frozen_zone")
-"""effects that show as exact repeats; nothing is fitted"""
-
 
 class Data(Protocol):
     """A recording as one-step errors under any parameters: of a cart-pole or of a flight."""

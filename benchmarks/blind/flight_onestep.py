@@ -18,7 +18,7 @@ from benchmarks.blind.fitting import Candidate, Free, on_any, one
 from benchmarks.blind.onestep import Array, Values, actuate
 from datasets.blind import flight_kinds as blind_flight_kinds
 from datasets.blind.flight_control import PERIODS
-from datasets.blind.flight_plants import PLANTS, Motion, step
+from datasets.blind.flight_plants import PLANTS, RESTING, Motion, step
 from datasets.blind.flights import ACTIONS, NOISE, STATES, as_states
 
 SUBSTEPS = 4
@@ -102,7 +102,7 @@ def _motion(state: Array) -> Motion:
         ],
         -1,
     ).reshape(-1, 3, 3)
-    return Motion(state[:, :3], state[:, 3:6], turned, state[:, 10:])
+    return Motion(state[:, :3], state[:, 3:6], turned, state[:, 10:], RESTING)
 
 
 def system_of(path: Path) -> str:

@@ -12,56 +12,10 @@ from dataclasses import dataclass, field
 from itertools import permutations
 from typing import Any
 
+from visadapt.effects import EFFECTS, Role
+from visadapt.estimation.profiles import PROFILES
+
 LARGEST_CLASS = 3
-
-SIZE: dict[str, tuple[str, float]] = {
-    "actuator_gain": ("scale", 1.0),
-    "actuator_bias": ("offset", 0.0),
-    "actuator_delay": ("delay", 0.0),
-    "actuator_lag": ("time_constant", 0.0),
-    "actuator_deadzone": ("width", 0.0),
-    "actuator_saturation": ("limit", 0.0),
-    "actuator_backlash": ("width", 0.0),
-    "constant_force": ("force", 0.0),
-    "periodic_force": ("amplitude", 0.0),
-    "gust": ("force", 0.0),
-    "viscous_friction": ("coefficient", 0.0),
-    "coulomb_friction": ("force", 0.0),
-    "quadratic_drag": ("coefficient", 0.0),
-    "friction_patch": ("coefficient", 0.0),
-    "spring": ("stiffness", 0.0),
-    "pole_damping": ("coefficient", 0.0),
-    "track_tilt": ("angle", 0.0),
-    "cart_mass": ("scale", 1.0),
-    "pole_mass": ("scale", 1.0),
-    "pole_length": ("scale", 1.0),
-    "angle_offset": ("offset", 0.0),
-    "measurement_delay": ("delay", 0.0),
-    "dropout": ("rate", 0.0),
-    "linear_drag": ("coefficient", 0.0),
-    "periodic_wind": ("amplitude", 0.0),
-    "thrust_gain": ("scale", 1.0),
-    "payload": ("mass", 0.0),
-    "battery_sag": ("rate", 0.0),
-    "mass": ("scale", 1.0),
-    "lift_slope": ("scale", 1.0),
-    "drag": ("scale", 1.0),
-}
-"""the parameter that says how large an effect is, and its value where the effect does nothing"""
-
-LARGEST: dict[str, tuple[tuple[str, ...], float]] = {
-    "sensor_scale": (("position", "angle"), 1.0),
-    "wind": (("velocity_x", "velocity_y", "velocity_z"), 0.0),
-    "center_of_mass_offset": (("x", "y"), 0.0),
-    "inertia": (("scale_x", "scale_y", "scale_z"), 1.0),
-    "rotor_efficiency": (("scale_1", "scale_2", "scale_3", "scale_4"), 1.0),
-    "control_effectiveness": (("scale_elevator", "scale_aileron", "scale_rudder"), 1.0),
-    "trim_offset": (("elevator", "aileron", "rudder"), 0.0),
-}
-"""effects with several such parameters, of which the one counts that is furthest from doing nothing"""
-
-REGION = {"friction_patch": "x", "gust": "time", "frozen_zone": "theta"}
-"""effects that live in a region, and the variable of `where.regions` that shows it"""
 
 Answer = dict[str, Any]
 
@@ -71,7 +25,7 @@ class Truth:
     """One recording's line in the key."""
 
     kind: str
-    """single, pair, triple, none or foreign"""
+    """single, pair, triple, none (that a recording could show) or foreign"""
     effects: dict[str, dict[str, float]]
     """parameters by effect"""
     strengths: dict[str, float]
@@ -132,6 +86,21 @@ def classes(answer: Answer) -> list[set[str]]:
     return merged
 
 
+def sizes(effect: str) -> dict[str, float]:
+    """The parameters that say how large an effect is, those of one unit, with their values where it does nothing."""
+    strengths = [parameter for parameter in EFFECTS[effect].table if parameter.is_strength]
+    return {p.name: p.neutral for p in strengths if p.unit == strengths[0].unit and p.neutral is not None}
+
+
+def region_of(effect: str) -> tuple[str, str, str] | None:
+    """For an effect that acts in a region: the variable along which it lies, and the parameters of start and end."""
+    edges = EFFECTS[effect].region()
+    if edges is None:
+        return None
+    places = next(profile.places for kind, profile in PROFILES.items() if issubclass(kind, EFFECTS[effect].systems))
+    return places[edges[0].unit], edges[0].name, edges[1].name
+
+
 def matches(effects: set[str], groups: list[set[str]]) -> bool:
     """Whether every effect finds a class of its own that is small enough."""
     small = [group for group in groups if len(group) <= LARGEST_CLASS]
@@ -147,7 +116,8 @@ def score(truth: Truth, answer: Answer) -> Score:
     result = Score(truth.kind, answer["verdict"])
     if answer["verdict"] == "identified":
         result.closed = (answer.get("gap") or {}).get("closed")
-    groups, effects = classes(answer), set(truth.effects)
+    # Nothing is to be found of what no recording can show.
+    groups, effects = classes(answer), set() if truth.kind == "none" else set(truth.effects)
     ranking = answer.get("ranking") or []
     if truth.kind != "foreign" and ranking and ranking[0].get("probability") is not None:
         result.probability = float(ranking[0]["probability"])
@@ -166,39 +136,42 @@ def score(truth: Truth, answer: Answer) -> Score:
         for cause in answer["causes"]:
             if cause["effect"] in effects:
                 _parameters(result, cause, truth.effects[cause["effect"]])
-    for effect in sorted(effects & REGION.keys()):
-        result.overlaps.append(_overlap(answer, REGION[effect], truth.effects[effect]))
+    for effect in sorted(effects):
+        if (region := region_of(effect)) is not None:
+            variable, *edges = region
+            start, end = (truth.effects[effect][edge] for edge in edges)
+            result.overlaps.append(_overlap(answer, variable, start, end))
     return result
 
 
 def _parameters(result: Score, cause: dict[str, Any], true: dict[str, float]) -> None:
-    name, neutral = SIZE.get(cause["effect"], ("", 0.0))
-    if cause["effect"] in LARGEST:
-        names, neutral = LARGEST[cause["effect"]]
-        name = max(names, key=lambda n: abs(true[n] - neutral))
+    neutral = sizes(cause["effect"])
+    # Of several sizes the one that is furthest from doing nothing.
+    name = max(neutral, key=lambda n: abs(true[n] - neutral[n]), default="")
+    phases = {p.name for p in EFFECTS[cause["effect"]].table if p.role is Role.PHASE}
     for parameter, estimate in cause["parameters"].items():
         if parameter not in true or estimate.get("value") is None:
             continue
         value, truth = float(estimate["value"]), true[parameter]
-        if parameter == name and truth not in (0.0, neutral):
+        if parameter == name and truth not in (0.0, neutral[name]):
             result.errors.append(abs(value - truth) / abs(truth))
-            result.deviations.append(abs(value - truth) / abs(truth - neutral))
+            result.deviations.append(abs(value - truth) / abs(truth - neutral[name]))
         interval = estimate.get("ci90")
         if interval and None not in interval:
             low, high = interval
-            if parameter == "phase":
+            if parameter in phases:
                 # The turn that lies nearest to the interval.
                 truth += 2 * math.pi * round(((low + high) / 2 - truth) / (2 * math.pi))
             result.covered.append(bool(low <= truth <= high))
 
 
-def _overlap(answer: Answer, variable: str, true: dict[str, float]) -> float:
+def _overlap(answer: Answer, variable: str, start: float, end: float) -> float:
     """With the region of that variable that has the largest share of the gap."""
     regions = (answer.get("where") or {}).get("regions") or []
     own = [region for region in regions if region["variable"] == variable]
     if not own:
         return 0.0
     best = max(own, key=lambda region: region.get("share") or 0.0)
-    common = min(best["to"], true["end"]) - max(best["from"], true["start"])
-    whole = max(best["to"], true["end"]) - min(best["from"], true["start"])
+    common = min(best["to"], end) - max(best["from"], start)
+    whole = max(best["to"], end) - min(best["from"], start)
     return max(0.0, common) / whole if whole > 0 else 0.0

@@ -23,6 +23,7 @@ NONE: dict[str, float] = {
     "even_motor.coefficient": 0.0,
     "fading_gain.rate": 0.0,
     "angle_offset.offset": 0.0,
+    "position_offset.offset": 0.0,
     "measurement_delay.delay": 0.0,
     "sensor_scale.position": 1.0,
     "sensor_scale.angle": 1.0,
@@ -112,6 +113,7 @@ class Sensing:
         y[:2] *= p["sensor_scale.position"]
         y[2:] *= p["sensor_scale.angle"]
         y[2] += p["angle_offset.offset"]
+        y[0] += p["position_offset.offset"]
         turns = state[0] / p["encoder_ripple.wavelength"]
         y[0] += p["encoder_ripple.amplitude"] * np.sin(2 * np.pi * turns + p["encoder_ripple.phase"])
         y[2] += p["angle_drift.rate"] * t

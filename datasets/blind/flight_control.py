@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from datasets.blind.flight_plants import Array, Motion, Parameters
+from datasets.blind.flight_plants import RESTING, Array, Motion, Parameters
 
 PERIODS = {"quadrotor": 0.1, "fixed_wing": 0.05}
 """s between commands"""
@@ -121,7 +121,7 @@ def starts(system: str, fly: Flyers) -> Motion:
         ],
         -1,
     ).reshape(-1, 3, 3)
-    return Motion(first[:, :3], velocity, turned, np.zeros_like(velocity))
+    return Motion(first[:, :3], velocity, turned, np.zeros_like(velocity), RESTING)
 
 
 class Chain:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from datasets.blind.kinds import Build, Draw, Kind, Shape
+from datasets.blind.kinds import Build, Draw, Effects, Kind, Shape
 
 BOTH, QUADROTOR, WING = ("quadrotor", "fixed_wing"), ("quadrotor",), ("fixed_wing",)
 
@@ -36,6 +36,13 @@ NEUTRAL: dict[str, float] = {
             "thrust_curve.share",
             "crossed_rates.share",
             "crossed_surfaces.share",
+            *(f"rotor_drag.coefficient_{axis}" for axis in "xyz"),
+            "translational_lift.coefficient",
+            "motor_lag.time_constant",
+            *(f"rate_damping.rate_{axis}" for axis in "xyz"),
+            "ground_effect.radius",
+            "ground_effect.ground",
+            "dropout.rate",
         ),
         0.0,
     ),
@@ -82,6 +89,11 @@ def _directed(names: tuple[str, ...]) -> Draw:
         return {name: float(value) for name, value in zip(names, direction, strict=True)}
 
     return draw
+
+
+def _slowing(names: tuple[str, ...]) -> Draw:
+    """The same among positive parameters."""
+    return lambda rng, _: {name: abs(value) for name, value in _directed(names)(rng, 0.0).items()}
 
 
 def _along(size: float, shape: Shape) -> Shape:
@@ -166,7 +178,34 @@ NAMED: tuple[tuple[Kind, tuple[str, ...]], ...] = (
     ),
     (Kind("trim_offset", "dynamics", 0.0005, 0.06, _along, _directed(SURFACES)), WING),
 )
-"""The catalogue's effects that the check draws from, and on which vehicle."""
+"""The core of the catalogue, from which the sets 2032 are drawn, and on which vehicle."""
+
+REST: tuple[tuple[Kind, tuple[str, ...]], ...] = (
+    (
+        Kind("rotor_drag", "dynamics", 0.01, 1.5, _along, _slowing(tuple(f"coefficient_{axis}" for axis in "xyz"))),
+        QUADROTOR,
+    ),
+    (Kind("translational_lift", "dynamics", 0.003, 0.6, _plain("coefficient")), QUADROTOR),
+    (Kind("motor_lag", "actuation", 0.008, 0.15, _plain("time_constant")), QUADROTOR),
+    (
+        Kind("rate_damping", "dynamics", 0.1, 18.0, _along, _slowing(tuple(f"rate_{axis}" for axis in "xyz"))),
+        QUADROTOR,
+    ),
+    # The ground lies below nearly all of the places that are flown to.
+    (
+        Kind(
+            "ground_effect",
+            "dynamics",
+            0.1,
+            1.0,
+            lambda size, shape: {"radius": size, **shape},
+            lambda rng, _: {"ground": float(rng.uniform(-1.8, -1.2))},
+        ),
+        QUADROTOR,
+    ),
+    (Kind("dropout", "sensing", 0.003, 0.5, _plain("rate")), BOTH),
+)
+"""The rest of the catalogue."""
 
 FOREIGN: tuple[tuple[Kind, tuple[str, ...]], ...] = (
     (Kind("one_way_drag", "dynamics", 0.05, 3.0, _plain("coefficient")), BOTH),
@@ -177,3 +216,9 @@ FOREIGN: tuple[tuple[Kind, tuple[str, ...]], ...] = (
     (Kind("crossed_surfaces", "dynamics", 0.02, 1.0, _signed("share"), _sign), WING),
 )
 """What no name of the catalogue stands for."""
+
+
+def named(effects: Effects, system: str) -> list[Kind]:
+    """The kinds of the catalogue that a set of a vehicle is drawn from."""
+    groups = {"core": NAMED, "rest": REST, "all": NAMED + REST}
+    return [kind for kind, systems in groups[effects] if system in systems]

@@ -35,6 +35,8 @@ class Motion:
     """(N, 3, 3)"""
     rates: Array
     """(N, 3) rad/s"""
+    motors: Array
+    """(N or 1, 4) what a quadrotor's motors give: thrust in m/s2, torques in N m; used where they lag"""
 
     def plus(self, other: Motion, h: float) -> Motion:
         """A step of `h` along a derivative."""
@@ -43,6 +45,7 @@ class Motion:
             self.velocity + h * other.velocity,
             self.turned + h * other.turned,
             self.rates + h * other.rates,
+            self.motors + h * other.motors,
         )
 
 
@@ -102,6 +105,8 @@ def _pushes(p: Parameters, t: float, at: Motion) -> Array:
 ARM, RATE_GAINS = 0.2, np.array([16.6, 16.6, 5.0])
 LEAST, MOST = 2.21, 17.31
 """m/s2 of thrust at commands of -1 and 1"""
+RESTING = np.array([[(LEAST + MOST) / 2, 0.0, 0.0, 0.0]])
+"""thrust and torques of motors that a command of 0 has driven for long"""
 INERTIA = ARM**2 / 12 * np.array([4.5, 4.5, 7.0])
 """kg m2 of a mass of 1 kg"""
 ROLL = np.array([1.0, -1.0, -1.0, 1.0]) * ARM / np.sqrt(2)
@@ -117,20 +122,40 @@ def quadrotor(p: Parameters, t: float, at: Motion, command: Array) -> Motion:
     w = at.rates
     asked = (LEAST + MOST) / 2 + (MOST - LEAST) / 2 * command[:, 0]
     asked = asked * (1 + p["thrust_curve.share"] * command[:, 0] ** 2)
-    thrust = asked * p["thrust_gain.scale"] * np.exp(-p["battery_sag.rate"] * t)
     rates = 0.5 * command[:, 1:]
     rates[:, 1] += p["crossed_rates.share"] * rates[:, 0]
     torque = INERTIA * RATE_GAINS * (rates - w) + np.cross(w, INERTIA * w)
+    driven = np.concatenate([asked[:, None], torque], 1)
+    constant = p["motor_lag.time_constant"][:, None]
+    motors = np.where(constant > 0, (driven - at.motors) / np.maximum(constant, 1e-9), 0.0)
+    given = np.where(constant > 0, at.motors, driven)
+    thrust, torque = given[:, 0], given[:, 1:]
+    thrust = thrust * p["thrust_gain.scale"] * np.exp(-p["battery_sag.rate"] * t) * _cushion(p, at)
     scales = np.stack([p[f"rotor_efficiency.scale_{k}"] for k in (1, 2, 3, 4)], -1)
     rotors = scales * (np.concatenate([thrust[:, None], torque], 1) @ ALLOCATION.T)
     thrust = rotors.sum(1)
     torque = np.stack([rotors @ ROLL, rotors @ PITCH, rotors @ YAW], -1)
     torque[:, 0] -= p["center_of_mass_offset.y"] * thrust
     torque[:, 1] += p["center_of_mass_offset.x"] * thrust
+    torque = torque - INERTIA * np.stack([p[f"rate_damping.rate_{axis}"] for axis in "xyz"], -1) * w
+    air = np.einsum("nij,ni->nj", at.turned, at.velocity - _wind(p, t))
+    braked = -np.stack([p[f"rotor_drag.coefficient_{axis}"] for axis in "xyz"], -1) * air
+    thrust = thrust + p["translational_lift.coefficient"] * (air[:, 0] ** 2 + air[:, 1] ** 2)
     inertia = INERTIA * np.stack([p[f"inertia.scale_{axis}"] for axis in "xyz"], -1)
-    force = at.turned[:, :, 2] * thrust[:, None] + _pushes(p, t, at)
+    force = at.turned[:, :, 2] * thrust[:, None] + np.einsum("nij,nj->ni", at.turned, braked) + _pushes(p, t, at)
     acceleration = force / (1 + p["payload.mass"])[:, None] - [0, 0, GRAVITY]
-    return Motion(at.velocity, acceleration, _spun(at.turned, w), (torque - np.cross(w, inertia * w)) / inertia)
+    turning = (torque - np.cross(w, inertia * w)) / inertia
+    return Motion(at.velocity, acceleration, _spun(at.turned, w), turning, motors)
+
+
+def _cushion(p: Parameters, at: Motion) -> Array:
+    """The ground's factor on thrust: 1 / (1 - x) with x = (radius / 4 height)^2, which is kept below 1/4.
+
+    The bound, x / (1 + (4 x)^4)^(1/4), is written so that neither a radius nor a height of 0 is divided by.
+    """
+    square, height = p["ground_effect.radius"] ** 2, np.maximum(at.place[:, 2] - p["ground_effect.ground"], 0.0)
+    x = square / np.maximum((4 * height) ** 8 + (4 * square) ** 4, 1e-30) ** 0.25
+    return np.asarray(1 / (1 - x))
 
 
 MASS, AREA, SPAN, CHORD, DENSITY = 1.01, 0.276, 1.54, 0.185, 1.225
@@ -177,7 +202,8 @@ def fixed_wing(p: Parameters, t: float, at: Motion, command: Array) -> Motion:
     world = np.einsum("nij,nj->ni", at.turned, FLIP * force) + _pushes(p, t, at)
     acceleration = world / (MASS * p["mass.scale"])[:, None] - [0, 0, GRAVITY]
     turning = (pressure[:, None] * moment - np.cross(rates, rates @ J.T)) @ J_INVERSE.T
-    return Motion(at.velocity, acceleration, _spun(at.turned, at.rates), FLIP * turning)
+    still = np.zeros_like(at.motors)
+    return Motion(at.velocity, acceleration, _spun(at.turned, at.rates), FLIP * turning, still)
 
 
 PLANTS: dict[str, Plant] = {"quadrotor": quadrotor, "fixed_wing": fixed_wing}

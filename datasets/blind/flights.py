@@ -21,9 +21,9 @@ import numpy as np
 import tyro
 
 from datasets.blind.flight_control import CONTROLLERS, PERIODS, Chain, Flyers, starts
-from datasets.blind.flight_kinds import FOREIGN, NAMED, NEUTRAL
-from datasets.blind.flight_plants import PLANTS, Array, Motion, step
-from datasets.blind.kinds import Kind, Shape
+from datasets.blind.flight_kinds import FOREIGN, NEUTRAL, named
+from datasets.blind.flight_plants import PLANTS, RESTING, Array, Motion, step
+from datasets.blind.kinds import Effects, Kind, Shape
 from datasets.blind.sealing import names, place_of_key, seal
 
 System = Literal["quadrotor", "fixed_wing"]
@@ -60,6 +60,8 @@ class Settings:
     """of everything that is drawn"""
     key: Path | None = None
     """file for the answers; by default beside the folder, <out>.key.json"""
+    effects: Effects = "core"
+    """the catalogue's effects that are drawn: core, as in the sets 2032, rest, those beside it, or all"""
 
 
 @dataclass
@@ -78,6 +80,8 @@ class Draft:
     size: float = 0.0
     strength: float = 0.0
     """at that size"""
+    lottery: Array | None = None
+    """(ROWS, EPISODES), uniform: which rows a dropout loses"""
     readings: Array | None = None
     """(ROWS, EPISODES, 13)"""
     commands: Array | None = None
@@ -113,21 +117,23 @@ def make(settings: Settings) -> list[Draft]:
     mixtures = np.array(list(MIX))[np.searchsorted(np.cumsum(list(MIX.values())), places)]
     order.shuffle(mixtures)
     drafts = [Draft(np.random.default_rng(seed), str(m)) for seed, m in zip(seeds[1:], mixtures, strict=True)]
-    for mixture, kinds in (("single", NAMED), ("foreign", FOREIGN)):
-        own = [kind for kind, systems in kinds if settings.system in systems]
+    foreign = [kind for kind, systems in FOREIGN if settings.system in systems]
+    for mixture, own in (("single", named(settings.effects, settings.system)), ("foreign", foreign)):
         members = [draft for draft in drafts if draft.mixture == mixture]
         chosen = np.concatenate([order.permutation(len(own)) for _ in range(-(-max(1, len(members)) // len(own)))])
         for draft, k in zip(members, chosen, strict=False):
             draft.kind, draft.shape = own[k], own[k].draw(draft.rng, ROWS * PERIODS[settings.system])
             draft.target = float(np.exp(draft.rng.uniform(*np.log(STRENGTHS))))
             draft.size = float(np.sqrt(own[k].low * own[k].high))
+            if own[k].stage == "sensing":
+                draft.lottery = draft.rng.random((ROWS, EPISODES))
     fly = CONTROLLERS[settings.system]([draft.rng for draft in drafts], ROWS, EPISODES)
     _seek([draft for draft in drafts if draft.kind is not None], drafts, settings.system, fly)
     flown = _flown(drafts, settings.system, fly, SUBSTEP)
     for k, draft in enumerate(drafts):
         own_columns = slice(k * EPISODES, (k + 1) * EPISODES)
         noise = draft.rng.normal(size=(ROWS, EPISODES, 13)) * NOISE
-        draft.readings = flown.states[:, own_columns] + noise
+        draft.readings = _read(draft, flown.states[:, own_columns] + noise)
         draft.commands = flown.commands[:, own_columns]
     return drafts
 
@@ -137,8 +143,11 @@ def _seek(searched: list[Draft], drafts: list[Draft], system: System, fly: Flyer
     for _ in range(rounds):
         flown = _flown(drafts, system, fly, 2 * SUBSTEP)
         gaps = _gaps(flown, system).reshape(len(drafts), EPISODES)
-        for draft, own in zip(drafts, gaps, strict=True):
+        for k, (draft, own) in enumerate(zip(drafts, gaps, strict=True)):
             draft.strength = float(np.sqrt(np.mean(own)))
+            if draft.lottery is not None:
+                states = flown.states[:, k * EPISODES : (k + 1) * EPISODES]
+                draft.strength = float(np.sqrt(np.mean(((_read(draft, states) - states) / NOISE) ** 2)))
         for draft in searched:
             assert draft.kind is not None
             if draft.strength > 0 and abs(np.log(draft.target / draft.strength)) > 0.1:
@@ -169,6 +178,16 @@ def _flown(drafts: list[Draft], system: System, fly: Flyers, h: float) -> Flight
     return Flights(motions, np.stack(states), np.stack(commands))
 
 
+def _read(draft: Draft, rows: Array) -> Array:
+    """Rows (ROWS, EPISODES, 13) as they are read: one that a dropout loses repeats the one before."""
+    if draft.lottery is None:
+        return rows
+    out, lost = rows.copy(), draft.lottery < _value(draft, "dropout.rate", 0.0)
+    for row in range(1, ROWS):
+        out[row] = np.where(lost[row][:, None], out[row - 1], rows[row])
+    return out
+
+
 def _value(draft: Draft, name: str, neutral: float) -> float:
     effect, parameter = name.split(".")
     return draft.effects.get(effect, {}).get(parameter, neutral)
@@ -182,7 +201,7 @@ def _gaps(flown: Flights, system: System, every: int = 4) -> Array:
     count = flown.states.shape[1]
     source = {name: np.full(len(rows) * count, value) for name, value in NEUTRAL.items()}
     names = ("place", "velocity", "turned", "rates")
-    at = Motion(*(np.concatenate([getattr(flown.motions[row], name) for row in rows]) for name in names))
+    at = Motion(*(np.concatenate([getattr(flown.motions[row], name) for row in rows]) for name in names), RESTING)
     for k in range(horizon):
         command = np.concatenate([flown.commands[row + k] for row in rows])
         for _ in range(round(period / (5 * SUBSTEP))):

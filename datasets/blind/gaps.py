@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 
 from datasets.blind.control import draw_driver
-from datasets.blind.kinds import FOREIGN, INSEPARABLE, KINDS, NAMED, Shape
+from datasets.blind.kinds import FOREIGN, INSEPARABLE, KINDS, NAMED, REST, Effects, Shape
 from datasets.blind.plant import PERIOD, Array
 from datasets.blind.sealing import names, place_of_key, seal
 from datasets.blind.simulation import Case, Run, simulate
@@ -44,6 +44,8 @@ class Settings:
     """weakest and strongest effect, in units of the noise; by default 2 to 30 (easy) or 0.7 to 6 (hard)"""
     key: Path | None = None
     """file for the answers; by default beside the folder, <out>.key.json"""
+    effects: Effects = "core"
+    """the catalogue's effects that are drawn: core, as in the sets 2028 and 2029, rest, those beside it, or all"""
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ class Draft:
     rng: np.random.Generator
     """its own random numbers, so that one redrawn recording leaves all others alone"""
     mixture: str
-    """single, pair, triple, none or foreign"""
+    """single, pair, triple, none (that a recording could show) or foreign"""
     case: Case | None = None
     """its machine, controller and noise"""
     run: Run | None = None
@@ -125,6 +127,9 @@ def make(settings: Settings) -> list[Draft]:
         if not 0 < weakest < strongest:
             raise ValueError(f"strengths are {weakest:g} and {strongest:g}, must be positive and rise")
         difficulty = replace(difficulty, strengths=settings.strengths)
+    if settings.effects == "rest":
+        # No recording shows these effects: the right answer is that of a recording without any.
+        difficulty = replace(difficulty, mix={"none": 1.0})
     seeds = np.random.SeedSequence([settings.seed, list(DIFFICULTIES).index(settings.kind)]).spawn(settings.count + 1)
     # Shares as even as the count allows, in an order that says nothing.
     edges = np.cumsum(list(difficulty.mix.values()))
@@ -136,11 +141,11 @@ def make(settings: Settings) -> list[Draft]:
         pending = [draft for draft in drafts if draft.run is None]
         if not pending:
             return drafts
-        _attempt(pending, difficulty, 0.95 ** (attempt // 2))
+        _attempt(pending, difficulty, settings.effects, 0.95 ** (attempt // 2))
     raise RuntimeError("some recordings could not be kept on the track; another seed will do")
 
 
-def _attempt(drafts: list[Draft], difficulty: Difficulty, excitation: float) -> None:
+def _attempt(drafts: list[Draft], difficulty: Difficulty, effects: Effects, excitation: float) -> None:
     """Draw each draft anew, seek the sizes, run it, and keep what stayed up and has the strengths it should."""
     deviations = np.array(difficulty.noise)[[0, 2]]
     cases = [_draw_case(draft.rng, difficulty, excitation) for draft in drafts]
@@ -149,7 +154,7 @@ def _attempt(drafts: list[Draft], difficulty: Difficulty, excitation: float) -> 
     kept = [(draft, case) for draft, case, run in zip(drafts, cases, bare, strict=True) if _stayed(run)]
     parts: list[list[Job]] = []
     for draft, case in kept:
-        chosen = _draw_kinds(draft.rng, draft.mixture)
+        chosen = _draw_kinds(draft.rng, draft.mixture, effects)
         parts.append([_draw_job(draft.rng, name, case, difficulty) for name in chosen])
     _seek([job for own in parts for job in own], difficulty.velocities, deviations)
     weakest, strongest = difficulty.strengths
@@ -169,7 +174,9 @@ def _stayed(run: Run) -> bool:
     return x <= CART_REACH and theta <= POLE_REACH
 
 
-def _draw_kinds(rng: np.random.Generator, mixture: str) -> list[str]:
+def _draw_kinds(rng: np.random.Generator, mixture: str, effects: Effects) -> list[str]:
+    if mixture == "none" and (effects == "rest" or (effects == "all" and rng.random() < 0.5)):
+        return [REST[int(rng.integers(len(REST)))].name]
     kinds = FOREIGN if mixture == "foreign" else NAMED
     while True:
         chosen = [kinds[i].name for i in rng.choice(len(kinds), SIZES[mixture], replace=False)]

@@ -8,11 +8,12 @@ import pytest
 import torch
 
 from benchmarks.blind.flight_onestep import system_of
-from benchmarks.blind.scoring import LARGEST, SIZE
-from datasets.blind.flight_kinds import NAMED, NEUTRAL
-from datasets.blind.flight_plants import PLANTS, Motion
-from datasets.blind.flights import ACTIONS, STATES, Settings, as_states, lines, main, make
-from visadapt.effects import EFFECTS, ActuationEffect
+from benchmarks.blind.scoring import sizes
+from datasets.blind.flight_kinds import NAMED, NEUTRAL, REST, named
+from datasets.blind.flight_plants import PLANTS, RESTING, Motion, quadrotor, step
+from datasets.blind.flights import ACTIONS, NOISE, STATES, Settings, as_states, lines, main, make
+from visadapt.effects import EFFECTS, DynamicsEffect
+from visadapt.effects.catalogue import catalogue
 from visadapt.systems import SYSTEMS
 from visadapt.systems.rigid_body import rotation
 from visadapt.world import World
@@ -28,7 +29,7 @@ def test_columns_are_the_library_s(system):
 
 @pytest.mark.parametrize(
     ("kind", "system"),
-    [(kind, system) for kind, systems in NAMED for system in systems],
+    [(kind, system) for kind, systems in NAMED + REST for system in systems],
     ids=lambda x: getattr(x, "name", x),
 )
 def test_an_effect_is_the_catalogue_s(kind, system):
@@ -37,7 +38,7 @@ def test_an_effect_is_the_catalogue_s(kind, system):
     parameters = kind.build(kind.high / 2, kind.draw(rng, 10.0))
     effect = EFFECTS[kind.name](**parameters).double()
     assert isinstance(SYSTEMS[system](), effect.systems)
-    if isinstance(effect, ActuationEffect):
+    if not isinstance(effect, DynamicsEffect):
         return
     generator = torch.Generator().manual_seed(1)
     count = 6
@@ -59,7 +60,7 @@ def test_an_effect_is_the_catalogue_s(kind, system):
         for name, neutral in NEUTRAL.items()
     }
     motion = Motion(
-        state[:, :3].numpy(), state[:, 3:6].numpy(), rotation(state[:, 6:10]).numpy(), state[:, 10:].numpy()
+        state[:, :3].numpy(), state[:, 3:6].numpy(), rotation(state[:, 6:10]).numpy(), state[:, 10:].numpy(), RESTING
     )
     found = PLANTS[system](p, 0.7, motion, command.numpy())
     np.testing.assert_allclose(found.velocity, expected[:, 3:6].numpy(), atol=1e-5)
@@ -67,11 +68,52 @@ def test_an_effect_is_the_catalogue_s(kind, system):
     np.testing.assert_allclose(as_states(motion, None)[:, 6:10], state[:, 6:10].numpy(), atol=1e-5)
 
 
-@pytest.mark.parametrize(("kind", "systems"), NAMED, ids=lambda x: getattr(x, "name", ""))
-def test_every_named_effect_has_a_size_that_is_scored(kind, systems):
+@pytest.mark.parametrize("kind", [kind for kind, _ in NAMED + REST], ids=lambda kind: kind.name)
+def test_every_named_effect_has_a_size_that_is_scored(kind):
     parameters = kind.build(kind.high, kind.draw(np.random.default_rng(0), 10.0))
-    names = LARGEST[kind.name][0] if kind.name in LARGEST else (SIZE[kind.name][0],)
-    assert set(names) <= parameters.keys() == {p.name for p in EFFECTS[kind.name].table}
+    assert sizes(kind.name).keys() <= parameters.keys() == {p.name for p in EFFECTS[kind.name].table}
+
+
+@pytest.mark.parametrize("system", SYSTEM_NAMES)
+def test_every_effect_of_the_catalogue_is_drawn_once(system):
+    effects = sorted(effect.name for effect in catalogue(SYSTEMS[system]()))
+    assert sorted(kind.name for kind in named("all", system)) == effects
+    assert sorted(kind.name for kind in named("core", system) + named("rest", system)) == effects
+
+
+def test_lagging_motors_are_the_catalogue_s():
+    """Two seconds of a quadrotor under steps of the command, by both codes."""
+    constant, period, substeps = 0.06, 0.1, 20
+    effect = EFFECTS["motor_lag"](time_constant=constant).double()
+    world = World(SYSTEMS["quadrotor"](), [effect], period, substeps=substeps)
+    state = torch.zeros(1, 13, dtype=torch.float64)
+    state[:, 6] = 1.0
+    at = world.start(state)
+    p = {name: np.full(1, neutral) for name, neutral in NEUTRAL.items()}
+    p["motor_lag.time_constant"][:] = constant
+    motion = Motion(np.zeros((1, 3)), np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 3)), RESTING)
+    rng = np.random.default_rng(0)
+    for row in range(20):
+        command = rng.uniform(-0.5, 0.5, (1, 4))
+        with torch.no_grad():
+            at = world.step(at, torch.as_tensor(command))
+        for k in range(substeps):
+            now = row * period + k * period / substeps
+            motion = step(quadrotor, p, now, motion, command, period / substeps)
+    # The library's substep has the mean of a lagging command, and the two lag gyroscopic torques differently.
+    np.testing.assert_allclose(as_states(motion, at.state[:, 6:10].numpy()), at.state.numpy(), atol=2e-3)
+
+
+def test_a_dropout_repeats_rows_at_its_rate():
+    drafts = make(Settings(Path("unused"), "fixed_wing", 4, seed=1, effects="rest"))
+    dropped = [draft for draft in drafts if draft.kind is not None and draft.kind.name == "dropout"]
+    assert dropped
+    for draft in dropped:
+        repeats = (draft.readings[1:] == draft.readings[:-1]).all(-1)
+        assert repeats.mean() == pytest.approx(draft.effects["dropout"]["rate"], abs=0.05)
+        assert draft.strength == pytest.approx(draft.target, rel=0.25)
+        moves = np.abs(np.diff(draft.readings, axis=0))[~repeats]
+        assert (moves > 0.01 * NOISE).mean() > 0.9
 
 
 def test_a_set_is_sealed_and_the_same_again(tmp_path, capsys):

@@ -11,9 +11,11 @@ from scipy.integrate import solve_ivp
 
 from datasets.blind.chain import NONE, Actuation, Sensing
 from datasets.blind.gaps import CART_REACH, POLE_REACH, Settings, key_text, lines, main, make
-from datasets.blind.kinds import FOREIGN, KINDS, NAMED
+from datasets.blind.kinds import FOREIGN, KINDS, NAMED, REST
 from datasets.blind.plant import MAX_FORCE, PERIOD, nominal, predict
 from datasets.blind.simulation import Case, simulate
+from visadapt.effects.catalogue import catalogue
+from visadapt.systems import CartPole
 
 
 def barto(t, s, force, torque=0.0):
@@ -207,11 +209,11 @@ def test_recordings_stay_up_and_strengths_are_in_range(drafts):
 
 
 def test_kinds_are_named_once_and_shared_by_no_side():
-    assert len(KINDS) == len(NAMED) + len(FOREIGN)
+    assert len(KINDS) == len(NAMED) + len(REST) + len(FOREIGN)
     assert len(FOREIGN) >= 10
 
 
-@pytest.mark.parametrize("kind", [k.name for k in NAMED + FOREIGN])
+@pytest.mark.parametrize("kind", [k.name for k in NAMED + REST + FOREIGN])
 def test_every_kind_acts(bare, kind):
     rng = np.random.default_rng(0)
     quiet = simulate([bare], False, 10)[0]
@@ -221,6 +223,18 @@ def test_every_kind_acts(bare, kind):
     changed = run.clean if effect.stage == "sensing" else run.true
     against = run.true if effect.stage == "sensing" else quiet.true
     assert np.abs(changed - against)[:, [0, 2]].max() > 1e-4
+
+
+def test_every_effect_of_the_catalogue_is_drawn_once():
+    assert sorted(k.name for k in NAMED + REST) == sorted(effect.name for effect in catalogue(CartPole()))
+
+
+def test_a_set_of_the_rest_has_what_no_recording_shows():
+    (draft,) = make(Settings(Path("unused"), "easy", 1, seed=1, effects="rest"))
+    assert draft.mixture == "none"
+    offset = draft.case.effects["position_offset"]["offset"]
+    np.testing.assert_allclose(draft.run.clean[:, 0] - draft.run.true[:, 0], offset)
+    np.testing.assert_allclose(draft.run.clean[:, 1:], draft.run.true[:, 1:])
 
 
 def test_the_key_is_sealed_and_everything_repeats(tmp_path, capsys, drafts):

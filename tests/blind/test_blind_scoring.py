@@ -9,10 +9,9 @@ import pytest
 from benchmarks.blind import diagnosis as blind_diagnosis
 from benchmarks.blind.baselines import afternoon, chance
 from benchmarks.blind.diagnosis import Settings, diagnose_one, read_log, run_one, write
-from benchmarks.blind.scoring import LARGEST, REGION, SIZE, Truth, classes, matches, score
+from benchmarks.blind.scoring import Truth, classes, matches, region_of, score, sizes
 from benchmarks.blind.tables import Row, confusion, label, read_table, tabulate
-from datasets.blind import flight_kinds as blind_flight_kinds
-from datasets.blind.kinds import NAMED
+from visadapt.effects.catalogue import catalogue
 from visadapt.evaluation.intervals import wilson
 
 
@@ -174,10 +173,26 @@ def test_wilsons_interval():
 
 
 def test_every_named_kind_can_be_scored():
-    in_flight = {kind.name for kind, _ in blind_flight_kinds.NAMED}
-    named = {kind.name for kind in NAMED}
-    assert named | in_flight == SIZE.keys() | LARGEST.keys() | {"frozen_zone"}
-    assert REGION.keys() <= named
+    for effect in catalogue():
+        assert sizes(effect.name) or region_of(effect.name)
+    assert sizes("wind") == {"velocity_x": 0.0, "velocity_y": 0.0, "velocity_z": 0.0}
+    assert sizes("sensor_scale") == {"position": 1.0, "angle": 1.0}
+    assert sizes("friction_patch") == {"coefficient": 0.0}
+    assert sizes("frozen_zone") == {}
+    regions = {effect.name: region_of(effect.name) for effect in catalogue() if region_of(effect.name)}
+    assert {name: region[0] for name, region in regions.items()} == {
+        "friction_patch": "x",
+        "gust": "time",
+        "frozen_zone": "theta",
+    }
+
+
+def test_what_no_recording_shows_is_rightly_no_gap():
+    hidden = truth("none", position_offset={"offset": 0.1})
+    s = score(hidden, answer("no_gap", ranking=[{"effects": [], "probability": 0.9}]))
+    assert (s.found, s.first_right, s.errors) == (None, True, [])
+    named = score(hidden, answer("identified", cause("spring")))
+    assert (named.found, named.first_right) == (None, False)
 
 
 @pytest.fixture

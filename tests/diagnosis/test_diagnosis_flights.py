@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 
 import numpy as np
@@ -11,10 +12,11 @@ import torch
 
 from visadapt import diagnose
 from visadapt.cli.main import main
-from visadapt.diagnosis.search.catalogue import catalogue, searched
+from visadapt.diagnosis.search.catalogue import searched
 from visadapt.diagnosis.search.sensor_checks import Readings
 from visadapt.effects import ActuatorDelay, ConstantForce, LiftSlope, LinearDrag, ThrustGain, Wind
-from visadapt.estimation.profiles import PROFILES, profile_of
+from visadapt.effects.catalogue import catalogue
+from visadapt.estimation.profiles import PROFILES
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole, FixedWing, Quadrotor
 from visadapt.world import World
@@ -75,7 +77,7 @@ def test_each_subject_s_columns_are_all_there():
 
 
 def test_what_a_system_cannot_tell_another_may():
-    names = {kind: {e.name for e in searched(catalogue(kind()), profile_of(kind()))} for kind in (CartPole, Quadrotor)}
+    names = {kind: {e.name for e in searched(catalogue(kind()), kind())} for kind in (CartPole, Quadrotor)}
     assert not {"constant_force", "actuator_bias"} <= names[CartPole]
     assert {"constant_force", "actuator_bias"} <= names[Quadrotor]
     assert not {"thrust_gain", "payload"} <= names[Quadrotor]
@@ -106,7 +108,9 @@ def test_a_wing_s_lift_slope_is_named_with_its_size():
 
 
 def test_the_command_reads_a_quadrotor_s_csv(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("visadapt.diagnosis.diagnose.all_effects", lambda system: [LinearDrag, ThrustGain])
+    # Not by its dotted name, which is that of the function.
+    module = importlib.import_module("visadapt.diagnosis.diagnose")
+    monkeypatch.setattr(module, "all_effects", lambda system: [LinearDrag, ThrustGain])
     recording = record(Quadrotor(), [LinearDrag(coefficient=0.5)], episodes=4)
     columns = ["episode", "time", *recording.measured, *(variable.name for variable in Quadrotor.actions)]
     lines = [",".join(columns)]

@@ -21,15 +21,15 @@ from visadapt.diagnosis.result import (
     Where,
 )
 from visadapt.diagnosis.search import heldout, localisation
-from visadapt.diagnosis.search.catalogue import catalogue as all_effects
 from visadapt.diagnosis.search.catalogue import searched
 from visadapt.diagnosis.search.causes import Named, causes, classes, ranking, stage_shares
 from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
 from visadapt.diagnosis.search.repeated_causes import held_causes, unaware
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import Readings
-from visadapt.effects import Effect
-from visadapt.estimation.profiles import SystemProfile, profile_of
+from visadapt.effects import EFFECTS, Effect
+from visadapt.effects.catalogue import catalogue as all_effects
+from visadapt.estimation.profiles import profile_of
 from visadapt.progress import Report, staged
 from visadapt.recordings import Recording
 from visadapt.systems import System
@@ -88,14 +88,13 @@ def _diagnose(
     progress: Report | None,
     policy: policy_bound.StatesToActions | None,
 ) -> Diagnosis:
-    profile = profile_of(system)
     readings = Readings.of(recording, system)
     rows = readings.rows
-    search = Search(system, rows, searched(effects, profile))
+    search = Search(system, rows, searched(effects, system))
     search.run(staged(progress, "search"))
     comparison = compare(search)
     best = comparison.best
-    places = classes(comparison, effects, profile)
+    places = classes(comparison, effects, system)
     held = held_causes(readings, search, comparison)
 
     # How far: the source, the best set, each cause alone, the runners-up; all on episodes held out.
@@ -118,7 +117,7 @@ def _diagnose(
             verdict = AMBIGUOUS
     terms = None if policy is None else policy_bound.policy_terms(policy, system, rows, best)
     before, after = disturbances(search, comparison)
-    regions = _regions(told, before if told else after, profile.places, seed)
+    regions = _regions(told, before if told else after, profile_of(system).places, seed)
     return Diagnosis(
         system=system.name,
         recording=RecordingSummary(len(recording.episodes), recording.samples, float(f"{recording.period:.9g}")),
@@ -129,9 +128,9 @@ def _diagnose(
             regions,
         ),
         causes=told,
-        ranking=ranking(comparison, effects, profile, closing, [each.cause for each in held]),
+        ranking=ranking(comparison, effects, system, closing, [each.cause for each in held]),
         gap=errors.gap(),
-        next_experiment=_next(comparison, verdict, places, profile),
+        next_experiment=_next(comparison, verdict, places, system),
         warnings=(*recording.warnings, *readings.warnings, *_doubts(comparison, verdict)),
         evidence=evidence(search, source, corrected, errors, before, after, regions, terms),
     )
@@ -153,8 +152,9 @@ def _regions(
     """Those of the causes that act in one, as they were fitted; then those where the residual stands out."""
     own = []
     for cause in told:
-        start, end = cause.parameters.get("start"), cause.parameters.get("end")
-        if start is not None and end is not None and start.unit in places:
+        edges = EFFECTS[cause.effect].region()
+        if edges is not None and edges[0].unit in places:
+            start, end = (cause.parameters[edge.name] for edge in edges)
             variable = places[start.unit]
             own.append(
                 Region(
@@ -169,13 +169,13 @@ def _regions(
     return (*own, *(region for region in localisation.regions(found, seed) if region.variable not in taken))
 
 
-def _next(comparison: ModelComparison, verdict: str, places: Sequence[Sequence[Named]], profile: SystemProfile) -> str:
+def _next(comparison: ModelComparison, verdict: str, places: Sequence[Sequence[Named]], system: System) -> str:
     if verdict == NO_GAP:
-        return next_experiment.more(profile)
+        return next_experiment.more(profile_of(system))
     if verdict == UNEXPLAINED:
         first = comparison.functions[0]
         return next_experiment.explain(first.port, first.variable)
-    return next_experiment.separate([[named.effect for named in place] for place in places], profile)
+    return next_experiment.separate([[named.effect for named in place] for place in places], system)
 
 
 def _doubts(comparison: ModelComparison, verdict: str) -> list[str]:

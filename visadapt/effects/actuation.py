@@ -8,6 +8,9 @@ backlash) are kept: they are continuous in command and parameter, with one-sided
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
@@ -23,10 +26,21 @@ class ActuatorDelay(ActuationEffect):
     """
 
     name = "actuator_delay"
+    order = 10
     equation = "u(t) = command(t - delay)"
     source = "Franklin, Powell and Workman (1998), Digital Control of Dynamic Systems, section 4.3.3"
     table = (Parameter("delay", "s", 0.0, 0.2, 0.0),)
     indistinguishable_from = ("measurement_delay",)
+    settled_by: ClassVar[Mapping[str, str]] = {
+        "measurement_delay": (
+            "time command and sensor against one clock: film the cart beside a lamp that lights with the command; a "
+            "late motion is the actuator's delay, a late reading of it the sensor's"
+        ),
+        "actuator_lag": (
+            "record steps of the command, large and held for half a second, at the highest rate that the sensors have: "
+            "after a delay the acceleration jumps, after a lag it creeps up"
+        ),
+    }
 
     def memory(self, commands: Tensor, substep: float) -> Tensor:
         return torch.zeros_like(commands[:, :1]).expand(-1, self._reach(commands, substep), -1)
@@ -61,6 +75,7 @@ class ActuatorBacklash(ActuationEffect):
     """
 
     name = "actuator_backlash"
+    order = 20
     equation = "u_k = min(max(u_(k-1), command_k - width/2), command_k + width/2)"
     source = "Tao and Kokotovic (1996), Adaptive Control of Systems with Actuator and Sensor Nonlinearities, chapter 2"
     table = (Parameter("width", "1", 0.0, 1.0, 0.0),)
@@ -82,6 +97,7 @@ class ActuatorDeadzone(ActuationEffect):
     """Commands too small to move anything (static friction in a gear, a valve's overlap); larger ones lose `width`."""
 
     name = "actuator_deadzone"
+    order = 30
     equation = "u = sign(command) max(|command| - width, 0)"
     source = "Tao and Kokotovic (1996), Adaptive Control of Systems with Actuator and Sensor Nonlinearities, chapter 2"
     table = (Parameter("width", "1", 0.0, 0.6, 0.0),)
@@ -95,6 +111,7 @@ class ActuatorSaturation(ActuationEffect):
     """The largest command that the motor follows: a supply or a current limit. Commands end at 1 anyway."""
 
     name = "actuator_saturation"
+    order = 40
     equation = "u = min(max(command, -limit), limit)"
     source = "Khalil (2002), Nonlinear Systems, section 1.2.7"
     table = (Parameter("limit", "1", 0.02, 1.0, 1.0),)
@@ -111,9 +128,16 @@ class ActuatorGain(ActuationEffect):
     """
 
     name = "actuator_gain"
+    order = 50
     equation = "u = scale command"
     source = "Franklin, Powell and Emami-Naeini (2015), Feedback Control of Dynamic Systems, section 2.3"
     table = (Parameter("scale", "1", 0.2, 8.0, 1.0, linear=True),)
+    settled_by: ClassVar[Mapping[str, str]] = {
+        "cart_mass": (
+            "push the cart by hand with the motor off, or weigh it: a heavier cart accelerates less under any force, a "
+            "weaker motor only under its own"
+        )
+    }
 
     def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
         return self.column("scale", commands) * commands, memory
@@ -123,10 +147,17 @@ class ActuatorBias(ActuationEffect):
     """A command that is there when none is given; a force of max_force * offset."""
 
     name = "actuator_bias"
+    order = 60
     equation = "u = command + offset"
     source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (additive actuator fault)"
     table = (Parameter("offset", "1", -0.35, 0.35, 0.0, linear=True),)
     indistinguishable_from = ("constant_force",)
+    settled_by: ClassVar[Mapping[str, str]] = {
+        "constant_force": (
+            "switch the motor off, let the cart stand with the pole hanging or removed, and measure the force on it "
+            "with a spring balance: a constant force is still there, an actuator bias is gone"
+        )
+    }
 
     def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
         return commands + self.column("offset", commands), memory
@@ -136,6 +167,7 @@ class ActuatorLag(ActuationEffect):
     """A motor that follows its command as a first-order system does: its current, its electronics."""
 
     name = "actuator_lag"
+    order = 70
     equation = "time_constant du/dt = command - u, u(0) = 0"
     source = "Franklin, Powell and Emami-Naeini (2015), Feedback Control of Dynamic Systems, section 3.1"
     table = (Parameter("time_constant", "s", 0.0, 0.3, 0.0),)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from visadapt.effects.base import DynamicsEffect, Effect, Parameter, expect, with_parameters
+from visadapt.effects.base import DynamicsEffect, Effect, Parameter, Role, expect, with_parameters
 from visadapt.systems import FixedWing, Quadrotor, System
 from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, beside, rotation, times
 
@@ -148,8 +148,8 @@ class PeriodicWind(AirDrag):
     source = "Hoblit (1988), Gust Loads on Aircraft, chapter 3 (one harmonic); Beard and McLain (2012), section 4.4"
     table = (
         Parameter("amplitude", "m/s", 0.0, 10.0, 0.0),
-        Parameter("frequency", "Hz", 0.02, 5.0, None),
-        Parameter("phase", "rad", -math.pi, math.pi, None),
+        Parameter("frequency", "Hz", 0.02, 5.0, None, role=Role.FREQUENCY),
+        Parameter("phase", "rad", -math.pi, math.pi, None, role=Role.PHASE),
         Parameter("direction", "rad", -math.pi / 2, math.pi / 2, None),
         Parameter("coefficient", "N s/m", 0.0, 3.0, 0.0),
     )

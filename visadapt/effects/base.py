@@ -8,6 +8,8 @@ Subclasses register themselves by name, so adding an effect is adding a class.
 from __future__ import annotations
 
 import copy
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, ClassVar, Self, TypeVar
@@ -29,6 +31,21 @@ class Stage(StrEnum):
     ANY = "any"
 
 
+class Role(StrEnum):
+    """What a parameter stands for, where a fit must treat it in a special way."""
+
+    PLAIN = "plain"
+    """Nothing special: a strength, or a shape such as a spring's rest position."""
+    START = "start"
+    """Where a region of a state or of time starts; searched within what the recording covers."""
+    END = "end"
+    """Where that region ends."""
+    FREQUENCY = "frequency"
+    """In Hz; searched on a logarithmic grid."""
+    PHASE = "phase"
+    """In rad; equal modulo a turn."""
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One parameter of an effect: its unit, the range searched, and the value at which the effect vanishes.
@@ -45,6 +62,17 @@ class Parameter:
     high: float
     neutral: float | None
     linear: bool = False
+    role: Role = Role.PLAIN
+
+    @property
+    def is_edge(self) -> bool:
+        """Whether it is the start or the end of a region."""
+        return self.role in (Role.START, Role.END)
+
+    @property
+    def is_strength(self) -> bool:
+        """Whether it switches the effect off at its neutral value; the edges of a region set its place instead."""
+        return self.neutral is not None and not self.is_edge
 
 
 class Effect(nn.Module):
@@ -59,6 +87,16 @@ class Effect(nn.Module):
     table: ClassVar[tuple[Parameter, ...]] = ()
     indistinguishable_from: ClassVar[tuple[str, ...]] = ()
     """Effects that passive data cannot separate from this one."""
+    separable_on: ClassVar[tuple[type[System], ...]] = ()
+    """Systems whose passive data do separate it from those, since there the two act on different motions."""
+    settled_by: ClassVar[Mapping[str, str]] = {}
+    """The experiment that tells this effect from another one, by the other's name; stated on one of the two."""
+    order: ClassVar[float] = math.inf
+    """Position among the effects of its stage, which act in ascending order; without one, it acts last."""
+    abrupt: ClassVar[bool] = False
+    """Whether it changes suddenly within a control period, which must then be integrated in several substeps."""
+    repeats_readings: ClassVar[bool] = False
+    """Whether it shows as readings that repeat exactly; it is then counted from those instead of being fitted."""
     no_gradient: ClassVar[str] = ""
     """Why there is no gradient in the parameters; empty where there is one."""
 
@@ -89,6 +127,12 @@ class Effect(nn.Module):
             made.__dict__[parameter.name] = values[..., column]
         return made
 
+    @classmethod
+    def region(cls) -> tuple[Parameter, Parameter] | None:
+        """The parameters at which the region that it acts in starts and ends; None where it acts everywhere."""
+        edges = {parameter.role: parameter for parameter in cls.table if parameter.is_edge}
+        return (edges[Role.START], edges[Role.END]) if len(edges) == 2 else None
+
     def value(self, name: str, like: Tensor) -> Tensor:
         """The parameter `name` with the device and dtype of `like`."""
         # Not get_parameter, which torch.func.functional_call's tensors do not pass.
@@ -105,6 +149,8 @@ class ActuationEffect(Effect):
     """Changes the command on its way to the physics."""
 
     stage = Stage.ACTUATION
+    # Commands jump between periods, and a delay, a lag or a play turns that into a change within one.
+    abrupt = True
 
     def acting_on(self, system: System) -> Self:
         """The effect with what it takes from the altered system's parameters; itself, where it takes nothing."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from visadapt.effects.base import DynamicsEffect, Parameter, expect, inside
+from visadapt.effects.base import DynamicsEffect, Parameter, Role, expect, inside
 from visadapt.systems import CartPole, RigidBody, System
 
 
@@ -49,6 +50,7 @@ class ConstantForce(ForceAlongX):
     source = "Newton's second law; the paper, section 3.2.1"
     table = (Parameter("force", "N", -10.0, 10.0, 0.0, linear=True),)
     indistinguishable_from = ("actuator_bias",)
+    separable_on = (RigidBody,)
 
     def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         return self.value("force", state).expand_as(time)
@@ -66,8 +68,8 @@ class PeriodicForce(ForceAlongX):
     source = "the paper, section 3.2.2"
     table = (
         Parameter("amplitude", "N", 0.0, 10.0, 0.0, linear=True),
-        Parameter("frequency", "Hz", 0.02, 5.0, None),
-        Parameter("phase", "rad", -math.pi, math.pi, None),
+        Parameter("frequency", "Hz", 0.02, 5.0, None, role=Role.FREQUENCY),
+        Parameter("phase", "rad", -math.pi, math.pi, None, role=Role.PHASE),
         Parameter("offset", "N", -10.0, 10.0, 0.0, linear=True),
     )
 
@@ -84,11 +86,12 @@ class Gust(CartForce):
     """
 
     name = "gust"
+    abrupt = True
     equation = "F = force for start <= t < end"
     source = "Newton's second law; discrete gusts: Hoblit (1988), Gust Loads on Aircraft, chapter 2 (here on a cart)"
     table = (
-        Parameter("start", "s", 0.0, 20.0, None),
-        Parameter("end", "s", 0.0, 20.0, None),
+        Parameter("start", "s", 0.0, 20.0, None, role=Role.START),
+        Parameter("end", "s", 0.0, 20.0, None, role=Role.END),
         Parameter("force", "N", -15.0, 15.0, 0.0, linear=True),
     )
 
@@ -129,6 +132,12 @@ class TrackTilt(DynamicsEffect):
     )
     source = "Lagrange's equations of the cart-pole with gravity along (-sin(angle), -cos(angle)) in the track's frame"
     table = (Parameter("angle", "rad", -0.3, 0.3, 0.0),)
+    settled_by: ClassVar[Mapping[str, str]] = {
+        "angle_offset": (
+            "turn the rig round by 180 degrees on the table and record again: a tilt changes its sign, an offset does "
+            "not"
+        )
+    }
     systems = (CartPole,)
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from visadapt.effects.aerial import VEHICLES, Vehicle, airspeed
-from visadapt.effects.base import DynamicsEffect, Parameter, expect, inside
+from visadapt.effects.base import DynamicsEffect, Parameter, Role, expect, inside
 from visadapt.effects.forces import CartForce
 from visadapt.systems import CartPole, System
 
@@ -21,6 +22,13 @@ class ViscousFriction(CartForce):
     equation = "F = -coefficient x_dot"
     source = "Olsson et al. (1998), Friction models and friction compensation, section 2"
     table = (Parameter("coefficient", "N s/m", 0.0, 30.0, 0.0, linear=True),)
+    settled_by: ClassVar[Mapping[str, str]] = {
+        "quadratic_drag": "record faster motions: drag grows with the square of the speed",
+        "coulomb_friction": (
+            "record slow reversals and fast runs: dry friction is as large at any speed and stops the cart near "
+            "standstill"
+        ),
+    }
 
     def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         return -self.value("coefficient", state) * state[:, 1]
@@ -37,6 +45,7 @@ class CoulombFriction(CartForce):
     """
 
     name = "coulomb_friction"
+    abrupt = True
     equation = "F = -force sign(x_dot)"
     source = "Olsson et al. (1998), Friction models and friction compensation, section 2"
     table = (Parameter("force", "N", 0.0, 6.0, 0.0),)
@@ -80,11 +89,12 @@ class FrictionPatch(CartForce):
     """
 
     name = "friction_patch"
+    abrupt = True
     equation = "F = -coefficient x_dot for start <= x < end"
     source = "Olsson et al. (1998), Friction models and friction compensation, section 2, here only on a stretch"
     table = (
-        Parameter("start", "m", -1.5, 1.5, None),
-        Parameter("end", "m", -1.5, 1.5, None),
+        Parameter("start", "m", -1.5, 1.5, None, role=Role.START),
+        Parameter("end", "m", -1.5, 1.5, None, role=Role.END),
         Parameter("coefficient", "N s/m", 0.0, 40.0, 0.0, linear=True),
     )
 

@@ -7,7 +7,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from visadapt.effects.base import Parameter, SensingEffect, inside
+from visadapt.effects.base import Parameter, Role, SensingEffect, inside
 from visadapt.systems import CartPole
 
 
@@ -19,6 +19,8 @@ class MeasurementDelay(SensingEffect):
     """
 
     name = "measurement_delay"
+    # First: it interpolates the true motion; the effects after it change the reading.
+    order = 10
     systems = (CartPole,)
     equation = "measured(t) = state(max(t - delay, 0))"
     source = (
@@ -71,10 +73,15 @@ class FrozenZone(SensingEffect):
     """
 
     name = "frozen_zone"
+    order = 20
+    repeats_readings = True
     systems = (CartPole,)
     equation = "measured_k = measured_(k-1) for start < theta_k < end, of theta and theta_dot"
     source = "Balaban et al. (2009), Modeling, detection, and disambiguation of sensor faults, section II"
-    table = (Parameter("start", "rad", -0.5, 0.5, 0.0), Parameter("end", "rad", -0.5, 0.5, 0.0))
+    table = (
+        Parameter("start", "rad", -0.5, 0.5, 0.0, role=Role.START),
+        Parameter("end", "rad", -0.5, 0.5, 0.0, role=Role.END),
+    )
 
     EDGE: ClassVar[float] = 0.001
     """rad"""
@@ -98,6 +105,7 @@ class SensorScale(SensingEffect):
     """Encoders with other counts per metre or turn than assumed; a velocity scales with its position."""
 
     name = "sensor_scale"
+    order = 30
     systems = (CartPole,)
     equation = "(x, x_dot) measured = position (x, x_dot), (theta, theta_dot) measured = angle (theta, theta_dot)"
     source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (multiplicative sensor fault)"
@@ -134,6 +142,7 @@ class AngleOffset(SensorOffset):
     """A pole that reads `offset` when it is upright."""
 
     name = "angle_offset"
+    order = 40
     equation = "theta measured = theta + offset"
     source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (additive sensor fault)"
     table = (Parameter("offset", "rad", -0.2, 0.2, 0.0, linear=True),)
@@ -148,6 +157,7 @@ class PositionOffset(SensorOffset):
     """
 
     name = "position_offset"
+    order = 50
     equation = "x measured = x + offset"
     source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (additive sensor fault)"
     table = (Parameter("offset", "m", -0.5, 0.5, 0.0, linear=True),)
@@ -161,6 +171,8 @@ class Dropout(SensingEffect):
     """
 
     name = "dropout"
+    order = 60
+    repeats_readings = True
     equation = "measured_k = measured_(k-1) with probability rate"
     source = "Schenato et al. (2007), Foundations of control and estimation over lossy networks, section II"
     table = (Parameter("rate", "1", 0.0, 0.5, 0.0),)

@@ -8,6 +8,7 @@ multiply, and masses and offsets add.
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from typing import ClassVar, Self
 
 import torch
@@ -37,6 +38,9 @@ class ThrustGain(DynamicsEffect):
     table = (Parameter("scale", "1", 0.3, 2.0, 1.0),)
     systems = VEHICLES
     indistinguishable_from = ("payload",)
+    settled_by: ClassVar[Mapping[str, str]] = {
+        "payload": "weigh the vehicle: a payload is on the scales, a thrust that is off is not"
+    }
 
     scale: Tensor
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from visadapt.effects import ActuationEffect, CoulombFriction, Effect, FrictionPatch, Gust
+from visadapt.effects import Effect
 from visadapt.estimation.linearise import linearise_reading, linearise_step, parameter_steps, search_range
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
@@ -35,7 +35,7 @@ class CandidateModel:
         self.profile = profile_of(system)
         self.effects = tuple(effects)
         self.rows = rows
-        abrupt = any(issubclass(e, ActuationEffect | CoulombFriction | FrictionPatch | Gust) for e in effects)
+        abrupt = any(effect.abrupt for effect in effects)
         smooth = 1 if effort == GLANCE else math.ceil(rows.period / self.profile.smooth_step)
         substeps = max(smooth, self.profile.substeps[effort] if abrupt else 1)
         nothing = [effect(**{parameter.name: 0.0 for parameter in effect.table}) for effect in effects]

@@ -14,7 +14,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from visadapt.effects import DynamicsEffect, Parameter
+from visadapt.effects import DynamicsEffect, Parameter, Role
 from visadapt.systems import System
 from visadapt.world import World
 
@@ -58,7 +58,7 @@ def load_effect(system: type[System]) -> type[DynamicsEffect]:
 
 def search_range(table: Sequence[Parameter]) -> tuple[Tensor, Tensor]:
     """Lowest and highest values (P,) that a fit may give the parameters."""
-    margin = torch.tensor([PHASE_MARGIN * (p.name == "phase") for p in table], dtype=torch.float64)
+    margin = torch.tensor([PHASE_MARGIN * (p.role is Role.PHASE) for p in table], dtype=torch.float64)
     low = torch.tensor([p.low for p in table], dtype=torch.float64)
     high = torch.tensor([p.high for p in table], dtype=torch.float64)
     return low - margin, high + margin

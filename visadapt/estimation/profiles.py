@@ -64,8 +64,6 @@ class SystemProfile:
     """an angle and its rate, of whose sensor defects are looked for"""
     conventions: tuple[Convention, ...] = ()
     """other sign conventions in which a recording may be"""
-    separable: tuple[frozenset[str], ...] = ()
-    """pairs of effects that are the same to passive data of another system, and not of this one"""
     promising: tuple[float, float] = (1.0, 0.0)
     """log likelihood that a lead must promise to be fitted, and more of it for each parameter; an effect costs more"""
     rivalling: float = 0.0
@@ -129,7 +127,6 @@ _VEHICLE = SystemProfile(
     substeps=(2, 3, 4),
     refresh=4,
     doubted=False,
-    separable=(frozenset({"constant_force", "actuator_bias"}),),
     promising=(1.0, 3.0),
     rivalling=0.3,
     retried=True,

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 import torch
 
 from visadapt.diagnosis.result import Cause, Estimate, Ranked
-from visadapt.diagnosis.search.catalogue import twins
 from visadapt.diagnosis.search.grids import spans
 from visadapt.diagnosis.search.model_comparison import ModelComparison, Weighed, exchanged
 from visadapt.diagnosis.search.search import ScoredModel, Search, posterior
-from visadapt.effects import Effect
-from visadapt.effects.base import Parameter
-from visadapt.estimation.profiles import SystemProfile
+from visadapt.effects import Effect, Parameter, Role
+from visadapt.effects.catalogue import twins
+from visadapt.systems import System
 
 NINETY = 1.6449
 """Deviations to either side that hold 90 % of a normal distribution."""
@@ -35,13 +34,13 @@ class Named:
     """the effect that was fitted in its place: itself, or its twin"""
 
 
-def classes(comparison: ModelComparison, effects: Sequence[type[Effect]], profile: SystemProfile) -> list[list[Named]]:
+def classes(comparison: ModelComparison, effects: Sequence[type[Effect]], system: System) -> list[list[Named]]:
     """For each place of the best set, the effects that fit as well there, the best first, twins behind each other."""
     out = []
     for effect, rivals in comparison.classes.items():
         here = [(effect, comparison.weighed[0])]
         here += [(exchanged(comparison.best.effects, rival.fitted.effects), rival) for rival in rivals]
-        members = [Named(twin, weighed, own) for own, weighed in here for twin in [own, *twins(own, effects, profile)]]
+        members = [Named(twin, weighed, own) for own, weighed in here for twin in [own, *twins(own, effects, system)]]
         out.append([member for member in members if member.effect in effects])
     return out
 
@@ -97,10 +96,10 @@ def _estimate(
     parameter: Parameter, value: float, deviation: float, seen: Mapping[str, tuple[float, float]]
 ) -> Estimate:
     low, high = value - NINETY * deviation, value + NINETY * deviation
-    if parameter.name == "phase":
+    if parameter.role is Role.PHASE:
         turn = 2 * math.pi * round(value / (2 * math.pi))
         return Estimate(value - turn, parameter.unit, (low - turn, high - turn))
-    if parameter.name in ("start", "end"):
+    if parameter.is_edge:
         # A region that goes beyond where the data are ends somewhere there.
         first, last = seen.get(parameter.unit, (parameter.low, parameter.high))
         if value < first:
@@ -113,7 +112,7 @@ def _estimate(
 def ranking(
     comparison: ModelComparison,
     effects: Sequence[type[Effect]],
-    profile: SystemProfile,
+    system: System,
     closing: Closing,
     held: Sequence[Cause],
 ) -> tuple[Ranked, ...]:
@@ -123,7 +122,7 @@ def ranking(
     for weighed in comparison.weighed:
         versions: list[tuple[str, ...]] = [()]
         for effect in weighed.fitted.effects:
-            alike = [e.name for e in [effect, *twins(effect, effects, profile)] if e in effects]
+            alike = [e.name for e in [effect, *twins(effect, effects, system)] if e in effects]
             versions = [(*version, name) for version in versions for name in alike]
         for version in versions:
             share = weighed.probability / len(versions)

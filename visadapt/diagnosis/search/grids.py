@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from visadapt.effects import Effect
-from visadapt.effects.base import Parameter
+from visadapt.effects import Effect, Parameter, Role
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
@@ -32,17 +31,17 @@ Spans = Mapping[str, tuple[float, float]]
 
 def grid(effect: type[Effect], spans: Spans) -> tuple[Tensor, list[int]]:
     """Parameters (G, P) to try, and the columns to which the effect is proportional."""
-    names = [parameter.name for parameter in effect.table]
     linear = [k for k, p in enumerate(effect.table) if p.linear and p.neutral is not None]
     axes = []
     for parameter in effect.table:
-        if parameter.name in ("start", "end"):
+        if parameter.is_edge:
             axes.append(_edges(parameter, spans, EDGES))
         else:
             axes.append(_values(parameter))
-    points = torch.cartesian_prod(*axes).reshape(-1, len(names))
-    if {"start", "end"} <= set(names):
-        points = points[points[:, names.index("start")] < points[:, names.index("end")]]
+    points = torch.cartesian_prod(*axes).reshape(-1, len(effect.table))
+    if (region := effect.region()) is not None:
+        start, end = (effect.table.index(edge) for edge in region)
+        points = points[points[:, start] < points[:, end]]
     return points, linear
 
 
@@ -62,11 +61,11 @@ def starts(effect: type[Effect], spans: Spans) -> tuple[Tensor, list[int]]:
         if parameter.neutral is not None:
             end = parameter.high if parameter.high > parameter.neutral else parameter.low
             axes.append(torch.tensor([parameter.neutral + NUDGE * (end - parameter.neutral)], dtype=torch.float64))
-        elif parameter.name in ("start", "end"):
+        elif parameter.is_edge:
             axes.append(_edges(parameter, spans, SHAPES))
         else:
             values = _values(parameter)
-            axes.append(values if parameter.unit == "Hz" else values[:: max(1, len(values) // 2)])
+            axes.append(values if parameter.role is Role.FREQUENCY else values[:: max(1, len(values) // 2)])
     return torch.cartesian_prod(*axes).reshape(-1, len(effect.table)), strengths
 
 
@@ -78,10 +77,10 @@ def _values(parameter: Parameter) -> Tensor:
     low, high, neutral = parameter.low, parameter.high, parameter.neutral
     if parameter.linear and neutral is not None:
         return torch.tensor([neutral], dtype=torch.float64)
-    if parameter.unit == "Hz":
+    if parameter.role is Role.FREQUENCY:
         ends = torch.tensor([low, high]).log10().tolist()
         return torch.logspace(ends[0], ends[1], FREQUENCIES, dtype=torch.float64)
-    if parameter.name == "phase":
+    if parameter.role is Role.PHASE:
         return torch.linspace(low, high, PHASES + 1, dtype=torch.float64)[:-1]
     if neutral is None:
         return torch.linspace(low, high, SHAPES + 2, dtype=torch.float64)[1:-1]

@@ -1,0 +1,19 @@
+from visadapt.diagnosis.report.next_experiment import separate
+from visadapt.effects import ActuatorBias, ConstantForce, CoulombFriction, QuadraticDrag, Spring, ViscousFriction
+from visadapt.systems import CartPole, Quadrotor
+
+
+def test_the_experiments_of_all_pairs_of_a_class_are_advised():
+    advice = separate([[CoulombFriction, QuadraticDrag, ViscousFriction], [Spring]], CartPole())
+    assert advice == (
+        "To tell coulomb_friction, quadratic_drag and viscous_friction apart: record faster motions: drag grows with "
+        "the square of the speed; record slow reversals and fast runs: dry friction is as large at any speed and stops "
+        "the cart near standstill."
+    )
+
+
+def test_an_experiment_for_a_cart_is_not_advised_on_a_vehicle_which_needs_none():
+    pair = [ConstantForce, ActuatorBias]
+    assert "spring balance" in separate([pair], CartPole())
+    assert "spring balance" not in separate([pair], Quadrotor())
+    assert "flights" in separate([pair], Quadrotor())

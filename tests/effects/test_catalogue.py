@@ -1,0 +1,50 @@
+import pytest
+
+from visadapt.effects import EFFECTS, ActuatorBias, ActuatorDelay, ConstantForce, Dropout, Payload, ViscousFriction
+from visadapt.effects.catalogue import catalogue, catalogue_markdown, catalogue_text, twins
+from visadapt.systems import SYSTEMS, CartPole, Quadrotor
+
+NAMED = sorted(EFFECTS.keys() - {"residual"})
+
+
+def test_a_system_has_the_effects_that_act_on_it():
+    assert {effect.name for effect in catalogue()} == set(NAMED)
+    for kind in SYSTEMS.values():
+        own = catalogue(kind())
+        assert {ConstantForce, ActuatorDelay, Dropout} <= set(own)
+        assert (ViscousFriction in own, Payload in own) == (kind is CartPole, kind is Quadrotor)
+
+
+def test_twins_are_those_of_a_system():
+    assert twins(ActuatorBias, catalogue(), CartPole()) == [ConstantForce]
+    assert twins(ConstantForce, catalogue(), CartPole()) == [ActuatorBias]
+    assert twins(ActuatorBias, catalogue(), Quadrotor()) == twins(ConstantForce, catalogue(), Quadrotor()) == []
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_every_effect_is_on_the_pages_with_all_that_it_states(name):
+    effect = EFFECTS[name]
+    (paragraph,) = (p for p in catalogue_text().split("\n\n") if p.startswith(f"{name} ("))
+    (section,) = (s for s in catalogue_markdown().split("### ") if s.startswith(f"{name}\n"))
+    for page in (paragraph, section):
+        assert effect.equation in page
+        assert effect.source in page
+        for parameter in effect.table:
+            assert parameter.name in page
+            assert f"{parameter.low:.4g} to {parameter.high:.4g}" in page
+        for other in effect.indistinguishable_from:
+            assert other in page
+    for parameter in effect.table:
+        assert f"| {parameter.name} | {parameter.unit} |" in section
+
+
+def test_the_text_of_an_effect():
+    assert catalogue_text(CartPole()).split("\n\n")[5].splitlines() == [
+        "actuator_bias (actuation)",
+        "  A command that is there when none is given; a force of max_force * offset.",
+        "  u = command + offset",
+        "  offset: -0.35 to 0.35, no effect at 0",
+        "  systems: cartpole, quadrotor, fixed_wing",
+        "  indistinguishable from: constant_force (separable on quadrotor, fixed_wing)",
+        "  source: Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (additive actuator fault)",
+    ]

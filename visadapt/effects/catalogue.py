@@ -1,0 +1,95 @@
+"""The catalogue of effects: which act on a system, which of them data cannot tell apart, and how it reads."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterable
+
+from visadapt.effects.base import EFFECTS, ActuationEffect, DynamicsEffect, Effect, Parameter, SensingEffect
+from visadapt.systems import SYSTEMS, System
+
+
+def catalogue(system: System | None = None) -> list[type[Effect]]:
+    """The named effects that act on a system, or on any: those on commands, dynamics and readings."""
+    stages = (ActuationEffect, DynamicsEffect, SensingEffect)
+    named: list[type[Effect]] = [effect for effect in EFFECTS.values() if issubclass(effect, stages)]
+    return named if system is None else [effect for effect in named if isinstance(system, effect.systems)]
+
+
+def separable(one: type[Effect], other: type[Effect], system: System) -> bool:
+    """Whether passive data of this system separate two effects that those of other systems do not."""
+    return other.name in one.indistinguishable_from and isinstance(system, (*one.separable_on, *other.separable_on))
+
+
+def twins(effect: type[Effect], effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:
+    """Those among `effects` that passive data of the system cannot separate from this one."""
+    return [
+        other
+        for other in effects
+        if other.name in effect.indistinguishable_from and not separable(effect, other, system)
+    ]
+
+
+def catalogue_text(system: System | None = None) -> str:
+    """The catalogue for a terminal: a paragraph an effect, sorted by stage and name."""
+    return "\n\n".join("\n".join(_lines(effect)) for effect in _sorted(system))
+
+
+def catalogue_markdown(system: System | None = None) -> str:
+    """The catalogue as a Markdown page: a section a stage, a subsection an effect, a table of its parameters."""
+    lines: list[str] = []
+    stage = None
+    for effect in _sorted(system):
+        if effect.stage is not stage:
+            stage = effect.stage
+            lines += [f"## {stage.value.capitalize()}", ""]
+        lines += [f"### {effect.name}", "", _summary(effect), "", f"    {effect.equation}", ""]
+        lines += ["| parameter | unit | range searched | no effect at |", "|---|---|---|---|"]
+        for parameter in effect.table:
+            low, high, neutral = _numbers(parameter)
+            lines.append(f"| {parameter.name} | {parameter.unit} | {low} to {high} | {neutral} |")
+        lines += ["", *(f"- {name}: {value}" for name, value in _facts(effect).items()), ""]
+    return "\n".join(lines)
+
+
+def _sorted(system: System | None) -> list[type[Effect]]:
+    stages = ("actuation", "dynamics", "sensing")
+    return sorted(catalogue(system), key=lambda effect: (stages.index(effect.stage), effect.order, effect.name))
+
+
+def _lines(effect: type[Effect]) -> list[str]:
+    lines = [f"{effect.name} ({effect.stage})", f"  {_summary(effect)}", f"  {effect.equation}"]
+    for parameter in effect.table:
+        low, high, neutral = _numbers(parameter)
+        off = f", no effect at {neutral}" if neutral else ""
+        unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+        lines.append(f"  {parameter.name}: {low} to {high}{unit}{off}")
+    return [*lines, *(f"  {name}: {value}" for name, value in _facts(effect).items())]
+
+
+def _summary(effect: type[Effect]) -> str:
+    """The first sentence or two of its docstring."""
+    return " ".join((inspect.getdoc(effect) or "").split("\n\n")[0].split())
+
+
+def _numbers(parameter: Parameter) -> tuple[str, str, str]:
+    """Range and neutral value; empty where there is none."""
+    return (
+        f"{parameter.low:.4g}",
+        f"{parameter.high:.4g}",
+        "" if parameter.neutral is None else f"{parameter.neutral:g}",
+    )
+
+
+def _facts(effect: type[Effect]) -> dict[str, str]:
+    facts = {"systems": _names(effect.systems)}
+    if effect.indistinguishable_from:
+        others = [EFFECTS[name] for name in effect.indistinguishable_from]
+        apart = tuple(kind for each in (effect, *others) for kind in each.separable_on)
+        but = f" (separable on {_names(apart)})" if apart else ""
+        facts["indistinguishable from"] = ", ".join(effect.indistinguishable_from) + but
+    return facts | {"source": effect.source}
+
+
+def _names(kinds: tuple[type[System], ...]) -> str:
+    return ", ".join(kind.name for kind in SYSTEMS.values() if issubclass(kind, kinds))
