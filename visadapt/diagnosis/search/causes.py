@@ -10,11 +10,12 @@ import torch
 
 from visadapt.diagnosis.result import Cause, Estimate, Ranked
 from visadapt.diagnosis.search.catalogue import twins
-from visadapt.diagnosis.search.grids import spans
 from visadapt.diagnosis.search.model_comparison import ModelComparison, Weighed, exchanged
-from visadapt.diagnosis.search.search import ScoredModel, Search, posterior
+from visadapt.diagnosis.search.search import ScoredModel, Search
 from visadapt.effects import Effect
 from visadapt.effects.base import Parameter
+from visadapt.estimation.fit_states import posterior
+from visadapt.estimation.grids import spans
 from visadapt.estimation.profiles import SystemProfile
 
 NINETY = 1.6449
