@@ -34,9 +34,10 @@ from datasets.blind import flights as blind_flights
 from train.rotorpy_quadrotor import published
 from visadapt import diagnose
 from visadapt.diagnosis.search.causes import NINETY
-from visadapt.diagnosis.search.search import Search, posterior
+from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import Readings
 from visadapt.effects import MotorLag, RateDamping, RotorDrag, TranslationalLift, Wind
+from visadapt.estimation.fit_states import posterior
 from visadapt.policies import FlightPolicy
 from visadapt.progress import reporting
 from visadapt.recordings import Episode, load_recording, write_recording

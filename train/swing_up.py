@@ -177,7 +177,7 @@ def _seed(settings: Settings, seed: int) -> Score:
     policy = StatePolicy(n_state=4)
     generator = torch.Generator().manual_seed(seed)
     about = {"seed": seed, "samples": SAMPLES}
-    train_or_load(folder / POLICY, policy, World(CartPole()), _states, LEARN, generator, about)
+    train_or_load(folder / POLICY, policy, World(CartPole()), None, LEARN, generator, about)
     return Score(**once(folder / "score.json", lambda: asdict(score(policy, settings.episodes))))
 
 
@@ -199,10 +199,6 @@ def score(policy: StatePolicy, episodes: int) -> Score:
 def see(observation: Observation) -> Tensor:
     """States with the angle between -pi and pi."""
     return within_a_turn(observation.state)
-
-
-def _states(state: Tensor) -> Tensor:
-    return state
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from tests.diagnosis.test_report import SCHEMA
 from visadapt import diagnose
 from visadapt.cli import main as cli
 from visadapt.diagnosis.policy_bound import check, policy_terms
-from visadapt.diagnosis.search.search import CAREFUL, Search
+from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import Readings
 from visadapt.effects import (
     ActuatorBacklash,
@@ -25,6 +25,7 @@ from visadapt.effects import (
     ConstantForce,
 )
 from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.fit_states import CAREFUL
 from visadapt.history import HORIZON
 from visadapt.policies import ImagePolicy, Policy, StatePolicy
 from visadapt.recordings import write_csv

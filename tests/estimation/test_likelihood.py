@@ -4,10 +4,11 @@ import pytest
 import torch
 
 from tests.diagnosed import record
-from visadapt.diagnosis.search.search import CAREFUL, Search
+from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import Readings
 from visadapt.effects import ActuatorDelay, CartMass, ConstantForce, SensorScale, ViscousFriction
 from visadapt.estimation.candidate import CandidateModel, linearise
+from visadapt.estimation.fit_states import CAREFUL
 from visadapt.systems import CartPole
 
 

@@ -8,7 +8,7 @@ from renderers import Camera, DrawnCartPole
 from renderers.drawn import AXLE, CART, POLE, SKY, TRACK
 from visadapt.effects import EFFECTS, ConstantForce
 from visadapt.learning.poses import PoseFinder
-from visadapt.learning.tracking import Tracker, TrackingError, TrackingWarning, estimate_states
+from visadapt.learning.tracking import Tracker, TrackingError, TrackingWarning
 from visadapt.recordings import Episode
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, constant_force, no_effects, sine_force
@@ -172,11 +172,6 @@ class TestTracks:
         for episode, track in zip(episodes, tracker.track([blind(e) for e in episodes]), strict=True):
             force = gap(track.episode)[:, 1] / gap(episode)[:, 1]
             assert np.abs(force - 1).max() < 0.15
-
-    def test_estimate_states_is_a_tracker_of_one_episode(self, tracker):
-        episode = blind(record(no_effects, 3))
-        alone = estimate_states(episode, Sketch(), WORLD, reach=0.3, lean=0.2)
-        np.testing.assert_allclose(alone.state, tracker.track([episode])[0].episode.state, atol=1e-4)
 
     def test_states_of_the_recording_are_not_looked_at_and_nothing_else_is_touched(self, tracker):
         episode = record(no_effects, 3)

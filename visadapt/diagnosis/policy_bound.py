@@ -28,8 +28,9 @@ import torch
 from torch import Tensor
 
 from visadapt.diagnosis.result import PolicyTerms
-from visadapt.diagnosis.search.search import ScoredModel, posterior
+from visadapt.diagnosis.search.search import ScoredModel
 from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.fit_states import posterior
 from visadapt.estimation.kalman import backward, forward
 from visadapt.estimation.likelihood import linear_problem, variances
 from visadapt.estimation.segments import Segments

@@ -58,7 +58,7 @@ class GroundLoss:
 def gap(world: World, windows: Windows) -> Tensor:
     """s*_{t+1} - f(s_t, a_t) (N, n_state): what the source leaves out in one step."""
     with torch.no_grad():
-        return windows.next_state - world.step(world.start(windows.state), windows.action).state
+        return windows.next_state - world.step(windows.start(world), windows.action).state
 
 
 def left_over(residual: Residual, source: World, windows: Windows) -> Tensor:

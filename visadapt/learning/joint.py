@@ -104,7 +104,7 @@ def adapt(
     residual: Residual,
     source: World,
     target: Target,
-    observe: Observe,
+    observe: Observe | None,
     see: See,
     settings: AdaptSettings,
     folder: Path,
@@ -117,7 +117,7 @@ def adapt(
     Args:
         policy, residual: the networks, changed in place; the policy listens to the residual.
         source: the physics known beforehand; effects that it has are named guesses, whose parameters are fitted.
-        observe: what a camera would show of a simulated state: the learnt renderer, or the identity.
+        observe: the camera of simulated states, a learnt renderer; None where the policy sees what sensors measure.
         see: what the policy is shown of the target.
         label: estimates the states from what a camera saw; without it, the states that the target tells are used.
         explorer: the policy that collects the target's data, in place of the one that is tuned (Algorithm 1).
@@ -212,7 +212,7 @@ def _tuned(
     here: Path,
     policy: Policy,
     grounded: World,
-    observe: Observe,
+    observe: Observe | None,
     settings: AdaptSettings,
     windows: Windows,
     number: int,

@@ -2,13 +2,13 @@
 
 A batch of simulated streams runs under the policy. At each iteration the policy plans K actions, the world
 (physics, effects, residual, renderer) carries them out, and the gradient of the cost flows back through all of it.
-Then every stream takes the first planned step. A stream that strays further than delta_div from the reference
-starts anew, and delta_div grows as training goes on, so the policy learns to recover from ever further off.
+Then every stream takes the first planned step. A stream further than delta_div from the reference starts anew, and
+delta_div grows as training goes on, so the policy learns to recover from ever further off.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from visadapt.history import HORIZON, History
-from visadapt.learning.streams import Streams, StreamSettings, StreamState
+from visadapt.learning.streams import Streams, StreamSettings, StreamState, look
 from visadapt.learning.windows import Observe, Windows
 from visadapt.policies import Policy
 from visadapt.progress import Progress
@@ -56,9 +56,9 @@ class TuneSettings:
 
 
 def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None:
-    """Let the feed-forward undo what the residual expects, as far as commands can: least squares about rest.
+    """Make the feed-forward cancel the correction that the residual predicts, by least squares about rest.
 
-    `scale` (n_state,) is the residual's, in whose units the policy hears corrections.
+    `scale` (n_state,) is the residual's, the unit of the corrections that the policy reads.
     """
     rest = source.start(torch.zeros(1, policy.n_state).to(scale))
     still = torch.zeros(1, policy.n_action).to(scale)
@@ -70,7 +70,7 @@ def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None
 def tune(
     policy: Policy,
     world: World,
-    observe: Observe,
+    observe: Observe | None,
     settings: TuneSettings,
     generator: torch.Generator,
     windows: Windows | None = None,
@@ -80,9 +80,10 @@ def tune(
     """Train `policy` in `world`, in place; returns the loss of every iteration.
 
     Args:
-        observe: what the policy sees of a state; differentiable, it passes the gradient to a residual that looks.
-        windows: recorded starts, where settings.recorded asks for them.
-        checkpoint: where the training state is kept now and then and taken up again from.
+        observe: the camera through which the policy sees, differentiable for the sake of a residual that reads frames;
+            None for a policy on states, which sees what the world's sensors measure.
+        windows: recorded starts, where settings.recorded asks for them, and the times at which other starts begin.
+        checkpoint: file of the training state, written every `EVERY` iterations and resumed from.
 
     Raises:
         DivergedError: the loss is not finite.
@@ -113,7 +114,8 @@ def tune(
         history = stream.history
         noise = settings.observation_noise * torch.randn(history.observations.shape, generator=generator)
         plan = policy(History(history.observations + noise.to(history.observations), history.actions))
-        states, first = imagine(world, partial(streams.show, place=stream.place), stream.at, history, plan)
+        show = partial(task.show, place=stream.place)
+        states, first = imagine(world, observe, stream.at, history, plan, show, generator)
         loss = task.cost(states, plan, stream.at.state, stream.place).mean()
         if not bool(loss.isfinite()):
             raise DivergedError(f"the policy's loss is {float(loss.detach())} at iteration {iteration}")
@@ -142,7 +144,7 @@ def train_or_load(
     path: Path,
     policy: Policy,
     world: World,
-    observe: Observe,
+    observe: Observe | None,
     settings: TuneSettings,
     generator: torch.Generator,
     about: Mapping[str, Any],
@@ -169,9 +171,22 @@ def _step(world: World, policy: Policy, stream: StreamState) -> tuple[WorldState
 
 
 def imagine(
-    world: World, observe: Observe, at: WorldState, history: History, plan: Tensor
+    world: World,
+    observe: Observe | None,
+    at: WorldState,
+    history: History,
+    plan: Tensor,
+    show: Callable[[Tensor], Tensor] = lambda seen: seen,
+    generator: torch.Generator | None = None,
 ) -> tuple[Tensor, WorldState]:
-    """Carry out a plan (B, K, n_action): the states that follow (B, K, n_state), and the world after the first step."""
+    """Carry out a plan (B, K, n_action): the states that follow (B, K, n_state), and the world after the first step.
+
+    Args:
+        observe: the camera; None where the sensors' measurements are seen.
+        at: where the plan begins, its row read; that of the world returned is not.
+        show: adds to what is seen what the task shows beside it.
+        generator: for random sensing effects.
+    """
     states = []
     first = at
     for k in range(plan.shape[1]):
@@ -180,5 +195,6 @@ def imagine(
         if k == 0:
             first = at
         if world.has_residual and k + 1 < plan.shape[1]:
-            history = history.acting(plan[:, k]).observing(observe(at.state))
+            seen, at = look(world, observe, at, generator)
+            history = history.acting(plan[:, k]).observing(show(seen))
     return torch.stack(states, 1), first

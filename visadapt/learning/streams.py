@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import torch
@@ -12,6 +12,9 @@ from visadapt.history import History
 from visadapt.learning.windows import Observe, Windows
 from visadapt.tasks.base import Task
 from visadapt.world import World, WorldState
+
+PROBE = 0.5
+"""Command under which a world is tested for a dependence on time: not zero, since some effects scale commands."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +70,15 @@ class StreamSettings:
 
 
 class Streams:
-    """A batch of simulated episodes in progress."""
+    """A batch of simulated episodes in progress.
+
+    Args:
+        observe: the camera through which the policy sees; None where it sees what the sensors measure.
+        windows: recorded starts. Each begins at its time in its episode, with the memory that effects have there.
+    """
 
     def __init__(
-        self, world: World, task: Task, observe: Observe, windows: Windows | None, settings: StreamSettings
+        self, world: World, task: Task, observe: Observe | None, windows: Windows | None, settings: StreamSettings
     ) -> None:
         self.world = world
         self.task = task
@@ -79,10 +87,12 @@ class Streams:
         self.settings = settings
         self.now: StreamState
         self.age: Tensor
-
-    def show(self, state: Tensor, place: Tensor) -> Tensor:
-        """What the policy is shown of states (B, n_state) at places."""
-        return self.task.show(self.observe(state), place)
+        self._recorded: WorldState | None = None
+        self._times: Tensor | None = None
+        if windows is not None:
+            with torch.no_grad():
+                self._recorded = windows.start(world) if settings.recorded > 0 else None
+                self._times = windows.time if _depends_on_time(world, windows) else None
 
     @torch.no_grad()
     def start(self, progress: float, generator: torch.Generator) -> None:
@@ -92,32 +102,64 @@ class Streams:
 
     @torch.no_grad()
     def advance(self, at: WorldState, action: Tensor, progress: float, generator: torch.Generator) -> None:
-        """Take the step to `at` under `action`; restart what strayed. `progress` in [0, 1] drives the curriculum."""
-        state = self.task.disturb(at.state, generator)
+        """Take the step to `at`, whose row is not read yet, under `action`; restart the streams that have diverged.
+
+        `progress` in [0, 1] drives the curriculum.
+        """
+        at = replace(at, state=self.task.disturb(at.state, generator))
         place = self.task.advance(self.now.place)
-        history = self.now.history.acting(action).observing(self.show(state, place)).detach()
-        self.now = StreamState(WorldState(at.time, state, at.memory).detach(), history, place)
+        seen, at = look(self.world, self.observe, at, generator)
+        history = self.now.history.acting(action).observing(self.task.show(seen, place)).detach()
+        self.now = StreamState(at.detach(), history, place)
         self.age += 1
-        keep = (self.age < self.settings.longest) & ~self.task.diverged(state, place, progress)
+        keep = (self.age < self.settings.longest) & ~self.task.diverged(at.state, place, progress)
         if not bool(keep.all()):
             self.now = self.now.where(keep, self._fresh(progress, generator))
             self.age = torch.where(keep, self.age, 0)
 
     def _fresh(self, progress: float, generator: torch.Generator) -> StreamState:
-        count, recorded, windows = self.settings.count, self.settings.recorded, self.windows
+        count, windows = self.settings.count, self.windows
         state, place = self.task.begin(count, progress, generator)
-        history = History.start(self.show(state, place), len(self.world.system.actions))
-        if windows is not None and recorded > 0:
-            places = windows.place.to(place)
-            # A fall on record is beyond delta_div; starting from it would drown what can be learnt.
-            near = (~self.task.diverged(windows.state, places[:, -1], progress)).nonzero()[:, 0]
-            if len(near):
-                from_record = torch.rand(count, generator=generator) < recorded
-                rows = near[torch.randint(len(near), (count,), generator=generator)]
-                past = windows.history(rows)
-                seen, now, where = self.task.augment(past.observations, windows.state[rows], places[rows], generator)
-                shown = self.task.show(seen.flatten(0, 1), where.flatten(0, 1)).unflatten(0, seen.shape[:2])
-                history = History(shown, past.actions).where(from_record, history)
-                place = torch.where(from_record[:, None], where[:, -1], place)
-                state = torch.where(from_record[:, None], now, state)
-        return StreamState(self.world.start(state), history, place)
+        at = self.world.start(state)
+        if self._times is not None:
+            # Streams are shorter than episodes: those that all began at time 0 would never meet a gust that comes
+            # late, or all phases of a slow force. So they begin at the times of samples, in proportion to how often
+            # each was recorded.
+            at = replace(at, time=self._times[torch.randint(len(self._times), (count,), generator=generator)].to(state))
+        seen, at = look(self.world, self.observe, at, generator)
+        history = History.start(self.task.show(seen, place), len(self.world.system.actions))
+        fresh = StreamState(at, history, place)
+        if windows is None or self._recorded is None:
+            return fresh
+        places = windows.place.to(place)
+        # A fall on record is beyond delta_div; starting from it would drown what can be learnt.
+        near = (~self.task.diverged(windows.state, places[:, -1], progress)).nonzero()[:, 0]
+        if not len(near):
+            return fresh
+        from_record = torch.rand(count, generator=generator) < self.settings.recorded
+        rows = near[torch.randint(len(near), (count,), generator=generator)]
+        past = windows.history(rows)
+        seen, now, where = self.task.augment(past.observations, windows.state[rows], places[rows], generator)
+        shown = self.task.show(seen.flatten(0, 1), where.flatten(0, 1)).unflatten(0, seen.shape[:2])
+        # The history ends with the recorded reading of this row, so the sensors have read it.
+        _, at = look(self.world, self.observe, replace(self._recorded[rows], state=now), generator)
+        return StreamState(at, History(shown, past.actions), where[:, -1]).where(from_record, fresh)
+
+
+def look(
+    world: World, observe: Observe | None, at: WorldState, generator: torch.Generator | None
+) -> tuple[Tensor, WorldState]:
+    """What is seen (B, ...) of the row `at`, and the world with that row read.
+
+    Through a camera, `observe`, the true state; without one (None) what the sensors measure.
+    """
+    return world.measure(at, generator) if observe is None else (observe(at.state), at)
+
+
+def _depends_on_time(world: World, windows: Windows) -> bool:
+    """Whether the same state under the same command goes on differently at other times of the recording."""
+    time = windows.time.unique()
+    state = windows.state[:1].expand(len(time), -1)
+    command = torch.full((len(time), world.substeps, len(world.system.actions)), PROBE).to(state)
+    after = world.integrate(time, state, command)
+    return not torch.allclose(after, after[:1], rtol=1e-5, atol=1e-6)

@@ -228,16 +228,6 @@ class Tracker:
         )
 
 
-def estimate_states(
-    episode: Episode, renderer: nn.Module, world: World, reach: float | None = None, lean: float = 0.5
-) -> Episode:
-    """The episode with the states that its frames tell; for several episodes a `Tracker` is faster and does better.
-
-    Arguments and errors are those of `Tracker` and its `track`.
-    """
-    return Tracker(renderer, world, reach, lean).track([episode])[0].episode
-
-
 def _longest(missed: Tensor) -> int:
     """Most rows (T,) missed one after the other."""
     used = torch.cat((torch.tensor([-1]), (~missed).nonzero()[:, 0], torch.tensor([len(missed)])))

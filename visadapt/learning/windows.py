@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from visadapt.history import LENGTH, History
 from visadapt.recordings import Episode
+from visadapt.world import World, WorldState
 
 Observe = Callable[[Tensor], Tensor]
-"""States (B, n_state) to observations (B, ...): a learnt renderer, or the identity where states are seen."""
+"""True states (B, n_state) to frames (B, H, W): a camera. Without one (None) a policy sees what the sensors measure."""
 
 SOURCES = ("camera", "rendered", "state")
 """What a window shows: the camera's frames, frames rendered from the states, or the states themselves."""
@@ -21,9 +23,10 @@ SOURCES = ("camera", "rendered", "state")
 
 @dataclass(frozen=True)
 class Windows:
-    """N samples (s_t, a_t, s_{t+1}) of the target, each with the history a policy had before a_t.
+    """N samples (s_t, a_t, s_{t+1}) of E recorded episodes, each with the history a policy had before a_t.
 
-    Observations are kept once, by row of the recording; a window refers to the rows that it shows.
+    Observations are kept once, by row of the recording; a window refers to the rows that it shows. Episodes are kept
+    whole as well: effects with memory depend on all commands and states since the episode began.
     """
 
     observations: Tensor
@@ -42,6 +45,14 @@ class Windows:
     """(N,) number of the episode"""
     place: Tensor
     """(N, LENGTH, n_place) where the rows that it shows were on their course; of width 0 where there is none"""
+    time: Tensor
+    """(N,) s from the begin of the episode to s_t"""
+    row: Tensor
+    """(N,) row of s_t in its episode"""
+    commands: Tensor
+    """(E, T, n_action) of whole episodes, from their begin; zero after their end"""
+    states: Tensor
+    """(E, T, n_state) of whole episodes; after their end the last state repeats"""
 
     @classmethod
     def cut(cls, episodes: Sequence[Episode], source: str, observe: Observe | None = None) -> Windows:
@@ -55,6 +66,9 @@ class Windows:
         dtype = torch.get_default_dtype()
         parts: list[tuple[Tensor, ...]] = []
         observations: list[Tensor] = []
+        commands: list[Tensor] = []
+        states: list[Tensor] = []
+        longest = max((len(episode.time) for episode in episodes), default=0)
         first = 0
         for number, episode in enumerate(episodes):
             if episode.state is None:
@@ -66,6 +80,9 @@ class Windows:
             place = torch.zeros(len(state), 0) if episode.place is None else torch.as_tensor(episode.place)
             back = torch.arange(-LENGTH + 1, 1) + torch.arange(count)[:, None]
             padded = torch.cat((torch.zeros(LENGTH, action.shape[1], dtype=dtype), action))
+            time = torch.as_tensor(episode.time - episode.time[0], dtype=dtype)
+            commands.append(pad(action[:count], (0, 0, 0, longest - count)))
+            states.append(torch.cat((state, state[-1:].expand(longest - len(state), -1))))
             parts.append(
                 (
                     first + back.clamp(min=0),
@@ -75,16 +92,31 @@ class Windows:
                     state[1 : count + 1],
                     torch.full((count,), number),
                     place[back.clamp(min=0)],
+                    time[:count],
+                    torch.arange(count),
                 )
             )
             first += len(state)
         if not parts or not sum(len(part[0]) for part in parts):
             raise ValueError("the recording holds no sample: every episode has a single row")
         joined = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
-        return cls(torch.cat(observations), *joined)
+        return cls(torch.cat(observations), *joined, torch.stack(commands), torch.stack(states))
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    def start(self, world: World) -> WorldState:
+        """`world` at s_t of every window (N rows): at its time, with the memory that its episode's past leaves there.
+
+        Rows are not read yet.
+        """
+        memory = world.memories(self.states[:, 0], self.commands, self.states)
+        return WorldState(self.time, self.state, tuple(each[self.episode, self.row] for each in memory))
+
+    def with_states(self, states: Tensor) -> Windows:
+        """The same windows with other states (E, T, n_state), say smoothed ones; observations stay as recorded."""
+        state, following = states[self.episode, self.row], states[self.episode, self.row + 1]
+        return replace(self, states=states, state=state, next_state=following)
 
     def history(self, index: Tensor) -> History:
         """What the policy had seen and done before the action of these windows."""

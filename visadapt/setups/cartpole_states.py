@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from visadapt.effects import Residual
 from visadapt.learning.grounding import GroundSettings
@@ -55,11 +54,6 @@ class StateSettings:
     ground: GroundSettings = field(default_factory=GroundSettings)
 
 
-def observe(state: Tensor) -> Tensor:
-    """The states themselves."""
-    return state
-
-
 def pretrain(
     source: World, settings: StateSettings, path: Path, seed: int, report: Report | None = None
 ) -> StatePolicy:
@@ -68,7 +62,7 @@ def pretrain(
     policy = StatePolicy(n_state=4, with_history=settings.with_history)
     about = {"seed": seed, **asdict(settings.source)}
     generator = torch.Generator().manual_seed(seed)
-    train_or_load(path, policy, source, observe, settings.source, generator, about, staged(report, "source policy"))
+    train_or_load(path, policy, source, None, settings.source, generator, about, staged(report, "source policy"))
     return policy
 
 
@@ -88,4 +82,4 @@ def adapt_states(
     system = source.system if settings.with_history else None
     residual = Residual(StateResidualNetwork(n_state=4, system=system, period=source.period), torch.ones(4))
     plan = AdaptSettings(settings.adapted, settings.ground, budget, round_samples, "state", seed=seed)
-    return adapt(policy, residual, source, target, observe, see_states, plan, folder, report=report)
+    return adapt(policy, residual, source, target, None, see_states, plan, folder, report=report)

@@ -110,7 +110,7 @@ class Flight:
         settings = TuneSettings(self.task, how.iterations, how.batch, how.rate, own.longest, observation_noise=0.0)
         generator = torch.Generator().manual_seed(seed)
         progress = staged(report, f"{self.system.name}: source policy")
-        train_or_load(path, policy, self.source, _states, settings, generator, {"seed": seed, **asdict(how)}, progress)
+        train_or_load(path, policy, self.source, None, settings, generator, {"seed": seed, **asdict(how)}, progress)
         return policy
 
     def load(self, path: Path) -> FlightPolicy:
@@ -167,7 +167,7 @@ class Flight:
             feedforward=False,
             seed=seed,
         )
-        args = (policy, residual, source, target, _states, see_goals, settings, folder)
+        args = (policy, residual, source, target, None, see_goals, settings, folder)
         return adapt(*args, report=report, explorer=explorer)
 
 
@@ -239,10 +239,6 @@ def kept_score(path: Path, target: FlightTarget, policy: Policy, seed: int, flig
     # JSON has no infinity: that of a flight that was not finite is null there.
     missing: dict[str, Any] = {key: math.inf for key, value in found.items() if value is None}
     return FlightScore(**(found | missing))
-
-
-def _states(state: Tensor) -> Tensor:
-    return state
 
 
 def _step(source: World, state: Tensor, action: Tensor) -> Tensor:

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import torch
 
 from visadapt.diagnosis.result import Cause, Estimate, Ranked
-from visadapt.diagnosis.search.grids import spans
 from visadapt.diagnosis.search.model_comparison import ModelComparison, Weighed, exchanged
-from visadapt.diagnosis.search.search import ScoredModel, Search, posterior
+from visadapt.diagnosis.search.search import ScoredModel, Search
 from visadapt.effects import Effect, Parameter, Role
 from visadapt.effects.catalogue import twins
+from visadapt.estimation.fit_states import posterior
+from visadapt.estimation.grids import spans
 from visadapt.systems import System
 
 NINETY = 1.6449

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from visadapt.diagnosis.search import unexplained
-from visadapt.diagnosis.search.search import Effects, joined
 from visadapt.estimation.candidate import COARSE, CandidateModel
+from visadapt.estimation.fit_states import Effects, joined
 from visadapt.estimation.kalman import backward, forward
 from visadapt.estimation.likelihood import FitState, fit, linear_problem, variances
 from visadapt.estimation.profiles import profile_of

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import torch
 
-from visadapt.diagnosis.search.search import Effects, ScoredModel, Search
+from visadapt.diagnosis.search.search import ScoredModel, Search
 from visadapt.diagnosis.search.unexplained import Function, functions
 from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.fit_states import Effects
 
 WITHIN = 10.0
 """Log posterior odds that such a set may be behind the best."""

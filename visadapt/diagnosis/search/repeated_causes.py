@@ -13,11 +13,11 @@ from visadapt.diagnosis.search import heldout
 from visadapt.diagnosis.search.causes import NINETY
 from visadapt.diagnosis.search.heldout import RolloutErrors
 from visadapt.diagnosis.search.model_comparison import ModelComparison
-from visadapt.diagnosis.search.repeated_readings import zone
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import BAND, Readings
 from visadapt.effects import Dropout, FrozenZone
 from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.repeated_readings import zone
 from visadapt.evaluation.intervals import wilson
 
 FEWEST = 2

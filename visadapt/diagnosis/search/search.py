@@ -9,16 +9,26 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from visadapt.diagnosis.search.screening import Candidate, screen
 from visadapt.effects import Effect
-from visadapt.estimation.candidate import COARSE, FINE, CandidateModel
-from visadapt.estimation.likelihood import FitState, fit, rough
+from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.fit_states import (
+    CAREFUL,
+    QUICK,
+    Effects,
+    extended,
+    first_fits,
+    joined,
+    neutral,
+    only,
+    posterior,
+    widths,
+)
+from visadapt.estimation.likelihood import FitState, fit
 from visadapt.estimation.profiles import profile_of
+from visadapt.estimation.screening import Candidate, screen
 from visadapt.estimation.segments import Segments
 from visadapt.progress import Progress
 from visadapt.systems import System
-
-Effects = tuple[type[Effect], ...]
 
 MOST = 6
 """Effects in a set."""
@@ -29,9 +39,6 @@ LEADS = 8
 SUSPICIOUS = 5.0
 WIDE = 6
 """Log likelihood that process noise adds to the best set from which on the search is widened, to so many sets."""
-
-QUICK, CAREFUL = (8, COARSE), (20, FINE)
-"""Iterations and effort of a fit that only has to show promise, and of one whose figures are reported."""
 
 CLOSE = 8.0
 POLISHED = 8
@@ -61,19 +68,6 @@ class ScoredModel:
     def names(self) -> tuple[str, ...]:
         """Standard names."""
         return tuple(effect.name for effect in self.effects)
-
-
-def first_fits(system: System, rows: Segments) -> FitState:
-    """A start for the source as it stands."""
-    state = rough(rows, system)[None]
-    return FitState(
-        torch.zeros(1, 0, dtype=torch.float64),
-        state,
-        torch.full((1, len(profile_of(system).driven)), math.log(0.2**2), dtype=torch.float64),
-        torch.full((1, len(rows.channels)), math.log(0.01**2), dtype=torch.float64),
-        torch.full((1,), -math.inf, dtype=torch.float64),
-        torch.zeros(1, 0, 0, dtype=torch.float64),
-    )
 
 
 class Search:
@@ -150,7 +144,7 @@ class Search:
                 key = frozenset(e.name for e in effects)
                 if key not in self.fitted and key not in seen:
                     seen.add(key)
-                    starts.append((effects, _grown(base.fits, lead.values)))
+                    starts.append((effects, extended(base.fits, lead.values)))
         return self.fit(starts, QUICK)
 
     def _leads(self, base: ScoredModel) -> list[Candidate]:
@@ -202,8 +196,7 @@ class Search:
 
     def _lead(self, base: ScoredModel, effect: type[Effect]) -> FitState:
         leads = screen(self.system, base.effects, base.fits, self.rows, [effect])
-        nothing = tuple(p.neutral if p.neutral is not None else 0.5 * (p.low + p.high) for p in effect.table)
-        return _grown(base.fits, leads[0].values if leads else nothing)
+        return extended(base.fits, leads[0].values if leads else neutral(effect))
 
     def leftover(self, sets: Sequence[ScoredModel]) -> list[float]:
         """Log likelihood that process noise adds to each set: how much it leaves unexplained."""
@@ -224,7 +217,7 @@ class Search:
             self._slopes = models[0].slopes
         results = []
         for k, (effects, _) in enumerate(starts):
-            own = _apart(out.of(torch.tensor([k])), len(models[k].table))
+            own = only(out, k, len(models[k].table))
             fitted = ScoredModel(effects, own, evidence(effects, own, len(self.catalogue)))
             key = frozenset(fitted.names)
             if key not in self.fitted or self.fitted[key].evidence < fitted.evidence:
@@ -234,17 +227,6 @@ class Search:
 
     def _counts(self, count: int) -> Tensor:
         return torch.ones(count, self.rows.shape[0], dtype=torch.float64)
-
-
-def widths(effects: Effects) -> Tensor:
-    """(K,) of the ranges in which the parameters of a set are searched."""
-    return torch.tensor([p.high - p.low for e in effects for p in e.table], dtype=torch.float64)
-
-
-def posterior(effects: Effects, fits: FitState) -> tuple[Tensor, Tensor]:
-    """Precision of a set's parameters: (K,) before the data, that of their ranges, and (K, K) with them."""
-    precision = 12 / widths(effects).square()
-    return precision, fits.information[0] + torch.diag(precision)
 
 
 def evidence(effects: Effects, fits: FitState, catalogue: int) -> float:
@@ -290,26 +272,6 @@ def _vague(effects: Effects, fits: FitState, sure: Tensor, precision: Tensor) ->
         if (strengths and all(strengths)) or (len(shapes) > 1 and all(shapes)):
             return True
     return False
-
-
-def joined(fits: Sequence[FitState]) -> FitState:
-    """Fits of one set each as fits of many."""
-    widest = max(f.theta.shape[1] for f in fits)
-    theta = torch.zeros(len(fits), widest, dtype=torch.float64)
-    for k, each in enumerate(fits):
-        theta[k, : each.theta.shape[1]] = each.theta[0]
-    rest = [torch.cat([getattr(f, name) for f in fits]) for name in ("state", "log_process", "log_noise")]
-    unknown = torch.full((len(fits),), -math.inf, dtype=torch.float64)
-    return FitState(theta, rest[0], rest[1], rest[2], unknown, torch.zeros(len(fits), widest, widest).double())
-
-
-def _apart(fits: FitState, count: int) -> FitState:
-    return replace(fits, theta=fits.theta[:, :count], information=fits.information[:, :count, :count])
-
-
-def _grown(base: FitState, values: tuple[float, ...]) -> FitState:
-    theta = torch.cat((base.theta, torch.tensor([values], dtype=torch.float64)), 1)
-    return replace(base, theta=theta)
 
 
 def _shrunk(whole: ScoredModel, gone: type[Effect]) -> FitState:

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from visadapt.diagnosis.search.localisation import disturbance
-from visadapt.diagnosis.search.repeated_readings import Holds, find_holds
 from visadapt.diagnosis.search.search import Search
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import Convention, profile_of
+from visadapt.estimation.repeated_readings import Holds, find_holds
 from visadapt.estimation.segments import Segments, cut
 from visadapt.recordings import Recording
 from visadapt.systems import System

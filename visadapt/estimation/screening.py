@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from visadapt.diagnosis.search.grids import grid, is_climbed, spans, starts
-from visadapt.diagnosis.search.sensitivity import View
 from visadapt.effects import Effect
+from visadapt.estimation.grids import grid, is_climbed, spans, starts
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
+from visadapt.estimation.sensitivity import View
 from visadapt.systems import System
 
 STEPS = 6
