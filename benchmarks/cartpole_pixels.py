@@ -14,25 +14,22 @@ from __future__ import annotations
 
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 import tyro
 
 from renderers import DrawnCartPole
-from visadapt.evaluation.cartpole_score import Evaluation, evaluate
-from visadapt.evaluation.result_tables import read_rows, say, speed_row, write_rows
+from visadapt.evaluation import CartPoleScore, kept_score
+from visadapt.evaluation.result_tables import print_speed, read_rows, speed_row, write_rows
 from visadapt.films.plots import plot_curve
-from visadapt.setups.cartpole_frames import PixelTask
-from visadapt.storage.run_folder import once, open_run
-from visadapt.systems import CartPole
+from visadapt.setups.cartpole_frames import cartpole_frames
+from visadapt.storage.run_folder import open_run
 from visadapt.targets import SyntheticTarget, no_effects, sine_force
-from visadapt.targets.rollout import see_frames
-from visadapt.world import World
+from visadapt.weights import shipped
 
 EXPERIMENT = "CartPole, pixels, 2(sin t + 1) N"
-SCORE_SEED = 2026
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,7 @@ class Variant:
     scored: tuple[int, ...]
     """samples after which the policy is scored"""
     observations: str = "camera"
-    told_states: bool = False
+    states_from_target: bool = False
 
 
 OURS = "ours, frames alone"
@@ -53,7 +50,7 @@ VARIANTS = (
     Variant(OURS, 1000, 100, (100, 200, 500, 1000)),
     Variant(OURS, 50, 50, (50,)),
     Variant("ours, frames alone, grounded on rendered frames", 200, 100, (200,), observations="rendered"),
-    Variant("ours, states told by the target", 200, 100, (200,), told_states=True),
+    Variant("ours, states told by the target", 200, 100, (200,), states_from_target=True),
 )
 
 
@@ -70,7 +67,6 @@ class Settings:
     work: Path = Path("runs/cartpole_pixels")
     out: Path = Path("results/cartpole_pixels.csv")
     picture: Path = Path("assets/curve.png")
-    assets: Path = Path("assets")
 
 
 def main(settings: Settings) -> None:
@@ -91,45 +87,38 @@ def main(settings: Settings) -> None:
     drawn = [row for row in read_rows(settings.out) if row["method"] in (OURS, "unadapted")]
     plot_curve(settings.picture, drawn)
     for row in rows:
-        say(row)
+        print_speed(row)
 
 
-def _scores(settings: Settings, number: int | None, seed: int) -> dict[str, Evaluation]:
+def _scores(settings: Settings, number: int | None, seed: int) -> dict[str, CartPoleScore]:
     """Scores of one job by samples: of the unadapted policy, or of one seed of a variant."""
     torch.set_num_threads(1)
     stream = DrawnCartPole()
     source, target = SyntheticTarget(no_effects, stream), SyntheticTarget(sine_force, stream)
-    task = PixelTask.load_renderer(World(CartPole()), settings.assets / "renderer.safetensors")
-    encoder, policy = task.load(settings.assets)
+    setup = cartpole_frames()
+    policy = setup.load(shipped("cartpole_frames"))
 
-    def score(where: SyntheticTarget, path: Path) -> Evaluation:
-        def fresh() -> dict[str, object]:
-            return asdict(evaluate(where, policy, see_frames, SCORE_SEED, settings.episodes)[0])
-
-        return Evaluation(**once(path, fresh))
+    def scored(where: SyntheticTarget, path: Path) -> CartPoleScore:
+        return kept_score(path, policy, where, settings.episodes)
 
     if number is None:
         folder = settings.work / "unadapted"
         open_run(folder, {"episodes": settings.episodes})
-        return {"source": score(source, folder / "source.json"), "target": score(target, folder / "target.json")}
+        return {"source": scored(source, folder / "source.json"), "target": scored(target, folder / "target.json")}
     variant = VARIANTS[number]
-    folder = settings.work / f"variant-{number}" / f"seed-{seed}"
-    open_run(folder, {"seed": seed, "episodes": settings.episodes, **asdict(variant), **asdict(task.settings)})
-    adapted = task.adapt(
-        policy,
-        encoder,
-        target,
-        folder,
-        variant.budget,
-        variant.round_samples,
-        seed,
-        variant.observations,
-        variant.told_states,
+    setup = replace(
+        setup,
+        settings=replace(setup.settings, observations=variant.observations),
+        label=None if variant.states_from_target else setup.label,
     )
+    folder = settings.work / f"variant-{number}" / f"seed-{seed}"
+    about = {"seed": seed, "episodes": settings.episodes, **asdict(variant), **setup.settings.numbers()}
+    open_run(folder, about)
+    adapted = setup.adapt(policy, target, folder, variant.budget, variant.round_samples, seed)
     scores = {}
     for samples in variant.scored:
         adapted.restore(policy, samples)
-        scores[str(samples)] = score(target, folder / f"score-{samples}.json")
+        scores[str(samples)] = scored(target, folder / f"score-{samples}.json")
     return scores
 
 

@@ -16,28 +16,24 @@ from __future__ import annotations
 import copy
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 import tyro
 
-from visadapt.evaluation.cartpole_score import Evaluation, evaluate
-from visadapt.evaluation.result_tables import read_rows, say, speed_row, write_rows
+from visadapt.evaluation import CartPoleScore, kept_score
+from visadapt.evaluation.result_tables import print_speed, read_rows, speed_row, write_rows
 from visadapt.films.plots import plot_curve
-from visadapt.policies import StatePolicy
-from visadapt.setups.cartpole_states import StateSettings, adapt_states, pretrain
-from visadapt.storage.run_folder import once, open_run
-from visadapt.systems import CartPole
+from visadapt.policies import Policy
+from visadapt.setups.cartpole_states import cartpole_states
+from visadapt.storage.run_folder import open_run
 from visadapt.targets import SyntheticTarget, constant_force, sine_force
-from visadapt.targets.rollout import see_states
-from visadapt.world import World
 
 FORCE = 3.3
 """N"""
 CONSTANT, SINE = f"CartPole, states, constant {FORCE} N", "CartPole, states, 2(sin t + 1) N"
 OURS = "ours, states"
-SCORE_SEED = 2026
 PLANS = {CONSTANT: ((50, 50, (50,)),), SINE: ((50, 50, (50,)), (1000, 100, (100, 200, 500, 1000)))}
 """experiment: (budget, samples in a round, samples after which the policy is scored)"""
 
@@ -78,33 +74,29 @@ def main(settings: Settings) -> None:
         drawn = [row for row in read_rows(settings.out) if row["experiment"] == SINE]
         plot_curve(settings.picture, drawn, paper=None)
     for row in rows:
-        say(row)
+        print_speed(row)
 
 
-def _scores(settings: Settings, experiment: str, seed: int) -> dict[str, Evaluation]:
+def _scores(settings: Settings, experiment: str, seed: int) -> dict[str, CartPoleScore]:
     """Scores of one seed of an experiment, by samples; before adaptation by domain."""
     torch.set_num_threads(1)
     folder = settings.work / ("constant" if experiment == CONSTANT else "sine") / f"seed-{seed}"
-    training = StateSettings(with_history=experiment == SINE)
-    open_run(folder, {"seed": seed, "episodes": settings.episodes, "plans": PLANS[experiment], **asdict(training)})
-    source = World(CartPole())
+    setup = cartpole_states(with_history=experiment == SINE)
+    about = {"seed": seed, "episodes": settings.episodes, "plans": PLANS[experiment], **setup.settings.numbers()}
+    open_run(folder, about)
     target = SyntheticTarget(constant_force(FORCE) if experiment == CONSTANT else sine_force)
-    unadapted = pretrain(source, training, folder / "policy.safetensors", seed)
+    unadapted = setup.pretrain(folder / "policy.safetensors", seed)
 
-    def score(name: str, policy: StatePolicy, where: SyntheticTarget) -> Evaluation:
-        def fresh() -> dict[str, object]:
-            return asdict(evaluate(where, policy, see_states, SCORE_SEED, settings.episodes)[0])
+    def scored(name: str, policy: Policy, where: SyntheticTarget) -> CartPoleScore:
+        return kept_score(folder / f"score-{name}.json", policy, where, settings.episodes)
 
-        return Evaluation(**once(folder / f"score-{name}.json", fresh))
-
-    scores = {"source": score("source", unadapted, SyntheticTarget()), "target": score("target", unadapted, target)}
-    for budget, round_samples, scored in PLANS[experiment]:
+    scores = {"source": scored("source", unadapted, SyntheticTarget()), "target": scored("target", unadapted, target)}
+    for budget, round_samples, after in PLANS[experiment]:
         policy = copy.deepcopy(unadapted)
-        work = folder / f"budget-{budget}"
-        adapted = adapt_states(policy, source, target, training, work, budget, round_samples, seed)
-        for samples in scored:
+        adapted = setup.adapt(policy, target, folder / f"budget-{budget}", budget, round_samples, seed)
+        for samples in after:
             adapted.restore(policy, samples)
-            scores[str(samples)] = score(str(samples), policy, target)
+            scores[str(samples)] = scored(str(samples), policy, target)
     return scores
 
 

@@ -18,25 +18,30 @@ import multiprocessing
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 import tyro
 
-from benchmarks.flight import EXPERIMENTS, MEASURES, SCORE_SEED, adapt, hidden, opened, source_policy, vehicle
+from datasets import quadrotor_references
 from visadapt.effects import Residual
+from visadapt.evaluation import SCORE_SEED, FlightScore, kept_score
 from visadapt.evaluation.result_tables import Row, miss_row, read_rows, write_rows
 from visadapt.films.plots import Panel, plot_panels
 from visadapt.learning.grounding import gap, left_over
 from visadapt.learning.windows import Windows
-from visadapt.policies import AutoregressivePolicy, FlightPolicy, Policy
-from visadapt.setups.flight import Flight, FlightScore, kept_score
+from visadapt.policies import AutoregressivePolicy, Policy
+from visadapt.setups.base import Setup
+from visadapt.setups.flight import flight_target
+from visadapt.setups.flight_experiments import EXPERIMENTS
 from visadapt.storage.run_folder import once
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import VELOCITY
-from visadapt.targets.rollout import run, see_goals
-from visadapt.tasks.courses import ToTarget
+from visadapt.targets.rollout import run
+from visadapt.tasks.reach import Reach
+from visadapt.weights import shipped
 
 REACH = 5.0
 """m off its course at which a flight of another policy than the current one ends"""
@@ -45,18 +50,19 @@ LASTING = 1.0
 MISMATCH = "dynamics mismatch in velocity"
 
 
-def random_policy(flight: Flight) -> Policy:
+def random_policy(setup: Setup) -> Policy:
     """Commands that wander about hover, or about level flight."""
-    if isinstance(flight.system, Quadrotor):
-        rest = torch.tensor([float(flight.system.hover()), 0.0, 0.0, 0.0])
+    system = setup.source.system
+    if isinstance(system, Quadrotor):
+        rest = torch.tensor([float(system.hover()), 0.0, 0.0, 0.0])
     else:
-        assert isinstance(flight.system, FixedWing)
-        rest = flight.system.trim(torch.tensor([ToTarget.speed]))[1][0]
-    return AutoregressivePolicy(len(flight.system.states), rest, math.exp(-flight.source.period / LASTING))
+        assert isinstance(system, FixedWing)
+        rest = system.trim(torch.tensor([Reach.speed]))[1][0]
+    return AutoregressivePolicy(len(system.states), rest, math.exp(-setup.source.period / LASTING))
 
 
 CURRENT = "data of the current policy"
-EXPLORERS: dict[str, Callable[[Flight], Policy]] = {"data of a random policy": random_policy}
+EXPLORERS: dict[str, Callable[[Setup], Policy]] = {"data of a random policy": random_policy}
 """Who else may collect."""
 
 
@@ -66,14 +72,12 @@ class Settings:
 
     seeds: int = 3
     experiments: tuple[str, ...] = ("quadrotor, drag", "fixed wing, drag")
-    """of benchmarks.flight"""
     flights: int = 100
     """that each policy is scored on"""
     jobs: int = 2
     """seeds at once, one core each"""
     references: Path = Path("data/quadrotor_references.npz")
     """made where it is not there"""
-    assets: Path = Path("assets")
     current: Path = Path("runs/flight")
     """where benchmarks.flight keeps its adaptations"""
     work: Path = Path("runs/data_collection")
@@ -117,26 +121,26 @@ def _draw(settings: Settings) -> None:
     panels = {}
     rows = read_rows(settings.out)
     for name in settings.experiments:
-        for measure, unit in ((MISMATCH, "m/s"), (MEASURES[EXPERIMENTS[name].vehicle], "m")):
-            own = [row for row in rows if row["experiment"] == told(name) and row["measure"] == measure]
+        for measure, unit in ((MISMATCH, "m/s"), (EXPERIMENTS[name].measure, "m")):
+            own = [row for row in rows if row["experiment"] == label(name) and row["measure"] == measure]
             panels[measure == MISMATCH, name] = Panel(name, f"{measure}, {unit}", own)
     ordered = [panels[first, name] for first in (True, False) for name in settings.experiments]
     plot_panels(settings.picture, ordered, columns=len(settings.experiments))
 
 
-def told(name: str) -> str:
+def label(name: str) -> str:
     """What the table calls an experiment here."""
     return f"{name}, data collection"
 
 
 def _rows(name: str, method: str, domain: str, samples: int, seeds: list[Stand]) -> list[Row]:
     """What the seeds of a method missed by, and their mismatch with its spread over them."""
-    kind = EXPERIMENTS[name].vehicle
-    missed = miss_row(told(name), kind.name, method, domain, samples, MEASURES[kind], [each.score for each in seeds])
+    kind, measure = EXPERIMENTS[name].vehicle.name, EXPERIMENTS[name].measure
+    missed = miss_row(label(name), kind, method, domain, samples, measure, [each.score for each in seeds])
     mismatches = [each.mismatch for each in seeds]
     mismatch = Row(
-        experiment=told(name),
-        system=kind.name,
+        experiment=label(name),
+        system=kind,
         method=method,
         domain=domain,
         samples=samples,
@@ -151,46 +155,52 @@ def _rows(name: str, method: str, domain: str, samples: int, seeds: list[Stand])
     return [missed, mismatch]
 
 
+def _prepared(settings: Settings, name: str) -> tuple[Setup, Policy]:
+    setup = EXPERIMENTS[name].setup(partial(quadrotor_references.ready, settings.references))
+    return setup, setup.load(shipped(EXPERIMENTS[name].vehicle.name))
+
+
 def _before(settings: Settings, name: str) -> Stand:
     """The policy of the source, in the target."""
-    flight = vehicle(EXPERIMENTS[name], settings.references)
-    folder = opened(flight, name, settings.current, 0, settings.flights)
-    return _stand(settings, flight, name, folder, "target", source_policy(settings.assets, flight))
+    setup, policy = _prepared(settings, name)
+    folder = EXPERIMENTS[name].open(setup, settings.current, 0, settings.flights)
+    return _stand(settings, setup, name, folder, "target", policy)
 
 
 def _stands(settings: Settings, name: str, by: str, seed: int) -> dict[int, Stand]:
     """One seed with data collected `by` one of the methods, by samples."""
     torch.set_num_threads(1)
-    flight = vehicle(EXPERIMENTS[name], settings.references)
-    explorer = EXPLORERS[by](flight) if by in EXPLORERS else None
+    experiment = EXPERIMENTS[name]
+    setup, policy = _prepared(settings, name)
+    explorer = EXPLORERS[by](setup) if by in EXPLORERS else None
     work = settings.current if explorer is None else settings.work / by.replace(" ", "-")
-    folder = opened(flight, name, work, seed, settings.flights)
-    policy = source_policy(settings.assets, flight)
-    adapted = adapt(flight, name, work, policy, seed, explorer=explorer, reach=math.inf if explorer is None else REACH)
+    folder = experiment.open(setup, work, seed, settings.flights)
+    reach = math.inf if explorer is None else REACH
+    adapted = experiment.adapt(setup, work, policy, seed, explorer=explorer, reach=reach)
     found = {}
     for samples in [each.samples for each in adapted.rounds]:
         adapted.restore(policy, samples)
-        found[samples] = _stand(settings, flight, name, folder, str(samples), policy)
+        found[samples] = _stand(settings, setup, name, folder, str(samples), policy)
     return found
 
 
-def _stand(settings: Settings, flight: Flight, name: str, folder: Path, key: str, policy: FlightPolicy) -> Stand:
+def _stand(settings: Settings, setup: Setup, name: str, folder: Path, key: str, policy: Policy) -> Stand:
     """How `policy` stands, kept in `folder` under `key`."""
-    target = flight.target(hidden(EXPERIMENTS[name], float(flight.system.mass)))
-    found = kept_score(folder / f"{key}.json", target, policy, SCORE_SEED, settings.flights)
+    target = flight_target(setup, EXPERIMENTS[name].effects(setup))
+    found = kept_score(folder / f"{key}.json", policy, target, settings.flights)
 
     def mismatch() -> dict[str, float]:
         generator = torch.Generator().manual_seed(SCORE_SEED)
-        flown = run(target, policy, see_goals, settings.flights, target.course.steps, generator, strict=False)
+        flown = run(target, policy, settings.flights, target.task.steps, generator, strict=False)
         windows = Windows.cut([each.episode for each in flown], "state")
-        return {"mean": float(_error(policy.residual, flight, windows)[:, VELOCITY].norm(dim=1).mean())}
+        return {"mean": float(_error(policy.residual, setup, windows)[:, VELOCITY].norm(dim=1).mean())}
 
     return Stand(found, once(folder / f"mismatch-{key}.json", mismatch)["mean"])
 
 
-def _error(residual: Residual | None, flight: Flight, windows: Windows) -> torch.Tensor:
+def _error(residual: Residual | None, setup: Setup, windows: Windows) -> torch.Tensor:
     """Of one step of the simulator (N, n_state)."""
-    return gap(flight.source, windows) if residual is None else left_over(residual, flight.source, windows)
+    return gap(setup.source, windows) if residual is None else left_over(residual, setup.source, windows)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
     python -m benchmarks.named_effects
 
-The quadrotor under a drag of 0.3 1/s (`benchmarks.flight`), adapted from 20, 50 and 100 counted samples in one round:
-with the residual alone; with drag as an effect whose coefficient is fitted beside it (the paper, A.3.3: "almost
+The quadrotor under a drag of 0.3 1/s, as in `benchmarks.flight`, adapted from 20, 50 and 100 counted samples in one
+round: with the residual alone; with drag as an effect whose coefficient is fitted beside it (the paper, A.3.3: "almost
 immediate closure of the dynamics gap"); and with a wrong name in its place.
 
 Writes results/named_effects.csv. Interrupt it anywhere; started again, it goes on.
@@ -14,17 +14,22 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 import tyro
 
-from benchmarks.flight import EXPERIMENTS, SCORE_SEED, hidden, vehicle
+from datasets import quadrotor_references
 from visadapt.effects import ConstantForce, Effect, LinearDrag, ThrustGain
+from visadapt.evaluation import FlightScore, kept_score
 from visadapt.evaluation.result_tables import miss_row, write_rows
-from visadapt.setups.flight import FlightScore, kept_score
+from visadapt.setups.flight import flight_target, quadrotor
+from visadapt.setups.flight_experiments import EXPERIMENTS
 from visadapt.storage.run_folder import open_run
+from visadapt.systems import Quadrotor
+from visadapt.weights import shipped
+from visadapt.world import World
 
 EXPERIMENT = EXPERIMENTS["quadrotor, drag"]
 BUDGETS = (20, 50, 100)
@@ -45,7 +50,6 @@ class Settings:
     jobs: int = 2
     """runs at once, one core each"""
     references: Path = Path("data/quadrotor_references.npz")
-    assets: Path = Path("assets")
     work: Path = Path("runs/named_effects")
     out: Path = Path("results/named_effects.csv")
 
@@ -60,8 +64,8 @@ def main(settings: Settings) -> None:
     for name in NAMES:
         for budget in BUDGETS:
             scores = [found[name, budget, seed] for seed in range(settings.seeds)]
-            told = ("quadrotor, drag, named effects", "quadrotor", name, "adapted", budget, "mean tracking error")
-            rows.append(miss_row(*told, scores))
+            label = ("quadrotor, drag, named effects", "quadrotor", name, "adapted", budget, EXPERIMENT.measure)
+            rows.append(miss_row(*label, scores))
     write_rows(settings.out, rows)
     for row in rows:
         print(f"{row.method:44} {row.samples:4} samples  {row.mean:.4f} +- {row.std:.4f} m")
@@ -69,13 +73,14 @@ def main(settings: Settings) -> None:
 
 def _scored(settings: Settings, name: str, budget: int, seed: int) -> FlightScore:
     torch.set_num_threads(1)
-    flight = vehicle(EXPERIMENT, settings.references)
+    train, test = quadrotor_references.ready(settings.references)
+    setup = quadrotor(train, test, World(Quadrotor(), NAMES[name](), train.period, substeps=2))
     folder = settings.work / name.replace(" ", "-").replace(",", "") / f"{budget}-{seed}"
-    open_run(folder, {"seed": seed, "flights": settings.flights, "budget": budget, **asdict(flight.settings)})
-    policy = flight.load(settings.assets / "quadrotor.safetensors")
-    draw = hidden(EXPERIMENT, float(flight.system.mass))
-    flight.adapt(policy, flight.target(draw, test=False), folder, budget, budget, seed, named=NAMES[name]())
-    return kept_score(folder / "score.json", flight.target(draw), policy, SCORE_SEED, settings.flights)
+    open_run(folder, {"seed": seed, "flights": settings.flights, "budget": budget, **setup.settings.numbers()})
+    policy = setup.load(shipped("quadrotor"))
+    hidden = EXPERIMENT.effects(setup)
+    setup.adapt(policy, flight_target(setup, hidden, test=False), folder, budget, budget, seed)
+    return kept_score(folder / "score.json", policy, flight_target(setup, hidden), settings.flights)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
     python -m benchmarks.power_loop
 
-The policy of the source (assets/quadrotor.safetensors, trained on random references alone) flies a vertical circle in
+The policy of the source (the shipped one, trained on random references alone) flies a vertical circle in
 the source, finely integrated, at five speeds: with a radius of 7 m, the least half metre that lets the fastest fly
 with body rates of at most 0.5 rad/s and a body that stays upright, and as tight as each speed allows. The paper does
 not say how wide its loop is. Nothing is drawn at random, so there is one flight each.
@@ -18,11 +18,12 @@ from pathlib import Path
 import torch
 import tyro
 
+from visadapt.evaluation import score
 from visadapt.evaluation.result_tables import Row, write_rows
-from visadapt.setups.flight import quadrotor, score
+from visadapt.setups.flight import flight_target, quadrotor
 from visadapt.systems import Quadrotor
-from visadapt.tasks.courses import AlongReferences
 from visadapt.tasks.references import Reference, power_loop, smallest_loop
+from visadapt.weights import shipped
 
 SPEEDS = (2.6, 3.4, 4.1, 4.6, 5.0)
 """m/s, the paper's"""
@@ -32,7 +33,6 @@ SPEEDS = (2.6, 3.4, 4.1, 4.6, 5.0)
 class Settings:
     """Where things are."""
 
-    assets: Path = Path("assets")
     out: Path = Path("results/power_loop.csv")
 
 
@@ -44,18 +44,16 @@ def main(settings: Settings) -> None:
             ("power loop", power_loop(speed)),
             ("power loop, tightest", power_loop(speed, smallest_loop(speed, Quadrotor()))),
         ):
-            rows += _flown(settings, f"{name}, {speed} m/s", loop)
+            rows += _flown(f"{name}, {speed} m/s", loop)
     write_rows(settings.out, rows)
     for row in rows:
         print(f"{row.experiment:32} {row.measure:24} {row.mean:.3f} m")
 
 
-def _flown(settings: Settings, name: str, loop: Reference) -> list[Row]:
+def _flown(name: str, loop: Reference) -> list[Row]:
     motion = torch.stack((loop.positions, loop.velocities, loop.accelerations, loop.jerks))
-    course = AlongReferences(Reference.of(motion[:, None], loop.period))
-    flight = quadrotor(course, course)
-    policy = flight.load(settings.assets / "quadrotor.safetensors")
-    found = score(flight.target(), policy, seed=0, flights=1)
+    setup = quadrotor(Reference.of(motion[:, None], loop.period))
+    found = score(setup.load(shipped("quadrotor")), flight_target(setup), episodes=1)
     row = Row(
         name, "quadrotor", "ours, states", "source", 0, "mean tracking error", "m", found.mean, None, 1, found.failed, 1
     )

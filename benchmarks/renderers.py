@@ -24,15 +24,17 @@ from rich.table import Table
 from renderers import DrawnCartPole, LayeredRenderer, MLPRenderer, RendererError, load_renderer
 from renderers.measure import measure
 from visadapt.evaluation.result_tables import Row, write_rows
+from visadapt.weights import shipped
 
 Floats = NDArray[np.floating]
+SHIPPED = shipped("renderer")
 
 
 @dataclass(frozen=True)
 class Settings:
     """What is compared, on what."""
 
-    layered: Path = Path("assets/renderer.safetensors")
+    layered: Path = SHIPPED
     """ours"""
     mlp: Path = Path("assets/renderer_mlp.safetensors")
     """the paper's"""

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,17 +21,21 @@ import torch
 import tyro
 from torch import Tensor
 
-from benchmarks.flight import EXPERIMENTS, hidden, vehicle
+from datasets import quadrotor_references
 from visadapt.effects import Residual
 from visadapt.evaluation.result_tables import Row, read_rows, write_rows
 from visadapt.films.plots import Panel, plot_panels
 from visadapt.learning.grounding import gap, ground, left_over, rescale
 from visadapt.learning.windows import Windows
-from visadapt.policies import FlightPolicy
+from visadapt.policies import Policy
 from visadapt.policies.networks import FlightResidualNetwork, ResidualNetwork, StateResidualNetwork
-from visadapt.setups.flight import Flight
+from visadapt.setups.base import Setup
+from visadapt.setups.flight import flight_target
+from visadapt.setups.flight_experiments import EXPERIMENTS
+from visadapt.systems import RigidBody
 from visadapt.systems.rigid_body import VELOCITY
-from visadapt.targets.rollout import run, see_goals
+from visadapt.targets.rollout import run
+from visadapt.weights import shipped
 
 EXPERIMENT = EXPERIMENTS["quadrotor, drag"]
 SAMPLES = (50, 100, 200, 500, 1000)
@@ -46,20 +51,20 @@ class Settings:
 
     seeds: int = 3
     references: Path = Path("data/quadrotor_references.npz")
-    assets: Path = Path("assets")
+    picture: Path = Path("assets/residual_samples.png")
     out: Path = Path("results/residual_samples.csv")
 
 
 def main(settings: Settings) -> None:
     """Ground all residuals and write the table."""
-    flight = vehicle(EXPERIMENT, settings.references)
-    policy = flight.load(settings.assets / "quadrotor.safetensors")
+    setup = EXPERIMENT.setup(partial(quadrotor_references.ready, settings.references))
+    policy = setup.load(shipped("quadrotor"))
     shares: dict[tuple[str, int], list[float]] = {}
     for seed in range(settings.seeds):
-        train, test = (_flown(flight, policy, 2 * seed + k) for k in (0, 1))
+        train, test = (_flown(setup, policy, 2 * seed + k) for k in (0, 1))
         for method in (OURS, PAPER):
             for samples in SAMPLES:
-                shares.setdefault((method, samples), []).append(_share(flight, method, train, samples, test, seed))
+                shares.setdefault((method, samples), []).append(_share(setup, method, train, samples, test, seed))
     rows = [
         Row(
             experiment="quadrotor, drag, residual by samples",
@@ -86,30 +91,32 @@ def main(settings: Settings) -> None:
 def _draw(settings: Settings) -> None:
     title = "quadrotor, drag 0.3 1/s: flights that were not learnt from"
     panel = Panel(title, "gap in velocity that is left, as a share", read_rows(settings.out))
-    plot_panels(settings.assets / "residual_samples.png", [panel])
+    plot_panels(settings.picture, [panel])
 
 
-def _flown(flight: Flight, policy: FlightPolicy, seed: int) -> Windows:
+def _flown(setup: Setup, policy: Policy, seed: int) -> Windows:
     """Samples of flights in the target."""
-    target = flight.target(hidden(EXPERIMENT, float(flight.system.mass)), test=False)
+    target = flight_target(setup, EXPERIMENT.effects(setup), test=False)
     generator = torch.Generator().manual_seed(seed)
-    runs = run(target, policy, see_goals, FLIGHTS, target.course.steps, generator, NOISE)
+    runs = run(target, policy, FLIGHTS, target.task.steps, generator, NOISE)
     return Windows.cut([each.episode for each in runs], "state")
 
 
-def _share(flight: Flight, method: str, train: Windows, samples: int, test: Windows, seed: int) -> float:
+def _share(setup: Setup, method: str, train: Windows, samples: int, test: Windows, seed: int) -> float:
     """The share of the gap in velocity that a residual leaves on `test`."""
     torch.manual_seed(seed)
+    source, own = setup.source, setup.settings.ground
+    assert isinstance(source.system, RigidBody)
     network: ResidualNetwork = (
-        FlightResidualNetwork(flight.system, flight.source.period)
+        FlightResidualNetwork(source.system, source.period)
         if method == OURS
-        else StateResidualNetwork(len(flight.system.states), len(flight.system.actions))
+        else StateResidualNetwork(len(source.system.states), len(source.system.actions))
     )
-    residual = Residual(network, torch.ones(len(flight.system.states)))
+    residual = Residual(network, torch.ones(len(source.system.states)))
     few = _first(train, samples)
-    rescale(residual, flight.source, few, flight.settings.ground.negligible)
-    ground(residual, flight.source, few, flight.settings.ground, torch.Generator().manual_seed(seed))
-    return _size(left_over(residual, flight.source, test)) / _size(gap(flight.source, test))
+    rescale(residual, source, few, own.negligible)
+    ground(residual, source, few, own, torch.Generator().manual_seed(seed))
+    return _size(left_over(residual, source, test)) / _size(gap(source, test))
 
 
 def _first(windows: Windows, count: int) -> Windows:

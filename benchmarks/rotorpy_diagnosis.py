@@ -31,23 +31,23 @@ import tyro
 
 from datasets import quadrotor_references
 from datasets.blind import flights as blind_flights
-from train.rotorpy_quadrotor import published
 from visadapt import diagnose
 from visadapt.diagnosis.search.causes import NINETY
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import Readings
 from visadapt.effects import MotorLag, RateDamping, RotorDrag, TranslationalLift, Wind
 from visadapt.estimation.fit_states import posterior
-from visadapt.policies import FlightPolicy
+from visadapt.policies import Policy
 from visadapt.progress import reporting
 from visadapt.recordings import Episode, load_recording, write_recording
-from visadapt.setups.flight import quadrotor
+from visadapt.setups.policy_file import load_policy
 from visadapt.storage.atomic_files import replacing
 from visadapt.storage.run_folder import once, open_run
 from visadapt.targets import TargetError
-from visadapt.targets.rollout import run, see_goals
+from visadapt.targets.rollout import run
 from visadapt.targets.rotorpy import BREEZE, SOURCE, Air, RotorpyTarget
-from visadapt.tasks.courses import AlongReferences
+from visadapt.tasks.follow import Follow
+from visadapt.weights import shipped
 from visadapt.world import World
 
 FLIGHTS = 10
@@ -75,8 +75,8 @@ FOUND: dict[str, tuple[str, float, tuple[tuple[str, str], ...]]] = {
     "lag": ("s", 1.0, (("motor_lag", "time_constant"),)),
     **{f"wind_{axis}": ("m/s", 1.0, (("wind", f"velocity_{axis}"),)) for axis in "xy"},
 }
-"""What rotorpy publishes, by `train.rotorpy_quadrotor`'s names: the unit, by what a parameter of ours is divided, and
-which effects and parameters stand for it. Drags add."""
+"""What rotorpy publishes, by the names of `RotorpyTarget.published`: the unit, by what a parameter of ours is divided,
+and which effects and parameters stand for it. Drags add."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,6 @@ class Settings:
     """of flights and noise"""
     references: Path = Path("data/quadrotor_references.npz")
     """made where it is not there"""
-    policy: Path = Path("assets/quadrotor.safetensors")
     out: Path = Path("runs/rotorpy_diagnosis")
     results: Path = Path("results/rotorpy_diagnosis.csv")
 
@@ -96,32 +95,32 @@ class Settings:
 def main(settings: Settings) -> None:
     """Fly, diagnose and write the table."""
     torch.set_num_threads(1)
-    course = AlongReferences(quadrotor_references.ready(settings.references)[1])
-    policy = quadrotor(course, course, SOURCE).load(settings.policy)
+    task = Follow(quadrotor_references.ready(settings.references)[1])
+    policy = load_policy(shipped("quadrotor"))
     open_run(settings.out, {"seed": settings.seed, "flights": FLIGHTS})
     parameters = "".join(f"{name} = {value!r}\n" for name, value in asdict(SOURCE).items())
     (settings.out / "source.toml").write_text(f"[parameters]\n{parameters}")
     rows: list[dict[str, str]] = []
     for kind in settings.kinds:
         air = KINDS[kind]
-        target = RotorpyTarget(course, air or Air(), aero=air is not None)
+        target = RotorpyTarget(task, air or Air(), aero=air is not None)
         path = settings.out / f"{kind.replace(' ', '-')}.h5"
         if not path.exists():
             record(target, policy, settings.seed, path)
         answer = once(path.with_suffix(".json"), partial(asked, path))
         sizes = once(path.with_suffix(".sizes.json"), partial(sized, path))
-        true = published(target)
+        true = target.published()
         rows += rows_of(kind, answer, sizes, true if air is not None else {"lag": true["lag"]})
     write(settings.results, rows)
     for row in rows:
         print(f"{row['air']:12} {row['what']:12} {row['value']} {row['unit']}  rotorpy: {row['published']}")
 
 
-def record(target: RotorpyTarget, policy: FlightPolicy, seed: int, path: Path) -> None:
+def record(target: RotorpyTarget, policy: Policy, seed: int, path: Path) -> None:
     """Flights as sensors read them."""
     policy.eval()
     generator = torch.Generator().manual_seed(seed)
-    flown = run(target, policy, see_goals, FLIGHTS, target.course.steps, generator, EXPLORATION)
+    flown = run(target, policy, FLIGHTS, target.task.steps, generator, EXPLORATION)
     rng = np.random.default_rng(seed)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_recording(path, [_read(each.episode, rng) for each in flown], *_names())

@@ -7,7 +7,6 @@ import torch
 
 from visadapt.effects import ConstantForce, LinearDrag
 from visadapt.setups.flight import quadrotor
-from visadapt.tasks.courses import AlongReferences
 from visadapt.tasks.references import Reference
 
 PERIOD = 0.1
@@ -35,11 +34,16 @@ def straight(count=2, rows=41, dtype=torch.float32):
     return Reference.of(torch.stack((position, velocity, still, still)).to(dtype), PERIOD)
 
 
-def small_flight(rows=21, **settings):
-    """The quadrotor on a few short references; `settings` are FlightSettings'."""
-    flight = quadrotor(AlongReferences(waves(8, rows)), AlongReferences(waves(5, rows, seed=1)))
-    flight.settings = dataclasses.replace(flight.settings, **settings)
-    return flight
+def small_quadrotor(rows=21, with_history=False, **training):
+    """The quadrotor on a few short references; `training` are TuneSettings', in the source and in each round."""
+    return trained_as(quadrotor(waves(8, rows), waves(5, rows, seed=1), with_history=with_history), **training)
+
+
+def trained_as(setup, **training):
+    """A setup with other TuneSettings, in the source and in each round."""
+    own = setup.settings
+    source, tuning = (dataclasses.replace(part, **training) for part in (own.source, own.tuning))
+    return dataclasses.replace(setup, settings=dataclasses.replace(own, source=source, tuning=tuning))
 
 
 def drag(rate):

@@ -16,26 +16,23 @@ Interrupt it anywhere; started again, it goes on and ends with the same numbers.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import tyro
 
 from renderers import DrawnCartPole
 from train import renderer as renderer_training
-from train.scoring import curves, filmed, score
-from visadapt.evaluation.cartpole_score import EPISODES, Evaluation
+from visadapt.evaluation import CartPoleScore, kept_score
 from visadapt.films.cartpole_panel import Panel
 from visadapt.films.plots import plot_losses
 from visadapt.films.video import write_film, write_still
 from visadapt.progress import reporting
-from visadapt.setups.cartpole_frames import PixelSettings, PixelTask
-from visadapt.storage.run_folder import once, open_run, write_json
-from visadapt.systems import CartPole
+from visadapt.setups.cartpole_frames import cartpole_frames
+from visadapt.storage.run_folder import open_run, write_json
 from visadapt.targets import SyntheticTarget, Target, TargetError, no_effects, sine_force
-from visadapt.targets.rollout import Run
-from visadapt.world import World
+from visadapt.targets.rollout import Run, film_run
+from visadapt.weights import shipped
 
 
 @dataclass(frozen=True)
@@ -43,74 +40,68 @@ class Settings:
     """What is adapted, and where results go."""
 
     from_scratch: bool = False
-    """train renderer, encoder and source policy too, instead of taking them from assets/"""
+    """train renderer, encoder and source policy too, instead of taking the shipped ones"""
     budget: int = 1000
     """N: target samples in all, all counted"""
     round_samples: int = 200
     """B: target samples in a round"""
     observations: str = "camera"
     """frames that ground the residual: the target's own ("camera"), or rendered from estimated states ("rendered")"""
-    told_states: bool = False
-    """learn from states that the target tells, as the paper does, instead of from its frames alone"""
-    episodes: int = EPISODES
+    states_from_target: bool = False
+    """learn from the target's own states, as the paper does, instead of from its frames alone"""
+    episodes: int = 100
     """episodes of each evaluation"""
     seed: int = 0
     out: Path = Path("runs/demo")
-    assets: Path = Path("assets")
 
 
 def main(settings: Settings) -> None:
     """Run the demo in `settings.out`, going on from what is there."""
     out = settings.out / "from-scratch" if settings.from_scratch else settings.out
-    training = PixelSettings()
-    chosen = {key: value for key, value in asdict(settings).items() if key not in ("out", "assets")}
-    about = open_run(out, {**chosen, "training": asdict(training)})
     stream = DrawnCartPole()
     source, target = SyntheticTarget(no_effects, stream), SyntheticTarget(sine_force, stream)
-    renderer = _renderer(settings, out)
+    setup = cartpole_frames(renderer=_renderer(settings, out))
+    setup = replace(
+        setup,
+        settings=replace(setup.settings, observations=settings.observations),
+        label=None if settings.states_from_target else setup.label,
+    )
+    chosen = {key: value for key, value in asdict(settings).items() if key != "out"}
+    about = open_run(out, {**chosen, "training": setup.settings.numbers()})
+    scores: dict[str, CartPoleScore] = {}
+    films: list[tuple[str, Run]] = []
+
+    def look(name: str, title: str, where: Target) -> None:
+        """Score the policy as it is now, and film one episode."""
+        scores[name] = kept_score(out / f"{name}.json", policy, where, settings.episodes)
+        print(f"{title}: {scores[name]}", flush=True)
+        films.append((title, film_run(where, policy)))
+
     with reporting() as report:
-        task = PixelTask.load_renderer(World(CartPole()), renderer, training)
         if settings.from_scratch:
-            encoder, policy = task.pretrain(out, settings.seed, report)
+            policy = setup.pretrain(out / "policy.safetensors", settings.seed, report)
         else:
-            encoder, policy = task.load(settings.assets)
-        scores: dict[str, dict[str, Any]] = {}
-        films: list[tuple[str, Run]] = []
-
-        def look(name: str, title: str, where: Target) -> None:
-            """Score the policy as it is now, and film one episode."""
-            scores[name] = once(out / f"{name}.json", lambda: score(where, policy, settings.episodes))
-            print(f"{title}: {Evaluation(**scores[name])}", flush=True)
-            films.append((title, filmed(where, policy)))
-
+            policy = setup.load(shipped("cartpole_frames"))
         look("source", "Source, 0 samples", source)
         look("before", "Target, before", target)
-        adapted = task.adapt(
-            policy,
-            encoder,
-            target,
-            out,
-            settings.budget,
-            settings.round_samples,
-            settings.seed,
-            settings.observations,
-            settings.told_states,
-            report,
-        )
+        adapted = setup.adapt(policy, target, out, settings.budget, settings.round_samples, settings.seed, report)
         look("after", f"Target, after {adapted.ledger.used:,} samples", target)
         panels = [Panel.redrawn(title, shown, stream) for title, shown in films]
         write_still(out / "film.png", panels, t=3.0)
         write_film(
             out / "film.mp4", panels, target.period, lambda done, total: report("film", done, total, float("nan"))
         )
-    plot_losses(out / "losses.png", curves(adapted))
-    write_json(out / "metrics.json", {"ledger": asdict(adapted.ledger), "scores": scores, **about})
+    plot_losses(out / "losses.png", adapted.rounds)
+    write_json(
+        out / "metrics.json",
+        {"ledger": asdict(adapted.ledger), "scores": {name: asdict(each) for name, each in scores.items()}, **about},
+    )
     print(f"film.mp4, film.png, losses.png and metrics.json are in {out}")
 
 
 def _renderer(settings: Settings, out: Path) -> Path:
     if not settings.from_scratch:
-        return settings.assets / "renderer.safetensors"
+        return shipped("renderer")
     path = out / "renderer.safetensors"
     if not path.exists():
         renderer_training.train(renderer_training.Settings(kinds=("layered",), out=out))

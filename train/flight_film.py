@@ -2,7 +2,7 @@
 
     python -m train.flight_film --vehicle quadrotor --experiment drag
 
-Source policies are those in assets/ (from train.flight_policies). Adapted weights are those that `benchmarks.flight`
+Source policies are the shipped ones (from train.flight_policies). Adapted weights are those that `benchmarks.flight`
 left in runs/flight; where they are not there yet, or not all, the policy is adapted there first, in the same way. Do
 not start it while the benchmark is at work on the same experiment and seed. Writes
 
@@ -16,29 +16,24 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import torch
 import tyro
 
-from benchmarks.flight import EXPERIMENTS, adapt, hidden
-from train.flight_policies import made
+from datasets import quadrotor_references
 from visadapt.films.flight_film import FlownPanel, write_flight_film, write_flight_still
 from visadapt.policies import Policy
 from visadapt.progress import reporting
-from visadapt.setups.flight import Flight
+from visadapt.setups.base import Setup
+from visadapt.setups.flight import flight_target
+from visadapt.setups.flight_experiments import EXPERIMENTS
 from visadapt.targets import TargetError
-from visadapt.targets.rollout import run, see_goals
+from visadapt.targets.rollout import run
 from visadapt.targets.synthetic import DrawEffects, no_effects
-
-NAMES = {
-    ("quadrotor", "drag"): "quadrotor, drag",
-    ("quadrotor", "force"): "quadrotor, 2 cos t",
-    ("fixed_wing", "drag"): "fixed wing, drag",
-    ("fixed_wing", "force"): "fixed wing, 2 cos t",
-}
-"""What the benchmark calls them."""
+from visadapt.weights import shipped
 
 
 @dataclass(frozen=True)
@@ -51,12 +46,11 @@ class Settings:
     seed: int = 0
     """of the adaptation"""
     flight: int = 12
-    """seed of the course, and of the force's phase: one that was not trained on"""
+    """seed of what is to be flown, and of the force's phase: one that was not trained on"""
     still: float = 6.0
     """s at which the still is taken; 0.3 s after it passed its target, if it flies through one"""
     references: Path = Path("data/quadrotor_references.npz")
     """made where it is not there"""
-    assets: Path = Path("assets")
     work: Path = Path("runs/flight")
     out: Path = Path("runs/films")
 
@@ -64,21 +58,20 @@ class Settings:
 def main(settings: Settings) -> None:
     """Adapt what is not adapted yet, fly, and film."""
     torch.set_num_threads(1)
-    name = NAMES[settings.vehicle, settings.experiment]
-    weights = settings.assets / f"{settings.vehicle}.safetensors"
-    if not weights.exists():
-        raise ValueError(f"{weights} is not there: python -m train.flight_policies --vehicles {settings.vehicle}")
-    flight = made(settings.vehicle, settings.references)
-    policy = flight.load(weights)
+    kind = settings.vehicle, settings.experiment
+    experiment = next(each for each in EXPERIMENTS.values() if (each.vehicle.name, each.hidden) == kind)
+    setup = experiment.setup(partial(quadrotor_references.ready, settings.references))
+    policy = setup.load(shipped(settings.vehicle))
     adapting = copy.deepcopy(policy)
-    draw = hidden(EXPERIMENTS[name], float(flight.system.mass))
+    hidden = experiment.effects(setup)
     with reporting() as report:
-        adapted = adapt(flight, name, settings.work, adapting, settings.seed, report)
-        before = flown(flight, draw, policy, settings.flight, "Target, before adaptation")
+        adapted = experiment.adapt(setup, settings.work, adapting, settings.seed, report)
+        before = flown(setup, hidden, policy, settings.flight, "Target, before adaptation")
+        after = f"Target, after {adapted.ledger.used:,} samples"
         panels = [
-            flown(flight, no_effects, policy, settings.flight, "Source, 0 samples"),
+            flown(setup, no_effects, policy, settings.flight, "Source, 0 samples"),
             before,
-            flown(flight, draw, adapting, settings.flight, f"Target, after {adapted.ledger.used:,} samples", before),
+            flown(setup, hidden, adapting, settings.flight, after, before),
         ]
         path = settings.out / f"{settings.vehicle}-{settings.experiment}.mp4"
         passed = max(panel.passed for panel in panels) + 0.3
@@ -90,18 +83,18 @@ def main(settings: Settings) -> None:
 
 
 def flown(
-    flight: Flight,
-    draw: DrawEffects,
+    setup: Setup,
+    draw_effects: DrawEffects,
     policy: Policy,
     seed: int,
     title: str,
     earlier: FlownPanel | None = None,
 ) -> FlownPanel:
-    """One flight under hidden effects; the seed alone decides on its course and its force."""
+    """One flight under hidden effects; the seed alone decides what is to be flown, and the force."""
     policy.eval()
-    target = flight.target(draw)
-    flights = run(target, policy, see_goals, 1, target.course.steps, torch.Generator().manual_seed(seed), strict=False)
-    return FlownPanel(title, flights[0], flight.system, target.course, target.first[0], earlier)
+    target = flight_target(setup, draw_effects)
+    flights = run(target, policy, 1, target.task.steps, torch.Generator().manual_seed(seed), strict=False)
+    return FlownPanel(title, flights[0], target.system, target.task, target.first[0], earlier)
 
 
 if __name__ == "__main__":

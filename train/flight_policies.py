@@ -2,8 +2,8 @@
 
     python -m train.flight_policies [--vehicles quadrotor fixed_wing]
 
-Writes assets/<vehicle>.safetensors, trained in the source alone by backpropagation through the physics, and prints
-how far 100 flights that were not trained on miss. Interrupt it anywhere; started again, it goes on.
+Writes visadapt/weights/<vehicle>.safetensors, trained in the source alone by backpropagation through the physics, and
+prints how far 100 flights that were not trained on miss. Interrupt it anywhere; started again, it goes on.
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ import torch
 import tyro
 
 from datasets import quadrotor_references
+from visadapt.evaluation import score
 from visadapt.progress import reporting
-from visadapt.setups.flight import Flight, fixed_wing, quadrotor, score
+from visadapt.setups.base import Setup
+from visadapt.setups.flight import fixed_wing, flight_target, quadrotor
 from visadapt.systems import FixedWing, Quadrotor
-from visadapt.systems.parameter_file import RigError, load_rig
-from visadapt.tasks.courses import AlongReferences
+from visadapt.systems.parameter_file import RigError, load_parameters
+from visadapt.world import World
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class Settings:
     references: Path = Path("data/quadrotor_references.npz")
     """made where it is not there"""
     seed: int = 0
-    out: Path = Path("assets")
+    out: Path = Path("visadapt/weights")
 
 
 def main(settings: Settings) -> None:
@@ -41,20 +43,21 @@ def main(settings: Settings) -> None:
     torch.set_num_threads(1)
     with reporting() as report:
         for name in settings.vehicles:
-            flight = made(name, settings.references, settings.params)
+            setup = vehicle(name, settings)
             began = time.perf_counter()
-            policy = flight.pretrain(settings.out / f"{name}.safetensors", settings.seed, report)
+            policy = setup.pretrain(settings.out / f"{name}.safetensors", settings.seed, report)
             took = time.perf_counter() - began
-            print(f"{name}: {score(flight.target(), policy, seed=2026)} in the source; {took:.0f} s", flush=True)
+            print(f"{name}: {score(policy, flight_target(setup))} in the source; {took:.0f} s", flush=True)
 
 
-def made(vehicle: str, references: Path, params: Path | None = None) -> Flight:
-    """A vehicle, the default one or that of a file, and its courses."""
-    if vehicle == "fixed_wing":
-        return fixed_wing(system=load_rig(params, FixedWing) if params else None)
-    train, test = quadrotor_references.ready(references)
-    own = load_rig(params, Quadrotor) if params else None
-    return quadrotor(AlongReferences(train), AlongReferences(test), own)
+def vehicle(name: str, settings: Settings) -> Setup:
+    """A vehicle, the default one or that of a file, and what it is to fly."""
+    if name == "fixed_wing":
+        wing = load_parameters(settings.params, FixedWing) if settings.params else FixedWing()
+        return fixed_wing(World(wing))
+    train, test = quadrotor_references.ready(settings.references)
+    own = load_parameters(settings.params, Quadrotor) if settings.params else Quadrotor()
+    return quadrotor(train, test, World(own, period=train.period, substeps=2))
 
 
 if __name__ == "__main__":

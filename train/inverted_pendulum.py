@@ -3,7 +3,7 @@
     python -m train.inverted_pendulum [--budget 500] [--seeds 0 1 2] [--out runs/inverted_pendulum]
 
 The target is one that no one here wrote. The source model is a cart-pole with the masses, length, gear and gravity
-that the environment publishes; nothing else is told. In order:
+that the environment publishes; nothing else. In order:
 
     1. the renderer learns how the environment looks, from its frames at set states: a calibration of the camera that
        runs no step of the target and is not counted
@@ -31,8 +31,7 @@ from torch import Tensor
 
 from renderers import LayeredRenderer, load_renderer, save_renderer
 from renderers.training import fit
-from train.scoring import curves, filmed, score
-from visadapt.evaluation.cartpole_score import EPISODES, Evaluation
+from visadapt.evaluation import CartPoleScore, kept_score
 from visadapt.evaluation.result_tables import Row, speed_row, write_rows
 from visadapt.films.cartpole_panel import Panel
 from visadapt.films.plots import plot_losses
@@ -44,14 +43,15 @@ from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
 from visadapt.progress import Report, reporting, staged
 from visadapt.recordings import Episode
-from visadapt.setups.cartpole_frames import PixelSettings, PixelTask
+from visadapt.setups.base import Setup, SetupSettings
+from visadapt.setups.cartpole_frames import cartpole_frames
 from visadapt.storage.atomic_files import replacing
-from visadapt.storage.run_folder import once, open_run, write_json
+from visadapt.storage.run_folder import open_run, write_json
 from visadapt.targets import Observation, SyntheticTarget, Target, TargetError
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.targets.inverted_pendulum import MAP, REACH, SOURCE, START, inverted_pendulum
-from visadapt.targets.rollout import Run
-from visadapt.tasks.base import Balance
+from visadapt.targets.rollout import Run, film_run
+from visadapt.tasks.balance import Balance
 from visadapt.tasks.cost import Cost
 from visadapt.world import World
 
@@ -73,7 +73,7 @@ ADAPT = TuneSettings(
     longest=25,
     recorded=0.8,
 )
-TRAINING = PixelSettings(SEE, LEARN, ADAPT)
+TRAINING = SetupSettings(LEARN, ADAPT, observations="camera", perception=SEE)
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Settings:
     frames: int = 4000
     """of set states, that the renderer is trained on"""
     renderer_steps: int = 800
-    episodes: int = EPISODES
+    episodes: int = 100
     """episodes of each evaluation"""
     out: Path = Path("runs/inverted_pendulum")
     results: Path = Path("results/inverted_pendulum.csv")
@@ -98,14 +98,14 @@ class Settings:
 class SeenSource(SyntheticTarget):
     """The source physics, integrated finely, seen through the learnt renderer; it ends where the environment would."""
 
-    def __init__(self, task: PixelTask) -> None:
-        super().__init__(system=SOURCE, period=task.source.period, start=START, angle_limit=ANGLE_LIMIT)
-        self.task = task
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(system=SOURCE, period=setup.source.period, start=START, angle_limit=ANGLE_LIMIT)
+        self.observe = setup.observe
 
     def _observe(self) -> Observation:
         seen = super()._observe()
         with torch.no_grad():
-            frame = self.task.observe(seen.state.nan_to_num().clamp(-10, 10))
+            frame = self.observe(seen.state.nan_to_num().clamp(-10, 10))
         inside = seen.state[:, 0].abs() <= REACH
         return replace(seen, alive=seen.alive & inside, frame=(255 * frame).round().clamp(0, 255).byte())
 
@@ -113,38 +113,40 @@ class SeenSource(SyntheticTarget):
 def main(settings: Settings) -> None:
     """Do the whole job in `settings.out`, going on from what is there."""
     out = settings.out
-    told = {key: value for key, value in asdict(settings).items() if key not in ("out", "results", "seeds")}
-    about = open_run(out, {**told, "training": asdict(TRAINING)})
+    chosen = {key: value for key, value in asdict(settings).items() if key not in ("out", "results", "seeds")}
+    about = open_run(out, {**chosen, "training": TRAINING.numbers()})
     target = inverted_pendulum()
-    scores: dict[str, dict[str, Any]] = {}
+    scores: dict[str, CartPoleScore] = {}
     adaptations: dict[int, dict[str, Any]] = {}
     films: list[tuple[str, Run]] = []
 
     def look(name: str, where: Target, policy: Policy) -> None:
-        scores[name] = once(out / f"{name}.json", lambda: score(where, policy, settings.episodes))
-        print(f"{name}: {Evaluation(**scores[name])}", flush=True)
+        scores[name] = kept_score(out / f"{name}.json", policy, where, settings.episodes)
+        print(f"{name}: {scores[name]}", flush=True)
 
     with reporting() as report:
         world = World(SOURCE, period=target.period)
-        task = PixelTask(world, _renderer(settings, target, report), TRAINING)
-        _, policy = task.pretrain(out / "source", 0, report)
-        look("source", SeenSource(task), policy)
+        setup = cartpole_frames(world, _renderer(settings, target, report), TRAINING)
+        source = out / "source" / "policy.safetensors"
+        policy = setup.pretrain(source, 0, report)
+        look("source", SeenSource(setup), policy)
         look("before", target, policy)
-        films.append(("InvertedPendulum-v5, before", filmed(target, policy)))
+        films.append(("InvertedPendulum-v5, before", film_run(target, policy)))
         for seed in settings.seeds:
-            encoder, policy = task.load(out / "source")
+            policy = setup.load(source)
             work, budget, in_round = out / f"seed-{seed}", settings.budget, settings.round_samples
-            adapted = task.adapt(policy, encoder, target, work, budget, in_round, seed, report=report)
+            adapted = setup.adapt(policy, target, work, budget, in_round, seed, report)
             look(f"after-{seed}", target, policy)
-            adaptations[seed] = {"ledger": asdict(adapted.ledger), "gap": _gap(task.source, adapted.episodes)}
+            adaptations[seed] = {"ledger": asdict(adapted.ledger), "gap": _gap(world, adapted.episodes)}
             if len(films) == 1:
-                films.append((f"after {adapted.ledger.used:,} samples", filmed(target, policy)))
-                plot_losses(out / "losses.png", curves(adapted))
+                films.append((f"after {adapted.ledger.used:,} samples", film_run(target, policy)))
+                plot_losses(out / "losses.png", adapted.rounds)
         panels = _panels(films)
         write_still(out / "film.png", panels, t=5.0)
         write_film(out / "film.mp4", panels, target.period, lambda k, n: report("film", k, n, float("nan")))
     about = {**about, "seeds": settings.seeds, "not counted": f"{settings.frames} frames at set states"}
-    write_json(out / "metrics.json", {"scores": scores, "adaptations": adaptations, **about})
+    numbers = {name: asdict(each) for name, each in scores.items()}
+    write_json(out / "metrics.json", {"scores": numbers, "adaptations": adaptations, **about})
     write_rows(settings.results, _rows(scores, adaptations))
     print(f"film.mp4, film.png, losses.png and metrics.json are in {out}, the table is {settings.results}")
 
@@ -213,14 +215,14 @@ def _gap(source: World, episodes: list[Episode]) -> dict[str, float]:
     return {"viscous_friction": float(found[0]), "pole_damping": float(found[1]), "explained": float(explained)}
 
 
-def _rows(scores: dict[str, dict[str, Any]], adaptations: dict[int, dict[str, Any]]) -> list[Row]:
+def _rows(scores: dict[str, CartPoleScore], adaptations: dict[int, dict[str, Any]]) -> list[Row]:
     """Speeds before and after, and what the gap is: the spread of these is over seeds."""
     used = max(sum(steps for _, steps in each["ledger"]["entries"]) for each in adaptations.values())
     what, system, method = "inverted_pendulum", "InvertedPendulum-v5", "ours, frames alone"
-    after = [Evaluation(**scores[f"after-{seed}"]) for seed in adaptations]
+    after = [scores[f"after-{seed}"] for seed in adaptations]
     rows = [
-        speed_row(what, "unadapted", "source", 0, [Evaluation(**scores["source"])], system),
-        speed_row(what, "unadapted", "target", 0, [Evaluation(**scores["before"])], system),
+        speed_row(what, "unadapted", "source", 0, [scores["source"]], system),
+        speed_row(what, "unadapted", "target", 0, [scores["before"]], system),
         speed_row(what, method, "adapted", used, after, system),
     ]
     for key, unit in {"viscous_friction": "N s/m", "pole_damping": "N m s/rad", "explained": "1"}.items():

@@ -2,9 +2,9 @@
 
 python -m train.renderer --help
 
-Writes assets/renderer.safetensors (ours), assets/renderer_mlp.safetensors and assets/renderer.png, a picture of drawn
-beside learnt frames of held-out states. Both are trained on the same frames by mean squared error. Ours starts from a
-guess of the camera that is some pixels off, and finds the camera by itself.
+Writes renderer.safetensors (ours; the shipped one is in visadapt/weights), renderer_mlp.safetensors and renderer.png, a
+picture of drawn beside learnt frames of held-out states, to runs/renderer. Both are trained on the same frames by mean
+squared error. Ours starts from a guess of the camera that is some pixels off, and finds the camera by itself.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Settings:
 
     kinds: tuple[Kind, ...] = ("layered", "mlp")
     """which renderers"""
-    out: Path = Path("assets")
+    out: Path = Path("runs/renderer")
     """folder to write to"""
     data: Path | None = None
     """frames that datasets.cartpole_frames wrote; without, they are drawn here"""

@@ -4,7 +4,7 @@
 
 The target is one that no one here wrote: rotorpy's Crazyflie Brushless, with its rotor drag, motors that lag, and wind
 (pip install 'visadapt[rotorpy]'). The source has the mass, arm and rate gain that rotorpy publishes, and no air. Since
-thrust is mass-normalised, the shipped policy of the default quadrotor (assets/quadrotor.safetensors) flies that source
+thrust is mass-normalised, the shipped policy of the default quadrotor flies that source
 as it is: nothing is trained there. In order:
 
     1. scores of that policy in the source, in rotorpy without air (what motors and rate loop cost), and in the target
@@ -31,19 +31,21 @@ import tyro
 from torch import Tensor
 
 from datasets import quadrotor_references
+from visadapt.evaluation import FlightScore, kept_score
 from visadapt.evaluation.result_tables import Row, miss_row, write_rows
-from visadapt.policies import FlightPolicy
+from visadapt.policies import Policy
 from visadapt.progress import reporting
 from visadapt.recordings import Episode
-from visadapt.setups.flight import FlightScore, kept_score, quadrotor
+from visadapt.setups.flight import flight_target, quadrotor
 from visadapt.storage.run_folder import once, open_run, write_json
 from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, rotation, times
 from visadapt.targets import TargetError
 from visadapt.targets.flight import FlightTarget
 from visadapt.targets.rotorpy import BREEZE, SOURCE, RotorpyTarget
-from visadapt.tasks.courses import AlongReferences
+from visadapt.tasks.follow import Follow
+from visadapt.weights import shipped
+from visadapt.world import World
 
-SCORE_SEED = 2026
 METHODS = {"ours, states": False, "ours, states with history": True}
 """Whether the residual sees what was left unexplained over the last periods."""
 UNITS = {"drag_x": "1/s", "drag_y": "1/s", "drag_z": "1/s", "lift": "1/m", "lag": "s", "wind_x": "m/s", "wind_y": "m/s"}
@@ -64,8 +66,6 @@ class Settings:
     """that each policy is scored on"""
     references: Path = Path("data/quadrotor_references.npz")
     """made where it is not there"""
-    policy: Path = Path("assets/quadrotor.safetensors")
-    """of the source"""
     out: Path = Path("runs/rotorpy")
     results: Path = Path("results/rotorpy.csv")
 
@@ -73,12 +73,16 @@ class Settings:
 def main(settings: Settings) -> None:
     """Do the whole job in `settings.out`, going on from what is there."""
     torch.set_num_threads(1)
-    train, test = (AlongReferences(part) for part in quadrotor_references.ready(settings.references))
-    flight = quadrotor(train, test, SOURCE)
-    policy = flight.load(settings.policy)
-    targets = {"source": flight.target(), "no air": RotorpyTarget(test, aero=False), "target": RotorpyTarget(test)}
-    told = {key: getattr(settings, key) for key in ("budget", "round_samples", "flights")}
-    about = open_run(settings.out, {**told, "air": asdict(BREEZE), "training": asdict(flight.settings)})
+    references = quadrotor_references.ready(settings.references)
+    train, test = (Follow(part) for part in references)
+    source = World(SOURCE, period=train.period, substeps=2)
+    setups = {method: quadrotor(*references, source, with_history) for method, with_history in METHODS.items()}
+    setup = setups["ours, states"]
+    policy = setup.load(shipped("quadrotor"))
+    targets = {"source": flight_target(setup), "no air": RotorpyTarget(test, aero=False), "target": RotorpyTarget(test)}
+    chosen = {key: getattr(settings, key) for key in ("budget", "round_samples", "flights")}
+    training = {method: each.settings.numbers() for method, each in setups.items()}
+    about = open_run(settings.out, {**chosen, "air": asdict(BREEZE), "training": training})
     before = {name: [_scored(settings, name.replace(" ", "-"), where, policy)] for name, where in targets.items()}
     after: dict[str, list[FlightScore]] = {method: [] for method in settings.methods}
     gaps = []
@@ -89,10 +93,10 @@ def main(settings: Settings) -> None:
                 name = f"{'history' if METHODS[method] else 'state'}-{seed}"
                 work, target = settings.out / name, RotorpyTarget(train)
                 counted = (settings.budget, settings.round_samples)
-                adapted = flight.adapt(adapting, target, work, *counted, seed, METHODS[method], report=report)
+                adapted = setups[method].adapt(adapting, target, work, *counted, seed, report)
                 after[method].append(_scored(settings, f"after-{name}", targets["target"], adapting))
                 gaps.append(once(settings.out / f"gap-{name}.json", partial(explain, adapted.episodes)))
-    true = published(RotorpyTarget(test))
+    true = RotorpyTarget(test).published()
     write_json(settings.out / "metrics.json", {"gaps": gaps, "published": true, **about})
     write_rows(settings.results, _rows(settings, before, after, gaps))
     for key, unit in UNITS.items():
@@ -162,25 +166,8 @@ def _least_squares(wanted: Tensor, *parts: Tensor) -> list[float]:
     return list(torch.linalg.lstsq(torch.stack(parts, 1), wanted[:, None]).solution[:, 0].tolist())
 
 
-def published(target: RotorpyTarget) -> dict[str, float]:
-    """What rotorpy's parameters say at the rotor speed of a hover; damping, in 1/s, is that of turns."""
-    own = target.vehicle
-    flow = 4 * float(np.sqrt(own["mass"] * 9.81 / 4 / own["k_eta"])) / own["mass"]
-    drag = {"drag_x": own["k_d"] * flow, "drag_y": own["k_d"] * flow, "drag_z": own["k_z"] * flow}
-    # A rotor at (x, y) meets a turn with drags in its place: along z they turn about x and y, level ones about z.
-    x, y = np.mean([np.square(place[:2]) for place in own["rotor_pos"].values()], 0)
-    levers = {
-        "x": own["k_z"] * y / own["Ixx"],
-        "y": own["k_z"] * x / own["Iyy"],
-        "z": own["k_d"] * (x + y) / own["Izz"],
-    }
-    damping = {f"damping_{axis}": float(lever) * flow * own["mass"] for axis, lever in levers.items()}
-    wind = dict(zip(("wind_x", "wind_y"), target.air.steady[:2], strict=True))
-    return {**drag, **damping, "lift": 4 * own["k_h"] / own["mass"], "lag": own["tau_m"], **wind}
-
-
-def _scored(settings: Settings, name: str, target: FlightTarget, policy: FlightPolicy) -> FlightScore:
-    found = kept_score(settings.out / f"{name}.json", target, policy, SCORE_SEED, settings.flights)
+def _scored(settings: Settings, name: str, target: FlightTarget, policy: Policy) -> FlightScore:
+    found = kept_score(settings.out / f"{name}.json", policy, target, settings.flights)
     print(f"{name}: {found}", flush=True)
     return found
 

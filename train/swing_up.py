@@ -28,6 +28,7 @@ import torch
 import tyro
 from torch import Tensor
 
+from visadapt.evaluation import SCORE_SEED
 from visadapt.evaluation.result_tables import Row, write_rows
 from visadapt.films.swing_up_film import SwingPanel, write_swing_film, write_swing_still
 from visadapt.learning.policy import TuneSettings, train_or_load
@@ -38,7 +39,7 @@ from visadapt.storage.run_folder import once, open_run
 from visadapt.systems import CartPole
 from visadapt.targets import Observation, Start, SyntheticTarget
 from visadapt.targets.rollout import run
-from visadapt.tasks.base import SwingUp, within_a_turn
+from visadapt.tasks.balance import SwingUp, within_a_turn
 from visadapt.tasks.cost import SettlingCost
 from visadapt.world import World
 
@@ -46,7 +47,6 @@ SAMPLES = 20_000
 STEPS, SWING = 300, 100
 """of an episode, and how many of them may pass before the pole is up"""
 UP = math.radians(10)
-SCORE_SEED = 2026
 POLICY = "policy.safetensors"
 ANYWHERE = (0.5, 0.5, math.pi, 1.0)
 """half-widths of the uniform distribution of the first state"""
@@ -159,7 +159,7 @@ def film(settings: Settings) -> None:
     policy = StatePolicy(n_state=4)
     load_network(settings.work / "seed-0" / POLICY, policy)
     target = SyntheticTarget(start=Filmed(), angle_limit=math.inf)
-    runs = run(target, policy.eval(), see, len(FILMED), STEPS, torch.Generator())
+    runs = run(target, policy.eval(), len(FILMED), STEPS, torch.Generator(), see=see)
     panels = [SwingPanel(title, each) for title, each in zip(FILMED, runs, strict=True)]
     due = SWING * target.period
     write_swing_still(settings.still, panels, STILL, due)
@@ -184,7 +184,7 @@ def _seed(settings: Settings, seed: int) -> Score:
 def score(policy: StatePolicy, episodes: int) -> Score:
     """Run episodes from anywhere."""
     target = SyntheticTarget(start=Start(*ANYWHERE), angle_limit=math.inf)
-    runs = run(target, policy, see, episodes, STEPS, torch.Generator().manual_seed(SCORE_SEED))
+    runs = run(target, policy, episodes, STEPS, torch.Generator().manual_seed(SCORE_SEED), see=see)
     states = torch.stack([within_a_turn(torch.as_tensor(each.episode.state)) for each in runs])
     held = states[:, SWING + 1 :]
     good = (held[..., 2].abs() < UP).all(1)

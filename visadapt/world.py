@@ -58,6 +58,12 @@ class World(nn.Module):
     Raises:
         ValueError: an unknown integrator, or a period or number of substeps that is not positive.
         TypeError: an effect that does not act on this system.
+
+    >>> import torch, visadapt as va
+    >>> world = va.World(va.CartPole(), [va.effects.ConstantForce(force=1.1)])
+    >>> at = world.step(world.start(torch.zeros(1, 4)), torch.zeros(1, 1))
+    >>> float(at.time), bool(at.state[0, 1] > 0)  # pushed towards +x
+    (0.05000000074505806, True)
     """
 
     def __init__(

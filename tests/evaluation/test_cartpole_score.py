@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from visadapt.evaluation.cartpole_score import evaluate, score
+from visadapt.evaluation.cartpole_score import score_cartpole, score_runs
 from visadapt.policies import Policy
 from visadapt.recordings import Episode
 from visadapt.targets import SyntheticTarget, sine_force
-from visadapt.targets.rollout import Run, see_states
+from visadapt.targets.rollout import Run, run
 
 
 def an_episode(speeds, survived):
@@ -23,7 +23,7 @@ class TestScore:
     def test_the_fallen_are_counted_and_never_averaged_in(self):
         calm, quick = an_episode([0.1, -0.3, 0.2], True), an_episode([0.4, 0.4, -0.4], True)
         fallen = an_episode([100.0, -100.0], False)
-        found = score([fallen, calm, quick, fallen, fallen])
+        found = score_runs([fallen, calm, quick, fallen, fallen])
         assert (found.episodes, found.survived) == (5, 2)
         assert found.mean_speed == pytest.approx(0.3)
         assert found.std_speed == pytest.approx(0.1)
@@ -31,7 +31,7 @@ class TestScore:
         assert str(found) == "0.300 m/s, 2 of 5 episodes up"
 
     def test_where_all_fell_there_is_no_speed(self):
-        found = score([an_episode([1.0, 1.0], False)] * 2)
+        found = score_runs([an_episode([1.0, 1.0], False)] * 2)
         assert (found.episodes, found.survived) == (2, 0)
         assert found.mean_speed is None
         assert found.std_speed is None
@@ -54,7 +54,8 @@ class Steady(Policy):
 class TestEvaluate:
     def test_the_same_seed_gives_the_same_result_and_another_seed_another(self):
         def made(seed):
-            found, runs = evaluate(SyntheticTarget(sine_force), Steady(), see_states, seed, 5, 40)
+            found = score_cartpole(Steady(), SyntheticTarget(sine_force), 5, seed, 40)
+            runs = run(SyntheticTarget(sine_force), Steady(), 5, 40, torch.Generator().manual_seed(seed))
             return dataclasses.astuple(found), [r.episode.state for r in runs]
 
         first, states = made(3)
@@ -66,12 +67,15 @@ class TestEvaluate:
         assert made(4)[0] != first
 
     def test_what_holds_the_pole_survives_and_what_pushes_the_wrong_way_falls(self):
-        held, runs = evaluate(SyntheticTarget(), Steady(), see_states, 0, 5, 100)
+        runs = run(SyntheticTarget(), Steady(), 5, 100, torch.Generator().manual_seed(0))
+        held = score_cartpole(Steady(), SyntheticTarget(), 5, 0, 100)
         assert held.survived == 5
         assert held.mean_length == 100
         speeds = [np.abs(r.episode.state[:, 1]).mean() for r in runs]
         assert held.mean_speed == pytest.approx(np.mean(speeds))
-        fallen, runs = evaluate(SyntheticTarget(), Steady((0.0, -1.5, -0.3)), see_states, 0, 5, 100)
+        wrong = Steady((0.0, -1.5, -0.3))
+        runs = run(SyntheticTarget(), wrong, 5, 100, torch.Generator().manual_seed(0))
+        fallen = score_runs(runs)
         assert fallen.survived == 0
         assert fallen.mean_length < 30
         for r in runs:
@@ -81,6 +85,7 @@ class TestEvaluate:
     def test_a_survivor_that_stands_beside_a_fallen_one_is_not_cut_short(self):
         # Starts reach 0.1 rad: some episodes are over at once, or soon.
         target = SyntheticTarget(angle_limit=0.09)
-        found, runs = evaluate(target, Steady(), see_states, 1, 12, 60)
+        runs = run(target, Steady(), 12, 60, torch.Generator().manual_seed(1))
+        found = score_runs(runs)
         assert 0 < found.survived < 12
         assert all((r.episode.samples == 60) == r.survived for r in runs)

@@ -13,7 +13,6 @@ import pytest
 import torch
 from PIL import Image
 
-from train.flight_film import NAMES
 from visadapt.films.canvas import RED, Canvas
 from visadapt.films.drawing3d import NEAR, Pen, PinholeCamera
 from visadapt.films.flight_film import FlownPanel, flight_still, write_flight_film, write_flight_still
@@ -23,26 +22,28 @@ from visadapt.recordings import Episode
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import from_angles, rotation
 from visadapt.targets.rollout import Run
-from visadapt.tasks.courses import AlongReferences, Course, ToTarget
+from visadapt.tasks.flight import FlightTask
+from visadapt.tasks.follow import Follow
+from visadapt.tasks.reach import Reach
 from visadapt.tasks.references import Reference
 
 SPEED = 1.5
 """m/s of the reference, along x"""
 
 
-def along(seconds: float = 1.0) -> AlongReferences:
+def along(seconds: float = 1.0) -> Follow:
     """A straight reference at a steady speed."""
     time = torch.arange(round(seconds / 0.1) + 1) * 0.1
     motion = torch.zeros(4, 1, len(time), 3)
     motion[0, 0, :, 0], motion[1, 0, :, 0] = SPEED * time, SPEED
-    return AlongReferences(Reference.of(motion, 0.1))
+    return Follow(Reference.of(motion, 0.1))
 
 
 def following(
     aside: tuple[float, float, float] = (0.0, 0.0, 0.0), rows: int = 11, survived: bool = True, **other
 ) -> FlownPanel:
     """A quadrotor that flies beside its reference all the way."""
-    course = along()
+    task = along()
     time = np.arange(rows) * 0.1
     state = np.zeros((rows, 13))
     state[:, 0], state[:, 3], state[:, 6] = SPEED * time, SPEED, 1.0
@@ -50,7 +51,7 @@ def following(
     run = Run(
         Episode(time, np.zeros((rows, 4)), state), survived, np.tile(other.pop("force", (0.0, 0.0, 0.0)), (rows, 1))
     )
-    return FlownPanel("a flight", run, Quadrotor(), course, torch.tensor([0, 0]), **other)
+    return FlownPanel("a flight", run, Quadrotor(), task, torch.tensor([0, 0]), **other)
 
 
 def reaching(miss: float) -> FlownPanel:
@@ -59,7 +60,7 @@ def reaching(miss: float) -> FlownPanel:
     state = np.zeros((140, 13))
     state[:, 0], state[:, 1], state[:, 3], state[:, 6] = 11.5 * time, miss, 11.5, 1.0
     run = Run(Episode(time, np.zeros((140, 4)), state), True, np.zeros(140))
-    return FlownPanel("a flight", run, FixedWing(), ToTarget(0.05), torch.tensor([50.0, 0.0, 0.0]))
+    return FlownPanel("a flight", run, FixedWing(), Reach(), torch.tensor([50.0, 0.0, 0.0]))
 
 
 def count(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
@@ -108,11 +109,11 @@ def test_positions_between_rows_go_through_the_rows_and_errors_are_the_course_s(
     np.testing.assert_allclose(panel.position[::5], panel.states[:, :3], atol=1e-6)
     np.testing.assert_allclose(panel.position[:, 0], SPEED * panel.times, atol=1e-6)
     states = torch.from_numpy(panel.states)[None]
-    assert panel.score[-1] == pytest.approx(float(panel.course.misses(states, panel.place[None]).mean()), abs=1e-6)
+    assert panel.score[-1] == pytest.approx(float(panel.task.misses(states, panel.task_state[None]).mean()), abs=1e-6)
     assert panel.score[-1] == pytest.approx(0.05)
     wing = reaching(0.2)
     flown = torch.from_numpy(np.array(wing.run.episode.state))[None]
-    assert wing.worst == pytest.approx(float(wing.course.misses(flown, wing.place[None])))
+    assert wing.worst == pytest.approx(float(wing.task.misses(flown, wing.task_state[None])))
     assert wing.passed == pytest.approx(50 / 11.5, abs=0.051)
     np.testing.assert_allclose(wing.nearest, (50, 0.2, 0), atol=1e-6)
     assert wing.end == pytest.approx(wing.passed + 0.5, abs=0.051)
@@ -260,8 +261,8 @@ def test_a_flight_of_one_row_is_a_picture():
         (lambda: flight_still([following(), reaching(0.1)], 0.0), "film them apart"),
         (lambda: following(rows=12), "12 rows, its reference 11"),
         (
-            lambda: dataclasses.replace(following(), course=cast(Course, object())),
-            "no picture is known of a course object",
+            lambda: dataclasses.replace(following(), task=cast(FlightTask, object())),
+            "no picture is known of a task object",
         ),
         (
             lambda: dataclasses.replace(
@@ -295,11 +296,3 @@ def test_a_disk_that_fills_up_leaves_the_old_film(tmp_path: Path):
     assert len(done.stdout.strip().splitlines()) == 1
     assert old.read_bytes() == b"the film of yesterday"
     assert list(tmp_path.iterdir()) == [old]
-
-
-def test_what_can_be_filmed_is_what_the_benchmark_runs():
-    from benchmarks.flight import EXPERIMENTS
-
-    assert set(NAMES.values()) == set(EXPERIMENTS)
-    for (vehicle, hidden), name in NAMES.items():
-        assert (EXPERIMENTS[name].vehicle.name, EXPERIMENTS[name].hidden) == (vehicle, hidden)

@@ -1,3 +1,4 @@
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -6,15 +7,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from visadapt.films.plots import Panel, Round, plot_curve, plot_losses, plot_panels
+from visadapt.films.plots import Panel, plot_curve, plot_losses, plot_panels
+from visadapt.learning.joint import Round
 
 
 def make_round(samples: int) -> Round:
-    return {
-        "samples": samples,
-        "grounding": [(i, 1 / (1 + i), 2 / (1 + i) if i % 2 else None) for i in range(10)],
-        "policy": [(i, 0.5 / (1 + i)) for i in range(5)],
-    }
+    grounding = [(i, 1 / (1 + i), 2 / (1 + i) if i % 2 else math.nan) for i in range(10)]
+    return Round(samples, grounding, [0.5 / (1 + i) for i in range(5)])
 
 
 def make_row(domain: str, samples: int, mean: object, failed: object = 0) -> dict[str, object]:
@@ -34,9 +33,9 @@ def is_a_picture(path: Path) -> bool:
     [
         [make_round(200), make_round(400), make_round(1000)],
         [make_round(200)],
-        [{"samples": 50, "grounding": [], "policy": [(0, 1.0)]}],
-        [{"samples": 50, "grounding": [(0, 0.0, None)], "policy": [(0, float("nan"))]}],
-        [{"samples": 50, "grounding": [(0, 1.0, 1.2), (1, 0.1, 0.3)], "policy": [(i, 1.0) for i in range(50)]}] * 3,
+        [Round(50, [], [1.0])],
+        [Round(50, [(0, 0.0, math.nan)], [math.nan])],
+        [Round(50, [(0, 1.0, 1.2), (1, 0.1, 0.3)], [1.0] * 50)] * 3,
     ],
 )
 def test_losses_are_plotted_whatever_a_round_lacks(tmp_path: Path, rounds: list[Round]):

@@ -10,7 +10,7 @@ from tests.scenes import (
     stir,
 )
 from visadapt.effects import ActuatorDelay, ConstantForce, Residual
-from visadapt.evaluation.cartpole_score import evaluate
+from visadapt.evaluation.cartpole_score import score_cartpole
 from visadapt.history import History
 from visadapt.learning.policy import DivergedError, TuneSettings, imagine, initialise_feedforward, tune
 from visadapt.learning.windows import Windows
@@ -19,8 +19,7 @@ from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import Episode
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget
-from visadapt.targets.rollout import see_states
-from visadapt.tasks.base import Balance
+from visadapt.tasks.balance import Balance
 from visadapt.tasks.cost import PAPER_CARTPOLE, Cost
 from visadapt.world import World
 
@@ -141,12 +140,12 @@ class TestOnStates:
         torch.manual_seed(0)
         policy = StatePolicy(4)
         target = SyntheticTarget()
-        before, _ = evaluate(target, policy, see_states, 0, 20, 100)
+        before = score_cartpole(policy, target, 20, 0, 100)
         task = Balance(PAPER_CARTPOLE, divergence=ANYWHERE)
         settings = TuneSettings(task, 200, 16, learning_rate=1e-2, observation_noise=0.0, longest=100)
         world = World(CartPole(), integrator="euler")
         losses = tune(policy, world, identity, settings, torch.Generator().manual_seed(0))
-        after, _ = evaluate(target, policy, see_states, 0, 20, 100)
+        after = score_cartpole(policy, target, 20, 0, 100)
         assert len(losses) == 200
         assert sum(losses[-20:]) < 0.3 * sum(losses[:20])
         assert before.survived < 5
@@ -254,7 +253,7 @@ class TestReplay:
         settings = TuneSettings(task, 300, 32, 1e-2, 100, streams=4, every=3, observation_noise=0.0)
         tune(policy, World(CartPole(), integrator="euler"), identity, settings, torch.Generator().manual_seed(0))
         assert Stepped.steps == 4 * 100
-        assert evaluate(SyntheticTarget(), policy, see_states, 0, 20, 100)[0].survived == 20
+        assert score_cartpole(policy, SyntheticTarget(), 20, 0, 100).survived == 20
 
 
 class TestResuming:

@@ -75,14 +75,14 @@ class TestAlignment:
             assert torch.equal(found.actions, lived.actions)
             lived = lived.acting(action[t : t + 1]).observing(state[t + 1 : t + 2])
 
-    def test_places_are_those_of_the_rows_that_it_shows_and_none_where_there_are_none(self):
-        placed = [replace(each, place=np.stack([each.time, -each.time], 1)) for each in TWO]
+    def test_task_states_are_those_of_the_rows_that_it_shows_and_none_where_there_are_none(self):
+        placed = [replace(each, task_state=np.stack([each.time, -each.time], 1)) for each in TWO]
         windows = Windows.cut(placed, "state")
-        assert windows.place.shape == (len(windows), LENGTH, 2)
+        assert windows.task_state.shape == (len(windows), LENGTH, 2)
         for row in (0, 3, 6):
             first = [max(row - back, 0) for back in range(LENGTH - 1, -1, -1)]
-            np.testing.assert_array_equal(windows.place[row, :, 0], TWO[0].time[first])
-        assert Windows.cut(TWO, "state").place.shape == (len(windows), LENGTH, 0)
+            np.testing.assert_array_equal(windows.task_state[row, :, 0], TWO[0].time[first])
+        assert Windows.cut(TWO, "state").task_state.shape == (len(windows), LENGTH, 0)
 
     def test_the_action_of_the_last_row_was_not_executed_and_is_nowhere(self):
         windows = Windows.cut(TWO, "state")

@@ -16,12 +16,12 @@ def an_episode(rows=ROWS, seed=0, frames=True):
         action=rng.uniform(-1, 1, (rows, 1)).astype(np.float32),
         state=rng.normal(size=(rows, 4)),
         frame=rng.integers(0, 256, (rows, 10, 12), np.uint8) if frames else None,
-        place=rng.normal(size=(rows, 2)),
+        task_state=rng.normal(size=(rows, 2)),
     )
 
 
 def assert_same(a, b):
-    for name in ("time", "action", "state", "frame", "place"):
+    for name in ("time", "action", "state", "frame", "task_state"):
         left, right = getattr(a, name), getattr(b, name)
         if left is None:
             assert right is None
@@ -63,7 +63,7 @@ class TestEpisode:
         with pytest.raises(RecordingError, match="clock does not run forward after row 7"):
             replace(an_episode(), time=time)
 
-    @pytest.mark.parametrize("name", ["action", "state", "frame", "place"])
+    @pytest.mark.parametrize("name", ["action", "state", "frame", "task_state"])
     def test_rows_that_do_not_match(self, name):
         good = an_episode()
         with pytest.raises(RecordingError, match=f"37 rows has 36 rows of {name}"):

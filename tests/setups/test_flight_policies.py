@@ -12,7 +12,8 @@ from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION
 from visadapt.targets import FlightTarget, SyntheticTarget, TargetError
 from visadapt.targets.rollout import see_goals
-from visadapt.tasks.courses import AlongReferences, ToTarget
+from visadapt.tasks.follow import Follow
+from visadapt.tasks.reach import Reach
 from visadapt.world import World
 
 KINDS = ["follow", "reach"]
@@ -26,11 +27,11 @@ def made(kind, dtype=torch.float32):
 
 
 def shown(kind, batch=5, dtype=torch.float64):
-    """States on their way, off their course, and goals."""
-    course = AlongReferences(waves(batch)) if kind == "follow" else ToTarget(0.05)
-    state, place = course.start(batch, seeded())
+    """States on their way, off their line, and goals."""
+    task = Follow(waves(batch)) if kind == "follow" else Reach()
+    state, task_state = task.evaluation_start(batch, seeded())
     state = state + 0.2 * torch.randn(state.shape, generator=seeded(1))
-    return torch.cat((state, course.goal(place)), 1).to(dtype)
+    return task.show(state, task_state).to(dtype)
 
 
 def a_history(kind, dtype=torch.float64):
@@ -157,10 +158,9 @@ def test_a_wing_that_flies_at_its_point_or_stands_in_it_sees_finite_numbers():
 
 
 def test_what_a_policy_is_shown_of_a_target_is_its_state_and_then_its_goal():
-    course = AlongReferences(waves(4))
-    seen = FlightTarget(course, Quadrotor(), PERIOD).reset(3, seeded())
+    seen = FlightTarget(Follow(waves(4)), Quadrotor()).reset(3, seeded())
     shown = see_goals(seen)
     assert torch.equal(shown[:, :13], seen.state)
     assert torch.equal(shown[:, 13:], seen.goal)
-    with pytest.raises(TargetError, match="the target has none: give it a course"):
+    with pytest.raises(TargetError, match="the target has none: give it a task"):
         see_goals(SyntheticTarget().reset(1, seeded()))

@@ -4,17 +4,20 @@ import pytest
 import torch
 from torch import nn
 
-from tests.flying import PERIOD, drag, push, seeded, small_flight, straight, waves
+from tests.flying import PERIOD, drag, push, seeded, small_quadrotor, straight, waves
 from visadapt.effects import ConstantForce
+from visadapt.evaluation import score
+from visadapt.evaluation.flight_score import FAR
 from visadapt.history import HORIZON
 from visadapt.policies import AutoregressivePolicy, FollowPolicy, Policy
-from visadapt.setups.flight import FAR, TrainSettings, fixed_wing, score
+from visadapt.setups.flight import fixed_wing
 from visadapt.storage.checkpoints import CheckpointError
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION, VELOCITY
 from visadapt.targets import FlightTarget, TargetError
-from visadapt.targets.rollout import run, see_goals
-from visadapt.tasks.courses import AlongReferences, ToTarget
+from visadapt.targets.rollout import run
+from visadapt.tasks.follow import Follow
+from visadapt.tasks.reach import Reach
 from visadapt.world import World
 
 
@@ -39,7 +42,7 @@ class Level(Still):
     """Commands of the wing's level flight."""
 
     def forward(self, history):
-        command = FixedWing().trim(torch.tensor([ToTarget.speed]))[1]
+        command = FixedWing().trim(torch.tensor([Reach.speed]))[1]
         return command.repeat(len(history.observations), HORIZON, 1)
 
 
@@ -49,20 +52,19 @@ def uncertain(batch, generator):
 
 
 def a_target(draw=None, rows=11, **more):
-    course = AlongReferences(waves(5, rows))
-    return FlightTarget(course, Quadrotor(), PERIOD, *([draw] if draw else []), **more)
+    return FlightTarget(Follow(waves(5, rows)), Quadrotor(), *([draw] if draw else []), **more)
 
 
 class TestTarget:
     def test_the_same_seed_gives_the_same_flights_and_another_others(self):
         target = a_target(uncertain)
-        one, same, other = (run(target, Still(), see_goals, 4, 8, seeded(seed)) for seed in (0, 0, 1))
+        one, same, other = (run(target, Still(), 4, 8, seeded(seed)) for seed in (0, 0, 1))
         for a, b, c in zip(one, same, other, strict=True):
             assert (a.episode.state == b.episode.state).all()
             assert (a.force == b.force).all()
             assert (a.force[:, 0] != c.force[:, 0]).all()
 
-    @pytest.mark.parametrize("made", [a_target, lambda: FlightTarget(ToTarget(0.05), FixedWing(), 0.05)])
+    @pytest.mark.parametrize("made", [a_target, lambda: FlightTarget(Reach(), FixedWing())])
     def test_without_effects_it_agrees_with_the_source_though_it_integrates_otherwise(self, made):
         target = made()
         source = World(target.system, period=target.period, substeps=4)
@@ -92,7 +94,7 @@ class TestTarget:
         assert target.first[:, 1].tolist() == [0] * 4
         which = target.first[:, 0]
         for row in range(7):
-            wanted = target.course.goal(torch.stack((which, torch.full((4,), row)), 1))
+            wanted = target.task.goal(torch.stack((which, torch.full((4,), row)), 1))
             assert torch.equal(seen.goal, wanted)
             seen = target.step(torch.zeros(4, 4))
 
@@ -108,11 +110,11 @@ class TestTarget:
         assert target.step(action).alive.tolist() == [True, False, True]
 
     def test_given_a_reach_a_flight_ends_where_it_is_further_off(self):
-        course = AlongReferences(straight(rows=21))
-        near, far = (FlightTarget(course, Quadrotor(), PERIOD, push(6.0), reach=reach) for reach in (1.0, math.inf))
-        ended, whole = (run(target, Still(), see_goals, 2, 20, seeded()) for target in (near, far))
+        task = Follow(straight(rows=21))
+        near, far = (FlightTarget(task, Quadrotor(), push(6.0), reach=reach) for reach in (1.0, math.inf))
+        ended, whole = (run(target, Still(), 2, 20, seeded()) for target in (near, far))
         for one, other, which in zip(ended, whole, near.first[:, 0], strict=True):
-            away = torch.from_numpy(other.episode.state[:, POSITION]) - course.references.positions[which]
+            away = torch.from_numpy(other.episode.state[:, POSITION]) - task.references.positions[which]
             assert one.episode.samples == int((away.norm(dim=1) > 1.0).int().argmax())
             assert not one.survived
             assert other.survived
@@ -125,9 +127,9 @@ class TestTarget:
 class TestScore:
     def test_it_is_the_mean_over_flights_of_the_mean_distance_over_each(self):
         target = a_target()
-        found = score(target, Still(), 3, 5)
-        runs = run(a_target(), Still(), see_goals, 5, 10, seeded(3))
-        own, which = target.course.references, target.first[:, 0]
+        found = score(Still(), target, 5, 3)
+        runs = run(a_target(), Still(), 5, 10, seeded(3))
+        own, which = target.task.references, target.first[:, 0]
         away = torch.stack(
             [
                 (torch.from_numpy(each.episode.state[1:, POSITION]) - own.positions[k, 1:]).norm(dim=-1)
@@ -142,47 +144,42 @@ class TestScore:
 
     def test_a_flight_that_strays_beyond_a_metre_has_failed_and_counts_with_what_it_missed_by(self):
         # 1 s under a force of 6 N: 3 m at its end, 1 m on the way.
-        near, far = (score(a_target(draw), Still(), 0, 5) for draw in (None, push(6.0)))
+        near, far = (score(Still(), a_target(draw), 5, 0) for draw in (None, push(6.0)))
         assert (near.failed, far.failed) == (0, 5)
         assert far.mean == pytest.approx(1.1, abs=2 * near.mean)
         assert math.isfinite(far.worst)
         assert "0 of 5 stayed near" in str(far)
 
     def test_one_that_is_not_finite_is_infinite_in_the_mean_and_the_others_are_still_counted(self):
-        found, whole = score(a_target(), Still(broken=2), 0, 5), score(a_target(), Still(), 0, 5)
+        found, whole = score(Still(broken=2), a_target(), 5, 0), score(Still(), a_target(), 5, 0)
         assert found.flights == 5
         assert whole.failed <= found.failed <= whole.failed + 1
         assert (found.mean, found.std, found.worst) == (math.inf, math.inf, math.inf)
 
     def test_while_data_are_collected_it_is_an_error(self):
         with pytest.raises(TargetError, match=r"synthetic vehicle: the state after step 4 is not finite \(episode 2\)"):
-            run(a_target(), Still(broken=2), see_goals, 5, 10, seeded())
+            run(a_target(), Still(broken=2), 5, 10, seeded())
 
     def test_a_wing_is_scored_by_how_near_it_came_to_its_point(self):
-        course = ToTarget(0.05)
-        course.distance, course.sideways, course.steps = 6.0, 3.0, 14
-        target = FlightTarget(course, FixedWing(), 0.05)
-        found = score(target, Level(), 0, 10)
+        target = FlightTarget(Reach(distance=6.0, sideways=3.0), FixedWing())
+        found = score(Level(), target, 10, 0)
         aside = target.first[:, 1:].norm(dim=1)
         assert found.mean == pytest.approx(float(aside.mean()), abs=0.01)
         assert found.worst == pytest.approx(float(aside.max()), abs=0.01)
         assert found.failed == int((aside > FAR).sum())
 
 
-BRIEF = TrainSettings(4, 1e-3, batch=8)
-SMALL = {"source": BRIEF, "tuning": BRIEF, "recovering": BRIEF, "longest": 10}
+SMALL = {"iterations": 4, "learning_rate": 1e-3, "batch": 8, "longest": 10}
 
 
 def adapted(folder, with_history=False, report=None, stops_at=None, draw=None, explorer=None):
     """30 samples in two rounds, in flights of at most 10."""
-    flight = small_flight(rows=11, **SMALL)
+    setup = small_quadrotor(rows=11, with_history=with_history, **SMALL)
     torch.manual_seed(0)
     policy = FollowPolicy(PERIOD)
-    target = Counted(flight.train, Quadrotor(), PERIOD, draw or drag(0.3))
+    target = Counted(setup.settings.source.task, Quadrotor(), draw or drag(0.3))
     target.stops_at = stops_at
-    found = flight.adapt(
-        policy, target, folder, 30, 18, seed=1, with_history=with_history, report=report, explorer=explorer
-    )
+    found = setup.adapt(policy, target, folder, 30, 18, seed=1, report=report, explorer=explorer)
     return policy, found, target
 
 
@@ -254,17 +251,17 @@ class TestAdapt:
 
 class TestPretrain:
     def test_it_writes_weights_that_it_reads_the_next_time(self, tmp_path):
-        flight, path = small_flight(rows=11, **SMALL), tmp_path / "quadrotor.safetensors"
-        trained = flight.pretrain(path, 0)
+        setup, path = small_quadrotor(rows=11, **SMALL), tmp_path / "quadrotor.safetensors"
+        trained = setup.pretrain(path, 0)
         assert [each.name for each in tmp_path.iterdir()] == [path.name]
         torch.manual_seed(0)
         assert not torch.equal(FollowPolicy(PERIOD).first.weight, trained.first.weight)
-        read = flight.pretrain(path, 1)
+        read = setup.pretrain(path, 1)
         for key, value in trained.state_dict().items():
             assert torch.equal(value, read.state_dict()[key]), key
 
     def test_another_vehicles_weights_are_refused(self, tmp_path):
         path = tmp_path / "policy.safetensors"
-        small_flight(rows=11, **SMALL).pretrain(path, 0)
+        small_quadrotor(rows=11, **SMALL).pretrain(path, 0)
         with pytest.raises(CheckpointError, match="holds a FollowPolicy, a ReachPolicy is needed"):
             fixed_wing().pretrain(path, 0)

@@ -15,9 +15,8 @@ from visadapt.recordings import read_recording
 from visadapt.storage.checkpoints import CheckpointError
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, TargetError
-from visadapt.targets.rollout import see_states
 from visadapt.targets.synthetic import constant_force
-from visadapt.tasks.base import Balance
+from visadapt.tasks.balance import Balance
 from visadapt.tasks.cost import PAPER_CARTPOLE
 from visadapt.world import World
 
@@ -64,7 +63,6 @@ def run(folder, settings, target=None, report=None, with_history=False):
         source,
         target or Counted(),
         lambda state: state,
-        see_states,
         settings,
         folder,
         report=report,
@@ -212,7 +210,7 @@ class TestLearning:
         policy = StatePolicy(4)
         residual = Residual(StateResidualNetwork(4), torch.ones(4))
         source = World(CartPole(), integrator="euler")
-        args = (source, Counted(), lambda state: state, see_states, QUICK, tmp_path)
+        args = (source, Counted(), lambda state: state, QUICK, tmp_path)
         adapted = adapt(policy, residual, *args, label=label)
         recorded = [
             episode for number in (1, 2) for episode in read_recording(tmp_path / f"round-0{number}/recording.h5")

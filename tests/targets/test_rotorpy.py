@@ -12,13 +12,13 @@ import torch
 
 from benchmarks.rotorpy_diagnosis import rows_of
 from tests.flying import PERIOD, seeded, straight, waves
-from train.rotorpy_quadrotor import explain, published
+from train.rotorpy_quadrotor import explain
 from visadapt.recordings import Episode
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY
 from visadapt.targets import TargetError
 from visadapt.targets import rotorpy as ours
 from visadapt.targets.rotorpy import SOURCE, Air, RotorpyTarget
-from visadapt.tasks.courses import AlongReferences
+from visadapt.tasks.follow import Follow
 from visadapt.tasks.references import Reference
 from visadapt.world import World
 
@@ -37,7 +37,7 @@ def level(speed=0.0, count=1):
     """References straight ahead along x at a steady speed."""
     velocity = torch.tensor([speed, 0.0, 0.0]).expand(count, 41, 3)
     position = velocity * PERIOD * torch.arange(41)[:, None]
-    return AlongReferences(Reference.of(torch.stack((position, velocity, 0 * position, 0 * position)), PERIOD))
+    return Follow(Reference.of(torch.stack((position, velocity, 0 * position, 0 * position)), PERIOD))
 
 
 def fly(target, commands, batch=1, seed=0):
@@ -152,14 +152,14 @@ def test_each_flight_has_its_own_gusts_and_the_same_seed_the_same():
 
 @pytest.mark.usefixtures("rotorpy")
 def test_states_are_in_our_order_and_the_quaternion_is_continuous():
-    course = AlongReferences(waves(3))
-    target = RotorpyTarget(course)
+    task = Follow(waves(3))
+    target = RotorpyTarget(task)
     commands = rough(30, 3, size=1.0)
     commands[:, :, 3] = 1.0  # it turns about z by more than half a turn, where one sign of the quaternion would jump
     commands[:, :, 0] = SOURCE.hover()
     commands = torch.cat((commands, commands, commands))
     states = fly(target, commands, 3)
-    torch.testing.assert_close(states[0], course.start(3, seeded())[0])
+    torch.testing.assert_close(states[0], task.evaluation_start(3, seeded())[0])
     attitude = states[..., ATTITUDE]
     torch.testing.assert_close(attitude.norm(dim=-1), torch.ones(states.shape[:2]))
     # Never faster than 2 rad/s: within 0.1 s, by 0.2 rad at most.
@@ -173,8 +173,8 @@ def test_the_batch_flies_as_rotorpys_multirotors_do_one_at_a_time():
     quad_params = pytest.importorskip("rotorpy.vehicles.crazyfliebrushless_params").quad_params
     multirotor = pytest.importorskip("rotorpy.vehicles.multirotor")
     commands, wind = rough(10, 2), (1.5, -1.0, 0.5)
-    course = AlongReferences(straight())
-    states = fly(RotorpyTarget(course, air=Air(steady=wind)), commands, 2)
+    task = Follow(straight())
+    states = fly(RotorpyTarget(task, air=Air(steady=wind)), commands, 2)
     start = states[0].double().numpy()
     exact = {"rtol": 1e-8, "atol": 1e-10}
     vehicle = multirotor.Multirotor(quad_params, control_abstraction="cmd_ctbr", integrator_kwargs=exact)
@@ -192,7 +192,7 @@ def test_the_batch_flies_as_rotorpys_multirotors_do_one_at_a_time():
 
 @pytest.mark.usefixtures("rotorpy")
 def test_what_explains_the_gap_is_what_rotorpy_has_in_its_parameters():
-    target = RotorpyTarget(AlongReferences(waves(8)), air=Air(steady=(1.5, -0.5, 0.0)))
+    target = RotorpyTarget(Follow(waves(8)), air=Air(steady=(1.5, -0.5, 0.0)))
     commands = 0.15 * torch.randn(40, 8, 4, generator=seeded(4)) + hovering(40, 8)
     states = fly(target, commands, 8)
     actions = torch.cat((commands, 0 * commands[:1])).clamp(-1, 1)
@@ -217,7 +217,7 @@ def test_a_turn_is_braked_as_published(axis, name):
     target = RotorpyTarget(level(), air=STILL, changes={"tau_m": 0.011})
     rates = fly(target, commands)[-1, 0, RATES]
     gain = float(SOURCE.roll_gain)
-    expected = 0.2 * SOURCE.max_rate * gain / (gain + published(target)[f"damping_{name}"])
+    expected = 0.2 * SOURCE.max_rate * gain / (gain + target.published()[f"damping_{name}"])
     assert float(rates[axis]) == pytest.approx(expected, rel=0.03)
 
 

@@ -11,7 +11,7 @@ from visadapt.history import HORIZON
 from visadapt.policies import Policy
 from visadapt.systems import CartPole
 from visadapt.targets import Start, SyntheticTarget, TargetError, constant_force, no_effects, sine_force
-from visadapt.targets.rollout import run, see_frames, see_states
+from visadapt.targets.rollout import run, see_frames
 from visadapt.world import World
 
 
@@ -55,7 +55,7 @@ class Feedback(Scripted):
 class TestSynthetic:
     def test_the_same_seed_gives_the_same_episodes_and_another_others(self):
         target = SyntheticTarget(sine_force, DrawnCartPole())
-        one, same, other = (run(target, Scripted(), see_frames, 3, 8, seeded(s)) for s in (0, 0, 1))
+        one, same, other = (run(target, Scripted(), 3, 8, seeded(s), see=see_frames) for s in (0, 0, 1))
         for a, b, c in zip(one, same, other, strict=True):
             np.testing.assert_array_equal(a.episode.state, b.episode.state)
             np.testing.assert_array_equal(a.episode.frame, b.episode.frame)
@@ -155,7 +155,7 @@ class TestSynthetic:
 class TestRun:
     def test_a_policy_that_balances_survives_and_its_rows_are_those_of_the_target(self):
         target, policy = SyntheticTarget(), Feedback()
-        runs = run(target, policy, see_states, 4, 60, seeded())
+        runs = run(target, policy, 4, 60, seeded())
         assert all(r.survived for r in runs)
         assert all(r.episode.samples == 60 for r in runs)
         episode = runs[2].episode
@@ -170,8 +170,7 @@ class TestRun:
 
     def test_exploration_is_noise_on_the_commands_that_are_recorded_and_executed(self):
         quiet, noisy = (
-            run(SyntheticTarget(), Feedback(), see_states, 20, 50, seeded(4), exploration)[0].episode
-            for exploration in (0.0, 0.05)
+            run(SyntheticTarget(), Feedback(), 20, 50, seeded(4), exploration)[0].episode for exploration in (0.0, 0.05)
         )
         first = noisy.action[0] - quiet.action[0]
         assert first != 0
@@ -182,7 +181,7 @@ class TestRun:
 
     def test_an_episode_is_cut_where_it_ends_and_others_go_on(self):
         weak = Feedback(gains=(0.0, 0.0, 0.1, 0.0))
-        runs = run(SyntheticTarget(start=Start(0, 0, 0.3, 0)), weak, see_states, 12, 60, seeded())
+        runs = run(SyntheticTarget(start=Start(0, 0, 0.3, 0)), weak, 12, 60, seeded())
         lengths = [r.episode.samples for r in runs]
         assert len(set(lengths)) > 3
         for r in runs:
@@ -197,7 +196,7 @@ class TestRun:
     @pytest.mark.parametrize("step", [0, 3])
     def test_a_policy_that_says_nan_is_an_error_that_names_the_step(self, step):
         with pytest.raises(TargetError, match=rf"synthetic cart-pole: the state after step {step + 1} is not finite"):
-            run(SyntheticTarget(), Feedback(broken_at=step), see_states, 2, 10, seeded())
+            run(SyntheticTarget(), Feedback(broken_at=step), 2, 10, seeded())
 
     def test_a_target_that_says_nan_is_an_error(self):
         class Broken(SyntheticTarget):
@@ -207,11 +206,11 @@ class TestRun:
                 return seen
 
         with pytest.raises(TargetError, match=r"state after step 1 is not finite \(episode 1\)"):
-            run(Broken(), Scripted(), see_states, 3, 10, seeded())
+            run(Broken(), Scripted(), 3, 10, seeded())
 
     def test_frames_asked_of_a_target_without_a_camera(self):
         with pytest.raises(TargetError, match="shows none: give it a camera"):
-            run(SyntheticTarget(), Scripted(), see_frames, 1, 3, seeded())
+            run(SyntheticTarget(), Scripted(), 1, 3, seeded(), see=see_frames)
 
     def test_a_policy_of_frames_is_shown_frames_between_0_and_1_and_nothing_else(self):
         shown = []
@@ -221,6 +220,6 @@ class TestRun:
                 shown.append(history)
                 return super().command(history)
 
-        runs = run(SyntheticTarget(camera=DrawnCartPole()), Watch(), see_frames, 2, 4, seeded())
+        runs = run(SyntheticTarget(camera=DrawnCartPole()), Watch(), 2, 4, seeded(), see=see_frames)
         latest = np.stack([history.observations[0, -1].numpy() for history in shown])
         np.testing.assert_allclose(latest, runs[0].episode.frame[:4] / 255, atol=1e-6)

@@ -16,9 +16,9 @@ from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
 from visadapt.targets.flight import FlightTarget
-from visadapt.targets.rollout import run, see_goals
-from visadapt.tasks.courses import AlongReferences, ToTarget
-from visadapt.tasks.flight import Follow, FollowCost, Reach
+from visadapt.targets.rollout import run
+from visadapt.tasks.follow import Follow, FollowCost
+from visadapt.tasks.reach import Reach
 from visadapt.world import World
 
 ROWS = 31
@@ -29,11 +29,11 @@ def identity(state):
 
 
 def following(**changes):
-    return Follow(AlongReferences(waves(6, ROWS)), **changes)
+    return Follow(waves(6, ROWS), **changes)
 
 
 def reaching(**changes):
-    return Reach(ToTarget(0.05), **changes)
+    return Reach(**changes)
 
 
 def streams(task, world, batch, longest=1000, seed=0):
@@ -45,17 +45,17 @@ def streams(task, world, batch, longest=1000, seed=0):
 class TestFollowCost:
     """On straight references, on which rates are zero."""
 
-    task = Follow(AlongReferences(straight(rows=ROWS)), FollowCost(position=2.0, velocity=3.0, rates=5.0, action=7.0))
-    place = torch.tensor([[0, 4], [1, 11]])
+    task = Follow(straight(rows=ROWS), FollowCost(position=2.0, velocity=3.0, rates=5.0, action=7.0))
+    task_state = torch.tensor([[0, 4], [1, 11]])
 
     def on_it(self):
-        which, row = self.place.unbind(1)
-        rows = [self.task.course.on(which, row + k) for k in range(HORIZON + 1)]
+        which, row = self.task_state.unbind(1)
+        rows = [self.task.on(which, row + k) for k in range(HORIZON + 1)]
         return rows[0], torch.stack(rows[1:], 1)
 
     def cost(self, states, plan=None):
         plan = torch.zeros(2, HORIZON, 4) if plan is None else plan
-        return self.task.cost(states, plan, self.on_it()[0], self.place)
+        return self.task.cost(states, plan, self.on_it()[0], self.task_state)
 
     def test_on_the_reference_it_is_zero_but_for_effort(self):
         _, states = self.on_it()
@@ -79,9 +79,9 @@ class TestFollowCost:
         torch.testing.assert_close(self.cost(states), torch.zeros(2), rtol=0, atol=1e-9)
 
     def test_being_a_row_late_is_being_off_by_a_rows_way(self):
-        which, row = self.place.unbind(1)
-        late = torch.stack([self.task.course.on(which, row + k) for k in range(HORIZON)], 1)
-        way = self.task.course.references.velocities[which, 0] * PERIOD
+        which, row = self.task_state.unbind(1)
+        late = torch.stack([self.task.on(which, row + k) for k in range(HORIZON)], 1)
+        way = self.task.references.velocities[which, 0] * PERIOD
         torch.testing.assert_close(self.cost(late), 2.0 * HORIZON * way.square().sum(1), rtol=1e-4, atol=1e-6)
 
 
@@ -89,7 +89,7 @@ class TestReachCost:
     """The reference leads straight from here to the point, at 11.5 m/s."""
 
     task = reaching(along=2.0, across=3.0, rates=5.0, action=7.0)
-    place = torch.tensor([[50.0, 4.0, -3.0], [50.0, 0.0, 0.0]], dtype=torch.float64)
+    task_state = torch.tensor([[50.0, 4.0, -3.0], [50.0, 0.0, 0.0]], dtype=torch.float64)
     here = torch.tensor([[14.0, 4.0, 24.0], [20.0, 0.0, 0.0]], dtype=torch.float64)
     way = torch.tensor([[0.8, 0.0, -0.6], [1.0, 0.0, 0.0]], dtype=torch.float64)
 
@@ -103,7 +103,7 @@ class TestReachCost:
 
     def cost(self, states, plan=None):
         plan = torch.zeros(2, HORIZON, 4, dtype=torch.float64) if plan is None else plan
-        return self.task.cost(states, plan, self.on_it()[0], self.place)
+        return self.task.cost(states, plan, self.on_it()[0], self.task_state)
 
     def test_on_the_line_and_in_time_it_is_zero_but_for_effort(self):
         _, states = self.on_it()
@@ -131,30 +131,30 @@ class TestWhereStreamsStart:
     @pytest.mark.parametrize(("progress", "share"), [(0.0, 0.05), (0.25, 0.525), (0.5, 1.0), (1.0, 1.0)])
     def test_around_a_reference_as_far_off_as_the_curriculum_allows(self, progress, share):
         task = following()
-        state, place = task.begin(3000, progress, seeded())
-        off = state - task.course.on(*place.unbind(1))
+        state, task_state = task.training_start(3000, progress, seeded())
+        off = state - task.on(*task_state.unbind(1))
         torch.testing.assert_close(off[:, POSITION].std(0), torch.full((3,), 0.1 * share), rtol=0.06, atol=0)
         torch.testing.assert_close(off[:, VELOCITY].std(0), torch.full((3,), 0.2 * share), rtol=0.06, atol=0)
         assert not off[:, VELOCITY.stop :].any()
 
     def test_anywhere_on_any_reference_but_on_its_last_row_which_leads_nowhere(self):
-        _, place = following().begin(3000, 0.0, seeded())
-        assert place[:, 0].unique().tolist() == list(range(6))
-        assert place[:, 1].unique().tolist() == list(range(ROWS - 1))
+        _, task_state = following().training_start(3000, 0.0, seeded())
+        assert task_state[:, 0].unique().tolist() == list(range(6))
+        assert task_state[:, 1].unique().tolist() == list(range(ROWS - 1))
 
     @pytest.mark.parametrize("progress", [0.0, 0.3, 1.0])
     def test_a_stream_does_not_stray_where_it_starts(self, progress):
         for task in (following(), reaching()):
-            state, place = task.begin(1000, progress, seeded())
-            assert int(task.diverged(state, place, progress).sum()) < 10
+            state, task_state = task.training_start(1000, progress, seeded())
+            assert int(task.diverged(state, task_state, progress).sum()) < 10
 
     def test_half_of_the_wings_start_in_trim_and_the_others_near_the_line_to_the_point(self):
         task = reaching()
-        state, place = task.begin(4000, 0.0, seeded())
-        trimmed = task.course.start(1, seeded())[0]
+        state, task_state = task.training_start(4000, 0.0, seeded())
+        trimmed = task.evaluation_start(1, seeded())[0]
         at_start = (state == trimmed).all(1)
         assert 0.47 < float(at_start.float().mean()) < 0.53
-        off, to = state[~at_start] - trimmed, place[~at_start]
+        off, to = state[~at_start] - trimmed, task_state[~at_start]
         share = off[:, :1] / to[:, :1]
         assert float(share.max()) > 0.98
         torch.testing.assert_close(share.mean(), torch.tensor(0.5), rtol=0.05, atol=0)
@@ -173,7 +173,7 @@ class TestStreams:
         state = made.now.at.state.clone()
         state[:, POSITION] += off
         at = self.WORLD.step(self.WORLD.start(state), torch.zeros(len(state), 4))
-        before = made.now.place.clone()
+        before = made.now.task_state.clone()
         made.advance(at, torch.zeros(len(state), 4), progress, seeded(3))
         return before
 
@@ -181,9 +181,9 @@ class TestStreams:
         """Streams of one age amid their references."""
         made = streams(following(), self.WORLD, batch)
         made.age[:] = 7
-        place = torch.stack((torch.arange(batch), torch.full((batch,), 12)), 1)
-        at = self.WORLD.start(made.task.course.on(*place.unbind(1)))
-        made.now = dataclasses.replace(made.now, at=at, place=place)
+        task_state = torch.stack((torch.arange(batch), torch.full((batch,), 12)), 1)
+        at = self.WORLD.start(made.task.on(*task_state.unbind(1)))
+        made.now = dataclasses.replace(made.now, at=at, task_state=task_state)
         return made
 
     @pytest.mark.parametrize(("progress", "far"), [(0.0, 0.1), (0.25, 1.05), (0.5, 2.0), (1.0, 2.0)])
@@ -193,18 +193,18 @@ class TestStreams:
         before = self.step(made, off, progress)
         assert made.age.tolist() == [8, 8, 8, 0, 0, 8]
         kept = torch.tensor([0, 1, 2, 5])
-        assert torch.equal(made.now.place[kept], before[kept] + torch.tensor([0, 1]))
+        assert torch.equal(made.now.task_state[kept], before[kept] + torch.tensor([0, 1]))
         assert made.now.at.state.isfinite().all()
-        assert not made.task.diverged(made.now.at.state, made.now.place, 1.0).any()
-        # What the policy is shown goes with the place: of those that go on and of those that begin.
+        assert not made.task.diverged(made.now.at.state, made.now.task_state, 1.0).any()
+        # What the policy is shown goes with the task state: of those that go on and of those that begin.
         assert torch.equal(made.now.history.observations[:, -1, :13], made.now.at.state)
-        assert torch.equal(made.now.history.observations[:, -1, 13:], made.task.course.goal(made.now.place))
+        assert torch.equal(made.now.history.observations[:, -1, 13:], made.task.goal(made.now.task_state))
         assert torch.equal(made.now.history.observations[3, 0], made.now.history.observations[3, -1])
 
     def test_one_at_the_end_of_its_reference_starts_anew(self):
         made = self.middle()
-        made.now.place[2, 1] = ROWS - 2
-        made.now.at.state[2] = made.task.course.on(*made.now.place[2:3].unbind(1))[0]
+        made.now.task_state[2, 1] = ROWS - 2
+        made.now.at.state[2] = made.task.on(*made.now.task_state[2:3].unbind(1))[0]
         self.step(made, torch.zeros(6, 3), 1.0)
         assert made.age.tolist() == [8, 8, 0, 8, 8, 8]
 
@@ -219,24 +219,24 @@ class TestStreams:
         world = World(FixedWing(), period=0.05)
         made = streams(reaching(), world, 5)
         made.age[:] = 7
-        state, place = made.task.course.start(5, seeded())
-        made.now = dataclasses.replace(made.now, place=place)
-        state[:, POSITION] = 0.5 * place
-        state[1, POSITION] = place[1] + torch.tensor([0.1, 0.0, 0.0])
+        state, task_state = made.task.evaluation_start(5, seeded())
+        made.now = dataclasses.replace(made.now, task_state=task_state)
+        state[:, POSITION] = 0.5 * task_state
+        state[1, POSITION] = task_state[1] + torch.tensor([0.1, 0.0, 0.0])
         state[2, POSITION] += torch.tensor([0.0, 9.0, 0.0])
         state[3, POSITION] += torch.tensor([0.0, 0.0, 6.0])
         at = world.step(world.start(state), torch.zeros(5, 4))
         made.advance(at, torch.zeros(5, 4), 0.0, seeded(3))
         assert made.age.tolist() == [8, 0, 0, 8, 8]
-        assert torch.equal(made.now.place[[0, 3, 4]], place[[0, 3, 4]])
-        assert torch.equal(made.now.history.observations[:, -1, 13:], made.now.place)
+        assert torch.equal(made.now.task_state[[0, 3, 4]], task_state[[0, 3, 4]])
+        assert torch.equal(made.now.history.observations[:, -1, 13:], made.now.task_state)
 
     def test_recorded_starts_are_as_far_off_another_reference_with_the_past_that_they_had(self):
         """What the source leaves unexplained stays as it was recorded: without air a vehicle flies alike anywhere."""
         task = following(first_divergence=1.0)
-        target = FlightTarget(task.course, Quadrotor(), PERIOD, push(2.0))
+        target = FlightTarget(task, Quadrotor(), push(2.0))
         torch.manual_seed(0)
-        flown = run(target, FollowPolicy(PERIOD), see_goals, 2, 12, seeded(4))
+        flown = run(target, FollowPolicy(PERIOD), 2, 12, seeded(4))
         windows = Windows.cut([each.episode for each in flown], "state")
         made = Streams(self.WORLD, task, identity, windows, StreamSettings(40, 1000, 1.0))
         made.start(0.0, seeded(5))
@@ -245,8 +245,8 @@ class TestStreams:
         def unexplained(history):
             return network.unexplained(network.predict, history.observations[..., :13], history.actions)
 
-        def off(state, place):
-            return state[..., : VELOCITY.stop] - task.course.on(*place.long().unbind(-1))[..., : VELOCITY.stop]
+        def off(state, task_state):
+            return state[..., : VELOCITY.stop] - task.on(*task_state.long().unbind(-1))[..., : VELOCITY.stop]
 
         now, found = made.now, set()
         every = windows.history(torch.arange(len(windows)))
@@ -255,46 +255,46 @@ class TestStreams:
             alike &= (windows.state - now.at.state[b])[:, VELOCITY.stop :].abs().amax(1) == 0
             row = int(alike.nonzero()[0])
             found.add(row)
-            here, there = off(now.at.state[b : b + 1], now.place[b : b + 1]), windows.state[row : row + 1]
-            torch.testing.assert_close(here, off(there, windows.place[row : row + 1, -1]), rtol=0, atol=1e-5)
+            here, there = off(now.at.state[b : b + 1], now.task_state[b : b + 1]), windows.state[row : row + 1]
+            torch.testing.assert_close(here, off(there, windows.task_state[row : row + 1, -1]), rtol=0, atol=1e-5)
             past = unexplained(windows.history(torch.tensor([row])))
             torch.testing.assert_close(unexplained(now.history[b : b + 1]), past, rtol=0, atol=2e-3)
         assert len(found) > 12
-        assert set(now.place[:, 0].tolist()) - set(target.first[:, 0].tolist())
+        assert set(now.task_state[:, 0].tolist()) - set(target.first[:, 0].tolist())
         assert torch.equal(now.history.observations[:, -1, :13], now.at.state)
-        assert torch.equal(now.history.observations[:, -1, 13:], task.course.goal(now.place))
+        assert torch.equal(now.history.observations[:, -1, 13:], task.goal(now.task_state))
 
     def test_recorded_starts_of_a_wing_are_as_they_were_recorded_with_all_that_it_was_shown(self):
         task = reaching()
-        target = FlightTarget(task.course, FixedWing(), 0.05, push(2.0))
+        target = FlightTarget(task, FixedWing(), push(2.0))
         torch.manual_seed(0)
-        flown = run(target, ReachPolicy(), see_goals, 2, 12, seeded(4))
+        flown = run(target, ReachPolicy(), 2, 12, seeded(4))
         windows = Windows.cut([each.episode for each in flown], "state")
         made = Streams(World(FixedWing(), period=0.05), task, identity, windows, StreamSettings(20, 1000, 1.0))
         made.start(0.0, seeded(5))
         for b in range(20):
             # Both flights begin in the same state: their points tell them apart.
-            there = (target.first[windows.episode] == made.now.place[b]).all(1)
+            there = (target.first[windows.episode] == made.now.task_state[b]).all(1)
             row = int(((windows.state == made.now.at.state[b]).all(1) & there).nonzero()[0])
             seen = windows.history(torch.tensor([row])).observations[0]
             assert torch.equal(made.now.history.observations[b, :, :13], seen)
-            assert torch.equal(made.now.history.observations[b, :, 13:], made.now.place[b].expand(LENGTH, -1))
+            assert torch.equal(made.now.history.observations[b, :, 13:], made.now.task_state[b].expand(LENGTH, -1))
             assert torch.equal(made.now.history.actions[b], windows.past_actions[row])
 
     def test_tuned_along_references_the_cost_of_a_plan_falls(self):
         torch.manual_seed(0)
         task, policy = following(), FollowPolicy(PERIOD)
-        state, place = task.begin(64, 0.3, seeded(9))
+        state, task_state = task.training_start(64, 0.3, seeded(9))
 
         def show(at):
-            return task.show(at, place)
+            return task.show(at, task_state)
 
         @torch.no_grad()
         def cost():
             history = History.start(show(state), 4)
             plan = policy(history)
             states, _ = imagine(self.WORLD, show, self.WORLD.start(state), history, plan)
-            return float(task.cost(states, plan, state, place).mean())
+            return float(task.cost(states, plan, state, task_state).mean())
 
         before = cost()
         settings = TuneSettings(task, 40, 8, learning_rate=1e-2, longest=5, observation_noise=0.0)
@@ -313,23 +313,23 @@ class Imagined:
         )
         self.residual = Residual(stir(network.double(), 1), torch.full((13,), 0.02)).double()
         self.world = World(system, [self.residual, LinearDrag(coefficient=0.3)], period).requires_grad_(False)
-        state, self.place = task.begin(3, 1.0, seeded(2))
-        self.place = self.place.double() if self.place.is_floating_point() else self.place
+        state, self.task_state = task.training_start(3, 1.0, seeded(2))
+        self.task_state = self.task_state.double() if self.task_state.is_floating_point() else self.task_state
         self.at = self.world.start(state.double())
         self.history = History.start(self.show(state.double()), 4)
         self.policy = stir(policy.double(), 2)
         self.policy.residual = self.residual
 
     def show(self, state):
-        return self.task.show(state, self.place)
+        return self.task.show(state, self.task_state)
 
     def cost(self, plan):
         states, _ = imagine(self.world, self.show, self.at, self.history, plan)
-        return self.task.cost(states, plan, self.at.state, self.place).sum()
+        return self.task.cost(states, plan, self.at.state, self.task_state).sum()
 
 
 def along_reference():
-    task = Follow(AlongReferences(waves(6, ROWS, dtype=torch.float64)))
+    task = Follow(waves(6, ROWS, dtype=torch.float64))
     return Imagined(task, Quadrotor(), PERIOD, FollowPolicy(PERIOD))
 
 

@@ -7,7 +7,7 @@ from renderers import LayeredRenderer
 from train.inverted_pendulum import ANGLE_LIMIT, GUESS, SeenSource, _gap
 from visadapt.effects import ViscousFriction
 from visadapt.recordings import Episode
-from visadapt.setups.cartpole_frames import PixelTask
+from visadapt.setups.cartpole_frames import cartpole_frames
 from visadapt.targets.inverted_pendulum import SOURCE
 from visadapt.world import World
 
@@ -37,8 +37,7 @@ def test_the_gap_is_put_down_to_the_friction_that_made_it():
 
 
 def test_the_source_is_seen_through_the_renderer_and_ends_where_the_environment_would():
-    task = PixelTask(World(SOURCE, period=0.04), LayeredRenderer(100, 120, *GUESS))
-    target = SeenSource(task)
+    target = SeenSource(cartpole_frames(World(SOURCE, period=0.04), LayeredRenderer(100, 120, *GUESS)))
     seen = target.reset(3, torch.Generator().manual_seed(0))
     assert seen.frame.shape == (3, 100, 120)
     assert seen.frame.dtype == torch.uint8

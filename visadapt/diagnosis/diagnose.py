@@ -68,6 +68,18 @@ def diagnose(
 
     Raises:
         ValueError: the world has effects of its own, or a system that cannot be diagnosed; or no policy on its states.
+
+    >>> import pathlib, tempfile, torch, visadapt as va
+    >>> target = va.SyntheticTarget(va.constant_force(2.0))
+    >>> policy = va.load_policy(va.shipped("cartpole_states"))
+    >>> runs = va.run(target, policy, 2, 30, torch.Generator().manual_seed(0), exploration=0.3)
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.h5"
+    >>> va.write_recording(path, [run.episode for run in runs], ["x", "x_dot", "theta", "theta_dot"], ["command"])
+    >>> source = va.World(va.CartPole())
+    >>> run = va.load_recording(path, source.system)
+    >>> found = va.diagnose(run, source, catalogue=[va.effects.ConstantForce])
+    >>> found.verdict, [cause.effect for cause in found.causes]
+    ('identified', ['constant_force'])
     """
     if len(world.effects):
         raise ValueError("diagnose: the world is the source and has no effects; give the bare system")

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from visadapt.effects import EFFECTS, Effect
+
 SCHEMA_VERSION = 1
 
 IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP = "identified", "ambiguous", "unexplained", "no_gap"
@@ -215,6 +217,13 @@ class Diagnosis:
 
     Raises:
         ValueError: an unknown verdict, or causes where the verdict says that there are none.
+
+    >>> import visadapt as va
+    >>> from visadapt.diagnosis.result import Gap, RecordingSummary, Where
+    >>> gap = Gap("error", before=1.0, after=1.0, floor=1.0, black_box=1.0, closed=0.0)
+    >>> found = va.Diagnosis("cartpole", RecordingSummary(4, 240, 0.05), "no_gap", Where({}, {}), (), (), gap, "")
+    >>> found.causes, found.gap.before
+    ((), 1.0)
     """
 
     system: str
@@ -238,6 +247,43 @@ class Diagnosis:
             raise ValueError(f"the verdict is {self.verdict!r}; there are {', '.join(VERDICTS)}")
         if bool(self.causes) != (self.verdict in (IDENTIFIED, AMBIGUOUS)):
             raise ValueError(f"the verdict {self.verdict!r} does not go with {len(self.causes)} causes")
+
+    def __str__(self) -> str:
+        # Imported here: the report is written from this result.
+        from visadapt.diagnosis.report.text import as_text
+
+        return as_text(self)
+
+    def effects(self) -> list[Effect]:
+        """The causes as effects at their found values, for a `World` that explains the recording.
+
+        Of effects that this recording cannot tell apart the first in `causes` is taken, which is the likeliest; the
+        others are its `indistinguishable_from`.
+
+        Raises:
+            ValueError: the diagnosis named no cause (no_gap or unexplained), or a parameter has no finite value.
+
+        >>> import visadapt as va
+        >>> from visadapt.diagnosis.result import *
+        >>> found = Diagnosis(
+        ...     "cartpole", RecordingSummary(10, 1000, 0.05), "identified", Where({}, {}),
+        ...     (Cause("viscous_friction", {"coefficient": Estimate(2.1, "N s/m", (1.9, 2.3))}, 0.98, 0.95),),
+        ...     (), Gap("", 1.0, 0.1, 0.1, 0.1, 1.0), "",
+        ... )
+        >>> world = va.World(va.CartPole(), found.effects())
+        >>> [(effect.name, round(effect.coefficient.item(), 2)) for effect in world.effects]
+        [('viscous_friction', 2.1)]
+        """
+        if not self.causes:
+            raise ValueError(
+                f"the verdict is {self.verdict}: the diagnosis named no cause to put into a world; "
+                + ("the source explains the recording as it is" if self.verdict == NO_GAP else "adapt with a residual")
+            )
+        taken: list[Cause] = []
+        for cause in self.causes:
+            if not any(cause.effect in (one.effect, *one.indistinguishable_from) for one in taken):
+                taken.append(cause)
+        return [_effect(cause) for cause in taken]
 
     def to_json(self) -> dict[str, Any]:
         """What json.dumps takes, strictly (null for what is not finite); keys and their order are the schema's."""
@@ -276,6 +322,14 @@ class Diagnosis:
             "next_experiment": self.next_experiment,
             "warnings": list(self.warnings),
         }
+
+
+def _effect(cause: Cause) -> Effect:
+    values = {name: estimate.value for name, estimate in cause.parameters.items()}
+    for name, value in values.items():
+        if not math.isfinite(value):
+            raise ValueError(f"{cause.effect}: the recording does not determine its {name}; record what does")
+    return EFFECTS[cause.effect](**values)
 
 
 def _region(region: Region) -> dict[str, Any]:

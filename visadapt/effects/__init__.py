@@ -2,6 +2,10 @@
 
 Each module lists here once, and each of its classes is then a name of this package: a new effect in one of them needs
 no other edit. The catalogue, the command line and the diagnosis find it in `EFFECTS`, where it registers itself.
+
+>>> import visadapt as va
+>>> sorted(va.effects.EFFECTS)[:3]
+['actuator_backlash', 'actuator_bias', 'actuator_deadzone']
 """
 
 from visadapt.effects.actuation import *

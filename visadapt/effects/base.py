@@ -54,6 +54,10 @@ class Parameter:
     have one, the effect vanishes when all of them take it. `linear` holds where what the effect adds (to the load,
     the command or the measured value) is proportional to value - neutral while its nonlinear parameters are fixed;
     what several linear parameters add is a sum.
+
+    >>> import visadapt as va
+    >>> va.effects.ViscousFriction.table[0].unit
+    'N s/m'
     """
 
     name: str
@@ -76,7 +80,13 @@ class Parameter:
 
 
 class Effect(nn.Module):
-    """Base of all effects. Parameters are tensors in physical units: scalars, or one value per batch row (B,)."""
+    """Base of all effects. Parameters are tensors in physical units: scalars, or one value per batch row (B,).
+
+    >>> import visadapt as va
+    >>> friction = va.effects.ViscousFriction(coefficient=2.0)
+    >>> isinstance(friction, va.Effect), friction.name, friction.stage.value
+    (True, 'viscous_friction', 'dynamics')
+    """
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
@@ -146,7 +156,12 @@ class Effect(nn.Module):
 
 
 class ActuationEffect(Effect):
-    """Changes the command on its way to the physics."""
+    """Changes the command on its way to the physics.
+
+    >>> import visadapt as va
+    >>> isinstance(va.effects.ActuatorGain(scale=0.8), va.ActuationEffect)
+    True
+    """
 
     stage = Stage.ACTUATION
     # Commands jump between periods, and a delay, a lag or a play turns that into a change within one.
@@ -172,7 +187,23 @@ class ActuationEffect(Effect):
 
 
 class DynamicsEffect(Effect):
-    """Adds a load, a generalised force per degree of freedom, to the physics, or changes its parameters."""
+    """Adds a load, a generalised force per degree of freedom, to the physics, or changes its parameters.
+
+    >>> import torch, visadapt as va
+    >>> class Magnet(va.DynamicsEffect):
+    ...     name = "doc_magnet"
+    ...     systems = (va.CartPole,)
+    ...     equation = "force = strength x^3"
+    ...     source = "an example"
+    ...     table = (va.Parameter("strength", "N/m3", 0.0, 50.0, neutral=0.0, linear=True),)
+    ...     def load(self, time, state, system):
+    ...         force = self.value("strength", state) * state[:, 0] ** 3
+    ...         return torch.stack((force, torch.zeros_like(force)), 1)
+    >>> world = va.World(va.CartPole(), [Magnet(strength=8.0)])
+    >>> float(world.load(world.start(torch.tensor([[0.5, 0.0, 0.0, 0.0]])))[0, 0])
+    1.0
+    >>> _ = va.effects.EFFECTS.pop("doc_magnet")  # an effect of one's own stays registered; this one was an example
+    """
 
     stage = Stage.DYNAMICS
 
@@ -196,7 +227,14 @@ class DynamicsEffect(Effect):
 
 
 class SensingEffect(Effect):
-    """Changes what is measured of the state, row by row."""
+    """Changes what is measured of the state, row by row.
+
+    >>> import torch, visadapt as va
+    >>> world = va.World(va.CartPole(), [va.effects.AngleOffset(offset=0.1)])
+    >>> measured, _ = world.measure(world.start(torch.zeros(1, 4)))
+    >>> round(float(measured[0, 2]), 3)
+    0.1
+    """
 
     stage = Stage.SENSING
 

@@ -10,7 +10,12 @@ from visadapt.systems import SYSTEMS, System
 
 
 def catalogue(system: System | None = None) -> list[type[Effect]]:
-    """The named effects that act on a system, or on any: those on commands, dynamics and readings."""
+    """The named effects that act on a system, or on any: those on commands, dynamics and readings.
+
+    >>> import visadapt as va
+    >>> "viscous_friction" in [effect.name for effect in va.catalogue(va.CartPole())]
+    True
+    """
     stages = (ActuationEffect, DynamicsEffect, SensingEffect)
     named: list[type[Effect]] = [effect for effect in EFFECTS.values() if issubclass(effect, stages)]
     return named if system is None else [effect for effect in named if isinstance(system, effect.systems)]

@@ -18,6 +18,12 @@ class Residual(Effect):
         network: maps a `History`, whose last action is the one being executed, to (B, n_state) in units of `scale`;
             only a `networks.ResidualNetwork` can be grounded.
         scale: (n_state,) typical size of a correction per period, in state units.
+
+    >>> import torch, visadapt as va
+    >>> from visadapt.policies.networks import StateResidualNetwork
+    >>> residual = va.Residual(StateResidualNetwork(n_state=4), torch.ones(4))
+    >>> va.World(va.CartPole(), [residual]).has_residual
+    True
     """
 
     name = "residual"

@@ -1,7 +1,8 @@
-"""How well a policy does on a target: how fast the cart moves, and, apart, how many episodes survive."""
+"""How fast the cart moves, and, apart, how many episodes survive."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,13 +10,14 @@ import torch
 
 from visadapt.policies import Policy
 from visadapt.targets import Target
-from visadapt.targets.rollout import Run, See, run
+from visadapt.targets.rollout import Run, run
 
-EPISODES, STEPS = 100, 250
+EPISODE_STEPS = 250
+"""Steps of an episode that is scored."""
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class CartPoleScore:
     """Scores of a set of episodes. Speeds are over surviving episodes only; the fallen are counted apart."""
 
     episodes: int
@@ -32,21 +34,20 @@ class Evaluation:
         return f"{speed}, {self.survived} of {self.episodes} episodes up"
 
 
-def evaluate(
-    target: Target, policy: Policy, see: See, seed: int, episodes: int = EPISODES, steps: int = STEPS
-) -> tuple[Evaluation, list[Run]]:
-    """Run `episodes` episodes of `steps` steps from starts drawn with `seed`; the steps are free and not counted."""
+def score_cartpole(
+    policy: Policy, target: Target, episodes: int, seed: int, steps: int = EPISODE_STEPS
+) -> CartPoleScore:
+    """Run `episodes` episodes of `steps` steps that start as `seed` says; their steps are not counted."""
     policy.eval()
-    runs = run(target, policy, see, episodes, steps, torch.Generator().manual_seed(seed))
-    return score(runs), runs
+    return score_runs(run(target, policy, episodes, steps, torch.Generator().manual_seed(seed)))
 
 
-def score(runs: list[Run]) -> Evaluation:
+def score_runs(runs: Sequence[Run]) -> CartPoleScore:
     """Scores of episodes whose second state is the cart's velocity."""
     speeds = np.array(
         [np.abs(r.episode.state[:, 1]).mean() for r in runs if r.survived and r.episode.state is not None]
     )
-    return Evaluation(
+    return CartPoleScore(
         episodes=len(runs),
         survived=len(speeds),
         mean_speed=float(speeds.mean()) if len(speeds) else None,

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from visadapt.evaluation.cartpole_score import Evaluation
-from visadapt.setups.flight import FlightScore
+from visadapt.evaluation.cartpole_score import CartPoleScore
+from visadapt.evaluation.flight_score import FlightScore
 from visadapt.storage.atomic_files import replacing
 
 
@@ -37,9 +37,9 @@ class Row:
 
 
 def speed_row(
-    experiment: str, method: str, domain: str, samples: int, scores: Sequence[Evaluation], system: str = "cartpole"
+    experiment: str, method: str, domain: str, samples: int, scores: Sequence[CartPoleScore], system: str = "cartpole"
 ) -> Row:
-    """Mean cart speed over the surviving episodes of all seeds (one Evaluation each), with its spread over them."""
+    """Mean cart speed over the surviving episodes of all seeds (one CartPoleScore each), with its spread over them."""
     weights = np.array([score.survived for score in scores], float)
     means = np.array([score.mean_speed or 0.0 for score in scores])
     spreads = np.array([score.std_speed or 0.0 for score in scores])
@@ -100,7 +100,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def say(row: Row) -> None:
+def print_speed(row: Row) -> None:
     """Print a row of speeds."""
     episodes = row.episodes or 0
     up = f"{episodes - row.failed} of {episodes} up"

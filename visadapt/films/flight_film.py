@@ -1,6 +1,6 @@
 """Films of flights side by side: a close-up in three dimensions, the goal magnified, and the distance over time.
 
-    panels = [FlownPanel("source", run, flight.system, target.course, target.first[0]), ...]
+    panels = [FlownPanel("source", run, flight.system, target.task, target.first[0]), ...]
     write_flight_film("film.mp4", panels)
 
 All panels share one clock and one set of scales. A path is teal where it is on its course and red where it is far
@@ -170,7 +170,7 @@ def _draw_chart(canvas: Canvas, panel: FlownPanel, i: int, scales: Scales) -> No
     line = plot.place(panel.times, height(panel.distances))[: i + 1]
     plot.line(canvas, line, TEAL, 2)
     rows = panel.row(i) + 1
-    times = np.arange(rows) * panel.course_period
+    times = np.arange(rows) * panel.task.period
     plot.line(canvas, plot.place(times, height(panel.score[:rows])), INK, 1)
     lost = not panel.run.survived and i == len(panel.times) - 1
     plot.cursor(canvas, line[-1], TEAL, lost)

@@ -10,12 +10,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from visadapt.evaluation.flight_score import FAR
 from visadapt.films.drawing3d import Floats
-from visadapt.setups.flight import FAR
 from visadapt.systems import RigidBody
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, VELOCITY, rotation
 from visadapt.targets.rollout import Run
-from visadapt.tasks.courses import AlongReferences, Course, ToTarget
+from visadapt.tasks.flight import FlightTask
+from visadapt.tasks.follow import Follow
+from visadapt.tasks.reach import Reach
 from visadapt.tasks.references import cubic
 
 FINE = 0.02
@@ -28,40 +30,40 @@ LIMIT = 1e4
 
 @dataclass(frozen=True)
 class FlownPanel:
-    """A flight, and the course that it was on.
+    """A flight, and the task that it flew.
 
     Between rows, positions are cubics through the rows' positions and velocities, attitudes and forces are
     interpolated, and commands are held. Arrays are over instants (N, ...), FINE apart, unless they say otherwise.
 
     Raises:
-        ValueError: a run without states of a rigid body, or longer than its reference; a course of another kind.
+        ValueError: a run without states of a rigid body, or longer than its reference; a task of another kind.
     """
 
     title: str
     run: Run
     vehicle: RigidBody
-    course: Course
-    """`AlongReferences`, or `ToTarget`"""
-    place: Tensor
-    """where on its course the flight began: one of `FlightTarget.first`"""
+    task: FlightTask
+    """`Follow`, or `Reach`"""
+    task_state: Tensor
+    """in which the flight began: one of `FlightTarget.first`"""
     earlier: FlownPanel | None = None
     """a flight to compare with, drawn faintly"""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.course, AlongReferences | ToTarget):
-            raise ValueError(f"panel {self.title!r}: no picture is known of a course {type(self.course).__name__}")
+        if not isinstance(self.task, Follow | Reach):
+            raise ValueError(f"panel {self.title!r}: no picture is known of a task {type(self.task).__name__}")
         state = self.run.episode.state
         if state is None or state.shape[1] != len(self.vehicle.states):
             raise ValueError(f"panel {self.title!r}: the run has no states of a {self.vehicle.name} to show")
-        if isinstance(self.course, AlongReferences) and len(state) > self.course.steps + 1:
+        if isinstance(self.task, Follow) and len(state) > self.task.steps + 1:
             raise ValueError(
-                f"panel {self.title!r}: the run has {len(state)} rows, its reference {self.course.steps + 1}"
+                f"panel {self.title!r}: the run has {len(state)} rows, its reference {self.task.steps + 1}"
             )
 
     @property
     def follows(self) -> bool:
         """Whether the flight is to follow a reference, and not to fly through a point."""
-        return isinstance(self.course, AlongReferences)
+        return isinstance(self.task, Follow)
 
     @cached_property
     def states(self) -> Floats:
@@ -73,19 +75,12 @@ class FlownPanel:
         if self.follows:
             return held
         nearest = int(self._misses(held).argmin()) if len(held) > 1 else 0
-        return held[: nearest + 2 + round(AFTER / self.course_period)]
-
-    @property
-    def course_period(self) -> float:
-        """s between rows"""
-        if isinstance(self.course, ToTarget):
-            return self.course.period
-        return self._along.references.period
+        return held[: nearest + 2 + round(AFTER / self.task.period)]
 
     @property
     def end(self) -> float:
         """s, of the last row that is shown"""
-        return (len(self.states) - 1) * self.course_period
+        return (len(self.states) - 1) * self.task.period
 
     @cached_property
     def times(self) -> Floats:
@@ -98,7 +93,7 @@ class FlownPanel:
 
     def row(self, instant: int) -> int:
         """The last row at or before an instant."""
-        return min(int(self.times[instant] / self.course_period + 1e-6), len(self.states) - 1)
+        return min(int(self.times[instant] / self.task.period + 1e-6), len(self.states) - 1)
 
     @cached_property
     def position(self) -> Floats:
@@ -134,10 +129,10 @@ class FlownPanel:
     @cached_property
     def reference(self) -> Floats:
         """(M, 3) m, the whole reference from its start, FINE apart; or the straight line to the point, (2, 3)."""
-        if isinstance(self.course, ToTarget):
-            return np.stack([self.states[0, POSITION], self.place.double().numpy()])
-        whole, which = self._along.references, int(self.place[0])
-        rows = slice(int(self.place[1]), None)
+        if isinstance(self.task, Reach):
+            return np.stack([self.states[0, POSITION], self.task_state.double().numpy()])
+        whole, which = self._along.references, int(self.task_state[0])
+        rows = slice(int(self.task_state[1]), None)
         positions, velocities = (part[which, rows].double().numpy() for part in (whole.positions, whole.velocities))
         count = round((len(positions) - 1) * whole.period / FINE) + 1
         return self._smooth(positions, velocities, np.arange(count) * FINE)
@@ -158,7 +153,7 @@ class FlownPanel:
     def score(self) -> Floats:
         """(rows,) m up to each row, as flights are scored: the mean distance, or the nearest that it came."""
         if self.follows:
-            every = round(self.course_period / FINE)
+            every = round(self.task.period / FINE)
             away = self.away[::every]
             mean: Floats = away[1:].cumsum() / np.arange(1, len(away))
             return np.concatenate([away[:1], mean])
@@ -188,7 +183,7 @@ class FlownPanel:
     @cached_property
     def passed(self) -> float:
         """s at which a flight came nearest to its target"""
-        return float(self.score.argmin() * self.course_period)
+        return float(self.score.argmin() * self.task.period)
 
     @cached_property
     def failed(self) -> float | None:
@@ -205,25 +200,25 @@ class FlownPanel:
         return float(self.away.max() if self.follows else self.score[-1])
 
     @property
-    def _along(self) -> AlongReferences:
-        assert isinstance(self.course, AlongReferences)
-        return self.course
+    def _along(self) -> Follow:
+        assert isinstance(self.task, Follow)
+        return self.task
 
     def _misses(self, states: Floats) -> Floats:
         """(rows - 1,) m: how near each step of a flight came to its target."""
         steps = torch.from_numpy(np.stack([states[:-1], states[1:]], 1))
-        return np.asarray(self.course.misses(steps, self.place.double().expand(len(steps), 3))[:, 0])
+        return np.asarray(self.task.misses(steps, self.task_state.double().expand(len(steps), 3))[:, 0])
 
     def _smooth(self, values: Floats, slopes: Floats, times: Floats) -> Floats:
         """Values (M, n) at times (M,) of the cubics through values and slopes (rows, n)."""
         if len(values) == 1:
             return values
-        rows = torch.arange(len(values)).double() * self.course_period
+        rows = torch.arange(len(values)).double() * self.task.period
         return cubic(rows, torch.from_numpy(values), torch.from_numpy(slopes), torch.from_numpy(times)).numpy()
 
     def _between(self, values: Floats) -> Floats:
         """Values (N, ...) at the instants, linear between rows (rows, ...)."""
-        at = self.times / self.course_period
+        at = self.times / self.task.period
         row = np.minimum(at.astype(int), max(len(values) - 2, 0))
         share = (at - row).reshape(-1, *[1] * (values.ndim - 1))
         following: NDArray[np.intp] = np.minimum(row + 1, len(values) - 1)

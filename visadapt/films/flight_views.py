@@ -8,12 +8,12 @@ from typing import Self
 
 import numpy as np
 
+from visadapt.evaluation.flight_score import FAR
 from visadapt.films.canvas import BLUE, HAIRLINE, INK, MUTED, RED, TEAL, TROUGH, Canvas, Colour, text_width
 from visadapt.films.drawing3d import Floats, Pen, PinholeCamera, blend, dropped
 from visadapt.films.flight_panel import FINE, FlownPanel
 from visadapt.films.vehicle_shapes import draw_vehicle, outline
 from visadapt.films.widgets import ceiling
-from visadapt.setups.flight import FAR
 from visadapt.systems import Quadrotor
 
 AMBER: Colour = (232, 168, 48)

@@ -6,7 +6,7 @@ import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,22 +14,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
+from visadapt.learning.joint import Round
 from visadapt.storage.atomic_files import replacing
 
 BLUE, ORANGE, TEAL, INK, MUTED, HAIRLINE = "#2f67c9", "#de7416", "#0e7a70", "#1f2933", "#6e7a88", "#d8dde3"
 PAPER_VALUE = (1000, 0.29)
 """Samples and m/s: the paper's image policy in the target after adaptation, its checkpoint chosen on the target."""
-
-
-class Round(TypedDict):
-    """One round of the joint loop; iterations count within the round and phase."""
-
-    samples: int
-    """target samples counted by the end of the round's collection"""
-    grounding: Sequence[tuple[int, float, float | None]]
-    """iteration, loss on the training data, loss on held-out data"""
-    policy: Sequence[tuple[int, float]]
-    """iteration, loss"""
 
 
 def plot_losses(path: str | os.PathLike[str], rounds: Sequence[Round]) -> None:
@@ -43,15 +33,13 @@ def plot_losses(path: str | os.PathLike[str], rounds: Sequence[Round]) -> None:
     figure = Figure(figsize=(9.0, 5.4), dpi=150, layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
     start = 0.0
-    whole = sum(
-        _span([row[0] for row in each["grounding"]]) + _span([row[0] for row in each["policy"]]) for each in rounds
-    )
+    whole = sum(_span([row[0] for row in each.grounding]) + _span(range(len(each.policy))) for each in rounds)
     for i, each in enumerate(rounds):
         first = i == 0
         for axes in (upper, lower):
             axes.axvline(start, color=HAIRLINE, linewidth=1, zorder=0)
         upper.annotate(
-            f"{each['samples']:,}" + (" samples" if first else ""),
+            f"{each.samples:,}" + (" samples" if first else ""),
             (start, 1.0),
             (3, 3),
             xycoords=("data", "axes fraction"),
@@ -60,7 +48,7 @@ def plot_losses(path: str | os.PathLike[str], rounds: Sequence[Round]) -> None:
             fontsize=8,
         )
         for column, colour, name in ((1, BLUE, "training data"), (2, ORANGE, "held out")):
-            points = np.array([_floats(row[0], row[column]) for row in each["grounding"]]).reshape(-1, 2)
+            points = np.array([_floats(row[0], row[column]) for row in each.grounding]).reshape(-1, 2)
             label = name if first else None
             solved = len(points) == 2
             if solved:  # beside each other, or one would hide the other
@@ -68,10 +56,10 @@ def plot_losses(path: str | os.PathLike[str], rounds: Sequence[Round]) -> None:
             dot = "o" if solved else None
             x = start + points[:, 0]
             upper.plot(x, points[:, 1], color=colour, linewidth=1.4, label=label, marker=dot, ms=4, markevery=[-1])
-        start += _span([row[0] for row in each["grounding"]])
-        points = np.array([_floats(*row) for row in each["policy"]]).reshape(-1, 2)
+        start += _span([row[0] for row in each.grounding])
+        points = np.array([_floats(*row) for row in enumerate(each.policy)]).reshape(-1, 2)
         lower.plot(start + points[:, 0], points[:, 1], color=TEAL, linewidth=1.4)
-        start += _span([row[0] for row in each["policy"]])
+        start += _span(range(len(each.policy)))
     for axes, title in ((upper, "grounding loss"), (lower, "policy loss")):
         _scale(axes)
         _dress(axes, title)

@@ -24,7 +24,7 @@ from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, read_recording, write_recording
 from visadapt.storage.checkpoints import load_tree, load_weights, save_tree
 from visadapt.targets import Target, TargetError
-from visadapt.targets.rollout import See, run
+from visadapt.targets.rollout import run
 from visadapt.world import World
 
 Label = Callable[[list[Episode]], list[Episode]]
@@ -79,8 +79,17 @@ class Round:
 
 @dataclass(frozen=True)
 class Adapted:
-    """The outcome of `adapt`; policy and residual were changed in place."""
+    """The outcome of `adapt`; policy and residual were changed in place.
 
+    >>> import visadapt as va
+    >>> policy = va.load_policy(va.shipped("cartpole_states"))
+    >>> target = va.SyntheticTarget(va.constant_force(1.0))
+    >>> result = va.adapt(policy, va.World(va.CartPole()), target, samples=20, iterations=1)
+    >>> result.ledger.entries
+    [('round 1/1: data', 20)]
+    """
+
+    policy: Policy
     ledger: Ledger
     rounds: list[Round]
     episodes: list[Episode]
@@ -105,7 +114,6 @@ def adapt(
     source: World,
     target: Target,
     observe: Observe | None,
-    see: See,
     settings: AdaptSettings,
     folder: Path,
     label: Label | None = None,
@@ -118,8 +126,7 @@ def adapt(
         policy, residual: the networks, changed in place; the policy listens to the residual.
         source: the physics known beforehand; effects that it has are named guesses, whose parameters are fitted.
         observe: the camera of simulated states, a learnt renderer; None where the policy sees what sensors measure.
-        see: what the policy is shown of the target.
-        label: estimates the states from what a camera saw; without it, the states that the target tells are used.
+        label: estimates the states from the camera's frames; without it, the target's own states are used.
         explorer: the policy that collects the target's data, in place of the one that is tuned (Algorithm 1).
 
     Raises:
@@ -138,7 +145,7 @@ def adapt(
         wanted = min(settings.round_samples, ledger.left)
         collector = policy if explorer is None else explorer
         drawn = _generator(settings, number, 0)
-        new = _collected(here / "recording.h5", collector, target, see, wanted, settings, drawn)
+        new = _collected(here / "recording.h5", collector, target, wanted, settings, drawn)
         for episode in new:
             ledger.count(f"{name}: data", episode.samples)
         episodes += new if label is None else label(new)
@@ -155,7 +162,7 @@ def adapt(
             initialise_feedforward(policy, source, residual.scale)
         losses = _tuned(here, policy, grounded, observe, settings, windows, number, staged(report, f"{name}: tune"))
         rounds.append(Round(ledger.used, grounding, losses))
-    return Adapted(ledger, rounds, episodes, folder)
+    return Adapted(policy, ledger, rounds, episodes, folder)
 
 
 def _weights(folder: Path, number: int) -> Path:
@@ -172,7 +179,6 @@ def _collected(
     path: Path,
     policy: Policy,
     target: Target,
-    see: See,
     wanted: int,
     settings: AdaptSettings,
     generator: torch.Generator,
@@ -184,7 +190,7 @@ def _collected(
     left = wanted
     while left > 0:
         steps = min(left, settings.longest_episode)
-        episode = run(target, policy, see, 1, steps, generator, settings.exploration)[0].episode
+        episode = run(target, policy, 1, steps, generator, settings.exploration)[0].episode
         if episode.samples == 0:
             raise TargetError(f"{target.name}: the episode is over before its first step")
         episodes.append(episode)

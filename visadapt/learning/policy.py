@@ -110,13 +110,13 @@ def tune(
         stream = streams.now
         if settings.streams is not None:
             past = past or stream
-            stream = past[torch.randint(len(past.place), (settings.batch,), generator=generator)]
+            stream = past[torch.randint(len(past.task_state), (settings.batch,), generator=generator)]
         history = stream.history
         noise = settings.observation_noise * torch.randn(history.observations.shape, generator=generator)
         plan = policy(History(history.observations + noise.to(history.observations), history.actions))
-        show = partial(task.show, place=stream.place)
+        show = partial(task.show, task_state=stream.task_state)
         states, first = imagine(world, observe, stream.at, history, plan, show, generator)
-        loss = task.cost(states, plan, stream.at.state, stream.place).mean()
+        loss = task.cost(states, plan, stream.at.state, stream.task_state).mean()
         if not bool(loss.isfinite()):
             raise DivergedError(f"the policy's loss is {float(loss.detach())} at iteration {iteration}")
         optimiser.zero_grad()

@@ -23,21 +23,22 @@ class StreamState:
 
     at: WorldState
     history: History
-    place: Tensor
+    task_state: Tensor
     """(B, ...) the task's"""
 
     def where(self, keep: Tensor, other: StreamState) -> StreamState:
         """This stream in the rows where `keep` (B,) holds, `other` in the rest."""
-        place = torch.where(keep.reshape(-1, *[1] * (self.place.dim() - 1)), self.place, other.place)
-        return StreamState(self.at.where(keep, other.at), self.history.where(keep, other.history), place)
+        rows = keep.reshape(-1, *[1] * (self.task_state.dim() - 1))
+        task_state = torch.where(rows, self.task_state, other.task_state)
+        return StreamState(self.at.where(keep, other.at), self.history.where(keep, other.history), task_state)
 
     def __getitem__(self, rows: Tensor) -> StreamState:
-        return StreamState(self.at[rows], self.history[rows], self.place[rows])
+        return StreamState(self.at[rows], self.history[rows], self.task_state[rows])
 
     def joined(self, other: StreamState) -> StreamState:
         """This stream and, after it, another."""
         return StreamState(
-            self.at.joined(other.at), self.history.joined(other.history), torch.cat((self.place, other.place))
+            self.at.joined(other.at), self.history.joined(other.history), torch.cat((self.task_state, other.task_state))
         )
 
     def tree(self) -> dict[str, Any]:
@@ -48,14 +49,14 @@ class StreamState:
             "memory": list(self.at.memory),
             "observations": self.history.observations,
             "actions": self.history.actions,
-            "place": self.place,
+            "task_state": self.task_state,
         }
 
     @classmethod
     def of(cls, tree: dict[str, Any]) -> Self:
         """From what `tree` gave."""
         at = WorldState(tree["time"], tree["state"], tuple(tree["memory"]))
-        return cls(at, History(tree["observations"], tree["actions"]), tree["place"])
+        return cls(at, History(tree["observations"], tree["actions"]), tree["task_state"])
 
 
 @dataclass(frozen=True)
@@ -107,19 +108,19 @@ class Streams:
         `progress` in [0, 1] drives the curriculum.
         """
         at = replace(at, state=self.task.disturb(at.state, generator))
-        place = self.task.advance(self.now.place)
+        task_state = self.task.advance(self.now.task_state)
         seen, at = look(self.world, self.observe, at, generator)
-        history = self.now.history.acting(action).observing(self.task.show(seen, place)).detach()
-        self.now = StreamState(at.detach(), history, place)
+        history = self.now.history.acting(action).observing(self.task.show(seen, task_state)).detach()
+        self.now = StreamState(at.detach(), history, task_state)
         self.age += 1
-        keep = (self.age < self.settings.longest) & ~self.task.diverged(at.state, place, progress)
+        keep = (self.age < self.settings.longest) & ~self.task.diverged(at.state, task_state, progress)
         if not bool(keep.all()):
             self.now = self.now.where(keep, self._fresh(progress, generator))
             self.age = torch.where(keep, self.age, 0)
 
     def _fresh(self, progress: float, generator: torch.Generator) -> StreamState:
         count, windows = self.settings.count, self.windows
-        state, place = self.task.begin(count, progress, generator)
+        state, task_state = self.task.training_start(count, progress, generator)
         at = self.world.start(state)
         if self._times is not None:
             # Streams are shorter than episodes: those that all began at time 0 would never meet a gust that comes
@@ -127,19 +128,19 @@ class Streams:
             # each was recorded.
             at = replace(at, time=self._times[torch.randint(len(self._times), (count,), generator=generator)].to(state))
         seen, at = look(self.world, self.observe, at, generator)
-        history = History.start(self.task.show(seen, place), len(self.world.system.actions))
-        fresh = StreamState(at, history, place)
+        history = History.start(self.task.show(seen, task_state), len(self.world.system.actions))
+        fresh = StreamState(at, history, task_state)
         if windows is None or self._recorded is None:
             return fresh
-        places = windows.place.to(place)
+        task_states = windows.task_state.to(task_state)
         # A fall on record is beyond delta_div; starting from it would drown what can be learnt.
-        near = (~self.task.diverged(windows.state, places[:, -1], progress)).nonzero()[:, 0]
+        near = (~self.task.diverged(windows.state, task_states[:, -1], progress)).nonzero()[:, 0]
         if not len(near):
             return fresh
         from_record = torch.rand(count, generator=generator) < self.settings.recorded
         rows = near[torch.randint(len(near), (count,), generator=generator)]
         past = windows.history(rows)
-        seen, now, where = self.task.augment(past.observations, windows.state[rows], places[rows], generator)
+        seen, now, where = self.task.augment(past.observations, windows.state[rows], task_states[rows], generator)
         shown = self.task.show(seen.flatten(0, 1), where.flatten(0, 1)).unflatten(0, seen.shape[:2])
         # The history ends with the recorded reading of this row, so the sensors have read it.
         _, at = look(self.world, self.observe, replace(self._recorded[rows], state=now), generator)

@@ -43,8 +43,8 @@ class Windows:
     """(N, n_state) s_{t+1}"""
     episode: Tensor
     """(N,) number of the episode"""
-    place: Tensor
-    """(N, LENGTH, n_place) where the rows that it shows were on their course; of width 0 where there is none"""
+    task_state: Tensor
+    """(N, LENGTH, n_task_state) the task states of the rows that it shows; of width 0 where the target has none"""
     time: Tensor
     """(N,) s from the begin of the episode to s_t"""
     row: Tensor
@@ -77,7 +77,8 @@ class Windows:
             action = torch.as_tensor(episode.action, dtype=dtype)
             observations.append(_seen(episode, number, state, source, observe))
             count = episode.samples
-            place = torch.zeros(len(state), 0) if episode.place is None else torch.as_tensor(episode.place)
+            has_task = episode.task_state is not None
+            task_state = torch.as_tensor(episode.task_state) if has_task else torch.zeros(len(state), 0)
             back = torch.arange(-LENGTH + 1, 1) + torch.arange(count)[:, None]
             padded = torch.cat((torch.zeros(LENGTH, action.shape[1], dtype=dtype), action))
             time = torch.as_tensor(episode.time - episode.time[0], dtype=dtype)
@@ -91,7 +92,7 @@ class Windows:
                     state[:count],
                     state[1 : count + 1],
                     torch.full((count,), number),
-                    place[back.clamp(min=0)],
+                    task_state[back.clamp(min=0)],
                     time[:count],
                     torch.arange(count),
                 )

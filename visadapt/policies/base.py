@@ -7,6 +7,9 @@ policy need not learn to see again what grounding has learnt to see, and adapts 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
 import torch
 from torch import Tensor, nn
 
@@ -20,10 +23,23 @@ class Policy(nn.Module):
     The correction enters in two ways, both of no weight at first: among the features, and straight into the plan as
     a feed-forward, since what is known to push can be pushed against. `learning.policy.initialise_feedforward` gives
     the feed-forward its weights once there is a residual; tuning changes all of them.
+
+    >>> import torch, visadapt as va
+    >>> from visadapt.history import History
+    >>> policy = va.load_policy(va.shipped("cartpole_states"))
+    >>> policy.act(History.start(torch.zeros(2, 4), n_action=1)).shape
+    torch.Size([2, 1])
     """
 
-    def __init__(self, n_state: int, n_action: int) -> None:
+    shown: ClassVar[str] = "state"
+    """what it is shown of a target: state, frame, or state and goal (`targets.rollout.SHOWN`)"""
+
+    def __init__(self, n_state: int, n_action: int, arguments: Mapping[str, Any] | None = None) -> None:
         super().__init__()
+        self.arguments = dict(arguments or {})
+        """the constructor's, from which a file that holds the policy makes it again"""
+        self.grounded_in: dict[str, Any] | None = None
+        """the world that its residual completes, as `setups.policy_file.describe` puts it; None without a residual"""
         self.n_state = n_state
         self.n_action = n_action
         self.feedforward = nn.Linear(n_state, HORIZON * n_action, bias=False)

@@ -11,10 +11,20 @@ from visadapt.policies.networks import FEATURES, FrameEncoder, mlp
 
 
 class ImagePolicy(Policy):
-    """A 4-layer CNN on the last 5 frames and 5 actions (the paper, section 3.2.3)."""
+    """A 4-layer CNN on the last 5 frames and 5 actions (the paper, section 3.2.3).
+
+    It carries the encoder as it was when it had learnt to see (`learning.perception`), before the policy was trained:
+    the residual begins with that one. No training of the policy changes it.
+    """
+
+    shown = "frame"
 
     def __init__(self, background: Tensor, contrast: float, n_state: int = 4, n_action: int = 1) -> None:
-        super().__init__(n_state, n_action)
+        # Drawn first, as it was when it was a network of its own: the same seed gives the same weights.
+        perception = FrameEncoder(background, contrast, n_action).requires_grad_(False)
+        given = {"background": background, "contrast": contrast, "n_state": n_state, "n_action": n_action}
+        super().__init__(n_state, n_action, given)
+        self.perception = perception
         self.encoder = FrameEncoder(background, contrast, n_action)
         self.hidden = nn.Linear(FEATURES + n_state, 64)
         self.out = nn.Linear(64, HORIZON * n_action)
@@ -33,7 +43,8 @@ class StatePolicy(Policy):
     """The paper's MLP for balancing, 32-64-64-32-10, tanh (A.1.3), on the state, or on 5 states and actions."""
 
     def __init__(self, n_state: int, n_action: int = 1, with_history: bool = False) -> None:
-        super().__init__(n_state, n_action)
+        given = {"n_state": n_state, "n_action": n_action, "with_history": with_history}
+        super().__init__(n_state, n_action, given)
         self.with_history = with_history
         inputs = LENGTH * (n_state + n_action) if with_history else n_state
         self.first = nn.Linear(inputs + n_state, 32)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -18,8 +21,11 @@ class FlightPolicy(Policy):
     what a subclass makes of the goal. A linear path past the hidden layers carries what feedback does near the goal.
     """
 
-    def __init__(self, n_aim: int, n_action: int = 4, width: int = 128) -> None:
-        super().__init__(len(RigidBody.states), n_action)
+    shown = "state and goal"
+
+    def __init__(self, n_aim: int, arguments: Mapping[str, Any] | None = None) -> None:
+        n_action, width = 4, 128
+        super().__init__(len(RigidBody.states), n_action, arguments)
         self.first = nn.Linear(15 + n_aim + self.n_state, width)
         self.rest = mlp(width, width, width)
         self.out = nn.Linear(width, HORIZON * n_action)
@@ -63,7 +69,7 @@ class FollowPolicy(FlightPolicy):
     """Follows a reference, whose next HORIZON positions and velocities (6 each), `period` s apart, are its goal."""
 
     def __init__(self, period: float) -> None:
-        super().__init__(6 * HORIZON)
+        super().__init__(6 * HORIZON, {"period": period})
         self.period = period
 
     def aim(self, state: Tensor, goal: Tensor) -> Tensor:

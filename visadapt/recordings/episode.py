@@ -22,6 +22,11 @@ class Episode:
     Raises:
         RecordingError: arrays of another shape or type, rows that do not match, a clock that does not run forward,
             or a value that is not finite.
+
+    >>> import numpy as np, visadapt as va
+    >>> episode = va.Episode(time=0.05 * np.arange(3), action=np.zeros((3, 1)), state=np.zeros((3, 4)))
+    >>> episode.samples
+    2
     """
 
     time: NDArray[np.floating]
@@ -32,13 +37,13 @@ class Episode:
     """(T, n_state), SI units"""
     frame: NDArray[np.uint8] | None = None
     """(T, H, W)"""
-    place: NDArray[np.floating] | None = None
-    """(T, n_place) where it was on its course, in the course's own numbers: policies are trained on from there"""
+    task_state: NDArray[np.floating] | None = None
+    """(T, n_task_state) how far it was in its task, in the task's own numbers: training goes on from there"""
 
     def __post_init__(self) -> None:
         if self.state is None and self.frame is None:
             raise RecordingError("an episode needs states or frames")
-        for name, axes in (("time", 1), ("action", 2), ("state", 2), ("frame", 3), ("place", 2)):
+        for name, axes in (("time", 1), ("action", 2), ("state", 2), ("frame", 3), ("task_state", 2)):
             values = getattr(self, name)
             if values is not None:
                 self._check(name, values, axes)

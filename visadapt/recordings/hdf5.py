@@ -1,11 +1,11 @@
-"""Recordings as HDF5: one group for each episode, and in it the datasets time, action, state, frame and place.
+"""Recordings as HDF5: one group for each episode, and in it the datasets time, action, state, frame and task_state.
 
     /                       attributes format, version, state_names (optional), action_names (optional)
     /episode_00000/time     (T,) s, floating point
     /episode_00000/action   (T, n_action), floating point
     /episode_00000/state    (T, n_state), floating point; state, frame, or both
     /episode_00000/frame    (T, H, W) uint8, gzip
-    /episode_00000/place    (T, n_place) floating point, where the target has a course
+    /episode_00000/task_state  (T, n_task_state) floating point, where the target has a task
 
 All datasets carry a checksum (Fletcher-32), so that damaged bytes are an error and not data.
 """
@@ -42,6 +42,15 @@ def write_recording(
     Raises:
         RecordingError: no episodes, episodes that do not belong together, or names that do not fit their columns.
         DiskFullError: the disk is full; what stood at `path` before stays.
+
+    >>> import pathlib, tempfile, torch, visadapt as va
+    >>> target = va.SyntheticTarget(va.constant_force(2.0))
+    >>> policy = va.load_policy(va.shipped("cartpole_states"))
+    >>> runs = va.run(target, policy, 2, 30, torch.Generator().manual_seed(0), exploration=0.3)
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.h5"
+    >>> va.write_recording(path, [run.episode for run in runs], ["x", "x_dot", "theta", "theta_dot"], ["command"])
+    >>> len(va.read_recording(path))
+    2
     """
     path = Path(path)
     _check_alike(path, episodes)
@@ -80,6 +89,13 @@ def read_recording(path: str | os.PathLike[str], frames: bool = True) -> list[Ep
     Raises:
         RecordingError: the file is missing, torn, of another format or version, or its rows make no episode;
             the message is one line that says which file and episode, and what would be right.
+
+    >>> import numpy as np, pathlib, tempfile, visadapt as va
+    >>> episode = va.Episode(time=0.05 * np.arange(3), action=np.zeros((3, 1)), state=np.zeros((3, 4)))
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.h5"
+    >>> va.write_recording(path, [episode])
+    >>> va.read_recording(path)[0].samples
+    2
     """
     path = Path(path)
     with _opened(path) as file:
@@ -108,7 +124,7 @@ def _group_name(number: int) -> str:
 
 
 def _write_episode(group: h5py.Group, episode: Episode) -> None:
-    for name in ("time", "action", "state", "place"):
+    for name in ("time", "action", "state", "task_state"):
         values = getattr(episode, name)
         if values is not None:
             group.create_dataset(name, data=values, fletcher32=True)
@@ -139,7 +155,7 @@ def _read_episode(path: Path, file: h5py.File, number: int, frames: bool) -> Epi
         raise RecordingError(f"{where} holds frames alone; states are needed")
     try:
         frame = _read(where, group, "frame") if frames else None
-        return Episode(time, action, state, frame, _read(where, group, "place"))
+        return Episode(time, action, state, frame, _read(where, group, "task_state"))
     except ValueError as error:
         raise RecordingError(f"{where}: {error}") from error
 
@@ -160,7 +176,7 @@ def _check_alike(path: Path, episodes: Sequence[Episode]) -> None:
     """All episodes hold the same things, of the same width."""
     if not episodes:
         raise RecordingError(f"{path}: a recording needs at least one episode")
-    for name in ("action", "state", "frame", "place"):
+    for name in ("action", "state", "frame", "task_state"):
         first = _row_shape(getattr(episodes[0], name))
         for number, episode in enumerate(episodes):
             shape = _row_shape(getattr(episode, name))

@@ -47,7 +47,9 @@ class _Notes:
 
 
 def load_recording(
-    paths: Sequence[str | os.PathLike[str]], system: System, columns: Mapping[str, str] | None = None
+    paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    system: System,
+    columns: Mapping[str, str] | None = None,
 ) -> Recording:
     """Read states and actions from CSV and HDF5 files.
 
@@ -57,17 +59,27 @@ def load_recording(
     recording's warnings.
 
     Args:
-        paths: files, or folders whose CSV and HDF5 files are taken in the order of their names.
+        paths: one or several: files, or folders whose CSV and HDF5 files are taken in the order of their names.
         system: the source, whose names and units the recording is brought to.
         columns: our name of a column to the file's, where they are not evident.
 
     Raises:
         RecordingError: a recording that cannot be used; one line that says which file, row and column, and what
             would be right.
+
+    >>> import pathlib, tempfile, torch, visadapt as va
+    >>> target = va.SyntheticTarget(va.constant_force(2.0))
+    >>> policy = va.load_policy(va.shipped("cartpole_states"))
+    >>> runs = va.run(target, policy, 2, 30, torch.Generator().manual_seed(0), exploration=0.3)
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.h5"
+    >>> va.write_recording(path, [run.episode for run in runs], ["x", "x_dot", "theta", "theta_dot"], ["command"])
+    >>> run = va.load_recording(path, va.CartPole())
+    >>> run.samples, round(run.period, 6)
+    (60, 0.05)
     """
     note = _Notes()
     every: list[tuple[list[Rows], tuple[str, ...], bool]] = []
-    files = _files(paths)
+    files = _files([paths] if isinstance(paths, str | os.PathLike) else paths)
     for path in files:
         rows, measured, force = _read(path, system, columns or {})
         for one in rows:

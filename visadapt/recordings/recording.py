@@ -9,7 +9,13 @@ from visadapt.recordings.episode import Episode
 
 @dataclass(frozen=True)
 class Recording:
-    """Episodes of states and actions. Every episode's clock is steady: its rows are one period apart."""
+    """Episodes of states and actions. Every episode's clock is steady: its rows are one period apart.
+
+    >>> import numpy as np, visadapt as va
+    >>> episode = va.Episode(time=0.05 * np.arange(3), action=np.zeros((3, 1)), state=np.zeros((3, 2)))
+    >>> va.Recording((episode,), measured=("x", "theta"), period=0.05, sources=("run.csv",)).samples
+    2
+    """
 
     episodes: tuple[Episode, ...]
     """`state` holds the columns `measured`, no others; `action` all of the system's, in its order"""

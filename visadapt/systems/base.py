@@ -11,7 +11,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Variable:
-    """One entry of a state or action vector: its name, SI unit and the range a run is expected to stay in."""
+    """One entry of a state or action vector: its name, SI unit and the range a run is expected to stay in.
+
+    >>> import visadapt as va
+    >>> va.Variable("theta", "rad", -0.3, 0.3).unit
+    'rad'
+    """
 
     name: str
     unit: str
@@ -24,6 +29,21 @@ class System(ABC):
 
     Subclasses are frozen dataclasses whose fields are the physical parameters in SI units: numbers, or tensors, () or
     (B,), where an effect has changed them.
+
+    >>> from dataclasses import dataclass
+    >>> import torch, visadapt as va
+    >>> @dataclass(frozen=True)
+    ... class Slider(va.System):
+    ...     mass: float = 2.0
+    ...     name = "slider"
+    ...     states = (va.Variable("x", "m", -1.0, 1.0), va.Variable("x_dot", "m/s", -1.0, 1.0))
+    ...     actions = (va.Variable("command", "1", -1.0, 1.0),)
+    ...     loads = (va.Variable("force", "N", -10.0, 10.0),)
+    ...     def derivative(self, state, command, load):
+    ...         return torch.stack((state[:, 1], (command[:, 0] + load[:, 0]) / self.mass), 1)
+    >>> world = va.World(Slider(), period=0.1)
+    >>> world.step(world.start(torch.zeros(1, 2)), torch.ones(1, 1)).state
+    tensor([[0.0025, 0.0500]])
     """
 
     name: ClassVar[str]

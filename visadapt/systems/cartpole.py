@@ -18,7 +18,14 @@ from visadapt.systems.base import System, Variable, holds
 
 @dataclass(frozen=True)
 class CartPole(System):
-    """A uniform pole on a cart. Defaults are the paper's CartPole (0.05 s between commands)."""
+    """A uniform pole on a cart. Defaults are the paper's CartPole (0.05 s between commands).
+
+    >>> import visadapt as va
+    >>> va.CartPole(cart_mass=0.5).cart_mass
+    0.5
+    >>> [variable.name for variable in va.CartPole.states]
+    ['x', 'x_dot', 'theta', 'theta_dot']
+    """
 
     cart_mass: float | Tensor = 1.0
     """kg"""

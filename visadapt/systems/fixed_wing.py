@@ -48,6 +48,11 @@ class FixedWing(RigidBody):
     second brings; `zero` is what is there without a cause, and 0 sideways for an aircraft that is its own mirror image.
 
     Roll rate decays at 1.95 V a second, which RK4 bears in steps of 0.05 s up to 28 m/s: a dive needs shorter ones.
+
+    >>> import torch, visadapt as va
+    >>> state, command = va.FixedWing().trim(torch.tensor([11.5]))
+    >>> state.shape, command.shape
+    (torch.Size([1, 13]), torch.Size([1, 4]))
     """
 
     mass: float | Tensor = 1.01

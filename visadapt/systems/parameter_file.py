@@ -27,11 +27,17 @@ class RigError(ValueError):
     """A rig's file that cannot be used; the message is one line: which file and key, and what would be right."""
 
 
-def load_rig(path: str | os.PathLike[str], system_class: type[SystemT]) -> SystemT:
+def load_parameters(path: str | os.PathLike[str], system_class: type[SystemT]) -> SystemT:
     """The system with the parameters of a TOML file.
 
     Raises:
         RigError: no such file, no TOML, no table `[parameters]`, an unknown key, or an impossible value.
+
+    >>> import pathlib, tempfile, visadapt as va
+    >>> rig = pathlib.Path(tempfile.mkdtemp()) / "rig.toml"
+    >>> _ = rig.write_text("[parameters]\\ncart_mass = 0.23\\n")
+    >>> va.load_parameters(rig, va.CartPole).cart_mass
+    0.23
     """
     try:
         content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))

@@ -21,7 +21,12 @@ from visadapt.systems.rigid_body import RigidBody, beside, columns, times
 
 @dataclass(frozen=True)
 class Quadrotor(RigidBody):
-    """Defaults are Flightmare's vehicle and the paper's ranges of commands (0.1 s between commands)."""
+    """Defaults are Flightmare's vehicle and the paper's ranges of commands (0.1 s between commands).
+
+    >>> import visadapt as va
+    >>> [variable.name for variable in va.Quadrotor.actions]
+    ['thrust', 'rate_x', 'rate_y', 'rate_z']
+    """
 
     mass: float | Tensor = 1.0
     """kg"""

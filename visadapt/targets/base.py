@@ -15,7 +15,13 @@ class TargetError(RuntimeError):
 
 @dataclass(frozen=True)
 class Observation:
-    """What a batch of targets shows at one instant."""
+    """What a batch of targets shows at one instant.
+
+    >>> import torch, visadapt as va
+    >>> seen = va.SyntheticTarget().reset(3, torch.Generator().manual_seed(0))
+    >>> isinstance(seen, va.Observation), seen.state.shape, bool(seen.alive.all())
+    (True, torch.Size([3, 4]), True)
+    """
 
     state: Tensor
     """(B, n_state), SI units: for labels and scores, never for an image policy"""
@@ -27,14 +33,25 @@ class Observation:
     """(B,), or of vehicles (B, 3), the disturbance in N, where the target knows it: for films only"""
     goal: Tensor | None = None
     """(B, n_goal) what the policy is to do, where that is not always the same"""
-    place: Tensor | None = None
-    """(B, n_place) where each is on its course, where there is one: the task's and the course's own numbers"""
+    task_state: Tensor | None = None
+    """(B, n_task_state) how far each is in its task, where the target has one: the task's own numbers"""
 
 
 class Target(ABC):
     """A batch of machines of one kind, reset and stepped together.
 
     A row whose episode has ended may still be stepped: what it shows then means nothing.
+
+    >>> import torch, visadapt as va
+    >>> class Rig(va.Target):
+    ...     name, period, n_action = "my rig", 0.05, 1
+    ...     def reset(self, batch, generator):
+    ...         return va.Observation(torch.zeros(batch, 4), torch.ones(batch, dtype=torch.bool))
+    ...     def step(self, action):
+    ...         return va.Observation(torch.zeros(len(action), 4), torch.ones(len(action), dtype=torch.bool))
+    >>> policy = va.load_policy(va.shipped("cartpole_states"))
+    >>> va.score(policy, Rig(), episodes=2, steps=5).survived
+    2
     """
 
     name: str

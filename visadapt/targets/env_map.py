@@ -22,7 +22,12 @@ ASPECT_TOLERANCE = 0.01
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry of the environment's observation or action vector, and the straight line between it and ours."""
+    """One entry of the environment's observation or action vector, and the straight line between it and ours.
+
+    >>> import visadapt as va
+    >>> va.Entry(index=2, scale=-1.0).offset
+    0.0
+    """
 
     index: int
     scale: float = 1.0
@@ -45,6 +50,11 @@ class EnvMap:
 
     In a TOML file it has the same names: tables `[states]` (`x = { index = 0 }`), `[limits]` and `[options]`, and
     `actions`, `crop`, `contrast`, `width`, `height` above them.
+
+    >>> import visadapt as va
+    >>> states = {"x": va.Entry(0), "theta": va.Entry(1), "x_dot": va.Entry(2), "theta_dot": va.Entry(3)}
+    >>> va.EnvMap(states, actions=(va.Entry(0),), crop=(0, 0, 240, 200)).width
+    120
     """
 
     states: Mapping[str, Entry]

@@ -36,6 +36,12 @@ class GymnasiumTarget(Target):
     Raises:
         TargetError: gymnasium is not installed, the environment is not to be had, has discrete actions, no
             rgb_array, or no period, or the mapping does not fit it.
+
+    >>> import torch, visadapt as va
+    >>> from visadapt.targets.inverted_pendulum import MAP
+    >>> target = va.GymnasiumTarget("InvertedPendulum-v5", MAP, frames=False)
+    >>> target.reset(2, torch.Generator().manual_seed(0)).state.shape, target.period
+    (torch.Size([2, 4]), 0.04)
     """
 
     def __init__(

@@ -21,7 +21,7 @@ See = Callable[[Observation], Tensor]
 def see_frames(observation: Observation) -> Tensor:
     """Frames (B, H, W) in [0, 1]."""
     if observation.frame is None:
-        raise TargetError("the policy sees frames, but the target shows none: give it a camera")
+        raise TargetError("the policy is shown frames, but the target has none: give it a camera")
     return observation.frame.to(torch.get_default_dtype()) / 255
 
 
@@ -33,8 +33,15 @@ def see_states(observation: Observation) -> Tensor:
 def see_goals(observation: Observation) -> Tensor:
     """States and, after them, goals (B, n_state + n_goal)."""
     if observation.goal is None:
-        raise TargetError("the policy is told its goal, but the target has none: give it a course")
+        raise TargetError("the policy is shown its goal, but the target has none: give it a task")
     return torch.cat((observation.state, observation.goal), 1)
+
+
+FILM_SEED = 12
+"""Of the episodes that films show."""
+
+SHOWN: dict[str, See] = {"state": see_states, "frame": see_frames, "state and goal": see_goals}
+"""What `Policy.shown` names."""
 
 
 @dataclass(frozen=True)
@@ -51,22 +58,30 @@ class Run:
 def run(
     target: Target,
     policy: Policy,
-    see: See,
     batch: int,
     steps: int,
     generator: torch.Generator,
     exploration: float = 0.0,
     strict: bool = True,
+    see: See | None = None,
 ) -> list[Run]:
     """Run `batch` episodes of at most `steps` steps each; an episode that ends is cut there, and marked.
 
     Args:
         exploration: standard deviation of white noise on the commands, so that what they do shows in the data.
         strict: whether a state that is not finite is an error; if not, its episode ends before it.
+        see: what the policy is shown, where that is not what `policy.shown` names.
 
     Raises:
         TargetError: the target shows a state that is not finite while its episode goes on, or no frame.
+
+    >>> import torch, visadapt as va
+    >>> policy = va.load_policy(va.shipped("cartpole_states"))
+    >>> runs = va.run(va.SyntheticTarget(), policy, 2, 20, torch.Generator().manual_seed(0))
+    >>> [(run.episode.samples, run.survived) for run in runs]
+    [(20, True), (20, True)]
     """
+    see = see or SHOWN[policy.shown]
     observation = target.reset(batch, generator)
     _check_finite(target, observation, torch.ones_like(observation.alive), "the first state")
     history = History.start(see(observation), target.n_action)
@@ -91,6 +106,11 @@ def run(
     return [_cut(rows, b, int(length[b]), bool(running[b]), target.period) for b in range(batch)]
 
 
+def film_run(target: Target, policy: Policy, steps: int = 250) -> Run:
+    """The episode that films show: its start and hidden effects are neither those of a training nor of a score."""
+    return run(target, policy.eval(), 1, steps, torch.Generator().manual_seed(FILM_SEED))[0]
+
+
 def _check_finite(target: Target, observation: Observation, rows: Tensor, which: str) -> None:
     broken = rows & ~observation.state.isfinite().all(1)
     if bool(broken.any()):
@@ -104,15 +124,15 @@ def _cut(rows: list[tuple[Observation, Tensor]], b: int, length: int, survived: 
     frames = None
     if kept[0][0].frame is not None:
         frames = np.stack([seen.frame[b].numpy() for seen, _ in kept if seen.frame is not None])
-    place = None
-    if kept[0][0].place is not None:
-        place = np.stack([seen.place[b].double().numpy() for seen, _ in kept if seen.place is not None])
+    task_state = None
+    if kept[0][0].task_state is not None:
+        task_state = np.stack([seen.task_state[b].double().numpy() for seen, _ in kept if seen.task_state is not None])
     episode = Episode(
         time=np.arange(len(kept)) * period,
         action=action,
         state=np.stack([seen.state[b].numpy() for seen, _ in kept]),
         frame=frames,
-        place=place,
+        task_state=task_state,
     )
     force = np.array([0.0 if seen.force is None else seen.force[b].numpy() for seen, _ in kept])
     return Run(episode, survived, force)

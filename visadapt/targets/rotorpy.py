@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +20,7 @@ from visadapt.systems import Quadrotor
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY
 from visadapt.targets.base import Observation, TargetError
 from visadapt.targets.flight import FlightTarget
-from visadapt.tasks.courses import AlongReferences
+from visadapt.tasks.follow import Follow
 
 INSTALL = "pip install 'visadapt[rotorpy]'"
 TICK = 0.01
@@ -69,7 +70,7 @@ class RotorpyTarget(FlightTarget):
     States are rotorpy's in our order: its quaternion is (x, y, z, w). Rotors start at the speed of a hover.
 
     Args:
-        course: where flights start and what a policy is told.
+        task: where flights start and what a policy is shown.
         air: the wind.
         aero: whether the air acts at all.
         changes: parameters of rotorpy's vehicle in the place of the published ones, by rotorpy's names.
@@ -80,13 +81,13 @@ class RotorpyTarget(FlightTarget):
 
     def __init__(
         self,
-        course: AlongReferences,
+        task: Follow,
         air: Air = BREEZE,
         aero: bool = True,
         changes: Mapping[str, Any] | None = None,
         name: str = "rotorpy's Crazyflie Brushless",
     ) -> None:
-        super().__init__(course, SOURCE, course.references.period, name=name)
+        super().__init__(task, SOURCE, name=name)
         self._physics = _import("rotorpy.vehicles.multirotor", "torchdiffeq", "roma")
         self._winds = _import("rotorpy.wind.default_winds")
         self.vehicle = {**_import("rotorpy.vehicles.crazyfliebrushless_params").quad_params, **(changes or {})}
@@ -98,8 +99,8 @@ class RotorpyTarget(FlightTarget):
         self._ticks = 0
 
     def reset(self, batch: int, generator: torch.Generator) -> Observation:
-        state, self.first = self.course.start(batch, generator)
-        self._place = self.first
+        state, self.first = self.task.evaluation_start(batch, generator)
+        self._task_state = self.first
         state = state.double()
         hover = (self.vehicle["mass"] * 9.81 / 4 / self.vehicle["k_eta"]) ** 0.5
         self._state = {
@@ -132,8 +133,24 @@ class RotorpyTarget(FlightTarget):
                 self._state = self._multirotors.step(self._state, control, TICK)
                 self._ticks += 1
                 self._blow()
-        self._place = self.course.advance(self._place)
+        self._task_state = self.task.advance(self._task_state)
         return self._observation()
+
+    def published(self) -> dict[str, float]:
+        """What rotorpy's parameters say at the rotor speed of a hover; damping, in 1/s, is that of turns."""
+        own = self.vehicle
+        flow = 4 * float(np.sqrt(own["mass"] * 9.81 / 4 / own["k_eta"])) / own["mass"]
+        drag = {"drag_x": own["k_d"] * flow, "drag_y": own["k_d"] * flow, "drag_z": own["k_z"] * flow}
+        # A rotor at (x, y) meets a turn with drags in its place: along z they turn about x and y, level ones about z.
+        x, y = np.mean([np.square(place[:2]) for place in own["rotor_pos"].values()], 0)
+        levers = {
+            "x": own["k_z"] * y / own["Ixx"],
+            "y": own["k_z"] * x / own["Iyy"],
+            "z": own["k_d"] * (x + y) / own["Izz"],
+        }
+        damping = {f"damping_{axis}": float(lever) * flow * own["mass"] for axis, lever in levers.items()}
+        wind = dict(zip(("wind_x", "wind_y"), self.air.steady[:2], strict=True))
+        return {**drag, **damping, "lift": 4 * own["k_h"] / own["mass"], "lag": own["tau_m"], **wind}
 
     def _wind(self, batch: int, generator: torch.Generator) -> list[Any]:
         """rotorpy's profiles, whose sum blows."""
@@ -154,7 +171,7 @@ class RotorpyTarget(FlightTarget):
         own = self._state
         state = torch.cat((own["x"], own["v"], own["q"].roll(1, 1), own["w"]), 1).to(torch.get_default_dtype())
         alive = state.isfinite().all(1)
-        return Observation(state, alive, goal=self.course.goal(self._place), place=self._place)
+        return Observation(state, alive, goal=self.task.goal(self._task_state), task_state=self._task_state)
 
 
 def _import(module: str, *needs: str) -> Any:

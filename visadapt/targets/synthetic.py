@@ -25,13 +25,23 @@ def no_effects(batch: int, generator: torch.Generator) -> Sequence[Effect]:
 
 
 def sine_force(batch: int, generator: torch.Generator) -> Sequence[Effect]:
-    """Draws 2 (cos(t + phase) + 1) N on the cart (the paper, section 3.2.2), the phase uniform over a turn."""
+    """Draws 2 (cos(t + phase) + 1) N on the cart (the paper, section 3.2.2), the phase uniform over a turn.
+
+    >>> import torch, visadapt as va
+    >>> va.sine_force(2, torch.Generator().manual_seed(0))[0].name
+    'periodic_force'
+    """
     phase = math.pi * (2 * torch.rand(batch, generator=generator) - 1)
     return (PeriodicForce(amplitude=2.0, frequency=1 / (2 * math.pi), phase=phase, offset=2.0),)
 
 
 def constant_force(newtons: float) -> DrawEffects:
-    """The same force on the cart in every episode."""
+    """The same force on the cart in every episode.
+
+    >>> import torch, visadapt as va
+    >>> float(va.constant_force(3.3)(2, torch.Generator())[0].force)
+    3.299999952316284
+    """
 
     def draw(batch: int, generator: torch.Generator) -> Sequence[Effect]:
         return (ConstantForce(force=newtons),)
@@ -67,6 +77,11 @@ class SyntheticTarget(Target):
         system: its physics.
         period: s between actions.
         angle_limit: rad; the episode ends beyond it.
+
+    >>> import torch, visadapt as va
+    >>> target = va.SyntheticTarget(va.sine_force)
+    >>> target.reset(2, torch.Generator().manual_seed(0)).state.shape
+    torch.Size([2, 4])
     """
 
     n_action = 1

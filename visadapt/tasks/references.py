@@ -155,6 +155,12 @@ def read_reference(path: str | os.PathLike[str], period: float = 0.1, max_speed:
 
     Raises:
         RecordingError: one line that says which file, row and column is wrong, and what would be right.
+
+    >>> import pathlib, tempfile, visadapt as va
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "line.csv"
+    >>> _ = path.write_text("time,x,y,z\\n0,0,0,1\\n1,1,0,1\\n2,2,0,1\\n")
+    >>> va.read_reference(path).positions.shape
+    torch.Size([21, 3])
     """
     _check_positive(period=period, max_speed=max_speed)
     path = Path(path)

@@ -1,0 +1,133 @@
+"""Every public name is listed once and documented with an example, which is run here."""
+
+import ast
+import doctest
+import importlib
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import visadapt as va
+from visadapt.storage.checkpoints import CheckpointError
+
+ROOT = Path(__file__).parents[1]
+FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+
+
+@pytest.mark.parametrize("name", va.__all__)
+def test_the_example_of_every_public_name_runs(name):
+    if name == "GymnasiumTarget":
+        pytest.importorskip("mujoco")
+    found = getattr(va, name)
+    examples = doctest.DocTestFinder(recurse=inspect.isclass(found)).find(found, name, globs={})
+    assert examples[0].examples or ">>>" in (found.__doc__ or ""), f"{name} has no example"
+    for example in examples:
+        report = []
+        doctest.DocTestRunner(optionflags=FLAGS).run(example, out=report.append)
+        assert not report, "".join(report)
+
+
+def test_what_type_checkers_see_is_what_is_there():
+    tree = ast.parse(Path(va.__file__).read_text())
+    imports = [
+        node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module.startswith("visadapt")
+    ]
+    seen = {alias.name: node.module for node in imports for alias in node.names}
+    assert sorted(seen) == va.__all__
+    for name, module in seen.items():
+        assert getattr(va, name) is getattr(importlib.import_module(module), name, sys.modules.get(f"{module}.{name}"))
+
+
+def test_the_package_itself_imports_neither_torch_nor_numpy():
+    code = "import sys, visadapt; sys.exit(bool({'torch', 'numpy'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="has no attribute 'adopt'"):
+        va.adopt  # noqa: B018
+
+
+def test_from_a_diagnosis_to_a_better_policy(tmp_path):
+    """The lines of the README, on a rig that pushes the cart, with a single effect to look for."""
+    import torch
+
+    source, target = va.World(va.CartPole()), va.SyntheticTarget(va.constant_force(2.0))
+    policy = va.load_policy(va.shipped("cartpole_states"))
+    runs = va.run(target, policy, 3, 40, torch.Generator().manual_seed(0), exploration=0.3)
+    names = [variable.name for variable in va.CartPole.states]
+    va.write_recording(tmp_path / "run.h5", [run.episode for run in runs], names, ["command"])
+    found = va.diagnose(va.load_recording(tmp_path / "run.h5", source.system), source, [va.effects.ConstantForce])
+    assert "constant_force" in str(found)
+    world = va.World(source.system, found.effects())
+    assert float(world.effects[0].force) == pytest.approx(2.0, abs=0.1)
+    tuned = va.adapt(policy, world, iterations=60)
+    before, after = (va.score(each, target, episodes=10, steps=60).mean_speed for each in (policy, tuned))
+    assert after < 0.7 * before
+    va.film(tuned, target, tmp_path / "film.mp4", steps=3)
+    assert (tmp_path / "film.mp4").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(("verdict", "right"), [("no_gap", "the source explains"), ("unexplained", "adapt with a res")])
+def test_a_diagnosis_that_named_nothing_has_no_effects_and_says_why(verdict, right):
+    from visadapt.diagnosis.result import Gap, RecordingSummary, Where
+
+    gap = Gap("error", 1.0, 1.0, 1.0, 1.0, 0.0)
+    found = va.Diagnosis("cartpole", RecordingSummary(4, 240, 0.05), verdict, Where({}, {}), (), (), gap, "")
+    with pytest.raises(ValueError, match=f"the verdict is {verdict}: .*; {right}") as caught:
+        found.effects()
+    assert "\n" not in str(caught.value)
+
+
+def test_of_effects_that_fit_alike_the_first_is_taken():
+    from visadapt.diagnosis.result import Cause, Estimate, Gap, RecordingSummary, Where
+
+    def cause(name, parameter, *alike):
+        return Cause(name, {parameter: Estimate(1.0, "", (0.5, 1.5))}, 0.5, 0.9, alike)
+
+    causes = (
+        cause("viscous_friction", "coefficient", "quadratic_drag"),
+        cause("quadratic_drag", "coefficient", "viscous_friction"),
+        cause("constant_force", "force"),
+    )
+    gap = Gap("error", 1.0, 0.1, 0.1, 0.1, 1.0)
+    found = va.Diagnosis("cartpole", RecordingSummary(4, 240, 0.05), "ambiguous", Where({}, {}), causes, (), gap, "")
+    assert [effect.name for effect in found.effects()] == ["viscous_friction", "constant_force"]
+
+
+class TestPolicyFiles:
+    def test_an_adapted_policy_comes_back_with_the_residual_that_it_reads(self, tmp_path):
+        import torch
+
+        source = va.World(va.CartPole(), [va.effects.ViscousFriction(coefficient=0.0)])
+        policy = va.load_policy(va.shipped("cartpole_states"))
+        target = va.SyntheticTarget(va.constant_force(1.0))
+        result = va.adapt(policy, source, target, samples=40, folder=tmp_path, iterations=2)
+        again = va.load_policy(tmp_path / "policy.safetensors")
+        for key, value in result.policy.state_dict().items():
+            assert torch.equal(value, again.state_dict()[key]), key
+        assert va.score(again, target, 3, steps=30) == va.score(result.policy, target, 3, steps=30)
+
+    def test_what_is_no_policy_is_refused_in_one_line(self, tmp_path):
+        with pytest.raises(CheckpointError, match=r"renderer\.safetensors: a safetensors file, but not one that"):
+            va.load_policy(va.shipped("renderer"))
+        with pytest.raises(ValueError, match="no weights 'none' are shipped; there are cartpole_frames, "):
+            va.shipped("none")
+
+
+class TestRefusals:
+    def test_a_target_of_another_period(self):
+        policy, source = va.load_policy(va.shipped("cartpole_states")), va.World(va.CartPole())
+        with pytest.raises(ValueError, match=r"has 0.02 s between actions, the source 0.05 s: make the source World"):
+            va.adapt(policy, source, va.SyntheticTarget(period=0.02), samples=20)
+
+    def test_a_policy_of_another_system(self):
+        with pytest.raises(ValueError, match=r"the policy is a ReachPolicy .* a cartpole needs a StatePolicy"):
+            va.adapt(va.load_policy(va.shipped("fixed_wing")), va.World(va.CartPole()))
+
+    def test_a_quadrotor_without_references(self):
+        with pytest.raises(ValueError, match="give references="):
+            va.train(va.World(va.Quadrotor(), period=0.1))

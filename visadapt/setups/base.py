@@ -1,0 +1,189 @@
+"""The pieces of one control problem put together: pretraining in the source, tuning, adaptation to a target."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from visadapt.effects import Residual
+from visadapt.learning.grounding import GroundSettings
+from visadapt.learning.joint import Adapted, AdaptSettings, Label, adapt
+from visadapt.learning.perception import PerceptionSettings
+from visadapt.learning.policy import TuneSettings, train_or_load, tune
+from visadapt.learning.windows import Observe
+from visadapt.policies import Policy
+from visadapt.progress import Report, staged
+from visadapt.setups.policy_file import describe
+from visadapt.storage.checkpoints import load_network
+from visadapt.targets import Target
+from visadapt.tasks.base import Task
+from visadapt.world import World
+
+Prepare = Callable[[Policy, Path, int, Report | None], None]
+"""Teaches a new policy what it needs before its task, from a seed, going on from what is in a folder."""
+
+
+@dataclass(frozen=True)
+class SetupSettings:
+    """How a policy is trained and adapted."""
+
+    source: TuneSettings
+    """the policy in the source"""
+    tuning: TuneSettings
+    """the policy in the grounded source, in each round"""
+    ground: GroundSettings = field(default_factory=GroundSettings)
+    """the residual"""
+    observations: str = "state"
+    """what grounding shows the residual: one of `learning.windows.SOURCES`"""
+    longest_episode: int = 250
+    """steps of an episode of the target while data are collected"""
+    feedforward: bool = True
+    """begin with a policy that opposes what the residual expects; False where one command cannot undo it in a period"""
+    perception: PerceptionSettings | None = None
+    """how an encoder learns to see, where the policy is shown frames"""
+
+    def numbers(self) -> dict[str, Any]:
+        """All of them as JSON takes them, for a run's folder; a task's tensors, such as references, are left out."""
+        out: dict[str, Any] = _numbers(self)
+        return out
+
+
+@dataclass(frozen=True)
+class Setup:
+    """One control problem: a source, what the policy is to do and is shown, and how it learns.
+
+    `cartpole_states`, `cartpole_frames`, `quadrotor` and `fixed_wing` make those of the paper; one's own needs a task
+    in its settings, and the four fields without a default.
+
+    >>> import visadapt as va
+    >>> from visadapt.setups.cartpole_states import cartpole_states
+    >>> setup = cartpole_states(va.World(va.CartPole(pole_mass=0.2)))
+    >>> setup.load(va.shipped("cartpole_states")).n_action
+    1
+    """
+
+    source: World
+    """the physics known beforehand; effects that it has are named guesses, whose parameters adaptation fits"""
+    policy: Callable[[], Policy]
+    """makes a new policy"""
+    residual: Callable[[Policy, World], Residual]
+    """makes a new residual for a policy in the source"""
+    settings: SetupSettings
+    observe: Observe | None = None
+    """the camera of simulated states (B, n_state), a learnt renderer; None where the policy sees what sensors measure"""
+    label: Label | None = None
+    """estimates the states of recorded episodes from their frames; without it, the target's own states are used"""
+    prepare: Prepare | None = None
+    """called on a new policy before it is trained"""
+    test: Task | None = None
+    """the task that the policy is scored in, where that is not the one it is trained in: other references, say"""
+
+    def pretrain(self, path: Path, seed: int, report: Report | None = None) -> Policy:
+        """The policy trained in the source, or read from `path` where it is there; interrupted, it goes on.
+
+        Raises:
+            CheckpointError: `path` holds another network.
+        """
+        torch.manual_seed(seed)
+        policy = self.policy()
+        if self.prepare is not None and not path.exists():
+            self.prepare(policy, path.parent, seed, report)
+        settings, name = self.settings.source, self.source.system.name
+        about = {"arguments": policy.arguments, "seed": seed, **_numbers(settings)}
+        # Preparing draws from a generator of the seed itself.
+        generator = torch.Generator().manual_seed(seed if self.prepare is None else seed + 1)
+        progress = staged(report, f"{name}: source policy")
+        train_or_load(path, policy, self.source, self.observe, settings, generator, about, progress)
+        return policy.eval()
+
+    def load(self, path: Path) -> Policy:
+        """A policy that `pretrain` left; raises CheckpointError where there is none, or it does not fit."""
+        policy = self.policy()
+        load_network(path, policy)
+        return policy.eval()
+
+    def tune(self, policy: Policy, seed: int, report: Report | None = None) -> list[float]:
+        """Tune `policy`, in place, in the source with the effects that it has, without a target: losses by iteration.
+
+        Raises:
+            ValueError: a policy of another kind.
+        """
+        self.check_policy(policy)
+        settings = replace(self.settings.tuning, recorded=0.0)
+        generator = torch.Generator().manual_seed(seed)
+        return tune(policy, self.source, self.observe, settings, generator, progress=staged(report, "tune"))
+
+    def adapt(
+        self,
+        policy: Policy,
+        target: Target,
+        folder: Path,
+        budget: int,
+        round_samples: int,
+        seed: int,
+        report: Report | None = None,
+        explorer: Policy | None = None,
+    ) -> Adapted:
+        """Adapt `policy`, in place, to `target` with at most `budget` counted samples: Algorithm 1 in `folder`.
+
+        Args:
+            explorer: collects the data in place of `policy`.
+
+        Raises:
+            ValueError: a policy of another kind, a target of another period or with other actions, or a budget that
+                is smaller than a round.
+            TargetError: the target misbehaves. CheckpointError: `folder` holds a run of other networks.
+        """
+        self.check_policy(policy)
+        self.check_target(target)
+        torch.manual_seed(seed)
+        residual = self.residual(policy, self.source)
+        own = self.settings
+        settings = AdaptSettings(
+            own.tuning,
+            own.ground,
+            budget,
+            round_samples,
+            own.observations,
+            longest_episode=own.longest_episode,
+            feedforward=own.feedforward,
+            seed=seed,
+        )
+        args = (policy, residual, self.source, target, self.observe, settings, folder, self.label)
+        adapted = adapt(*args, report=report, explorer=explorer)
+        policy.grounded_in = describe(self.source)
+        return adapted
+
+    def check_policy(self, policy: Policy) -> None:
+        """Raises ValueError where `policy` is not one that this setup makes."""
+        wanted = self.policy()
+        if type(policy) is not type(wanted) or (policy.n_state, policy.n_action) != (wanted.n_state, wanted.n_action):
+            raise ValueError(
+                f"the policy is a {type(policy).__name__} of {policy.n_state} states and {policy.n_action} commands; "
+                f"a {self.source.system.name} needs a {type(wanted).__name__} of {wanted.n_state} and {wanted.n_action}"
+            )
+
+    def check_target(self, target: Target) -> None:
+        """Raises ValueError where `target` cannot be the source with other physics."""
+        if abs(target.period - self.source.period) > 1e-6:
+            raise ValueError(
+                f"{target.name} has {target.period:g} s between actions, the source {self.source.period:g} s: "
+                f"make the source World(system, period={target.period:g})"
+            )
+        actions = len(self.source.system.actions)
+        if target.n_action != actions:
+            raise ValueError(
+                f"{target.name} takes {target.n_action} actions, a {self.source.system.name} has {actions}"
+            )
+
+
+def _numbers(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        parts = {each.name: getattr(value, each.name) for each in fields(value)}
+        return {name: _numbers(part) for name, part in parts.items() if not isinstance(part, Tensor)}
+    return value

@@ -1,0 +1,105 @@
+"""Policies on disk: the network, what made it, and, once it is adapted, the residual that it reads.
+
+A file says which class of policy it holds and with which arguments that was made; of a residual, in which world it was
+grounded. So a policy is loaded without knowing where it comes from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from visadapt import policies
+from visadapt.effects import EFFECTS, Effect
+from visadapt.policies import Policy
+from visadapt.setups.residuals import residual_for
+from visadapt.storage.checkpoints import CheckpointError, load_tree, load_weights, save_network
+from visadapt.systems import SYSTEMS
+from visadapt.world import World
+
+KINDS: dict[str, type[Policy]] = {
+    name: kind for name, kind in vars(policies).items() if isinstance(kind, type) and issubclass(kind, Policy)
+}
+
+
+def save_policy(path: str | Path, policy: Policy, about: Mapping[str, Any] | None = None) -> None:
+    """Write a policy, and its residual if it has one, to a safetensors file; `about` is kept with it.
+
+    Raises:
+        DiskFullError: the disk is full; what stood at `path` before stays.
+
+    >>> import visadapt as va, tempfile, pathlib
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "policy.safetensors"
+    >>> va.save_policy(path, va.load_policy(va.shipped("quadrotor")))
+    >>> type(va.load_policy(path)).__name__
+    'FollowPolicy'
+    """
+    made = {"arguments": policy.arguments, "grounded_in": policy.grounded_in}
+    save_network(Path(path), policy, {**made, **(about or {})})
+
+
+def load_policy(path: str | Path) -> Policy:
+    """The policy in a file that `save_policy`, `train` or `adapt` wrote, with the residual that it reads.
+
+    Raises:
+        CheckpointError: the file is missing, torn, or holds something else.
+
+    >>> import visadapt as va
+    >>> policy = va.load_policy(va.shipped("cartpole_states"))
+    >>> policy.n_state, policy.n_action, policy.shown
+    (4, 1, 'state')
+    """
+    path = Path(path)
+    tree = load_tree(path)
+    if not isinstance(tree, dict) or not {"class", "settings", "weights"} <= tree.keys():
+        raise CheckpointError(f"{path}: a checkpoint, but not of a policy")
+    made = tree["settings"]
+    if tree["class"] not in KINDS or "arguments" not in made:
+        raise CheckpointError(f"{path}: holds a {tree['class']}, a policy ({', '.join(sorted(KINDS))}) is needed")
+    policy = KINDS[tree["class"]](**made["arguments"])
+    weights = tree["weights"]
+    if made.get("grounded_in") is not None:
+        policy.grounded_in = made["grounded_in"]
+        source = _world(made["grounded_in"], path)
+        policy.residual = residual_for(policy, source)
+        key = "residual.network.head.weight"
+        if key in weights and weights[key].shape != policy.state_dict()[key].shape:
+            policy.residual = residual_for(policy, source, with_history=True)
+    load_weights(policy, weights, path)
+    return policy.eval()
+
+
+def describe(world: World) -> dict[str, Any]:
+    """A world as plain values: its system's parameters, its clock, and its effects with their present values."""
+    system: Any = world.system
+    return {
+        "system": system.name,
+        "parameters": {each.name: float(getattr(system, each.name)) for each in fields(system)},
+        "period": world.period,
+        "integrator": world.integrator,
+        "substeps": world.substeps,
+        "effects": [
+            {"effect": effect.name, **{each.name: getattr(effect, each.name).detach() for each in effect.table}}
+            for effect in world.modules()
+            if isinstance(effect, Effect)
+        ],
+    }
+
+
+def _world(description: Mapping[str, Any], path: Path) -> World:
+    """The world that `describe` described; raises CheckpointError where its system or an effect is not known."""
+    for name, known in (
+        (description["system"], SYSTEMS),
+        *((one["effect"], EFFECTS) for one in description["effects"]),
+    ):
+        if name not in known:
+            raise CheckpointError(f"{path}: needs {name!r}, which is not known here: import the file that defines it")
+    system = SYSTEMS[description["system"]](**description["parameters"])
+    effects = []
+    for one in description["effects"]:
+        values = {name: value for name, value in one.items() if name != "effect"}
+        effects.append(EFFECTS[one["effect"]](**values))
+    clock = {name: description[name] for name in ("period", "integrator", "substeps")}
+    return World(system, effects, **clock)

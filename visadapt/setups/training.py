@@ -1,0 +1,194 @@
+"""Train a policy in a world, tune it there, or adapt it to a target: the right setup is found by system and policy."""
+
+from __future__ import annotations
+
+import copy
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import overload
+
+from renderers import LayeredRenderer
+from visadapt.learning.joint import Adapted
+from visadapt.policies import ImagePolicy, Policy, StatePolicy
+from visadapt.progress import Report
+from visadapt.setups.base import Setup
+from visadapt.setups.cartpole_frames import cartpole_frames
+from visadapt.setups.cartpole_states import cartpole_states
+from visadapt.setups.flight import fixed_wing, quadrotor
+from visadapt.setups.policy_file import save_policy
+from visadapt.systems import CartPole, FixedWing, Quadrotor
+from visadapt.targets import FlightTarget, Target
+from visadapt.tasks.follow import Follow
+from visadapt.tasks.references import Reference
+from visadapt.world import World
+
+Renderer = LayeredRenderer | str | Path
+
+
+def setup_for(
+    world: World,
+    policy: Policy | None = None,
+    renderer: Renderer | None = None,
+    references: Reference | None = None,
+    with_history: bool = False,
+) -> Setup:
+    """The setup of the world's system, for a given policy or a new one.
+
+    Args:
+        renderer: a cart-pole's states to frames, for a policy that is shown frames; without it, a new policy is shown
+            states, and one that is shown frames takes the shipped renderer.
+        references: (N, T, 3), what a quadrotor is to follow.
+        with_history: whether policy or residual also read the last periods, as against a force that changes.
+
+    Raises:
+        ValueError: a policy of another system, a system without a setup, or a quadrotor without references.
+
+    >>> import visadapt as va
+    >>> setup = va.setup_for(va.World(va.CartPole()))
+    >>> setup.settings.source.iterations
+    3000
+    """
+    system = world.system
+    if isinstance(system, CartPole):
+        if renderer is not None or isinstance(policy, ImagePolicy):
+            setup = cartpole_frames(world, renderer)
+        else:
+            setup = cartpole_states(world, policy.with_history if isinstance(policy, StatePolicy) else with_history)
+    elif isinstance(system, Quadrotor):
+        if references is None:
+            raise ValueError("a quadrotor follows references: give references=, such as visadapt.read_reference(path)")
+        setup = quadrotor(references, source=world, with_history=with_history)
+    elif isinstance(system, FixedWing):
+        setup = fixed_wing(world, with_history)
+    else:
+        raise ValueError(
+            f"no setup is known for a {system.name}: make a visadapt.Setup with a task, a policy and a residual"
+        )
+    if policy is not None:
+        setup.check_policy(policy)
+    return setup
+
+
+def train(
+    world: World,
+    path: str | Path | None = None,
+    seed: int = 0,
+    iterations: int | None = None,
+    renderer: Renderer | None = None,
+    references: Reference | None = None,
+    with_history: bool = False,
+    report: Report | None = None,
+) -> Policy:
+    """A policy trained in `world`, with the effects that it has, by backpropagation through it.
+
+    Args:
+        path: where it is kept; an interrupted training goes on from there, a finished one is read. Without it, the
+            policy is not kept.
+        iterations: instead of the setup's own.
+        renderer, references, with_history: as for `setup_for`.
+
+    Raises:
+        ValueError: a system without a setup, or a quadrotor without references.
+
+    >>> import visadapt as va
+    >>> policy = va.train(va.World(va.CartPole(), [va.effects.ViscousFriction(coefficient=2.0)]), iterations=2)
+    >>> policy.n_action
+    1
+    """
+    setup = setup_for(world, None, renderer, references, with_history)
+    if iterations is not None:
+        settings = replace(setup.settings, source=replace(setup.settings.source, iterations=iterations))
+        setup = replace(setup, settings=settings)
+    if path is not None:
+        return setup.pretrain(Path(path), seed, report)
+    with tempfile.TemporaryDirectory() as folder:
+        return setup.pretrain(Path(folder) / "policy.safetensors", seed, report)
+
+
+@overload
+def adapt(
+    policy: Policy,
+    source: World,
+    target: None = None,
+    *,
+    seed: int = ...,
+    iterations: int | None = ...,
+    renderer: Renderer | None = ...,
+    references: Reference | None = ...,
+    report: Report | None = ...,
+) -> Policy: ...
+@overload
+def adapt(
+    policy: Policy,
+    source: World,
+    target: Target,
+    samples: int = ...,
+    folder: str | Path | None = ...,
+    seed: int = ...,
+    round_samples: int | None = ...,
+    iterations: int | None = ...,
+    renderer: Renderer | None = ...,
+    references: Reference | None = ...,
+    with_history: bool = ...,
+    report: Report | None = ...,
+) -> Adapted: ...
+def adapt(
+    policy: Policy,
+    source: World,
+    target: Target | None = None,
+    samples: int = 1000,
+    folder: str | Path | None = None,
+    seed: int = 0,
+    round_samples: int | None = None,
+    iterations: int | None = None,
+    renderer: Renderer | None = None,
+    references: Reference | None = None,
+    with_history: bool = False,
+    report: Report | None = None,
+) -> Policy | Adapted:
+    """Tune a copy of `policy` in the world `source`; or, with a target, adapt it by the paper's Algorithm 1.
+
+    Without a target the policy is tuned in `source` with the effects that it has: those of a diagnosis, say. With one,
+    the policy is run there for `samples` counted steps, round by round; a residual learns what `source` leaves out, the
+    parameters of its effects are fitted, and the policy is tuned in the result.
+
+    Args:
+        samples: steps of the target in all; every one is counted.
+        folder: where a run is kept, its policy as policy.safetensors; an interrupted run goes on from there.
+        round_samples: steps in a round; a fifth of `samples` without it, and at least 20.
+        iterations: of tuning (in each round), instead of the setup's own.
+        renderer, references, with_history: as for `setup_for`.
+
+    Returns:
+        The tuned policy; with a target, the run: its `policy`, `ledger`, `rounds` and `episodes`.
+
+    Raises:
+        ValueError: a policy of another system, a target of another period or with other actions, or too few samples.
+        TargetError: the target misbehaves.
+
+    >>> import visadapt as va
+    >>> source, target = va.World(va.CartPole()), va.SyntheticTarget(va.sine_force)
+    >>> policy = va.load_policy(va.shipped("cartpole_states"))
+    >>> tuned = va.adapt(policy, va.World(va.CartPole(), [va.effects.ViscousFriction(coefficient=2.0)]), iterations=2)
+    >>> result = va.adapt(policy, source, target, samples=40, iterations=2)
+    >>> result.ledger.used
+    40
+    """
+    if references is None and isinstance(target, FlightTarget) and isinstance(target.task, Follow):
+        references = target.task.references
+    setup = setup_for(source, policy, renderer, references, with_history)
+    if iterations is not None:
+        settings = replace(setup.settings, tuning=replace(setup.settings.tuning, iterations=iterations))
+        setup = replace(setup, settings=settings)
+    policy = copy.deepcopy(policy)
+    if target is None:
+        setup.tune(policy, seed, report)
+        return policy
+    in_round = round_samples or min(samples, max(20, samples // 5))
+    with tempfile.TemporaryDirectory() as temporary:
+        place = Path(folder or temporary)
+        adapted = setup.adapt(policy, target, place, samples, in_round, seed, report)
+        if folder is not None:
+            save_policy(place / "policy.safetensors", policy)
+    return adapted

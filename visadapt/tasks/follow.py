@@ -1,0 +1,174 @@
+"""Follow a reference: the quadrotor's task."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from visadapt.history import HORIZON
+from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
+from visadapt.tasks.base import curriculum
+from visadapt.tasks.differential_flatness import demanded
+from visadapt.tasks.flight import FlightTask
+from visadapt.tasks.references import Reference
+
+
+@dataclass(frozen=True)
+class FollowCost:
+    """Weights of squared distances from the reference and of effort, A.1.1 of the paper.
+
+    C = sum_k position |x - x_nu|^2 + velocity |v - v_nu|^2 + rates |omega|^2 + action |a|^2
+
+    The paper holds thrust and rates near the middle of their range with weights of 5 and 0.1 on commands in [0, 1];
+    what pulls the thrust towards hovering also pulls the vehicle off its reference, so `action` is small.
+    """
+
+    position: float = 10.0
+    velocity: float = 1.0
+    rates: float = 0.1
+    action: float = 0.01
+
+    def __call__(self, states: Tensor, plan: Tensor, reference: Tensor) -> Tensor:
+        """Cost (B,) of states (B, K, 13) and actions (B, K, n_action); `reference` (B, K, 6): positions, velocities."""
+        away = states[..., : VELOCITY.stop] - reference
+        return (
+            self.position * away[..., POSITION].square().sum((1, 2))
+            + self.velocity * away[..., VELOCITY].square().sum((1, 2))
+            + self.rates * states[..., RATES].square().sum((1, 2))
+            + self.action * plan.square().sum((1, 2))
+        )
+
+
+@dataclass(frozen=True)
+class RecoverCost(FollowCost):
+    """The same for a vehicle that may be pushed further off its reference than a plan can bring it back.
+
+    sqrt(C + final |e_K + beyond e'_K|^2 + floor), with e_K the distance at the end of the plan and e'_K its rate
+
+    A plan that ends on the reference but not with its velocity flies through it and out again, further each time: what
+    counts is where the vehicle would be `beyond` s later. The root changes no best plan, but lets the many streams that
+    are near weigh as much as the few that are far off.
+    """
+
+    final: float = 10.0
+    beyond: float = 1.0
+    """s"""
+    floor: float = 0.01
+    """keeps the root differentiable at zero; about the cost of a plan with 1 cm of error all along"""
+
+    def __call__(self, states: Tensor, plan: Tensor, reference: Tensor) -> Tensor:
+        away = (states[..., : VELOCITY.stop] - reference)[:, -1]
+        later = away[:, POSITION] + self.beyond * away[:, VELOCITY]
+        return (super().__call__(states, plan, reference) + self.final * later.square().sum(1) + self.floor).sqrt()
+
+
+@dataclass(frozen=True)
+class Follow(FlightTask):
+    """Fly along one of many references, from its first row to its last. A task state is (reference, row)."""
+
+    references: Reference
+    """(N, T, 3)"""
+    cost_of: FollowCost = FollowCost()
+    start_spread: tuple[float, float] = (0.1, 0.2)
+    """standard deviation in m and m/s of the start around the reference"""
+    divergence: float = 2.0
+    """m, delta_div at the end of the curriculum: a stream further from its reference starts anew"""
+    first_divergence: float = 0.05
+    """share of `divergence` that the curriculum begins with; it reaches 1 at half of the iterations"""
+    candidates: int = 64
+    """rows of references drawn at random, of which `augment` takes the one flown most alike"""
+
+    @property
+    def period(self) -> float:
+        return self.references.period
+
+    @property
+    def steps(self) -> int:
+        return self.references.positions.shape[1] - 1
+
+    def evaluation_start(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """At the first rows of references drawn without replacement while they last."""
+        count = len(self.references.positions)
+        drawn = [torch.randperm(count, generator=generator) for _ in range(-(-batch // count))]
+        which = torch.cat(drawn)[:batch].to(self.references.positions.device)
+        row = torch.zeros_like(which)
+        return self.on(which, row), torch.stack((which, row), 1)
+
+    def training_start(self, batch: int, progress: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Somewhere on a reference, and a little off it."""
+        positions = self.references.positions
+        which = torch.randint(len(positions), (batch,), generator=generator).to(positions.device)
+        row = torch.randint(self.steps, (batch,), generator=generator).to(which)
+        state = self.on(which, row)
+        metres, speed = self.start_spread
+        spread = torch.tensor([metres] * 3 + [speed] * 3)
+        share = curriculum(self.first_divergence, progress)
+        off = share * spread * torch.randn(batch, len(spread), generator=generator)
+        state[:, : len(spread)] += off.to(state)
+        return state, torch.stack((which, row), 1)
+
+    def cost(self, states: Tensor, plan: Tensor, now: Tensor, task_state: Tensor) -> Tensor:
+        return self.cost_of(states, plan, self.ahead(task_state))
+
+    def diverged(self, state: Tensor, task_state: Tensor, progress: float) -> Tensor:
+        limit = self.divergence * curriculum(self.first_divergence, progress)
+        return ~(self.distance_off(state, task_state) <= limit) | (task_state[:, 1] >= self.steps)
+
+    def goal(self, task_state: Tensor) -> Tensor:
+        return self.ahead(task_state).flatten(1)
+
+    def advance(self, task_state: Tensor) -> Tensor:
+        return task_state + task_state.new_tensor((0, 1))
+
+    def misses(self, states: Tensor, task_state: Tensor) -> Tensor:
+        """The distance to the reference at every row but the first (the paper's average tracking error)."""
+        return (states[..., POSITION] - self.references.positions[task_state[:, 0]]).norm(dim=-1)[:, 1:]
+
+    def distance_off(self, state: Tensor, task_state: Tensor) -> Tensor:
+        rows = task_state[:, 1].clamp(max=self.steps)
+        return (state[:, POSITION] - self.references.positions[task_state[:, 0], rows]).norm(dim=-1)
+
+    def on(self, which: Tensor, row: Tensor) -> Tensor:
+        """The quadrotor's states (B, 13) on the references `which` (B,) at rows (B,)."""
+        own = self.references
+        every = (own.positions, own.velocities, own.accelerations, own.jerks)
+        position, velocity, acceleration, jerk = (values[which, row] for values in every)
+        return demanded(acceleration, jerk).state(position, velocity)
+
+    def ahead(self, task_state: Tensor) -> Tensor:
+        """Positions and velocities (B, HORIZON, 6) of the next rows; at its end a reference goes straight on."""
+        which = task_state[:, :1]
+        rows = task_state[:, 1:] + torch.arange(1, HORIZON + 1).to(task_state)
+        beyond = (rows - self.steps).clamp(min=0)[..., None] * self.period
+        rows = rows.clamp(max=self.steps)
+        velocity = self.references.velocities[which, rows]
+        return torch.cat((self.references.positions[which, rows] + beyond * velocity, velocity), -1)
+
+    def augment(
+        self, observed: Tensor, state: Tensor, task_state: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """As far off another reference, at the row of it that is flown most alike.
+
+        A vehicle that feels no air flies alike wherever it is and however fast: position and velocity change by as much
+        in all rows. Of `candidates` rows of references drawn at random, the one with the most similar velocity and
+        acceleration is taken, so that drag and tilt change little.
+        """
+        own, batch = self.references, len(observed)
+        which = torch.randint(len(own.positions), (batch, self.candidates), generator=generator)
+        row = torch.randint(task_state.shape[1] - 1, self.steps, (batch, self.candidates), generator=generator)
+
+        def motion(which: Tensor, row: Tensor) -> Tensor:
+            return torch.cat((own.velocities[which, row], own.accelerations[which, row]), -1)
+
+        now = task_state[:, -1]
+        unlike = (motion(which, row) - motion(now[:, :1], now[:, 1:])).square().sum(-1)
+        best = unlike.argmin(1, keepdim=True)
+        chosen, until = which.gather(1, best)[:, 0], row.gather(1, best)[:, 0]
+        shift = torch.zeros_like(state)
+        for part, values in ((POSITION, own.positions), (VELOCITY, own.velocities)):
+            shift[:, part] = values[chosen, until] - values[now[:, 0], now[:, 1]]
+        back = torch.arange(1 - task_state.shape[1], 1)
+        there = torch.stack((chosen[:, None].expand(-1, len(back)), until[:, None] + back), -1)
+        return observed + shift[:, None], state + shift, there.to(task_state)
