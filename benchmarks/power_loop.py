@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import torch
 import tyro
 
 from visadapt.evaluation import score
@@ -51,8 +50,7 @@ def main(settings: Settings) -> None:
 
 
 def _flown(name: str, loop: Reference) -> list[Row]:
-    motion = torch.stack((loop.positions, loop.velocities, loop.accelerations, loop.jerks))
-    setup = quadrotor(Reference.of(motion[:, None], loop.period))
+    setup = quadrotor(loop)
     found = score(setup.load(shipped("quadrotor")), flight_target(setup), episodes=1)
     row = Row(
         name, "quadrotor", "ours, states", "source", 0, "mean tracking error", "m", found.mean, None, 1, found.failed, 1

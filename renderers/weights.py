@@ -69,9 +69,3 @@ def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRen
         )
     renderer.load_state_dict(weights)
     return renderer
-
-
-def training_of(path: Path) -> dict[str, Any]:
-    """How the renderer in a file came about, as it was saved."""
-    with safe_open(path, framework="pt") as file:
-        return dict(json.loads(file.metadata()[KEY])["training"])

@@ -192,28 +192,11 @@ def test_impossible_settings_are_named(change, message):
         make(dataclasses.replace(SMALL, **change))
 
 
-def test_a_slowed_reference_is_the_same_path_in_more_time(drawn):
-    train, _ = drawn
-    half = train.slowed(0.5)
-    assert half.positions.shape == (60, 201, 3)
-    torch.testing.assert_close(half.positions[:, ::2], train.positions, atol=1e-5, rtol=0)
-    torch.testing.assert_close(half.velocities[:, ::2], train.velocities / 2, atol=1e-5, rtol=0)
-    torch.testing.assert_close(half.accelerations[:, ::2], train.accelerations / 4, atol=1e-5, rtol=0)
-    torch.testing.assert_close(half.jerks[:, ::2], train.jerks / 8, atol=1e-5, rtol=0)
-    asked = asked_by(half)
-    assert asked.abs().max() < SMALL.margin
-    assert train.slowed(0.75).positions.shape[1] == 134
-    torch.testing.assert_close(train.slowed(1.0).positions, train.positions, atol=1e-5, rtol=0)
-    with pytest.raises(ValueError, match="share is 0, must be"):
-        train.slowed(0)
-
-
-def test_rows_between_are_those_of_the_reference_itself(fine):
-    rows = [fine.positions, fine.velocities, fine.accelerations, fine.jerks]
-    coarse = Reference.of(torch.stack([value[:, ::50] for value in rows]), 0.1)
-    slow = coarse.slowed(0.2)
-    torch.testing.assert_close(slow.positions, fine.positions[:, ::10], atol=2e-5, rtol=0)
-    torch.testing.assert_close(slow.velocities, fine.velocities[:, ::10] / 5, atol=1e-4, rtol=0)
+def test_between_rows_cubics_are_the_reference_itself(fine):
+    time = 0.1 * torch.arange(fine.positions[:, ::50].shape[1])
+    at = time[-1] * torch.linspace(0, 1, 10 * (len(time) - 1) + 1)
+    between = cubic(time, fine.positions[:, ::50], fine.velocities[:, ::50], at)
+    torch.testing.assert_close(between, fine.positions[:, : 50 * (len(time) - 1) + 1 : 5], atol=2e-5, rtol=0)
 
 
 def test_a_line_ends_at_its_target_at_a_steady_speed():

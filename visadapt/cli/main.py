@@ -69,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     diagnose.add_argument(
         "--policy",
         metavar="P.safetensors",
-        help="a policy on states, as visadapt.setups.cartpole_states.pretrain saves it, for which the terms of the "
+        help="a policy on states, as visadapt.save_policy writes it, for which the terms of the "
         "paper's Theorem 1 are told, on the terminal and in the report",
     )
     diagnose.add_argument("--json", metavar="F", help="write the result here, as visadapt/diagnosis/schema.json says")

@@ -75,7 +75,7 @@ class Setup:
     """makes a new residual for a policy in the source"""
     settings: SetupSettings
     observe: Observe | None = None
-    """the camera of simulated states (B, n_state), a learnt renderer; None where the policy sees what sensors measure"""
+    """the camera of simulated states (B, n_state), a learnt renderer; None where sensors' readings are seen"""
     label: Label | None = None
     """estimates the states of recorded episodes from their frames; without it, the target's own states are used"""
     prepare: Prepare | None = None

@@ -32,7 +32,7 @@ def quadrotor(
     with_history: bool = False,
     settings: SetupSettings | None = None,
 ) -> Setup:
-    """The quadrotor that follows references (N, T, 3).
+    """The quadrotor that follows references, (N, T, 3) or a single one, (T, 3).
 
     Args:
         train, test: references to train on, and to be scored on; the same without the latter.
@@ -47,6 +47,7 @@ def quadrotor(
         raise ValueError(
             f"the references have rows {train.period:g} s apart, the source {source.period:g} s between commands"
         )
+    train, test = train.as_many(), None if test is None else test.as_many()
     task, recover = Follow(train), Follow(train, RecoverCost(), divergence=3.0)
     tuning = _learn(task, 200, 1e-3, curriculum=False)
     if with_history:

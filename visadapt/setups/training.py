@@ -38,7 +38,7 @@ def setup_for(
     Args:
         renderer: a cart-pole's states to frames, for a policy that is shown frames; without it, a new policy is shown
             states, and one that is shown frames takes the shipped renderer.
-        references: (N, T, 3), what a quadrotor is to follow.
+        references: (N, T, 3) or (T, 3), what a quadrotor is to follow.
         with_history: whether policy or residual also read the last periods, as against a force that changes.
 
     Raises:

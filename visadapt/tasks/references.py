@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from itertools import pairwise
 from math import ceil, isfinite, pi
 from pathlib import Path
 from typing import Self
@@ -56,30 +55,16 @@ class Reference:
         positions, velocities, accelerations, jerks = motion
         return cls(positions, velocities, accelerations, jerks, period)
 
+    def as_many(self) -> Self:
+        """With a leading axis that numbers references, (1, T, 3), where this is a single one; else itself."""
+        if self.positions.dim() > 2:
+            return self
+        motion = torch.stack((self.positions, self.velocities, self.accelerations, self.jerks))
+        return type(self).of(motion[:, None], self.period)
+
     def states(self, gravity: float = 9.81) -> Tensor:
         """The quadrotor's states (..., T, 13) on the reference; the first row is where an episode starts."""
         return demanded(self.accelerations, self.jerks, gravity).state(self.positions, self.velocities)
-
-    def slowed(self, share: float) -> Self:
-        """The same path at a share of the speed, as a curriculum begins with; it takes 1 / share as many rows.
-
-        Raises:
-            ValueError: a share that is not in (0, 1].
-        """
-        if not 0 < share <= 1:
-            raise ValueError(f"share is {share}, must be above 0 and at most 1")
-        whole = [self.positions, self.velocities, self.accelerations, self.jerks]
-        last = whole[0].shape[-2] - 1
-        time = torch.arange(last + 1) * self.period
-        # Half a thousandth of a row forgives the rounding of last / share.
-        at = torch.arange(int(last / share + 5e-4) + 1) * (share * self.period)
-        time, at = time.to(whole[0]), at.to(whole[0])
-        between = [cubic(time, value, slope, at) for value, slope in pairwise(whole)]
-        # What is left is linear: the slope of the jerk is not known.
-        steps = whole[3].diff(dim=-2) / self.period
-        row = (at / self.period).long().clamp(max=last - 1)
-        between.append(whole[3][..., row, :] + steps[..., row, :] * (at - time[row])[:, None])
-        return type(self).of(torch.stack([value * share**order for order, value in enumerate(between)]), self.period)
 
 
 def line(start: Tensor, target: Tensor, speed: float, period: float = 0.1) -> Reference:
