@@ -28,10 +28,9 @@ import tyro
 from torch import Tensor
 
 from train.flight_policies import made
-from train.scoring import curves
 from visadapt.effects import Effect, LinearDrag, PeriodicForce
 from visadapt.evaluation.result_tables import miss_row, read_rows, write_rows
-from visadapt.films.plots import Panel, plot_losses, plot_panels
+from visadapt.films.plots import Chart, plot_charts, plot_losses
 from visadapt.learning.joint import Adapted
 from visadapt.policies import FlightPolicy, Policy
 from visadapt.progress import Report
@@ -116,12 +115,12 @@ def _draw(settings: Settings) -> None:
     panels = []
     for name in settings.experiments:
         own = [row for row in rows if row["experiment"] == name]
-        panels.append(Panel(name, f"{MEASURES[EXPERIMENTS[name].vehicle]}, m", own))
-    plot_panels(settings.assets / "curve_flight.png", panels, columns=min(2, len(panels)))
+        panels.append(Chart(name, f"{MEASURES[EXPERIMENTS[name].vehicle]}, m", own))
+    plot_charts(settings.assets / "curve_flight.png", panels, columns=min(2, len(panels)))
     if ALTERNATION in settings.experiments:
         flight = vehicle(EXPERIMENTS[ALTERNATION], settings.references)
         adapted = adapt(flight, ALTERNATION, settings.work, source_policy(settings.assets, flight), seed=0)
-        plot_losses(settings.assets / "alternation.png", curves(adapted))
+        plot_losses(settings.assets / "alternation.png", adapted.rounds)
 
 
 class SidePush(PeriodicForce):

@@ -24,12 +24,11 @@ import tyro
 
 from renderers import DrawnCartPole
 from train import renderer as renderer_training
-from train.scoring import curves, filmed, score
+from train.scoring import filmed, score
 from visadapt.evaluation.cartpole_score import EPISODES, Evaluation
-from visadapt.films.cartpole_panel import Panel
+from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.films.plots import plot_losses
-from visadapt.films.video import write_film, write_still
-from visadapt.progress import reporting
+from visadapt.progress import reporting, staged
 from visadapt.setups.cartpole_frames import PixelSettings, PixelTask
 from visadapt.storage.run_folder import once, open_run, write_json
 from visadapt.systems import CartPole
@@ -98,12 +97,10 @@ def main(settings: Settings) -> None:
             report,
         )
         look("after", f"Target, after {adapted.ledger.used:,} samples", target)
-        panels = [Panel.redrawn(title, shown, stream) for title, shown in films]
-        write_still(out / "film.png", panels, t=3.0)
-        write_film(
-            out / "film.mp4", panels, target.period, lambda done, total: report("film", done, total, float("nan"))
-        )
-    plot_losses(out / "losses.png", curves(adapted))
+        film = CartPoleFilm([CartPolePanel.redrawn(title, shown, stream) for title, shown in films], target.period)
+        film.write_still(out / "film.png", t=3.0)
+        film.write(out / "film.mp4", staged(report, "film"))
+    plot_losses(out / "losses.png", adapted.rounds)
     write_json(out / "metrics.json", {"ledger": asdict(adapted.ledger), "scores": scores, **about})
     print(f"film.mp4, film.png, losses.png and metrics.json are in {out}")
 

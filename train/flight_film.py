@@ -24,9 +24,10 @@ import tyro
 
 from benchmarks.flight import EXPERIMENTS, adapt, hidden
 from train.flight_policies import made
-from visadapt.films.flight_film import FlownPanel, write_flight_film, write_flight_still
+from visadapt.films.flight_film import FlightFilm
+from visadapt.films.flight_panel import FlightPanel
 from visadapt.policies import Policy
-from visadapt.progress import reporting
+from visadapt.progress import reporting, staged
 from visadapt.setups.flight import Flight
 from visadapt.targets import TargetError
 from visadapt.targets.rollout import run, see_goals
@@ -82,8 +83,9 @@ def main(settings: Settings) -> None:
         ]
         path = settings.out / f"{settings.vehicle}-{settings.experiment}.mp4"
         passed = max(panel.passed for panel in panels) + 0.3
-        write_flight_still(path.with_suffix(".png"), panels, settings.still if before.follows else passed)
-        write_flight_film(path, panels, lambda done, total: report("film", done, total, float("nan")))
+        film = FlightFilm(panels)
+        film.write_still(path.with_suffix(".png"), settings.still if before.follows else passed)
+        film.write(path, staged(report, "film"))
     for panel in panels:
         print(f"{panel.title:30} {100 * float(panel.score[-1]):7.2f} cm {'mean' if before.follows else 'nearest'}")
     print(f"{path} and {path.with_suffix('.png').name} are written")
@@ -95,13 +97,13 @@ def flown(
     policy: Policy,
     seed: int,
     title: str,
-    earlier: FlownPanel | None = None,
-) -> FlownPanel:
+    earlier: FlightPanel | None = None,
+) -> FlightPanel:
     """One flight under hidden effects; the seed alone decides on its course and its force."""
     policy.eval()
     target = flight.target(draw)
     flights = run(target, policy, see_goals, 1, target.course.steps, torch.Generator().manual_seed(seed), strict=False)
-    return FlownPanel(title, flights[0], flight.system, target.course, target.first[0], earlier)
+    return FlightPanel(title, flights[0], flight.system, target.course, target.first[0], earlier)
 
 
 if __name__ == "__main__":

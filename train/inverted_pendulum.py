@@ -31,12 +31,11 @@ from torch import Tensor
 
 from renderers import LayeredRenderer, load_renderer, save_renderer
 from renderers.training import fit
-from train.scoring import curves, filmed, score
+from train.scoring import filmed, score
 from visadapt.evaluation.cartpole_score import EPISODES, Evaluation
 from visadapt.evaluation.result_tables import Row, speed_row, write_rows
-from visadapt.films.cartpole_panel import Panel
+from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.films.plots import plot_losses
-from visadapt.films.video import write_film, write_still
 from visadapt.learning.grounding import gap
 from visadapt.learning.perception import Paths, PerceptionSettings
 from visadapt.learning.policy import TuneSettings
@@ -139,10 +138,10 @@ def main(settings: Settings) -> None:
             adaptations[seed] = {"ledger": asdict(adapted.ledger), "gap": _gap(task.source, adapted.episodes)}
             if len(films) == 1:
                 films.append((f"after {adapted.ledger.used:,} samples", filmed(target, policy)))
-                plot_losses(out / "losses.png", curves(adapted))
-        panels = _panels(films)
-        write_still(out / "film.png", panels, t=5.0)
-        write_film(out / "film.mp4", panels, target.period, lambda k, n: report("film", k, n, float("nan")))
+                plot_losses(out / "losses.png", adapted.rounds)
+        film = CartPoleFilm(_panels(films), target.period)
+        film.write_still(out / "film.png", t=5.0)
+        film.write(out / "film.mp4", staged(report, "film"))
     about = {**about, "seeds": settings.seeds, "not counted": f"{settings.frames} frames at set states"}
     write_json(out / "metrics.json", {"scores": scores, "adaptations": adaptations, **about})
     write_rows(settings.results, _rows(scores, adaptations))
@@ -175,7 +174,7 @@ def _renderer(settings: Settings, target: GymnasiumTarget, report: Report) -> La
     return renderer
 
 
-def _panels(films: Sequence[tuple[str, Run]]) -> list[Panel]:
+def _panels(films: Sequence[tuple[str, Run]]) -> list[CartPolePanel]:
     """The runs as the environment draws them at the states that they went through, larger than the policy sees them."""
     options = {**MAP.options, "width": 480, "height": 400}
     view = replace(MAP, crop=(0, 0, 480, 400), width=480, height=400, options=options)
@@ -184,7 +183,7 @@ def _panels(films: Sequence[tuple[str, Run]]) -> list[Panel]:
     for title, shown in films:
         assert shown.episode.state is not None
         picture = large.show(shown.episode.state)
-        panels.append(Panel(title, shown, picture, angle_limit=ANGLE_LIMIT, force_known=False))
+        panels.append(CartPolePanel(title, shown, picture, angle_limit=ANGLE_LIMIT, force_known=False))
     return panels
 
 

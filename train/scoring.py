@@ -1,4 +1,4 @@
-"""What the adaptations from pixels share: scores, episodes for the film, curves of the losses."""
+"""What the adaptations from pixels share: scores, and episodes for the film."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from dataclasses import asdict
 import torch
 
 from visadapt.evaluation.cartpole_score import STEPS, evaluate
-from visadapt.films.plots import Round
-from visadapt.learning.joint import Adapted
 from visadapt.policies import Policy
 from visadapt.targets import Target
 from visadapt.targets.rollout import Run, run, see_frames
@@ -25,11 +23,3 @@ def score(target: Target, policy: Policy, episodes: int) -> dict[str, object]:
 def filmed(target: Target, policy: Policy) -> Run:
     """The episode that is shown."""
     return run(target, policy, see_frames, 1, STEPS, torch.Generator().manual_seed(FILM_SEED))[0]
-
-
-def curves(adapted: Adapted) -> list[Round]:
-    """Losses round by round, for `plot_losses`."""
-    return [
-        Round(samples=each.samples, grounding=each.grounding, policy=list(enumerate(each.policy)))
-        for each in adapted.rounds
-    ]
