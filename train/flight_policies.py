@@ -19,7 +19,7 @@ from datasets import quadrotor_references
 from visadapt.progress import reporting
 from visadapt.setups.flight import Flight, fixed_wing, quadrotor, score
 from visadapt.systems import FixedWing, Quadrotor
-from visadapt.systems.parameter_file import RigError, load_rig
+from visadapt.systems.parameter_file import ParameterFileError, load_parameters
 from visadapt.tasks.courses import AlongReferences
 
 
@@ -51,14 +51,14 @@ def main(settings: Settings) -> None:
 def made(vehicle: str, references: Path, params: Path | None = None) -> Flight:
     """A vehicle, the default one or that of a file, and its courses."""
     if vehicle == "fixed_wing":
-        return fixed_wing(system=load_rig(params, FixedWing) if params else None)
+        return fixed_wing(system=load_parameters(params, FixedWing) if params else None)
     train, test = quadrotor_references.ready(references)
-    own = load_rig(params, Quadrotor) if params else None
+    own = load_parameters(params, Quadrotor) if params else None
     return quadrotor(AlongReferences(train), AlongReferences(test), own)
 
 
 if __name__ == "__main__":
     try:
         main(tyro.cli(Settings, description=__doc__))
-    except RigError as error:
+    except ParameterFileError as error:
         raise SystemExit(f"flight_policies: {error}") from error

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from visadapt.systems import FixedWing, Quadrotor
-from visadapt.systems.parameter_file import RigError, load_rig
+from visadapt.systems.parameter_file import ParameterFileError, load_parameters
 from visadapt.systems.rigid_body import from_angles
 from visadapt.world import World
 
@@ -334,7 +334,7 @@ def test_a_product_of_inertia_that_no_body_has_is_refused():
 def test_a_vehicle_of_ones_own_is_a_toml_file(tmp_path, system, text, expected):
     path = tmp_path / "rig.toml"
     path.write_text(f"[parameters]\n{text}")
-    assert load_rig(path, system) == expected
+    assert load_parameters(path, system) == expected
 
 
 @pytest.mark.parametrize(
@@ -349,5 +349,5 @@ def test_a_vehicle_of_ones_own_is_a_toml_file(tmp_path, system, text, expected):
 def test_one_line_names_the_file_and_key_of_an_impossible_vehicle(tmp_path, system, text, message):
     path = tmp_path / "rig.toml"
     path.write_text(f"[parameters]\n{text}\n")
-    with pytest.raises(RigError, match=f"rig.toml: {message}"):
-        load_rig(path, system)
+    with pytest.raises(ParameterFileError, match=f"rig.toml: {message}"):
+        load_parameters(path, system)

@@ -1,13 +1,13 @@
 import pytest
 
 from visadapt.systems import CartPole
-from visadapt.systems.parameter_file import RigError, load_rig
+from visadapt.systems.parameter_file import ParameterFileError, load_parameters
 
 
 def rig(tmp_path, text):
     path = tmp_path / "rig.toml"
     path.write_text(text)
-    return load_rig(path, CartPole)
+    return load_parameters(path, CartPole)
 
 
 def test_parameters_and_defaults(tmp_path):
@@ -35,11 +35,11 @@ def test_an_empty_table_is_the_default(tmp_path):
     ],
 )
 def test_one_line_names_file_and_key(tmp_path, text, message):
-    with pytest.raises(RigError, match=f"rig.toml: .*{message}") as caught:
+    with pytest.raises(ParameterFileError, match=f"rig.toml: .*{message}") as caught:
         rig(tmp_path, text)
     assert "\n" not in str(caught.value)
 
 
 def test_a_missing_file(tmp_path):
-    with pytest.raises(RigError, match=r"none.toml: cannot be read: No such file"):
-        load_rig(tmp_path / "none.toml", CartPole)
+    with pytest.raises(ParameterFileError, match=r"none.toml: cannot be read: No such file"):
+        load_parameters(tmp_path / "none.toml", CartPole)

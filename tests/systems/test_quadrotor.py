@@ -244,7 +244,7 @@ def test_an_impossible_parameter_is_named_with_its_value(name, value):
 
 
 def test_a_range_of_thrust_that_is_empty_is_named():
-    with pytest.raises(ValueError, match=r"max_thrust must be beyond min_thrust, got 2.0 and 2.21"):
+    with pytest.raises(ValueError, match=r"max_thrust must exceed min_thrust, got 2.0 and 2.21"):
         Quadrotor(max_thrust=2.0)
 
 

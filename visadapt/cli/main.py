@@ -22,7 +22,7 @@ from visadapt.storage.atomic_files import replacing
 from visadapt.storage.checkpoints import CheckpointError, load_network
 from visadapt.storage.run_folder import versions
 from visadapt.systems import System
-from visadapt.systems.parameter_file import RigError, load_rig
+from visadapt.systems.parameter_file import ParameterFileError, load_parameters
 from visadapt.world import World
 
 BAD_INPUT = 2
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         _diagnose(options)
-    except (InputError, RecordingError, RigError, CheckpointError, OSError) as error:
+    except (InputError, RecordingError, ParameterFileError, CheckpointError, OSError) as error:
         print(f"visadapt: {error}", file=sys.stderr)
         return BAD_INPUT
     return 0
@@ -100,7 +100,7 @@ def _positive(text: str) -> int:
 def _diagnose(options: argparse.Namespace) -> None:
     began = time.perf_counter()
     system_class = DIAGNOSABLE[options.system]
-    system = load_rig(options.params, system_class) if options.params else system_class()
+    system = load_parameters(options.params, system_class) if options.params else system_class()
     if options.effects:
         _run(Path(options.effects))
     policy = _state_policy(Path(options.policy), system) if options.policy else None

@@ -1,4 +1,4 @@
-"""The episode: what was measured and commanded, row by row."""
+"""The episode: measurements and commands, row by row."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ class RecordingError(ValueError):
 
 @dataclass(frozen=True)
 class Episode:
-    """One uninterrupted run of T rows, state or frame or both.
+    """One uninterrupted run of T rows with states, frames, or both.
 
     Row t holds what was measured at t and the action commanded from t to t + 1; the action of the last row was
     not executed, so T rows are T - 1 samples.
 
     Raises:
-        RecordingError: arrays of another shape or type, rows that do not match, a clock that does not run forward,
-            or a value that is not finite.
+        RecordingError: an array of another shape, type or number of rows, times that do not rise, or a value that is
+            not finite.
     """
 
     time: NDArray[np.floating]
@@ -33,7 +33,7 @@ class Episode:
     frame: NDArray[np.uint8] | None = None
     """(T, H, W)"""
     place: NDArray[np.floating] | None = None
-    """(T, n_place) where it was on its course, in the course's own numbers: policies are trained on from there"""
+    """(T, n_place) progress along its course, in the course's own numbers, from which policy learning can continue"""
 
     def __post_init__(self) -> None:
         if self.state is None and self.frame is None:
