@@ -48,7 +48,7 @@ from visadapt.storage.atomic_files import replacing
 from visadapt.storage.run_folder import once, open_run, write_json
 from visadapt.targets import Observation, SyntheticTarget, Target, TargetError
 from visadapt.targets.gymnasium import GymnasiumTarget
-from visadapt.targets.inverted_pendulum import MAP, REACH, SOURCE, START, inverted_pendulum
+from visadapt.targets.inverted_pendulum import MAP, REACH_M, SOURCE, START, inverted_pendulum
 from visadapt.targets.rollout import Run
 from visadapt.tasks.base import Balance
 from visadapt.tasks.cost import Cost
@@ -62,7 +62,7 @@ COST = Cost(state=(50.0, 3.0, 100.0, 0.3))
 """Receding over 10 steps of 0.04 s, the linearised source has eigenvalues of at most 0.967 under it; a force of 10 N
 that swings at 1 rad/s moves the cart by 0.12 m/s."""
 SEE = PerceptionSettings(iterations=2000, cart=Paths(0.8, 0.3, 3.0), pole=Paths(0.15, 0.4, 6.0))
-INSIDE = (REACH - 0.05, 1.0, ANGLE_LIMIT - 0.01, 1.5)
+INSIDE = (REACH_M - 0.05, 1.0, ANGLE_LIMIT - 0.01, 1.5)
 LEARN = TuneSettings(Balance(COST, (0.4, 0.2, 0.12, 0.2), (0.0, 0.1, 0.0, 0.2), INSIDE, first_divergence=0.3), 1500)
 ADAPT = TuneSettings(
     Balance(COST, (0.3, 0.1, 0.08, 0.1), (0.0,) * 4, INSIDE, first_divergence=0.4),
@@ -105,7 +105,7 @@ class SeenSource(SyntheticTarget):
         seen = super()._observe()
         with torch.no_grad():
             frame = self.task.observe(seen.state.nan_to_num().clamp(-10, 10))
-        inside = seen.state[:, 0].abs() <= REACH
+        inside = seen.state[:, 0].abs() <= REACH_M
         return replace(seen, alive=seen.alive & inside, frame=(255 * frame).round().clamp(0, 255).byte())
 
 

@@ -64,7 +64,7 @@ class PerceptionSettings:
 
 
 def scale(settings: PerceptionSettings, period: float) -> Tensor:
-    """(KINEMATICS,) units in which an encoder taught under `settings` gives positions and changes."""
+    """(N_KINEMATICS,) units in which an encoder taught under `settings` gives positions and changes."""
     return torch.cat((settings.cart.scale(period), settings.pole.scale(period)))
 
 
