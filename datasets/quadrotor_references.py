@@ -143,7 +143,7 @@ def _motions(settings: Settings, segments: int, speed: Tensor, rest: Tensor, gen
 
 
 def basis(time: Tensor, spacing: float, segments: int, derivative: int) -> Tensor:
-    """Uniform B-splines (T, segments + SPLINE_DEGREE), or their derivative of an order below SPLINE_DEGREE, at times (T,) in s.
+    """Uniform B-splines (T, segments + SPLINE_DEGREE), or a derivative of lower order, at times (T,) in s.
 
     By the truncated powers of de Boor (1978), A Practical Guide to Splines, chapter IX: knots `spacing` s apart.
     """

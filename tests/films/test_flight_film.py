@@ -242,7 +242,7 @@ def test_bad_input_is_one_clear_line(make, says: str):
 
 @pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="needs a limit on the size of files")
 def test_a_disk_that_fills_up_leaves_the_old_film(tmp_path: Path):
-    """A limit on the size of a file stands for a full disk: ffmpeg dies on it in the middle of writing."""
+    """A limit on the size of a file stands for a full disk: ffmpeg is stopped in the middle of writing."""
     old = tmp_path / "film.mp4"
     old.write_bytes(b"the film of yesterday")
     code = (
