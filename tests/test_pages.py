@@ -16,7 +16,7 @@ from benchmarks.all import COMMANDS
 from benchmarks.pages import BLOCK, CHANGED, GENERATED, PAGES, TABLES, filled
 from visadapt.effects import EFFECTS
 from visadapt.systems import CartPole
-from visadapt.systems.parameter_file import load_rig
+from visadapt.systems.parameter_file import load_parameters
 from visadapt.targets.env_map import EnvMap
 
 ROOT = Path(__file__).parents[1]
@@ -160,6 +160,6 @@ def test_the_effect_of_ones_own_works():
 def test_the_rig_and_the_map_of_the_page_load(tmp_path):
     rig, mapping = re.findall(r"```toml\n(.*?)```", text_of("own_rig.md"), re.DOTALL)
     (tmp_path / "rig.toml").write_text(rig)
-    assert load_rig(tmp_path / "rig.toml", CartPole).cart_mass == 0.23
+    assert load_parameters(tmp_path / "rig.toml", CartPole).cart_mass == 0.23
     (tmp_path / "map.toml").write_text(mapping)
     EnvMap.load(tmp_path / "map.toml").check("the page's map", CartPole, n_observation=4, n_action=1)

@@ -83,7 +83,7 @@ def tune(
         observe: the camera through which the policy sees, differentiable for the sake of a residual that reads frames;
             None for a policy on states, which sees what the world's sensors measure.
         windows: recorded starts, where settings.recorded asks for them, and the times at which other starts begin.
-        checkpoint: file of the training state, written every `EVERY` iterations and resumed from.
+        checkpoint: file of the training state, written every `CHECKPOINT_ITERATIONS` iterations and resumed from.
 
     Raises:
         DivergedError: the loss is not finite.
