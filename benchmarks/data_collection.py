@@ -29,7 +29,7 @@ from datasets import quadrotor_references
 from visadapt.effects import Residual
 from visadapt.evaluation import SCORE_SEED, FlightScore, kept_score
 from visadapt.evaluation.result_tables import Row, miss_row, read_rows, write_rows
-from visadapt.films.plots import Panel, plot_panels
+from visadapt.films.plots import Chart, plot_charts
 from visadapt.learning.grounding import gap, left_over
 from visadapt.learning.windows import Windows
 from visadapt.policies import AutoregressivePolicy, Policy
@@ -123,9 +123,9 @@ def _draw(settings: Settings) -> None:
     for name in settings.experiments:
         for measure, unit in ((MISMATCH, "m/s"), (EXPERIMENTS[name].measure, "m")):
             own = [row for row in rows if row["experiment"] == label(name) and row["measure"] == measure]
-            panels[measure == MISMATCH, name] = Panel(name, f"{measure}, {unit}", own)
+            panels[measure == MISMATCH, name] = Chart(name, f"{measure}, {unit}", own)
     ordered = [panels[first, name] for first in (True, False) for name in settings.experiments]
-    plot_panels(settings.picture, ordered, columns=len(settings.experiments))
+    plot_charts(settings.picture, ordered, columns=len(settings.experiments))
 
 
 def label(name: str) -> str:

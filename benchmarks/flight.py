@@ -28,7 +28,7 @@ import tyro
 from datasets import quadrotor_references
 from visadapt.evaluation import FlightScore, kept_score
 from visadapt.evaluation.result_tables import miss_row, read_rows, write_rows
-from visadapt.films.plots import Panel, plot_losses, plot_panels
+from visadapt.films.plots import Chart, plot_charts, plot_losses
 from visadapt.policies import Policy
 from visadapt.setups.base import Setup
 from visadapt.setups.flight import flight_target
@@ -89,8 +89,8 @@ def _draw(settings: Settings) -> None:
     panels = []
     for name in settings.experiments:
         own = [row for row in rows if row["experiment"] == name]
-        panels.append(Panel(name, f"{EXPERIMENTS[name].measure}, m", own))
-    plot_panels(settings.pictures / "curve_flight.png", panels, columns=min(2, len(panels)))
+        panels.append(Chart(name, f"{EXPERIMENTS[name].measure}, m", own))
+    plot_charts(settings.pictures / "curve_flight.png", panels, columns=min(2, len(panels)))
     if ALTERNATION in settings.experiments:
         setup, policy = prepared(settings, ALTERNATION)
         adapted = EXPERIMENTS[ALTERNATION].adapt(setup, settings.work, policy, seed=0)

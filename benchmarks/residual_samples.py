@@ -24,7 +24,7 @@ from torch import Tensor
 from datasets import quadrotor_references
 from visadapt.effects import Residual
 from visadapt.evaluation.result_tables import Row, read_rows, write_rows
-from visadapt.films.plots import Panel, plot_panels
+from visadapt.films.plots import Chart, plot_charts
 from visadapt.learning.grounding import gap, ground, left_over, rescale
 from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
@@ -90,8 +90,8 @@ def main(settings: Settings) -> None:
 
 def _draw(settings: Settings) -> None:
     title = "quadrotor, drag 0.3 1/s: flights that were not learnt from"
-    panel = Panel(title, "gap in velocity that is left, as a share", read_rows(settings.out))
-    plot_panels(settings.picture, [panel])
+    panel = Chart(title, "gap in velocity that is left, as a share", read_rows(settings.out))
+    plot_charts(settings.picture, [panel])
 
 
 def _flown(setup: Setup, policy: Policy, seed: int) -> Windows:

@@ -1,9 +1,9 @@
-"""Frames of the cart-pole with the states that they show: what the renderers are trained on.
+"""Frames of the cart-pole with their states, to train renderers on.
 
 python -m datasets.cartpole_frames --help
 
-Cart positions are uniform over a little more than the camera's reach, so that carts cut by the edge are seen too.
-Most pole angles are near upright, where a balancing policy lives; the rest are uniform over the full circle.
+Cart positions are uniform over a little more than the camera's reach, so that some carts are cut by the frame's edge.
+Most pole angles are near upright, where a balancing policy keeps the pole; the others are uniform over the full circle.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ class Settings:
     margin: float = 0.2
     """m beyond the camera's reach"""
     upright: float = 0.7
-    """share of the angles that are normal around upright"""
+    """share of the angles that are normally distributed around upright"""
     spread: float = 0.15
-    """rad, standard deviation of those"""
+    """rad, their standard deviation"""
 
 
 @dataclass(frozen=True)
 class Frames:
-    """States and what the camera shows of them."""
+    """States and the camera's frames of them."""
 
     x: NDArray[np.float64]
     """(N,) cart positions in m"""
@@ -90,7 +90,7 @@ def read(path: Path) -> Frames:
         with h5py.File(path, "r") as file:
             made = Frames(file["x"][:], file["theta"][:], file["frames"][:])
     except (OSError, KeyError) as error:
-        raise ValueError(f"{path}: not a whole data set of frames ({error})") from error
+        raise ValueError(f"{path}: not a complete data set of frames ({error})") from error
     if made.frames.ndim != 3 or made.frames.dtype != np.uint8 or not len(made.x) == len(made.theta) == len(made.frames):
         raise ValueError(f"{path}: frames must be (N, H, W) uint8 with an x and a theta for each")
     return made

@@ -1,17 +1,17 @@
-"""Random references that a quadrotor can fly: what its policies are trained and tested on.
+"""Random references that a quadrotor can fly, to train and test its policies on.
 
 python -m datasets.quadrotor_references --help
 
-Each is a spline of degree 5 with uniform knots (four continuous derivatives), so its acceleration, jerk and snap say
-what it asks of the quadrotor (see `visadapt.tasks.differential_flatness`). Its mean speed is drawn first, uniformly,
-and its start at rest or in motion; then shapes are drawn until one is feasible at that speed, so that hard speeds are
-not left out:
+Each is a spline of degree 5 with uniform knots (four continuous derivatives), whose acceleration, jerk and snap give
+the commands that it needs (see `visadapt.tasks.differential_flatness`). Its mean speed is drawn first, uniformly, and
+whether it starts at rest; then shapes are drawn until one is feasible at that speed, so that high speeds are as
+frequent as low ones:
 
     number of segments    uniform over whole numbers
     steps between control points    normal, each axis with a scale that is uniform in [0, 1]
 
-Feasible: every command that the motion asks for, the lag of the rate loop made up for, stays within `margin` of the
-range of commands, and the speed below `max_speed`, at instants half a period apart.
+Feasible: at instants half a period apart every command that the motion needs, including compensation of the rate
+loop's lag, stays within the share `margin` of the range of commands, and the speed below `max_speed`.
 """
 
 from __future__ import annotations
@@ -33,14 +33,13 @@ from visadapt.systems import Quadrotor
 from visadapt.tasks.differential_flatness import commands
 from visadapt.tasks.references import Reference
 
-DEGREE = 5
-"""of the splines"""
+SPLINE_DEGREE = 5
 
-TOGETHER = 1000
-"""References that are drawn at a time."""
+CHUNK_REFERENCES = 1000
+"""References that are drawn at a time, to bound the memory; another value draws other references."""
 
 FIELDS = ("positions", "velocities", "accelerations", "jerks")
-"""Derivatives of the position in their order, as `Reference` calls them."""
+"""Position and its derivatives, by their names in `Reference`."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class Settings:
     test: int = 1000
     """how many to test on"""
     seed: int = 0
-    """of everything that is drawn"""
+    """of all random numbers"""
     duration: float = 10.0
     """s"""
     period: float = 0.1
@@ -72,7 +71,7 @@ class Settings:
     max_segments: int = 15
     """of a spline"""
     margin: float = 0.9
-    """share of the range of commands that a reference may ask for; the rest is the controller's"""
+    """share of the range of commands that a reference may need; the rest is left to the controller"""
 
 
 def make(settings: Settings) -> tuple[Reference, Reference]:
@@ -80,7 +79,9 @@ def make(settings: Settings) -> tuple[Reference, Reference]:
     _check(settings)
     generator = torch.Generator().manual_seed(settings.seed)
     count = settings.train + settings.test
-    drawn = torch.cat([_draw(settings, min(TOGETHER, count - k), generator) for k in range(0, count, TOGETHER)], 1)
+    drawn = torch.cat(
+        [_draw(settings, min(CHUNK_REFERENCES, count - k), generator) for k in range(0, count, CHUNK_REFERENCES)], 1
+    )
     rows = drawn.to(torch.float32)
     return (
         Reference.of(rows[:, : settings.train], settings.period),
@@ -129,10 +130,10 @@ def _draw(settings: Settings, count: int, generator: torch.Generator) -> Tensor:
 
 def _motions(settings: Settings, segments: int, speed: Tensor, rest: Tensor, generator: torch.Generator) -> Tensor:
     """Positions and four derivatives (5, B, 2 T - 1, 3) of splines of mean speeds (B,), half a period between rows."""
-    steps = torch.randn(len(speed), segments + DEGREE - 1, 3, generator=generator, dtype=torch.float64)
+    steps = torch.randn(len(speed), segments + SPLINE_DEGREE - 1, 3, generator=generator, dtype=torch.float64)
     steps = steps * torch.rand(len(speed), 1, 3, generator=generator, dtype=torch.float64)
-    # Control points that coincide hold the spline still, in all its derivatives.
-    steps[:, : DEGREE - 1] *= ~rest[:, None, None]
+    # Where the first control points coincide, the spline starts at rest, with all derivatives zero.
+    steps[:, : SPLINE_DEGREE - 1] *= ~rest[:, None, None]
     points = torch.cat((torch.zeros_like(steps[:, :1]), steps.cumsum(1)), 1)
     rows = 2 * round(settings.duration / settings.period) + 1
     time = torch.linspace(0, settings.duration, rows, dtype=torch.float64)
@@ -142,23 +143,25 @@ def _motions(settings: Settings, segments: int, speed: Tensor, rest: Tensor, gen
 
 
 def basis(time: Tensor, spacing: float, segments: int, derivative: int) -> Tensor:
-    """Uniform B-splines (T, segments + DEGREE), or their derivative of an order below DEGREE, at times (T,) in s.
+    """Uniform B-splines (T, segments + SPLINE_DEGREE), or a derivative of lower order, at times (T,) in s.
 
     By the truncated powers of de Boor (1978), A Practical Guide to Splines, chapter IX: knots `spacing` s apart.
     """
-    place = time[:, None] / spacing - torch.arange(segments + DEGREE) + DEGREE
-    power = DEGREE - derivative
-    terms = [(-1) ** k * comb(DEGREE + 1, k) * (place - k).clamp(min=0) ** power for k in range(DEGREE + 2)]
+    place = time[:, None] / spacing - torch.arange(segments + SPLINE_DEGREE) + SPLINE_DEGREE
+    power = SPLINE_DEGREE - derivative
+    terms = [
+        (-1) ** k * comb(SPLINE_DEGREE + 1, k) * (place - k).clamp(min=0) ** power for k in range(SPLINE_DEGREE + 2)
+    ]
     value = torch.stack(terms).sum(0) / factorial(power) / spacing**derivative
-    return value * (place < DEGREE + 1)
+    return value * (place < SPLINE_DEGREE + 1)
 
 
 def _feasible(settings: Settings, motion: Tensor) -> Tensor:
     """Which motions (5, B, T, 3) a quadrotor can follow: (B,)."""
-    asked = commands(motion[2], motion[3], motion[4], Quadrotor())
+    needed = commands(motion[2], motion[3], motion[4], Quadrotor())
     slow = motion[1].norm(dim=-1).amax(1) <= settings.max_speed
-    # A body that must turn upside down has no flat answer here: its commands are out of range, or not numbers.
-    return slow & (asked.abs() <= settings.margin).all(-1).all(-1)
+    # Commands of a motion that would turn the body upside down are out of range or nan, so it is not feasible.
+    return slow & (needed.abs() <= settings.margin).all(-1).all(-1)
 
 
 def main(settings: Settings) -> None:
@@ -185,12 +188,12 @@ def read(path: Path) -> tuple[Reference, Reference]:
             rows = torch.stack([torch.from_numpy(file[name]) for name in FIELDS])
         train, period = int(about["train"]), float(about["period"])
     except (OSError, KeyError, ValueError, RuntimeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: not a whole data set of references ({error})") from error
+        raise ValueError(f"{path}: not a complete data set of references ({error})") from error
     return Reference.of(rows[:, :train], period), Reference.of(rows[:, train:], period)
 
 
 def ready(path: Path) -> tuple[Reference, Reference]:
-    """Read the data set in `path`, made first with the default settings where it is not there."""
+    """Read the data set in `path`; if there is none, it is made with the default settings first."""
     if not path.exists():
         main(Settings(out=path))
     return read(path)

@@ -1,4 +1,4 @@
-"""States to frames: drawn (OpenCV) and learnt (networks). Knows nothing of control."""
+"""States to frames: drawn (OpenCV) and learnt (networks). Independent of visadapt."""
 
 from renderers.camera import Camera
 from renderers.drawn import DrawnCartPole

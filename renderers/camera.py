@@ -1,4 +1,4 @@
-"""A camera that stands still and looks at a plane of motion squarely."""
+"""A fixed camera whose image plane is parallel to the plane of motion."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Camera:
-    """Maps metres in the plane of motion to pixels. Pixel centres lie at whole numbers, rows count downwards."""
+    """Maps metres in the plane of motion to pixels. Pixel centres are at whole numbers, rows count downwards."""
 
     width: int = 120
     """px"""
@@ -16,11 +16,11 @@ class Camera:
     scale: float = 40.0
     """px per m"""
     column: float = 59.5
-    """px, where x = 0 is"""
+    """px, column of x = 0"""
     row: float = 74.5
-    """px, where the hinge of the pole is"""
+    """px, row of the pole's hinge"""
 
     @property
     def reach(self) -> float:
-        """Largest |x| in m of a cart whose hinge is in the frame."""
+        """Largest |x| in m at which the hinge is in the frame."""
         return min(self.column + 0.5, self.width - 0.5 - self.column) / self.scale

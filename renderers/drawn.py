@@ -11,17 +11,15 @@ from numpy.typing import NDArray
 from renderers.camera import Camera
 
 SUPERSAMPLING = 6
-"""The scene is drawn this many times larger and averaged down, so that edges are anti-aliased to sub-pixel motion."""
+"""Factor by which the scene is drawn larger and then averaged down, so that motion of a fraction of a pixel shows."""
 
-SKY, TRACK, CART, POLE, AXLE = 245, 120, 60, 150, 20
+SKY_GREY, TRACK_GREY, CART_GREY, POLE_GREY, AXLE_GREY = 245, 120, 60, 150, 20
+"""Grey levels, 0 to 255."""
 
 
 @dataclass(frozen=True)
 class DrawnCartPole:
-    """Draws cart, pole and track in grey.
-
-    Sizes are in metres; `pole_length` is from the hinge to the tip.
-    """
+    """Draws cart, pole and track in grey; sizes are in m, `pole_length` from the hinge to the tip."""
 
     camera: Camera = field(default_factory=Camera)
     pole_length: float = 1.0
@@ -35,21 +33,21 @@ class DrawnCartPole:
 
     def _draw(self, x: float, theta: float) -> NDArray[np.uint8]:
         camera, zoom = self.camera, SUPERSAMPLING
-        canvas = np.full((camera.height * zoom, camera.width * zoom), SKY, np.uint8)
+        canvas = np.full((camera.height * zoom, camera.width * zoom), SKY_GREY, np.uint8)
         base = self.cart_height + 0.04
-        self._fill(canvas, _box(-10.0, 10.0, -base - 0.03, -base), TRACK)
-        self._fill(canvas, _box(x - self.cart_width / 2, x + self.cart_width / 2, -base, -0.04), CART)
+        self._fill(canvas, _box(-10.0, 10.0, -base - 0.03, -base), TRACK_GREY)
+        self._fill(canvas, _box(x - self.cart_width / 2, x + self.cart_width / 2, -base, -0.04), CART_GREY)
         along = np.array([np.sin(theta), np.cos(theta)])
         across = np.array([along[1], -along[0]]) * self.pole_width / 2
         hinge = np.array([x, 0.0])
         tip = hinge + along * self.pole_length
-        self._fill(canvas, np.array([hinge - across, hinge + across, tip + across, tip - across]), POLE)
+        self._fill(canvas, np.array([hinge - across, hinge + across, tip + across, tip - across]), POLE_GREY)
         around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-        self._fill(canvas, hinge + 0.05 * np.stack([np.cos(around), np.sin(around)], -1), AXLE)
+        self._fill(canvas, hinge + 0.05 * np.stack([np.cos(around), np.sin(around)], -1), AXLE_GREY)
         return np.asarray(cv2.resize(canvas, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
 
     def _fill(self, canvas: NDArray[np.uint8], corners: NDArray[np.floating], grey: int) -> None:
-        """Fills a polygon given in metres (n, 2), x to the right and z up from the hinge's height."""
+        """Fill a polygon of corners (n, 2) in m, x to the right and z up from the hinge."""
         camera, zoom, fraction_bits = self.camera, SUPERSAMPLING, 8
         columns = camera.column + camera.scale * corners[:, 0]
         rows = camera.row - camera.scale * corners[:, 1]

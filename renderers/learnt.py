@@ -10,14 +10,14 @@ from torch import Tensor, nn
 
 
 class MLPRenderer(nn.Module):
-    """The paper's renderer Psi (section 3.2.3): 4 layers, [32, 128, 256] hidden nodes, tanh. It stays blurry.
+    """The paper's renderer Psi (section 3.2.3): 4 layers, [32, 128, 256] hidden nodes, tanh. Its frames stay blurry.
 
-    The paper does not say how the state enters or how the weights begin. Here the angle enters as sine and cosine, and
-    the first layer begins with weights `WIDE` times larger than usual for x, sine and cosine: a pixel is 1/40 m, and a
-    network that begins smooth in its inputs takes far longer to resolve that.
+    The paper does not specify the input's encoding and the initial weights. Here the angle enters as sine and cosine,
+    and the first layer's initial weights for x, sine and cosine are `input_gain` times the usual ones: a pixel is
+    1/40 m, and a network that is smooth in its inputs at first takes far longer to resolve that.
     """
 
-    WIDE = (10.0, 5.0, 5.0)
+    input_gain = (10.0, 5.0, 5.0)
 
     def __init__(self, height: int, width: int) -> None:
         super().__init__()
@@ -33,12 +33,12 @@ class MLPRenderer(nn.Module):
             nn.Tanh(),
         )
         with torch.no_grad():
-            first.weight.mul_(torch.tensor(self.WIDE))
-            first.bias.mul_(max(self.WIDE))
+            first.weight.mul_(torch.tensor(self.input_gain))
+            first.bias.mul_(max(self.input_gain))
 
     @torch.no_grad()
     def start_from(self, frames: Tensor) -> None:
-        """Begin with the mean of frames (N, H, W) uint8 as the output at which all hidden units are zero."""
+        """Initialise the last layer's bias with the mean of frames (N, H, W) uint8."""
         self.last.bias.copy_((frames.float().mean(0) / 255).flatten())
 
     def forward(self, x: Tensor, theta: Tensor) -> Tensor:
@@ -50,11 +50,11 @@ class MLPRenderer(nn.Module):
 class Layer(nn.Module):
     """A learnt picture, with learnt opacity, that moves rigidly with the cart and may turn with the pole.
 
-    A point p of the frame (px) shows the picture at R(theta) (p - hinge(x)) + moved, where hinge(x) = origin + gain x
-    is the learnt camera and `moved` how far the origin is from its first guess: a better origin turns the picture
-    about another point but leaves it where it is at theta = 0, or every step of the camera would blur what the picture
-    has learnt so far. The picture has `detail` texels per pixel; `window` is (left, right, top, bottom) in px around
-    the first guess of the hinge at theta = 0.
+    A pixel p of the frame shows the picture at R(theta) (p - hinge(x)) + moved, where hinge(x) = origin + gain x is the
+    learnt camera and `moved` the distance of the origin from its first guess. With `moved`, a step of the origin
+    changes the point about which the picture turns but not its place at theta = 0; without it, every step of the
+    camera would blur what the picture has learnt so far. The picture has `detail` texels per pixel; `window` is
+    (left, right, top, bottom) in px around the first guess of the hinge at theta = 0.
     """
 
     centre: Tensor
@@ -71,7 +71,7 @@ class Layer(nn.Module):
         self.opacity = nn.Parameter(torch.full((1, rows, columns), -2.0))
 
     def forward(self, pixels: Tensor, hinge: Tensor, theta: Tensor, moved: Tensor) -> Tensor:
-        """Premultiplied shade and opacity (B, 2, H, W) at pixels (H, W, 3), each (column, row, 1).
+        """Shade times opacity, and opacity, (B, 2, H, W) at pixels (H, W, 3), each (column, row, 1).
 
         `hinge` (B, 2) and `moved` (2,) are in px, `theta` (B,) in rad.
         """
@@ -93,7 +93,7 @@ class Layer(nn.Module):
 
     @property
     def radius(self) -> float:
-        """Largest distance in px between the hinge and a row that the layer can cover, up or down."""
+        """Largest vertical distance in px from the hinge that the layer can cover."""
         far = self.centre.abs() + self.extent
         return float(far.norm() if self.turns else far[1])
 
@@ -101,9 +101,9 @@ class Layer(nn.Module):
 class LayeredRenderer(nn.Module):
     """Ours: a learnt background and two learnt pictures, cart and pole, moved by a learnt camera.
 
-    What is known beforehand is only that a rigid cart slides and a rigid pole turns about a hinge on it; how they
-    look, where the hinge is in the frame and how many pixels a metre is are learnt from frames.
-    Frames are sharp at every state because nothing but pictures is stored.
+    The model assumes only that a rigid cart slides and a rigid pole turns about a hinge on it; their appearance, the
+    hinge's place in the frame and the pixels per metre are learnt from frames. Since pictures are moved and never
+    interpolated between states, frames are sharp at every state.
     """
 
     guess: Tensor
@@ -111,7 +111,15 @@ class LayeredRenderer(nn.Module):
     def __init__(
         self, height: int, width: int, column: float, row: float, scale: float, reach: float, detail: float = 2.0
     ) -> None:
-        """A first guess of the camera: the hinge at x = 0 in px, px per m; `reach` is the pole's length in m."""
+        """Frames of (height, width) px from a first guess of the camera.
+
+        Args:
+            height, width: px.
+            column, row: px, of the hinge at x = 0.
+            scale: px per m.
+            reach: m, the pole's length, or a little more.
+            detail: texels per px of the pictures.
+        """
         super().__init__()
         self.arguments = {
             "height": height,
@@ -135,7 +143,7 @@ class LayeredRenderer(nn.Module):
 
     @torch.no_grad()
     def start_from(self, frames: Tensor) -> None:
-        """Begin with the median of frames (N, H, W) uint8 as the background: what stands still."""
+        """Initialise the background with the median of frames (N, H, W) uint8, which shows what does not move."""
         self.background.copy_((frames.median(0).values / 255).clamp(0.01, 0.99).logit())
 
     def forward(self, x: Tensor, theta: Tensor) -> Tensor:
@@ -156,7 +164,7 @@ class LayeredRenderer(nn.Module):
         return frame
 
     def _rows(self, layer: Layer, hinge: Tensor, moved: Tensor) -> tuple[int, int]:
-        """First row, and the one after the last, that a layer can cover: the rest need not be computed."""
+        """The first row that a layer can cover and the one after the last; the others need not be computed."""
         row, radius = hinge.detach()[:, 1], layer.radius + float(moved.detach().norm())
         first = max(0, math.floor(float(row.min()) - radius))
         return first, max(first, min(self.size[0], math.ceil(float(row.max()) + radius) + 1))

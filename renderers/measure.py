@@ -1,9 +1,9 @@
-"""Cart position and pole angle read from frames by classical computer vision.
+"""Cart position and pole angle measured in frames of the drawn scene by classical computer vision.
 
-Independent of every learnt renderer: nothing here is fitted. It knows how the scene is drawn (its greys and sizes)
-and where the camera stands, and finds in each frame (1) the cart's two vertical edges, to a fraction of a pixel from
-how much of each column the cart covers, and (2) the line through the pole's pixels by total least squares, weighted
-by how much of each pixel the pole covers.
+Nothing here is fitted, so that it is an independent check of learnt renderers. From the scene's known greys, sizes and
+camera it finds (1) the cart's two vertical edges, to a fraction of a pixel by the share of each column that the cart
+covers, and (2) the line through the pole's pixels by total least squares, weighted by the share of each pixel that the
+pole covers.
 """
 
 from __future__ import annotations
@@ -14,22 +14,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from renderers.drawn import CART, POLE, SKY, DrawnCartPole
+from renderers.drawn import CART_GREY, POLE_GREY, SKY_GREY, DrawnCartPole
 
 Floats = NDArray[np.float64]
 
-FAINT = 0.15
-"""Coverage by the cart below which a column counts as empty: what a learnt renderer leaves behind does not pull."""
-EDGE = 3
-"""px to either side of the pole's line in which its pixels are looked for"""
+LEAST_COVERAGE = 0.15
+"""Share covered by the cart below which a column counts as empty, so that faint artefacts of a renderer are ignored."""
+POLE_BAND_PX = 3
+"""px to either side of the pole's line within which pixels are taken to be the pole's"""
 
 
 def measure(frames: NDArray[np.uint8] | NDArray[np.floating], scene: DrawnCartPole) -> tuple[Floats, Floats]:
-    """Cart positions (B,) in m and pole angles (B,) in rad, seen in frames (B, H, W), uint8 or in [0, 1].
+    """Cart positions (B,) in m and pole angles (B,) in rad in frames (B, H, W), uint8 or in [0, 1].
 
-    NaN where no cart is seen, or less than half of the pole. A cart cut by the frame's edge is placed by its other
-    edge. The pole must stand above the cart (|theta| < 80 degrees): in front of cart and track little is seen of it,
-    and it hides the cart.
+    NaN where no cart, or less than half of the pole, is visible. A cart cut by the frame's edge is located by its other
+    edge. The pole must be above the cart (|theta| < 80 degrees): lower, it hides the cart and blends with the track.
+
+    Raises:
+        ValueError: frames of another size than the camera's.
     """
     camera = scene.camera
     if frames.ndim != 3 or frames.shape[1:] != (camera.height, camera.width):
@@ -49,20 +51,20 @@ def _cart(frame: Floats, scene: DrawnCartPole) -> float:
     """Column of the cart's middle, NaN without a cart."""
     camera = scene.camera
     half = scene.cart_width / 2 * camera.scale
-    # Rows that the cart covers whole, below the axle and above the track.
+    # Rows that the cart covers completely, below the axle and above the track.
     top, bottom = camera.row + 0.09 * camera.scale, camera.row + (scene.cart_height + 0.04) * camera.scale
     rows = slice(math.ceil(top + 0.5), math.floor(bottom - 0.5) + 1)
-    profile = np.clip((SKY - frame[rows]) / (SKY - CART), 0.0, 1.0).mean(0)
+    profile = np.clip((SKY_GREY - frame[rows]) / (SKY_GREY - CART_GREY), 0.0, 1.0).mean(0)
     size = 2 * round(half) + 1
     matched = cv2.filter2D(profile[None], -1, np.full((1, size), 1 / size), borderType=cv2.BORDER_CONSTANT)[0]
     middle = int((matched * profile).argmax())
     # A cart cut in half by the frame's edge still fills half of the box.
     if matched[middle] < 0.3 or profile[middle] <= 0.5:
         return math.nan
-    covered = np.where(profile > FAINT, profile, 0.0)
+    covered = np.where(profile > LEAST_COVERAGE, profile, 0.0)
     right = middle - 0.5 + _run(covered[middle:])
     left = middle + 0.5 - _run(covered[middle::-1])
-    if right - left > 2 * (half + EDGE):
+    if right - left > 2 * (half + POLE_BAND_PX):
         return math.nan
     if covered[: middle + 1].all() and covered[0] > 0.5:
         return right - half
@@ -72,7 +74,7 @@ def _cart(frame: Floats, scene: DrawnCartPole) -> float:
 
 
 def _run(covered: Floats) -> float:
-    """Columns covered from the first one on, up to the first empty one, with fractions."""
+    """Number of covered columns, with fractions, from the first one to the first empty one."""
     empty = np.flatnonzero(covered == 0)
     return float(covered[: empty[0] if len(empty) else None].sum())
 
@@ -85,9 +87,9 @@ def _pole(frame: Floats, scene: DrawnCartPole, column: float) -> float:
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(float)
     right, up = columns - column, camera.row - rows
     near, tip = 0.1 * camera.scale, scene.pole_length * camera.scale
-    cover = np.clip((SKY - frame) / (SKY - POLE), 0.0, 1.0)
+    cover = np.clip((SKY_GREY - frame) / (SKY_GREY - POLE_GREY), 0.0, 1.0)
     distance = np.hypot(right, up)
-    # All above the cart but the axle is sky or pole.
+    # Above the cart, everything but the axle is sky or pole.
     cover[(distance < near) | (distance > tip + 2) | (up < -0.5)] = 0.0
     if cover.sum() < 5:
         return math.nan
@@ -97,15 +99,15 @@ def _pole(frame: Floats, scene: DrawnCartPole, column: float) -> float:
         reach = _visible(scene, column, angle)
         if reach < tip / 2:
             return math.nan
-        # Only what lies along the line so far, and only as far out as the frame shows the pole's whole width.
+        # Only pixels along the present line, and only as far out as the pole's full width is in the frame.
         away, along = _about_line(camera.row, column, angle, rows, columns)
-        band = cover * (np.abs(away) < EDGE) * (along > 0) * (along < reach)
+        band = cover * (np.abs(away) < POLE_BAND_PX) * (along > 0) * (along < reach)
         total = band.sum()
         if total < 5:
             return math.nan
         centre_right, centre_up = float((band * right).sum() / total), float((band * up).sum() / total)
         a, b = right - centre_right, up - centre_up
-        # The axis of largest spread: its angle from the vertical is half that of the second moments.
+        # The principal axis; its angle from the vertical follows from the second moments.
         spread = 0.5 * math.atan2(2 * float((band * a * b).sum()), float((band * (b * b - a * a)).sum()))
         if math.cos(spread - math.atan2(centre_right, centre_up)) < 0:
             spread += math.pi
@@ -114,14 +116,14 @@ def _pole(frame: Floats, scene: DrawnCartPole, column: float) -> float:
 
 
 def _about_line(row: float, column: float, angle: float, rows: Floats, columns: Floats) -> tuple[Floats, Floats]:
-    """How far pixels are from a line through the hinge, in px, and how far along it."""
+    """Distances in px of pixels from a line through the hinge, and their positions along it."""
     right, up = columns - column, row - rows
     sine, cosine = math.sin(angle), math.cos(angle)
     return right * cosine - up * sine, right * sine + up * cosine
 
 
 def _visible(scene: DrawnCartPole, column: float, angle: float) -> float:
-    """Px from the hinge up to which the pole is in the frame in its whole width."""
+    """Distance in px from the hinge up to which the pole's full width is in the frame."""
     camera, sine, cosine = scene.camera, math.sin(angle), math.cos(angle)
     half = scene.pole_width / 2 * camera.scale + 1
     limit = scene.pole_length * camera.scale + 2

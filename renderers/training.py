@@ -10,7 +10,7 @@ from torch import Tensor
 from renderers.learnt import LayeredRenderer, MLPRenderer
 
 Progress = Callable[[int, int, float], None]
-"""Called with (steps done, steps in all, loss)."""
+"""Called with (steps done, steps in total, loss)."""
 
 
 def fit(
@@ -23,11 +23,19 @@ def fit(
     batch: int = 32,
     progress: Progress | None = None,
 ) -> None:
-    """Minimise the mean squared error of the renderer's frames by Adam under a one-cycle rate.
+    """Minimise the mean squared error of the renderer's frames, in place, by Adam under a one-cycle learning rate.
 
     Args:
+        renderer: to fit.
         x, theta: (N,) cart positions in m and pole angles in rad.
-        frames: (N, H, W) uint8, what a camera showed there.
+        frames: (N, H, W) uint8, the camera's frames there.
+        steps: of the optimiser, at least 3.
+        generator: draws the batches.
+        batch: frames in a step.
+        progress: called after each step.
+
+    Raises:
+        ValueError: fewer than 3 steps.
     """
     if steps < 3:
         raise ValueError(f"steps is {steps}, must be at least 3")
@@ -40,7 +48,7 @@ def fit(
         rates = [0.1, 0.05, 0.003]
     else:
         groups, rates = [{"params": list(renderer.parameters())}], [4e-3]
-    # Fused, since most of a step of the MLP, whose last layer has 3 million weights, would be the optimiser's.
+    # Fused, since the optimiser would take most of a step of the MLP, whose last layer has 3 million weights.
     optimiser = torch.optim.Adam(groups, fused=True)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rates, total_steps=steps, pct_start=max(0.2, 2 / steps))
     for step in range(steps):

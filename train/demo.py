@@ -24,10 +24,9 @@ import tyro
 from renderers import DrawnCartPole
 from train import renderer as renderer_training
 from visadapt.evaluation import CartPoleScore, kept_score
-from visadapt.films.cartpole_panel import Panel
+from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.films.plots import plot_losses
-from visadapt.films.video import write_film, write_still
-from visadapt.progress import reporting
+from visadapt.progress import reporting, staged
 from visadapt.setups.cartpole_frames import cartpole_frames
 from visadapt.storage.run_folder import open_run, write_json
 from visadapt.targets import SyntheticTarget, Target, TargetError, no_effects, sine_force
@@ -86,11 +85,9 @@ def main(settings: Settings) -> None:
         look("before", "Target, before", target)
         adapted = setup.adapt(policy, target, out, settings.budget, settings.round_samples, settings.seed, report)
         look("after", f"Target, after {adapted.ledger.used:,} samples", target)
-        panels = [Panel.redrawn(title, shown, stream) for title, shown in films]
-        write_still(out / "film.png", panels, t=3.0)
-        write_film(
-            out / "film.mp4", panels, target.period, lambda done, total: report("film", done, total, float("nan"))
-        )
+        film = CartPoleFilm([CartPolePanel.redrawn(title, shown, stream) for title, shown in films], target.period)
+        film.write_still(out / "film.png", t=3.0)
+        film.write(out / "film.mp4", staged(report, "film"))
     plot_losses(out / "losses.png", adapted.rounds)
     write_json(
         out / "metrics.json",

@@ -24,9 +24,10 @@ import torch
 import tyro
 
 from datasets import quadrotor_references
-from visadapt.films.flight_film import FlownPanel, write_flight_film, write_flight_still
+from visadapt.films.flight_film import FlightFilm
+from visadapt.films.flight_panel import FlightPanel
 from visadapt.policies import Policy
-from visadapt.progress import reporting
+from visadapt.progress import reporting, staged
 from visadapt.setups.base import Setup
 from visadapt.setups.flight import flight_target
 from visadapt.setups.flight_experiments import EXPERIMENTS
@@ -75,8 +76,9 @@ def main(settings: Settings) -> None:
         ]
         path = settings.out / f"{settings.vehicle}-{settings.experiment}.mp4"
         passed = max(panel.passed for panel in panels) + 0.3
-        write_flight_still(path.with_suffix(".png"), panels, settings.still if before.follows else passed)
-        write_flight_film(path, panels, lambda done, total: report("film", done, total, float("nan")))
+        film = FlightFilm(panels)
+        film.write_still(path.with_suffix(".png"), settings.still if before.follows else passed)
+        film.write(path, staged(report, "film"))
     for panel in panels:
         print(f"{panel.title:30} {100 * float(panel.score[-1]):7.2f} cm {'mean' if before.follows else 'nearest'}")
     print(f"{path} and {path.with_suffix('.png').name} are written")
@@ -88,13 +90,13 @@ def flown(
     policy: Policy,
     seed: int,
     title: str,
-    earlier: FlownPanel | None = None,
-) -> FlownPanel:
+    earlier: FlightPanel | None = None,
+) -> FlightPanel:
     """One flight under hidden effects; the seed alone decides what is to be flown, and the force."""
     policy.eval()
     target = flight_target(setup, draw_effects)
     flights = run(target, policy, 1, target.task.steps, torch.Generator().manual_seed(seed), strict=False)
-    return FlownPanel(title, flights[0], target.system, target.task, target.first[0], earlier)
+    return FlightPanel(title, flights[0], target.system, target.task, target.first[0], earlier)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from visadapt.progress import reporting
 from visadapt.setups.base import Setup
 from visadapt.setups.flight import fixed_wing, flight_target, quadrotor
 from visadapt.systems import FixedWing, Quadrotor
-from visadapt.systems.parameter_file import RigError, load_parameters
+from visadapt.systems.parameter_file import ParameterFileError, load_parameters
 from visadapt.world import World
 
 
@@ -63,5 +63,5 @@ def vehicle(name: str, settings: Settings) -> Setup:
 if __name__ == "__main__":
     try:
         main(tyro.cli(Settings, description=__doc__))
-    except RigError as error:
+    except ParameterFileError as error:
         raise SystemExit(f"flight_policies: {error}") from error

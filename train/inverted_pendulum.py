@@ -33,9 +33,8 @@ from renderers import LayeredRenderer, load_renderer, save_renderer
 from renderers.training import fit
 from visadapt.evaluation import CartPoleScore, kept_score
 from visadapt.evaluation.result_tables import Row, speed_row, write_rows
-from visadapt.films.cartpole_panel import Panel
+from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.films.plots import plot_losses
-from visadapt.films.video import write_film, write_still
 from visadapt.learning.grounding import gap
 from visadapt.learning.perception import Paths, PerceptionSettings
 from visadapt.learning.policy import TuneSettings
@@ -49,7 +48,7 @@ from visadapt.storage.atomic_files import replacing
 from visadapt.storage.run_folder import open_run, write_json
 from visadapt.targets import Observation, SyntheticTarget, Target, TargetError
 from visadapt.targets.gymnasium import GymnasiumTarget
-from visadapt.targets.inverted_pendulum import MAP, REACH, SOURCE, START, inverted_pendulum
+from visadapt.targets.inverted_pendulum import MAP, REACH_M, SOURCE, START, inverted_pendulum
 from visadapt.targets.rollout import Run, film_run
 from visadapt.tasks.balance import Balance
 from visadapt.tasks.cost import Cost
@@ -63,7 +62,7 @@ COST = Cost(state=(50.0, 3.0, 100.0, 0.3))
 """Receding over 10 steps of 0.04 s, the linearised source has eigenvalues of at most 0.967 under it; a force of 10 N
 that swings at 1 rad/s moves the cart by 0.12 m/s."""
 SEE = PerceptionSettings(iterations=2000, cart=Paths(0.8, 0.3, 3.0), pole=Paths(0.15, 0.4, 6.0))
-INSIDE = (REACH - 0.05, 1.0, ANGLE_LIMIT - 0.01, 1.5)
+INSIDE = (REACH_M - 0.05, 1.0, ANGLE_LIMIT - 0.01, 1.5)
 LEARN = TuneSettings(Balance(COST, (0.4, 0.2, 0.12, 0.2), (0.0, 0.1, 0.0, 0.2), INSIDE, first_divergence=0.3), 1500)
 ADAPT = TuneSettings(
     Balance(COST, (0.3, 0.1, 0.08, 0.1), (0.0,) * 4, INSIDE, first_divergence=0.4),
@@ -106,7 +105,7 @@ class SeenSource(SyntheticTarget):
         seen = super()._observe()
         with torch.no_grad():
             frame = self.observe(seen.state.nan_to_num().clamp(-10, 10))
-        inside = seen.state[:, 0].abs() <= REACH
+        inside = seen.state[:, 0].abs() <= REACH_M
         return replace(seen, alive=seen.alive & inside, frame=(255 * frame).round().clamp(0, 255).byte())
 
 
@@ -141,9 +140,9 @@ def main(settings: Settings) -> None:
             if len(films) == 1:
                 films.append((f"after {adapted.ledger.used:,} samples", film_run(target, policy)))
                 plot_losses(out / "losses.png", adapted.rounds)
-        panels = _panels(films)
-        write_still(out / "film.png", panels, t=5.0)
-        write_film(out / "film.mp4", panels, target.period, lambda k, n: report("film", k, n, float("nan")))
+        film = CartPoleFilm(_panels(films), target.period)
+        film.write_still(out / "film.png", t=5.0)
+        film.write(out / "film.mp4", staged(report, "film"))
     about = {**about, "seeds": settings.seeds, "not counted": f"{settings.frames} frames at set states"}
     numbers = {name: asdict(each) for name, each in scores.items()}
     write_json(out / "metrics.json", {"scores": numbers, "adaptations": adaptations, **about})
@@ -177,7 +176,7 @@ def _renderer(settings: Settings, target: GymnasiumTarget, report: Report) -> La
     return renderer
 
 
-def _panels(films: Sequence[tuple[str, Run]]) -> list[Panel]:
+def _panels(films: Sequence[tuple[str, Run]]) -> list[CartPolePanel]:
     """The runs as the environment draws them at the states that they went through, larger than the policy sees them."""
     options = {**MAP.options, "width": 480, "height": 400}
     view = replace(MAP, crop=(0, 0, 480, 400), width=480, height=400, options=options)
@@ -186,7 +185,7 @@ def _panels(films: Sequence[tuple[str, Run]]) -> list[Panel]:
     for title, shown in films:
         assert shown.episode.state is not None
         picture = large.show(shown.episode.state)
-        panels.append(Panel(title, shown, picture, angle_limit=ANGLE_LIMIT, force_known=False))
+        panels.append(CartPolePanel(title, shown, picture, angle_limit=ANGLE_LIMIT, force_known=False))
     return panels
 
 

@@ -30,10 +30,10 @@ from torch import Tensor
 
 from visadapt.evaluation import SCORE_SEED
 from visadapt.evaluation.result_tables import Row, write_rows
-from visadapt.films.swing_up_film import SwingPanel, write_swing_film, write_swing_still
+from visadapt.films.swing_up_film import SwingUpFilm, SwingUpPanel
 from visadapt.learning.policy import TuneSettings, train_or_load
 from visadapt.policies import StatePolicy
-from visadapt.progress import reporting
+from visadapt.progress import reporting, staged
 from visadapt.storage.checkpoints import load_network
 from visadapt.storage.run_folder import once, open_run
 from visadapt.systems import CartPole
@@ -151,21 +151,21 @@ def main(settings: Settings) -> None:
     for row in rows:
         print(f"{row.measure:48} {row.mean:.3f} +- {row.std:.3f} {row.unit}")
     print(f"{succeeded} of {settings.seeds * settings.episodes} episodes succeeded")
-    film(settings)
+    make_film(settings)
 
 
-def film(settings: Settings) -> None:
+def make_film(settings: Settings) -> None:
     """Film the first seed's policy."""
     policy = StatePolicy(n_state=4)
     load_network(settings.work / "seed-0" / POLICY, policy)
     target = SyntheticTarget(start=Filmed(), angle_limit=math.inf)
     runs = run(target, policy.eval(), len(FILMED), STEPS, torch.Generator(), see=see)
-    panels = [SwingPanel(title, each) for title, each in zip(FILMED, runs, strict=True)]
-    due = SWING * target.period
-    write_swing_still(settings.still, panels, STILL, due)
+    panels = [SwingUpPanel(title, each) for title, each in zip(FILMED, runs, strict=True)]
+    film = SwingUpFilm(panels, SWING * target.period)
+    film.write_still(settings.still, STILL)
+    path = settings.work / "film.mp4"
     with reporting() as report:
-        path = settings.work / "film.mp4"
-        write_swing_film(path, panels, due, lambda done, total: report("film", done, total, float("nan")))
+        film.write(path, staged(report, "film"))
     print(f"{path} and {settings.still} are written")
 
 

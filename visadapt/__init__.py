@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from visadapt.effects.catalogue import catalogue as catalogue
     from visadapt.effects.residual import Residual as Residual
     from visadapt.evaluation.scoring import score as score
-    from visadapt.films.film import film as film
+    from visadapt.films.filming import film as film
     from visadapt.learning.joint import Adapted as Adapted
     from visadapt.policies.base import Policy as Policy
     from visadapt.recordings.episode import Episode as Episode
@@ -78,7 +78,7 @@ _MODULES = {
     "effects.base": "ActuationEffect DynamicsEffect Effect Parameter SensingEffect",
     "effects.residual": "Residual",
     "evaluation.scoring": "score",
-    "films.film": "film",
+    "films.filming": "film",
     "learning.joint": "Adapted",
     "policies.base": "Policy",
     "recordings.episode": "Episode",

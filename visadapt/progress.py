@@ -1,4 +1,4 @@
-"""Progress on the terminal: a bar for each stage, with its loss and the time left."""
+"""Progress on the terminal: for each stage a bar with its loss and the time left."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from rich.progress import Progress as Bars
 from rich.progress import TimeRemainingColumn as TimeLeftColumn
 
 Report = Callable[[str, int, int, float], None]
-"""Called with (stage, steps done, steps in all, loss)."""
+"""Called with (stage, steps done, steps in total, loss); the loss is nan where a stage has none."""
 
 Progress = Callable[[int, int, float], None]
-"""Called with (steps done, steps in all, loss): the report of one stage."""
+"""Called with (steps done, steps in total, loss): the report of one stage."""
 
 
 @contextmanager
 def reporting() -> Iterator[Report]:
-    """A report that shows one bar per stage; where no terminal is attached, one line when a stage is done."""
+    """A report that shows one bar per stage; without a terminal it prints one line when a stage is done."""
     console = Console()
     columns = (
         TextColumn("{task.description:<22}"),
@@ -47,7 +47,7 @@ def reporting() -> Iterator[Report]:
 
 
 def staged(report: Report | None, stage: str) -> Progress | None:
-    """The report of one stage, or None where nothing is reported."""
+    """The report of one stage; None if `report` is."""
     if report is None:
         return None
     return lambda done, total, loss: report(stage, done, total, loss)

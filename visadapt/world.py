@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -108,12 +107,12 @@ class World(nn.Module):
             values: (P,) in the order of `table`, or (B, P) with a row for each row of the batch that is stepped.
                 A gradient flows back to them.
         """
-        made = copy.copy(self)
         effects, first = [], 0
         for effect in self._named:
             effects.append(effect.with_values(values[..., first : first + len(effect.table)]))
             first += len(effect.table)
-        made._modules = {"effects": nn.ModuleList(effects)}
+        made = object.__new__(type(self))  # a diagnosis makes thousands: without what a module registers
+        made.__dict__ = {**self.__dict__, "effects": effects, "_modules": {}}
         made._arrange()
         return made
 

@@ -181,7 +181,7 @@ class TestBadInput:
         path = tmp_path / "policy.safetensors"
         self.refuses(capsys, "policy.safetensors: there is no such checkpoint", recording, "--policy", path)
         path.write_bytes(b"torn")
-        self.refuses(capsys, "policy.safetensors: not a whole safetensors file", recording, "--policy", path)
+        self.refuses(capsys, "policy.safetensors: not a complete safetensors file", recording, "--policy", path)
         save_network(path, ImagePolicy(torch.zeros(100, 120), 1.0), {})
         self.refuses(capsys, "holds a ImagePolicy, a StatePolicy is needed", recording, "--policy", path)
         save_network(path, StatePolicy(7), {})

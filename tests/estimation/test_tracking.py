@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from renderers import Camera, DrawnCartPole
-from renderers.drawn import AXLE, CART, POLE, SKY, TRACK
+from renderers.drawn import AXLE_GREY, CART_GREY, POLE_GREY, SKY_GREY, TRACK_GREY
 from visadapt.effects import EFFECTS, ConstantForce
 from visadapt.learning.poses import PoseFinder
 from visadapt.learning.tracking import Tracker, TrackingError, TrackingWarning
@@ -23,7 +23,7 @@ class Sketch(torch.nn.Module):
     def __init__(self, drawn=None):
         super().__init__()
         self.drawn = drawn or DrawnCartPole()
-        self.shades = torch.nn.Parameter(torch.tensor([SKY, TRACK, CART, POLE, AXLE]) / 255)
+        self.shades = torch.nn.Parameter(torch.tensor([SKY_GREY, TRACK_GREY, CART_GREY, POLE_GREY, AXLE_GREY]) / 255)
 
     def forward(self, x, theta):
         drawn, camera = self.drawn, self.drawn.camera
@@ -121,7 +121,7 @@ class TestPoses:
         assert outside > 2 * inside
 
     def test_what_is_not_the_scene_is_not_explained(self, tracker):
-        frames = torch.stack([torch.full((100, 120), grey, dtype=torch.uint8) for grey in (0, SKY, 255)])
+        frames = torch.stack([torch.full((100, 120), grey, dtype=torch.uint8) for grey in (0, SKY_GREY, 255)])
         still = torch.from_numpy(DrawnCartPole()(np.array([9.0]), np.array([0.0])))
         assert not tracker.poses(torch.cat((frames, still))).explained.any()
 
@@ -196,7 +196,7 @@ class TestWhatCannotBeTracked:
     @pytest.mark.parametrize(("first", "last"), [(0, 21), (5, 16)])
     def test_too_many_of_them_are_an_error(self, tracker, first, last):
         episode = record(no_effects, 25)
-        episode.frame[first:last] = SKY
+        episode.frame[first:last] = SKY_GREY
         with pytest.raises(TrackingError, match=f"row {first} the first"):
             tracker.track([blind(episode)])
 

@@ -1,5 +1,4 @@
 import dataclasses
-import math
 import resource
 import subprocess
 import sys
@@ -13,10 +12,12 @@ import pytest
 import torch
 from PIL import Image
 
-from visadapt.films.canvas import RED, Canvas
-from visadapt.films.drawing3d import NEAR, Pen, PinholeCamera
-from visadapt.films.flight_film import FlownPanel, flight_still, write_flight_film, write_flight_still
-from visadapt.films.flight_views import CLOSE, VIOLET, Scales, draw_close_up
+from visadapt.films.canvas import Canvas
+from visadapt.films.colours import RED, VIOLET
+from visadapt.films.drawing3d import Pen, PinholeCamera
+from visadapt.films.flight_film import FlightFilm
+from visadapt.films.flight_panel import FlightPanel
+from visadapt.films.flight_views import FOLLOWING_VIEW, FlightScales, draw_close_up
 from visadapt.films.vehicle_shapes import draw_vehicle, outline
 from visadapt.recordings import Episode
 from visadapt.systems import FixedWing, Quadrotor
@@ -41,7 +42,7 @@ def along(seconds: float = 1.0) -> Follow:
 
 def following(
     aside: tuple[float, float, float] = (0.0, 0.0, 0.0), rows: int = 11, survived: bool = True, **other
-) -> FlownPanel:
+) -> FlightPanel:
     """A quadrotor that flies beside its reference all the way."""
     task = along()
     time = np.arange(rows) * 0.1
@@ -51,57 +52,20 @@ def following(
     run = Run(
         Episode(time, np.zeros((rows, 4)), state), survived, np.tile(other.pop("force", (0.0, 0.0, 0.0)), (rows, 1))
     )
-    return FlownPanel("a flight", run, Quadrotor(), task, torch.tensor([0, 0]), **other)
+    return FlightPanel("a flight", run, Quadrotor(), task, torch.tensor([0, 0]), **other)
 
 
-def reaching(miss: float) -> FlownPanel:
+def reaching(miss: float) -> FlightPanel:
     """A fixed wing that passes its target at a distance, to the left."""
     time = np.arange(140) * 0.05
     state = np.zeros((140, 13))
     state[:, 0], state[:, 1], state[:, 3], state[:, 6] = 11.5 * time, miss, 11.5, 1.0
     run = Run(Episode(time, np.zeros((140, 4)), state), True, np.zeros(140))
-    return FlownPanel("a flight", run, FixedWing(), Reach(), torch.tensor([50.0, 0.0, 0.0]))
+    return FlightPanel("a flight", run, FixedWing(), Reach(), torch.tensor([50.0, 0.0, 0.0]))
 
 
 def count(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
     return int((np.abs(picture.astype(int) - colour).max(-1) < 30).sum())
-
-
-def test_a_camera_sees_points_where_similar_triangles_put_them():
-    camera = PinholeCamera.towards(np.array([0.0, -10.0, 0.0]), np.zeros(3), 500.0, (400, 300))
-    seen, depth = camera.project(np.array([[0.0, 0, 0], [2, 0, 0], [0, 0, 1], [2, 10, 1]]))
-    np.testing.assert_allclose(seen, [[200, 150], [300, 150], [200, 100], [250, 125]], atol=1e-9)
-    np.testing.assert_allclose(depth, [10, 10, 10, 20])
-
-
-@pytest.mark.parametrize("down", [0.0, 0.3, -0.2])
-def test_the_horizon_is_where_endless_ground_is_seen(down: float):
-    camera = PinholeCamera.towards(np.zeros(3), np.array([1.0, 2.0, -down]), 500.0, (400, 300))
-    far = camera.project(1e9 * np.array([[1.0, 2.0, 0.0], [1.5, 1.5, 0.0]]))[0]
-    np.testing.assert_allclose(far[:, 1], camera.horizon, atol=1e-5)
-    assert camera.horizon == pytest.approx(150 - 500 * down / math.sqrt(5))
-
-
-def test_a_camera_around_points_sees_them_all_and_fills_its_picture():
-    points = np.random.default_rng(0).normal(size=(50, 3)) * (8, 1, 3)
-    seen = PinholeCamera.around(points, np.array([-0.5, -1, 0.6]), (200, 100), 10).project(points)[0]
-    assert (seen > 9.99).all()
-    assert (seen < (190.01, 90.01)).all()
-    gaps = np.array([seen.min(0), (200, 100) - seen.max(0)]) - 10
-    assert np.abs(gaps).min(1).max() < 1e-6
-
-
-def test_a_line_that_passes_the_camera_is_cut_there_and_not_mirrored():
-    canvas = Canvas(400, 300)
-    pen = Pen(canvas, PinholeCamera.towards(np.zeros(3), np.array([1.0, 0.0, 0.0]), 300.0, (400, 300)))
-    pen.line(np.array([[-5.0, -1, -0.5], [5.0, -1, -0.5]]), (0, 0, 0), 2)
-    rows, columns = np.nonzero(canvas.pixels[..., 0] < 128)
-    assert len(rows) > 100
-    assert columns.min() > 255  # to the right and below only, from 60 px and 30 px on outwards
-    assert rows.min() > 175
-    canvas = Canvas(400, 300)
-    Pen(canvas, pen.camera).line(np.array([[-5.0, -1, 0], [NEAR / 2, -1, 0]]), (0, 0, 0))
-    assert (canvas.pixels == 255).all()
 
 
 def test_positions_between_rows_go_through_the_rows_and_errors_are_the_course_s():
@@ -147,10 +111,9 @@ def test_a_vehicle_is_drawn_where_it_is_as_it_is_turned(vehicle, angles: tuple[f
 @pytest.mark.parametrize("aside", [(0.3, 0.0, 0.0), (-0.3, 0.0, 0.2), (0.0, 0.3, -0.3)])
 def test_the_error_is_drawn_from_the_reference_to_the_vehicle(aside: tuple[float, float, float]):
     panel, canvas = following(aside), Canvas(480, 360)
-    draw_close_up(canvas, panel, 1, Scales.of([panel, following()]))
-    offset, ahead, focal = CLOSE[True]
+    draw_close_up(canvas, panel, 1, FlightScales.of([panel, following()]))
     goal = panel.goal[1]
-    camera = PinholeCamera.towards(goal + np.array(offset), goal + np.array(ahead), focal, (480, 360))
+    camera = FOLLOWING_VIEW.camera(goal, (480, 360))
     ends = camera.project(np.stack([goal, goal + np.array(aside)]))[0]
     np.testing.assert_allclose(ends[0], (240, 180), atol=1e-6)
     between = ends[0] + np.linspace(0.2, 0.8, 9)[:, None] * (ends[1] - ends[0])
@@ -162,13 +125,13 @@ def test_a_hidden_force_is_drawn_towards_where_it_pushes():
     columns = []
     for newtons in (2.0, -2.0):
         panel = following(force=(newtons, 0.0, 0.0))
-        scene = flight_still([panel], 0.5)[60:420, 28:508].astype(int)
+        scene = FlightFilm([panel]).still(0.5)[60:420, 28:508].astype(int)
         violet = np.abs(scene - VIOLET).max(-1) < 30
         assert violet.sum() > 150
         columns.append(np.nonzero(violet)[1].mean())
     assert columns[0] > 260
     assert columns[1] < 220
-    assert count(flight_still([following()], 0.5)[60:420], VIOLET) == 0
+    assert count(FlightFilm([following()]).still(0.5)[60:420], VIOLET) == 0
 
 
 def test_outlines_have_the_vehicles_sizes():
@@ -181,7 +144,7 @@ def test_a_film_is_decoded_as_it_was_drawn(tmp_path: Path):
     panels = [following((0.0, 0.05, 0.0), rows=4)]
     path = tmp_path / "new folder" / "film.mp4"
     done: list[tuple[int, int]] = []
-    write_flight_film(path, panels, lambda now, total: done.append((now, total)))
+    FlightFilm(panels).write(path, lambda now, total, _: done.append((now, total)))
     reader = imageio_ffmpeg.read_frames(path)
     meta = next(reader)
     reader.close()
@@ -192,7 +155,7 @@ def test_a_film_is_decoded_as_it_was_drawn(tmp_path: Path):
     assert len(frames) == round((0.3 + 1.5) * 25) + 1
     assert done[-1] == (len(frames), len(frames))
     for i in (0, 20, len(frames) - 1):
-        drawn = flight_still(panels, i * 0.04)
+        drawn = FlightFilm(panels).still(i * 0.04)
         assert frames[i].shape == drawn.shape
         assert drawn.shape[0] % 2 == drawn.shape[1] % 2 == 0
         assert np.abs(frames[i].astype(float) - drawn).mean() < 2
@@ -201,10 +164,10 @@ def test_a_film_is_decoded_as_it_was_drawn(tmp_path: Path):
 
 def test_a_still_is_a_picture_and_its_end_stands_still(tmp_path: Path):
     panels = [following(), following((0.0, 0.05, 0.0))]
-    write_flight_still(tmp_path / "still.png", panels, 0.6)
+    FlightFilm(panels).write_still(tmp_path / "still.png", 0.6)
     with Image.open(tmp_path / "still.png") as picture:
-        assert np.array_equal(np.asarray(picture), flight_still(panels, 0.6))
-    assert np.array_equal(flight_still(panels, 1.0), flight_still(panels, 9.0))
+        assert np.array_equal(np.asarray(picture), FlightFilm(panels).still(0.6))
+    assert np.array_equal(FlightFilm(panels).still(1.0), FlightFilm(panels).still(9.0))
 
 
 def test_flights_that_failed_are_marked_as_such_from_then_on():
@@ -219,14 +182,14 @@ def test_flights_that_failed_are_marked_as_such_from_then_on():
     assert lost.failed == pytest.approx(0.6)
     for panel, before, after in ((strays, 0.4, 0.8), (lost, 0.5, 0.7)):
         banner = slice(60, 120), slice(28, 508)
-        assert count(flight_still([following(), panel], before)[:, 544:][banner], RED) == 0
-        assert count(flight_still([following(), panel], after)[:, 544:][banner], RED) > 2000
-        assert count(flight_still([following(), panel], after)[banner], RED) == 0
+        assert count(FlightFilm([following(), panel]).still(before)[:, 544:][banner], RED) == 0
+        assert count(FlightFilm([following(), panel]).still(after)[:, 544:][banner], RED) > 2000
+        assert count(FlightFilm([following(), panel]).still(after)[banner], RED) == 0
     missed, hit = reaching(1.3), reaching(0.01)
     assert missed.failed == pytest.approx(missed.passed)
     assert hit.failed is None
-    assert count(flight_still([missed, hit], 4.0)[60:120], RED) == 0
-    after_it = flight_still([missed, hit], 4.7)[60:120]
+    assert count(FlightFilm([missed, hit]).still(4.0)[60:120], RED) == 0
+    after_it = FlightFilm([missed, hit]).still(4.7)[60:120]
     assert count(after_it[:, :510], RED) > 2000
     assert count(after_it[:, 510:], RED) == 0
 
@@ -239,27 +202,27 @@ def test_a_flight_that_strays_beyond_all_bounds_is_drawn_all_the_same():
         panel, run=Run(dataclasses.replace(panel.run.episode, state=state), False, np.full(11, 1e30))
     )
     for t in (0.45, 0.5, 1.0):
-        assert flight_still([strayed, panel], t).shape == flight_still([panel, panel], t).shape
-    assert Scales.of([strayed, panel]).far == Scales.of([panel]).far
+        assert FlightFilm([strayed, panel]).still(t).shape == FlightFilm([panel, panel]).still(t).shape
+    assert FlightScales.of([strayed, panel]).far == FlightScales.of([panel]).far
 
 
 def test_an_earlier_flight_is_drawn_beside_the_later_one():
     plain, earlier = following((0.0, 0.01, 0.0)), following((0.0, 0.05, 0.1))
-    alone = flight_still([plain], 0.8)
-    both = flight_still([dataclasses.replace(plain, earlier=earlier)], 0.8)
+    alone = FlightFilm([plain]).still(0.8)
+    both = FlightFilm([dataclasses.replace(plain, earlier=earlier)]).still(0.8)
     assert (alone != both).any(-1).sum() > 500
 
 
 def test_a_flight_of_one_row_is_a_picture():
-    assert flight_still([following(rows=1)], 0.0).ndim == 3
+    assert FlightFilm([following(rows=1)]).still(0.0).ndim == 3
 
 
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: flight_still([], 0.0), "at least one panel"),
-        (lambda: flight_still([following(), reaching(0.1)], 0.0), "film them apart"),
-        (lambda: following(rows=12), "12 rows, its reference 11"),
+        (lambda: FlightFilm([]).still(0.0), "at least one panel"),
+        (lambda: FlightFilm([following(), reaching(0.1)]).still(0.0), "film them apart"),
+        (lambda: following(rows=12), "12 rows, its reference only 11"),
         (
             lambda: dataclasses.replace(following(), task=cast(FlightTask, object())),
             "no picture is known of a task object",
@@ -280,13 +243,13 @@ def test_bad_input_is_one_clear_line(make, says: str):
 
 @pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="needs a limit on the size of files")
 def test_a_disk_that_fills_up_leaves_the_old_film(tmp_path: Path):
-    """A limit on the size of a file stands for a full disk: ffmpeg dies on it in the middle of writing."""
+    """A limit on the size of a file stands for a full disk: ffmpeg is stopped in the middle of writing."""
     old = tmp_path / "film.mp4"
     old.write_bytes(b"the film of yesterday")
     code = (
         "import resource, sys; from tests.films.test_flight_film import *\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
-        "try: write_flight_film(sys.argv[1], [following(rows=1)])\n"
+        "try: FlightFilm([following(rows=1)]).write(sys.argv[1])\n"
         "except OSError as error: print(error); sys.exit(7)\n"
     )
     root = Path(__file__).parents[2]

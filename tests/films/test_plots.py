@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from visadapt.films.plots import Panel, plot_curve, plot_losses, plot_panels
+from visadapt.films.plots import Chart, plot_charts, plot_curve, plot_losses
 from visadapt.learning.joint import Round
 
 
 def make_round(samples: int) -> Round:
-    grounding = [(i, 1 / (1 + i), 2 / (1 + i) if i % 2 else math.nan) for i in range(10)]
-    return Round(samples, grounding, [0.5 / (1 + i) for i in range(5)])
+    losses = [(i, 1 / (1 + i), 2 / (1 + i) if i % 2 else math.nan) for i in range(10)]
+    return Round(samples, losses, [0.5 / (1 + i) for i in range(5)])
 
 
 def make_row(domain: str, samples: int, mean: object, failed: object = 0) -> dict[str, object]:
@@ -54,13 +54,13 @@ def test_the_curve_takes_the_rows_of_a_table(tmp_path: Path, unadapted: str, fai
 
 
 @pytest.mark.parametrize("columns", [1, 2, 3])
-def test_panels_take_the_rows_of_a_table_failed_and_missing_ones_too(tmp_path: Path, columns: int):
+def test_charts_take_the_rows_of_a_table_failed_and_missing_ones_too(tmp_path: Path, columns: int):
     wide = [make_row("adapted", n, mean) for n, mean in ((1000, 0.1), (50, "0.01"), (200, "inf"))]
     other = [make_row("target", n, 0.3) | {"method": "another", "std": ""} for n in (50, 200, 1000)]
     before = [make_row("target", 0, "nan"), make_row("source", 0, 0.06)]
-    panels = [Panel("left", "miss, m", [*before, *wide, *other]), Panel("right", "error, m/s", wide)]
-    plot_panels(tmp_path / "panels.png", panels, columns)
-    assert is_a_picture(tmp_path / "panels.png")
+    charts = [Chart("left", "miss, m", [*before, *wide, *other]), Chart("right", "error, m/s", wide)]
+    plot_charts(tmp_path / "charts.png", charts, columns)
+    assert is_a_picture(tmp_path / "charts.png")
 
 
 def test_nothing_to_plot_is_said(tmp_path: Path):
@@ -69,7 +69,7 @@ def test_nothing_to_plot_is_said(tmp_path: Path):
     with pytest.raises(ValueError, match="no rows"):
         plot_curve(tmp_path / "a.png", [make_row("source", 0, 0.1)])
     with pytest.raises(ValueError, match="no rows"):
-        plot_panels(tmp_path / "a.png", [Panel("left", "miss, m", [make_row("source", 0, 0.1)])])
+        plot_charts(tmp_path / "a.png", [Chart("left", "miss, m", [make_row("source", 0, 0.1)])])
     assert not list(tmp_path.iterdir())
 
 

@@ -5,20 +5,20 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from visadapt.films.canvas import RED, TEAL
-from visadapt.films.swing_up_film import CONE, SCENE, WIDTH, Scales, SwingPanel, swing_still, write_swing_film
+from visadapt.films.colours import RED, TEAL
+from visadapt.films.swing_up_film import PANEL_WIDTH, SCENE_HEIGHT, UPRIGHT_RAD, SwingUpFilm, SwingUpPanel
 from visadapt.recordings import Episode
 from visadapt.targets.rollout import Run
 
 PERIOD, DUE = 0.05, 0.5
 
 
-def panel(theta, x=0.0) -> SwingPanel:
-    """A pole that turns as told over 21 rows, on a cart that goes evenly to x."""
+def panel(theta, x=0.0) -> SwingUpPanel:
+    """21 rows of a pole at angles theta, on a cart that goes from 0 to x at a steady speed."""
     time = np.arange(21) * PERIOD
     place = x * time / time[-1]
     state = np.stack([place, np.full(21, x), np.broadcast_to(theta, 21), np.zeros(21)], -1)
-    return SwingPanel("a swing", Run(Episode(time, np.zeros((21, 1)), state), True, np.zeros(21)))
+    return SwingUpPanel("a swing", Run(Episode(time, np.zeros((21, 1)), state), True, np.zeros(21)))
 
 
 def count(picture, colour) -> int:
@@ -27,7 +27,7 @@ def count(picture, colour) -> int:
 
 def scene(panels, t, due=DUE):
     """Of the first panel."""
-    return swing_still(panels, t, due)[56 : 56 + SCENE, 28 : 28 + WIDTH]
+    return SwingUpFilm(panels, due).still(t)[56 : 56 + SCENE_HEIGHT, 28 : 28 + PANEL_WIDTH]
 
 
 RISING = np.linspace(math.pi, 0.0, 21)
@@ -37,7 +37,7 @@ def test_the_film_has_a_frame_for_every_row(tmp_path: Path):
     panels = [panel(RISING), panel(0.0, 3.0), panel(-RISING, -1.0)]
     path = tmp_path / "film.mp4"
     done: list[tuple[int, int]] = []
-    write_swing_film(path, panels, DUE, lambda now, total: done.append((now, total)))
+    SwingUpFilm(panels, DUE).write(path, lambda now, total, _: done.append((now, total)))
     frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
     assert frames == 21
     assert seconds == pytest.approx(21 * PERIOD)
@@ -48,26 +48,26 @@ def test_the_film_has_a_frame_for_every_row(tmp_path: Path):
 @pytest.mark.parametrize("angle", [0.1, -2.0, math.pi])
 def test_the_pole_is_drawn_where_it_is_at_its_angle_however_far_the_cart_goes(x: float, angle: float):
     panels = [panel(angle, x)]
-    scales = Scales.of(panels, DUE)
+    film = SwingUpFilm(panels, DUE)
     picture = scene(panels, 20 * PERIOD, due=2.0)
     along = np.array([math.sin(angle), math.cos(angle)])
     for share in (0.3, 0.9):
-        column, row = np.round(scales.seen(np.array([x, 0.0]) + share * along)).astype(int)
+        column, row = np.round(film.pixels(np.array([x, 0.0]) + share * along)).astype(int)
         assert np.ptp(picture[row, column].astype(int)) > 60, "coloured, as only the pole is"
-        aside = np.round(scales.seen(np.array([x, 0.0]) - share * along)).astype(int)
+        aside = np.round(film.pixels(np.array([x, 0.0]) - share * along)).astype(int)
         assert np.ptp(picture[aside[1], aside[0]].astype(int)) < 60
 
 
 def test_pole_and_cone_turn_teal_within_ten_degrees_to_either_side():
     for sign in (-1, 1):
-        assert count(scene([panel(sign * 0.9 * CONE)], 0.0), TEAL) > 300
-        assert count(scene([panel(sign * 1.1 * CONE)], 0.0), TEAL) == 0
+        assert count(scene([panel(sign * 0.9 * UPRIGHT_RAD)], 0.0), TEAL) > 300
+        assert count(scene([panel(sign * 1.1 * UPRIGHT_RAD)], 0.0), TEAL) == 0
 
 
 def test_it_is_up_since_it_was_last_outside_the_cone_however_often_it_turned():
     theta = np.full(21, 2 * math.pi)
     theta[:4] = 1.0
-    theta[6] = 2 * math.pi - 1.2 * CONE
+    theta[6] = 2 * math.pi - 1.2 * UPRIGHT_RAD
     assert panel(theta).up_from == 7
     assert panel(0.0).up_from == 0
     assert panel(math.pi).up_from == 21
@@ -86,5 +86,5 @@ def test_panels_of_different_length_have_no_clock_in_common():
     short = panel(0.0)
     episode = short.run.episode
     cut = Episode(episode.time[:9], episode.action[:9], episode.state[:9])
-    with pytest.raises(ValueError, match="all as long"):
-        swing_still([short, SwingPanel("short", Run(cut, True, np.zeros(9)))], 0.0, DUE)
+    with pytest.raises(ValueError, match="9 and 21 rows: a film of swing-ups needs equal lengths"):
+        SwingUpFilm([short, SwingUpPanel("short", Run(cut, True, np.zeros(9)))], DUE)

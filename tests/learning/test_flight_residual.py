@@ -160,14 +160,14 @@ class TestForceThatChanges:
         force = PeriodicForce(amplitude=2.0, frequency=0.2, phase=0.5, offset=0.0)
         windows = Windows.cut(flights([force], 4, LENGTH + 1), "state")
         rows = torch.arange(LENGTH - 1, len(windows), LENGTH)
-        told = a_network(True).told(windows.history(rows).acting(windows.action[rows]))
+        estimate = a_network(True).disturbance(windows.history(rows).acting(windows.action[rows]))
         turn = 2 * math.pi * 0.2
         # In units of 2 m/s2 and 2 m/s3: half a period, and two periods, before the last row.
         now, middle = (0.5 + turn * PERIOD * (LENGTH - 1 - back) for back in (0.5, 2.0))
-        torch.testing.assert_close(told[:, 0], torch.full((4,), math.cos(now)), rtol=0, atol=0.01)
-        torch.testing.assert_close(told[:, 6], torch.full((4,), -turn * math.sin(middle)), rtol=0, atol=0.03)
-        assert told[:, [1, 2, 3, 4, 5]].abs().max() < 0.01
-        assert not a_network().told(windows.history(torch.arange(4))).any()
+        torch.testing.assert_close(estimate[:, 0], torch.full((4,), math.cos(now)), rtol=0, atol=0.01)
+        torch.testing.assert_close(estimate[:, 6], torch.full((4,), -turn * math.sin(middle)), rtol=0, atol=0.03)
+        assert estimate[:, [1, 2, 3, 4, 5]].abs().max() < 0.01
+        assert not a_network().disturbance(windows.history(torch.arange(4))).any()
 
 
 @pytest.mark.parametrize("with_history", [False, True])

@@ -77,24 +77,26 @@ class TestPlans:
         assert policy(a_history(kind, dtype=torch.float64)).dtype == torch.float64
 
 
-@pytest.mark.parametrize("listens", [False, True])
+@pytest.mark.parametrize("with_residual", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
 class TestWhatIsSeen:
-    def policy(self, kind, listens):
+    def policy(self, kind, with_residual):
         policy = made(kind)
-        if listens:
+        if with_residual:
             policy.residual = residual(kind)
         return stir(policy)
 
-    def test_two_pasts_that_differ_only_before_the_last_5_give_the_same_plan(self, kind, listens):
+    def test_two_pasts_that_differ_only_before_the_last_5_give_the_same_plan(self, kind, with_residual):
         seen, done = observations(kind, LENGTH + 4, 1), actions(LENGTH + 3, 1)
         others_seen, others_done = observations(kind, LENGTH + 4, 2), actions(LENGTH + 3, 2)
         others_seen[-LENGTH:], others_done[-LENGTH:] = seen[-LENGTH:], done[-LENGTH:]
-        policy = self.policy(kind, listens)
+        policy = self.policy(kind, with_residual)
         assert torch.equal(policy(lived(seen, done)), policy(lived(others_seen, others_done)))
 
-    def test_each_of_the_last_5_observations_and_actions_is_heard_where_there_is_history(self, kind, listens):
-        policy, seen, done = self.policy(kind, listens), observations(kind, LENGTH + 1, 1), actions(LENGTH, 1)
+    def test_each_of_the_last_5_observations_and_actions_changes_the_plan_of_a_policy_with_history(
+        self, kind, with_residual
+    ):
+        policy, seen, done = self.policy(kind, with_residual), observations(kind, LENGTH + 1, 1), actions(LENGTH, 1)
         plan = policy(lived(seen, done))
         for back in range(1, LENGTH + 1):
             other_seen, other_done = seen.clone(), done.clone()
@@ -106,14 +108,14 @@ class TestWhatIsSeen:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-class TestListening:
+class TestResidualInput:
     def test_a_freshly_attached_residual_changes_no_action(self, kind):
         policy, history = made(kind), a_history(kind)
         plan = policy(history)
         policy.residual = stir(residual(kind))
         assert torch.equal(policy(history), plan)
 
-    def test_it_hears_what_the_residual_expects_if_nothing_is_done(self, kind):
+    def test_the_correction_is_what_the_residual_expects_without_an_action(self, kind):
         policy, history = made(kind), a_history(kind)
         assert torch.equal(policy.correction(history), torch.zeros(3, 4))
         policy.residual = stir(residual(kind))
@@ -121,19 +123,19 @@ class TestListening:
         assert expected.abs().min() > 1e-4
         assert torch.equal(policy.correction(history), expected)
 
-    def test_the_correction_reaches_the_plan_once_the_policy_listens(self, kind):
+    def test_the_correction_reaches_the_plan_once_the_policy_has_weights_on_it(self, kind):
         policy, history = stir(made(kind)), a_history(kind)
         plan = policy(history)
         policy.residual = stir(residual(kind))
         assert (policy(history) - plan).abs().max() > 1e-3
 
-    def test_learning_to_listen_leaves_the_residual_as_it_is(self, kind):
+    def test_gradients_reach_the_weights_on_the_correction_but_not_the_residual(self, kind):
         policy, history = made(kind), a_history(kind)
         policy.residual = stir(residual(kind))
         policy(history).square().sum().backward()
         assert all(weight.grad is None for weight in policy.residual.parameters())
-        listening = (policy.hidden if kind == "image" else policy.first).weight.grad[:, -4:]
-        assert listening.abs().max() > 0
+        weights = (policy.hidden if kind == "image" else policy.first).weight.grad[:, -4:]
+        assert weights.abs().max() > 0
 
 
 def test_frames_of_another_size_are_refused():

@@ -116,7 +116,7 @@ class TestBadFiles:
         paths["empty"].write_bytes(b"")
         paths["text"].write_text("not a checkpoint, but long enough to hold a header's length")
         save_file({"a": torch.zeros(1)}, paths["foreign"])
-        says = dict.fromkeys(names, "not a whole safetensors file")
+        says = dict.fromkeys(names, "not a complete safetensors file")
         says |= {"missing": "there is no such checkpoint", "foreign": "not one that visadapt wrote"}
         for name, path in paths.items():
             with pytest.raises(CheckpointError, match=says[name]) as caught:

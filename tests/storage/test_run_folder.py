@@ -67,7 +67,7 @@ class TestJson:
         path = tmp_path / "score.json"
         write_json(path, {"a": [1, 2, 3]})
         path.write_text(path.read_text()[:-4])
-        with pytest.raises(RunError, match=f"^{path}: not whole JSON") as caught:
+        with pytest.raises(RunError, match=f"^{path}: not complete JSON") as caught:
             read_json(path)
         assert "\n" not in str(caught.value)
 

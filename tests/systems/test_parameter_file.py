@@ -1,7 +1,7 @@
 import pytest
 
-from visadapt.systems import CartPole
-from visadapt.systems.parameter_file import RigError, load_parameters
+from visadapt.systems import CartPole, FixedWing, Quadrotor
+from visadapt.systems.parameter_file import ParameterFileError, load_parameters
 
 
 def rig(tmp_path, text):
@@ -35,11 +35,40 @@ def test_an_empty_table_is_the_default(tmp_path):
     ],
 )
 def test_one_line_names_file_and_key(tmp_path, text, message):
-    with pytest.raises(RigError, match=f"rig.toml: .*{message}") as caught:
+    with pytest.raises(ParameterFileError, match=f"rig.toml: .*{message}") as caught:
         rig(tmp_path, text)
     assert "\n" not in str(caught.value)
 
 
 def test_a_missing_file(tmp_path):
-    with pytest.raises(RigError, match=r"none.toml: cannot be read: No such file"):
+    with pytest.raises(ParameterFileError, match=r"none.toml: cannot be read: No such file"):
         load_parameters(tmp_path / "none.toml", CartPole)
+
+
+@pytest.mark.parametrize(
+    ("system", "text", "expected"),
+    [
+        (FixedWing, "mass = 2\nroll_aileron = -0.1\n", FixedWing(mass=2.0, roll_aileron=-0.1)),
+        (Quadrotor, "mass = 0.8\nmax_thrust = 20\n", Quadrotor(mass=0.8, max_thrust=20.0)),
+    ],
+)
+def test_a_vehicle_of_ones_own_is_a_toml_file(tmp_path, system, text, expected):
+    path = tmp_path / "rig.toml"
+    path.write_text(f"[parameters]\n{text}")
+    assert load_parameters(path, system) == expected
+
+
+@pytest.mark.parametrize(
+    ("system", "text", "message"),
+    [
+        (FixedWing, "wingspan = 2", "unknown key 'wingspan' in .parameters.; there are mass, inertia_x"),
+        (FixedWing, "span = -2", "fixed_wing: span must be positive, got -2.0"),
+        (Quadrotor, "arm = 2", "unknown key 'arm' in .parameters.; there are mass, arm_length"),
+        (Quadrotor, "mass = 0", "quadrotor: mass must be positive, got 0.0"),
+    ],
+)
+def test_one_line_names_the_file_and_key_of_an_impossible_vehicle(tmp_path, system, text, message):
+    path = tmp_path / "rig.toml"
+    path.write_text(f"[parameters]\n{text}\n")
+    with pytest.raises(ParameterFileError, match=f"rig.toml: {message}"):
+        load_parameters(path, system)

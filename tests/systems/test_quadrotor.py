@@ -1,54 +1,13 @@
-from dataclasses import dataclass
-from typing import ClassVar
-
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
-from visadapt.systems import Quadrotor, RigidBody
-from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY, from_angles, rotation, turning
+from tests.rigid_bodies import HEAVY, at_rest, fly, random_states
+from visadapt.systems import Quadrotor
+from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY, from_angles
 from visadapt.world import World
 
-HEAVY = Quadrotor(mass=1.7, arm_length=0.3, roll_gain=9.0, yaw_gain=3.0, max_rate=2.0, gravity=9.7)
 PARAMETERS = ("mass", "arm_length", "roll_gain", "yaw_gain", "min_thrust", "max_thrust", "max_rate", "gravity")
-
-
-@dataclass(frozen=True)
-class Tumbling(RigidBody):
-    """A body that nothing touches."""
-
-    mass: float = 0.8
-    gravity: float = 9.81
-    actions: ClassVar = Quadrotor.actions
-
-    def wrench(self, velocity, rates, command):
-        return torch.zeros_like(velocity), torch.zeros_like(velocity)
-
-    def inertia(self, like):
-        return like.new_tensor(((0.02, 0.001, 0.0), (0.001, 0.03, -0.002), (0.0, -0.002, 0.045)))
-
-
-def at_rest(batch=1, dtype=torch.float64):
-    state = torch.zeros(batch, 13, dtype=dtype)
-    state[:, 6] = 1
-    return state
-
-
-def random_states(batch, seed=0):
-    """Any attitude, of any norm."""
-    return torch.randn(batch, 13, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def fly(system, state, commands, period=0.1, substeps=50):
-    """States (K + 1, B, 13) under commands (K, B, 4)."""
-    world = World(system, period=period, substeps=substeps)
-    at = world.start(state)
-    states = [state]
-    for command in commands:
-        at = world.step(at, command)
-        states.append(at.state)
-    return torch.stack(states)
 
 
 def hovering(system, steps, batch=1):
@@ -130,65 +89,6 @@ def test_a_tilt_accelerates_to_its_side(angles, direction):
     assert float(change[0, 5]) == pytest.approx(9.81 * (np.cos(0.3) - 1))
 
 
-def test_a_body_that_nothing_turns_keeps_its_angular_momentum_and_its_energy():
-    system = Tumbling()
-    start = random_states(3)
-    start[:, RATES] *= 5
-    states = fly(system, start, torch.zeros(10, 3, 4, dtype=torch.float64), period=0.1, substeps=100)
-
-    def kept(state):
-        spun = state[:, RATES] @ system.inertia(state)
-        momentum = (rotation(state[:, ATTITUDE]) @ spun[..., None])[..., 0]
-        height, speed = state[:, 2], state[:, VELOCITY]
-        linear = system.mass * (speed.square().sum(1) / 2 + system.gravity * height)
-        return torch.cat((momentum, (spun * state[:, RATES]).sum(1, keepdim=True) / 2, linear[:, None]), 1)
-
-    assert (states[-1, :, RATES] - start[:, RATES]).abs().max() > 1
-    torch.testing.assert_close(kept(states[-1]), kept(start), rtol=1e-8, atol=1e-9)
-
-
-def test_loads_are_a_force_in_world_axes_and_a_torque_in_body_axes():
-    state = random_states(5)
-    command = random_states(5, seed=1)[:, :4]
-    load = random_states(5, seed=2)[:, :6]
-    change = HEAVY.derivative(state, command, load) - HEAVY.derivative(state, command, torch.zeros_like(load))
-    torch.testing.assert_close(change[:, VELOCITY], load[:, :3] / 1.7)
-    inertia = 1.7 * 0.3**2 / 12 * torch.tensor([4.5, 4.5, 7.0], dtype=torch.float64)
-    torch.testing.assert_close(change[:, RATES], load[:, 3:] / inertia)
-
-
-def test_physics_does_not_know_the_norm_of_the_quaternion_nor_its_sign():
-    state, command, load = random_states(6), random_states(6, seed=1)[:, :4], random_states(6, seed=2)[:, :6]
-    for factor in (0.3, -1.0, -4.0):
-        scaled = state.clone()
-        scaled[:, ATTITUDE] *= factor
-        expected = HEAVY.derivative(state, command, load)
-        expected[:, ATTITUDE] *= factor
-        torch.testing.assert_close(HEAVY.derivative(scaled, command, load), expected)
-
-
-def test_attitudes_agree_with_scipy():
-    attitude, vector = random_states(20)[:, ATTITUDE], random_states(20, seed=1)[:, :3]
-    own = Rotation.from_quat(attitude.numpy(), scalar_first=True)
-    np.testing.assert_allclose(rotation(attitude), own.as_matrix(), atol=1e-12)
-    angles = vector.clamp(-1.5, 1.5)
-    made = Rotation.from_euler("ZYX", angles.flip(1).numpy())
-    np.testing.assert_allclose(rotation(from_angles(angles)), made.as_matrix(), atol=1e-12)
-
-
-def test_a_steady_turn_ends_where_scipy_says():
-    rates = random_states(8)[:, :3]
-    start = random_states(8, seed=1)[:, ATTITUDE]
-    attitude, h = start, 0.001
-    for _ in range(1000):
-        middle = attitude + h / 2 * turning(attitude, rates)
-        attitude = attitude + h * turning(middle, rates)
-    # Rates are about the body's axes, so the turn comes first.
-    expected = Rotation.from_quat(start.numpy(), scalar_first=True) * Rotation.from_rotvec(rates.numpy())
-    np.testing.assert_allclose(rotation(attitude), expected.as_matrix(), atol=1e-5)
-    torch.testing.assert_close(attitude.norm(dim=1), start.norm(dim=1), rtol=1e-6, atol=0)
-
-
 @pytest.mark.parametrize("system", [Quadrotor(), HEAVY])
 def test_gradients_agree_with_finite_differences(system):
     inputs = [random_states(3), random_states(3, seed=1)[:, :4], random_states(3, seed=2)[:, :6]]
@@ -244,7 +144,7 @@ def test_an_impossible_parameter_is_named_with_its_value(name, value):
 
 
 def test_a_range_of_thrust_that_is_empty_is_named():
-    with pytest.raises(ValueError, match=r"max_thrust must be beyond min_thrust, got 2.0 and 2.21"):
+    with pytest.raises(ValueError, match=r"max_thrust must exceed min_thrust, got 2.0 and 2.21"):
         Quadrotor(max_thrust=2.0)
 
 

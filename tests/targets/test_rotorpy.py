@@ -224,11 +224,14 @@ def test_a_turn_is_braked_as_published(axis, name):
 def test_what_was_diagnosed_stands_beside_what_is_published():
     """Drags add, by the mass; only a parameter that stands alone has its interval."""
 
-    def told(value):
+    def found_at(value):
         return {"value": value, "ci90": [0.9 * value, 1.1 * value]}
 
-    drag = {f"coefficient_{axis}": told(value) for axis, value in zip("xyz", (0.022, 0.022, 0.066), strict=True)}
-    sizes = {"rotor_drag": drag, "wind": {"coefficient": told(0.011), "velocity_x": told(1.4), "velocity_y": told(0.1)}}
+    drag = {f"coefficient_{axis}": found_at(value) for axis, value in zip("xyz", (0.022, 0.022, 0.066), strict=True)}
+    sizes = {
+        "rotor_drag": drag,
+        "wind": {"coefficient": found_at(0.011), "velocity_x": found_at(1.4), "velocity_y": found_at(0.1)},
+    }
     answer = {"verdict": "unexplained", "ranking": [{"effects": ["wind", "rotor_drag"]}], "gap": {"closed": 0.9}}
     rows = {row["what"]: row for row in rows_of("steady wind", answer, sizes, {"drag_x": 0.755, "wind_x": 1.5})}
     said = [rows[name]["value"] for name in ("verdict", "most probable", "gap closed")]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from datasets.quadrotor_references import DEGREE, Settings, basis, main, make, read
+from datasets.quadrotor_references import SPLINE_DEGREE, Settings, basis, main, make, read
 from visadapt.recordings import RecordingError
 from visadapt.systems import Quadrotor
 from visadapt.systems.rigid_body import rotation
@@ -132,7 +132,7 @@ def test_splines_add_up_to_one_and_are_smooth_across_knots():
     time = torch.linspace(0, 10, 41, dtype=torch.float64)
     value = basis(time, 2.0, 5, 0)
     torch.testing.assert_close(value.sum(1), torch.ones_like(time))
-    assert value.shape == (41, 5 + DEGREE)
+    assert value.shape == (41, 5 + SPLINE_DEGREE)
     for order in range(5):
         about_a_knot = torch.tensor([4 - 1e-6, 4 + 1e-6], dtype=torch.float64)
         assert basis(about_a_knot, 2.0, 5, order).diff(dim=0).abs().max() < 1e-5
@@ -168,10 +168,10 @@ def test_a_file_that_is_missing_or_torn_is_one_line(tmp_path):
     torn = tmp_path / "torn.npz"
     main(dataclasses.replace(SMALL, train=2, test=0, out=torn))
     torn.write_bytes(torn.read_bytes()[:2000])
-    with pytest.raises(ValueError, match=r"torn\.npz: not a whole data set of references"):
+    with pytest.raises(ValueError, match=r"torn\.npz: not a complete data set of references"):
         read(torn)
     np.savez(torn, positions=np.zeros((1, 2, 3)))
-    with pytest.raises(ValueError, match="not a whole data set"):
+    with pytest.raises(ValueError, match="not a complete data set"):
         read(torn)
 
 

@@ -22,7 +22,7 @@ from visadapt.storage.atomic_files import replacing
 from visadapt.storage.checkpoints import CheckpointError, load_network
 from visadapt.storage.run_folder import versions
 from visadapt.systems import System
-from visadapt.systems.parameter_file import RigError, load_parameters
+from visadapt.systems.parameter_file import ParameterFileError, load_parameters
 from visadapt.world import World
 
 BAD_INPUT = 2
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         _diagnose(options)
-    except (InputError, RecordingError, RigError, CheckpointError, OSError) as error:
+    except (InputError, RecordingError, ParameterFileError, CheckpointError, OSError) as error:
         print(f"visadapt: {error}", file=sys.stderr)
         return BAD_INPUT
     return 0

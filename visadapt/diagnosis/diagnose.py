@@ -102,7 +102,7 @@ def _diagnose(
 ) -> Diagnosis:
     readings = Readings.of(recording, system)
     rows = readings.rows
-    search = Search(system, rows, searched(effects, system))
+    search = Search(system, rows, searched(effects, system), readings.source)
     search.run(staged(progress, "search"))
     comparison = compare(search)
     best = comparison.best

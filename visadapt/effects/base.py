@@ -7,7 +7,6 @@ Subclasses register themselves by name, so adding an effect is adding a class.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -131,10 +130,10 @@ class Effect(nn.Module):
 
     def with_values(self, values: Tensor) -> Self:
         """The same effect with other parameters: (P,) in the order of `table`, or (B, P), a row for each batch row."""
-        made = copy.copy(self)
-        made._parameters = {}  # plain tensors in their place, so that a gradient flows back to `values`
-        for column, parameter in enumerate(self.table):
-            made.__dict__[parameter.name] = values[..., column]
+        # Plain tensors in the place of registered parameters, so that a gradient flows back to `values`.
+        plain = {parameter.name: values[..., column] for column, parameter in enumerate(self.table)}
+        made = object.__new__(type(self))
+        made.__dict__ = {**self.__dict__, "_parameters": {}, **plain}
         return made
 
     @classmethod

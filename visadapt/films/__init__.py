@@ -1,1 +1,5 @@
-"""Films and plots of what was run."""
+"""Films and plots of runs and results."""
+
+from visadapt.films.filming import film
+
+__all__ = ["film"]

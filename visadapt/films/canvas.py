@@ -1,4 +1,4 @@
-"""A canvas for film frames: crisp text, anti-aliased lines and boxes in fractions of a pixel. Needs no display."""
+"""A canvas for film frames: crisp text, anti-aliased lines and boxes at sub-pixel coordinates. Needs no display."""
 
 from __future__ import annotations
 
@@ -13,23 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-Colour = tuple[int, int, int]
-"""Red, green, blue, 0 to 255."""
+from visadapt.films.colours import HAIRLINE, INK, PAPER, Colour
+
+Floats = NDArray[np.floating]
 Picture = NDArray[np.uint8]
 """(H, W, 3), red, green, blue."""
 
-PAPER: Colour = (255, 255, 255)
-INK: Colour = (31, 41, 51)
-MUTED: Colour = (110, 122, 136)
-HAIRLINE: Colour = (216, 221, 227)
-TROUGH: Colour = (236, 239, 243)
-BLUE: Colour = (47, 103, 201)
-ORANGE: Colour = (222, 116, 22)
-TEAL: Colour = (14, 122, 112)
-RED: Colour = (190, 42, 42)
-
 FRACTION_BITS = 6
 """OpenCV takes coordinates as whole numbers of 2**-FRACTION_BITS px."""
+FARTHEST_PX = 1e5
+"""Coordinates are clipped to +- this, far outside any canvas, so that they fit OpenCV's 32-bit integers."""
 
 
 class Canvas:
@@ -44,7 +37,17 @@ class Canvas:
         inner.pixels = self.pixels[top : top + height, left : left + width]
         return inner
 
-    def line(self, points: NDArray[np.floating], colour: Colour, thickness: int = 1) -> None:
+    @property
+    def width(self) -> int:
+        """px"""
+        return self.pixels.shape[1]
+
+    @property
+    def height(self) -> int:
+        """px"""
+        return self.pixels.shape[0]
+
+    def line(self, points: Floats, colour: Colour, thickness: int = 1) -> None:
         """A polyline through points (n, 2)."""
         if len(points) > 1:
             cv2.polylines(self.pixels, [_fixed(points)], False, colour, thickness, cv2.LINE_AA, FRACTION_BITS)
@@ -57,25 +60,29 @@ class Canvas:
             stop = min(at + length, whole)
             self.line(np.stack([a + (b - a) * at / whole, a + (b - a) * stop / whole]), colour)
 
-    def polygon(self, corners: Sequence[tuple[float, float]] | NDArray[np.floating], colour: Colour) -> None:
+    def polygon(self, corners: Sequence[tuple[float, float]] | Floats, colour: Colour) -> None:
         """A filled convex polygon."""
         cv2.fillConvexPoly(self.pixels, _fixed(np.array(corners)), colour, cv2.LINE_AA, FRACTION_BITS)
 
-    def glass(self, corners: NDArray[np.floating], colour: Colour, share: float) -> None:
-        """A filled convex polygon that lets through all but `share` of what is behind it."""
-        height, width = self.pixels.shape[:2]
-        left, top = np.clip(np.floor(corners.min(0)).astype(int) - 1, 0, (width, height))
-        right, bottom = np.clip(np.ceil(corners.max(0)).astype(int) + 1, 0, (width, height))
+    def disc(self, centre: Floats, radius: float, colour: Colour, corners: int = 20) -> None:
+        """A filled disc, drawn as a regular polygon."""
+        angle = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+        self.polygon(centre + radius * np.stack([np.cos(angle), np.sin(angle)], -1), colour)
+
+    def glass(self, corners: Floats, colour: Colour, opacity: float) -> None:
+        """A filled convex polygon of an opacity in [0, 1]."""
+        size = (self.width, self.height)
+        left, top = np.clip(np.floor(corners.min(0)).astype(int) - 1, 0, size)
+        right, bottom = np.clip(np.ceil(corners.max(0)).astype(int) + 1, 0, size)
         if left < right and top < bottom:
             cover = np.zeros((bottom - top, right - left), np.uint8)
             cv2.fillConvexPoly(cover, _fixed(corners - (left, top)), 255, cv2.LINE_AA, FRACTION_BITS)
             inside = (slice(top, bottom), slice(left, right))
-            self._blend(inside, cover.astype(np.float32) * (share / 255), colour)
+            self._blend(inside, cover.astype(np.float32) * (opacity / 255), colour)
 
     def box(self, left: float, top: float, right: float, bottom: float, colour: Colour) -> None:
         """A filled box; its edges blend with what is behind them in proportion to the pixels they cover."""
-        height, width = self.pixels.shape[:2]
-        rows, columns = _cover(top, bottom, height), _cover(left, right, width)
+        rows, columns = _cover(top, bottom, self.height), _cover(left, right, self.width)
         y, x = np.flatnonzero(rows), np.flatnonzero(columns)
         if len(y) and len(x):
             inside = (slice(y[0], y[-1] + 1), slice(x[0], x[-1] + 1))
@@ -91,10 +98,10 @@ class Canvas:
     def arrow(
         self, tail: tuple[float, float], tip: tuple[float, float], colour: Colour, thickness: float = 6.0
     ) -> None:
-        """A level arrow with a solid head; a short one is all head."""
+        """A horizontal arrow with a solid head; one shorter than its head is drawn as the head alone."""
         length = abs(tip[0] - tail[0])
-        way, head, y = np.sign(tip[0] - tail[0]), min(length, 2.6 * thickness), tip[1]
-        neck, half = tip[0] - way * head, head / 2.6
+        sign, head, y = np.sign(tip[0] - tail[0]), min(length, 2.6 * thickness), tip[1]
+        neck, half = tip[0] - sign * head, head / 2.6
         if length > head:
             self.box(min(tail[0], neck), y - thickness / 2, max(tail[0], neck), y + thickness / 2, colour)
         self.polygon([(tip[0], y), (neck, y - half * 1.3), (neck, y + half * 1.3)], colour)
@@ -109,26 +116,25 @@ class Canvas:
         bold: bool = False,
         align: Literal["left", "centre", "right"] = "left",
     ) -> None:
-        """A line of text at x px, `size` px tall."""
+        """A line of text, `size` px tall; `align` says which of its ends, or its middle, is at x px."""
         mask, left, top, advance = _glyphs(string, size, bold)
         start = round(x - {"left": 0.0, "centre": advance / 2, "right": advance}[align]) + left
         row = round(baseline) + top
-        height, width = self.pixels.shape[:2]
         upper, first = max(row, 0), max(start, 0)
-        lower, last = min(row + mask.shape[0], height), min(start + mask.shape[1], width)
+        lower, last = min(row + mask.shape[0], self.height), min(start + mask.shape[1], self.width)
         if upper < lower and first < last:
             cover = mask[upper - row : lower - row, first - start : last - start]
             self._blend((slice(upper, lower), slice(first, last)), cover, colour)
 
     def paste(self, left: int, top: int, picture: Picture) -> None:
-        """Puts a picture that fits on the canvas."""
+        """Copies a picture, which must fit on the canvas, to (left, top) px."""
         self.pixels[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
 
     def fade(self, share: float, colour: Colour = PAPER) -> None:
-        """Blends the whole area towards a colour."""
+        """Blends the whole area a share of the way towards a colour."""
         self._blend((slice(None), slice(None)), np.array(share, np.float32)[None, None], colour)
 
-    def _blend(self, inside: tuple[slice, slice], cover: NDArray[np.floating], colour: Colour) -> None:
+    def _blend(self, inside: tuple[slice, slice], cover: Floats, colour: Colour) -> None:
         below = self.pixels[inside].astype(np.float32)
         blended = below + (np.array(colour, np.float32) - below) * cover[..., None]
         self.pixels[inside] = np.round(blended).astype(np.uint8)
@@ -141,7 +147,7 @@ def text_width(string: str, size: int, bold: bool = False) -> float:
 
 @lru_cache(maxsize=4)
 def _font_file(bold: bool) -> Path:
-    # The one typeface that is there wherever matplotlib is; its digits are all equally wide, so numbers stand still.
+    # Installed with matplotlib; its digits are all equally wide, so that numbers do not jitter from frame to frame.
     return Path(matplotlib.get_data_path()) / "fonts" / "ttf" / ("DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf")
 
 
@@ -151,7 +157,7 @@ def _font(size: int, bold: bool) -> ImageFont.FreeTypeFont:
 
 
 @lru_cache(maxsize=4096)
-def _glyphs(string: str, size: int, bold: bool) -> tuple[NDArray[np.floating], int, int, float]:
+def _glyphs(string: str, size: int, bold: bool) -> tuple[Floats, int, int, float]:
     """Cover (h, w) in [0, 1], its left and top edge from the origin of the baseline in px, and the text's advance."""
     font = _font(size, bold)
     left, top, right, bottom = (int(edge) for edge in font.getbbox(string, anchor="ls"))
@@ -160,12 +166,12 @@ def _glyphs(string: str, size: int, bold: bool) -> tuple[NDArray[np.floating], i
     return np.asarray(image, np.float32) / 255, left, top, float(font.getlength(string))
 
 
-def _fixed(points: NDArray[np.floating]) -> NDArray[np.int32]:
+def _fixed(points: Floats) -> NDArray[np.int32]:
     """Fixed-point coordinates; OpenCV has pixel centres at whole numbers, this canvas half a pixel further on."""
-    return np.round((points - 0.5) * 2**FRACTION_BITS).astype(np.int32)
+    return np.round((points.clip(-FARTHEST_PX, FARTHEST_PX) - 0.5) * 2**FRACTION_BITS).astype(np.int32)
 
 
-def _cover(start: float, stop: float, size: int) -> NDArray[np.floating]:
-    """(size,) how much of each pixel lies between two edges."""
+def _cover(start: float, stop: float, size: int) -> Floats:
+    """(size,) share of each pixel that lies between two edges."""
     edges = np.arange(size, dtype=np.float32)
     return np.clip(np.minimum(edges + 1, stop) - np.maximum(edges, start), 0, 1)

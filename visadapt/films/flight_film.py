@@ -1,160 +1,139 @@
-"""Films of flights side by side: a close-up in three dimensions, the goal magnified, and the distance over time.
+"""Films of flights: a close-up in three dimensions, the surroundings of the goal magnified, the distance over time.
 
-    panels = [FlownPanel("source", run, flight.system, target.task, target.first[0]), ...]
-    write_flight_film("film.mp4", panels)
+    panels = [FlightPanel("source", run, flight.system, target.task, target.first[0]), ...]
+    FlightFilm(panels).write("film.mp4")
 
-All panels share one clock and one set of scales. A path is teal where it is on its course and red where it is far
-off; a flight that failed is marked from the moment on at which it did.
+All panels share one clock and one set of scales. A path is teal on its course and red far off it; a flight that failed
+is marked from that moment on.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from visadapt.films.canvas import BLUE, INK, MUTED, TEAL, Canvas, Picture
-from visadapt.films.drawing3d import Floats
-from visadapt.films.flight_panel import FINE, FlownPanel
-from visadapt.films.flight_views import EARLIER, VIOLET, Scales, draw_box, draw_close_up, draw_overview
-from visadapt.films.video import GUTTER, MARGIN, write_frames, write_picture
-from visadapt.films.widgets import Plot, banner, bar, ceiling, headline, reading
+from visadapt.films.canvas import Canvas, Floats
+from visadapt.films.colours import BLUE, INK, MUTED, ROSE, TEAL, VIOLET
+from visadapt.films.film import Film
+from visadapt.films.flight_panel import FlightPanel
+from visadapt.films.flight_views import FlightScales, draw_box, draw_close_up, draw_overview
+from visadapt.films.widgets import Plot, banner, bar, headline, reading
 
-__all__ = ["FlownPanel", "flight_still", "write_flight_film", "write_flight_still"]
-
-PERIOD = 2 * FINE
-"""s between frames"""
-HOLD = 1.5
-"""s for which the end is shown"""
-WIDTH, TITLE, SCENE, BOX, READINGS, BARS, CHART = 480, 40, 360, 152, 42, 68, 124
-"""px, of a panel and its parts below each other, GAP apart"""
-GAP = 14
-HEIGHT = TITLE + SCENE + BOX + READINGS + BARS + CHART + 4 * GAP
-COMMANDS = {"quadrotor": ("thrust", "roll rate", "pitch rate", "yaw rate")}
-"""Names of commands, where they are not the system's own"""
+PANEL_WIDTH, TITLE_HEIGHT, SCENE_HEIGHT, BOX_SIDE = 480, 40, 360, 152
+"""px"""
+READINGS_HEIGHT, BARS_HEIGHT, CHART_HEIGHT, PART_GAP = 42, 68, 124, 14
+"""px, of the other parts of a panel, and between parts"""
+COMMAND_LABELS = {"rate_x": "roll rate", "rate_y": "pitch rate", "rate_z": "yaw rate"}
+"""Labels of the commands whose names alone would not say what they are."""
 
 
-def flight_still(panels: Sequence[FlownPanel], t: float) -> Picture:
-    """The film's frame (H, W, 3) at t s, height and width even."""
-    return _frame(panels, t, _scales(panels))
-
-
-def write_flight_still(path: str | os.PathLike[str], panels: Sequence[FlownPanel], t: float) -> None:
-    """Write the film's frame at t s as a PNG."""
-    write_picture(path, flight_still(panels, t))
-
-
-def write_flight_film(
-    path: str | os.PathLike[str],
-    panels: Sequence[FlownPanel],
-    progress: Callable[[int, int], None] | None = None,
-) -> None:
-    """Write an mp4 (H.264, yuv420p) in real time, 25 frames a second, that rests on its end.
+@dataclass(frozen=True)
+class FlightFilm(Film):
+    """Flights side by side.
 
     Raises:
-        ValueError: no panels, or some that follow a reference beside others that fly through a point.
-        DiskFullError: the disk is full; nothing stands under the film's name that did not before.
-        FilmError: ffmpeg gave up for another reason.
+        ValueError: no panels, or flights along a reference beside flights through a point.
     """
-    scales = _scales(panels)
-    times = [k * PERIOD for k in range(round((scales.duration + HOLD) / PERIOD) + 1)]
-    write_frames(path, lambda t: _frame(panels, t, scales), times, PERIOD, progress)
+
+    panels: Sequence[FlightPanel]
+    period: float = 0.04
+    end_shown: float = 1.5
+    """s for which the last instant is shown"""
+
+    panel_width = PANEL_WIDTH
+    panel_height = TITLE_HEIGHT + SCENE_HEIGHT + BOX_SIDE + READINGS_HEIGHT + BARS_HEIGHT + CHART_HEIGHT + 4 * PART_GAP
+
+    def __post_init__(self) -> None:
+        if not self.panels:
+            raise ValueError("a film needs at least one panel")
+        if len({panel.follows for panel in self.panels}) > 1:
+            raise ValueError("flights along a reference and through a point share no scales: film them apart")
+
+    @property
+    def times(self) -> list[float]:
+        return [k * self.period for k in range(round((self.scales.duration + self.end_shown) / self.period) + 1)]
+
+    @cached_property
+    def scales(self) -> FlightScales:
+        """Shared by all panels"""
+        return FlightScales.of(self.panels)
+
+    def draw_panel(self, canvas: Canvas, panel: FlightPanel, t: float) -> None:
+        i, scales = panel.instant(t), self.scales
+        headline(canvas, TITLE_HEIGHT - 14, PANEL_WIDTH, panel.title, f"t = {panel.times[i]:5.2f} s")
+        top = TITLE_HEIGHT
+        scene = canvas.part(0, top, PANEL_WIDTH, SCENE_HEIGHT)
+        draw_close_up(scene, panel, i, scales)
+        _draw_distance(scene, panel, i, scales)
+        scene.frame(0, 0, PANEL_WIDTH, SCENE_HEIGHT)
+        top += SCENE_HEIGHT + PART_GAP
+        wide = PANEL_WIDTH - 2 * BOX_SIDE - 2 * 12
+        draw_overview(canvas.part(0, top, wide, BOX_SIDE), panel, i, scales)
+        boxes = (((0, 1), "from above"), ((0, 2), "from the side"))
+        if not panel.follows:
+            boxes = (((-1, 2), "target, from behind"), ((0, 2), "from the side"))
+        for k, (axes, name) in enumerate(boxes):
+            left = wide + 12 + k * (BOX_SIDE + 12)
+            draw_box(canvas.part(left, top, BOX_SIDE, BOX_SIDE), panel, i, scales, axes, name)
+        top += BOX_SIDE + PART_GAP
+        _draw_readings(canvas.part(0, top, PANEL_WIDTH, READINGS_HEIGHT), panel, i, scales)
+        top += READINGS_HEIGHT + PART_GAP
+        _draw_commands(canvas.part(0, top, PANEL_WIDTH, BARS_HEIGHT), panel, i)
+        top += BARS_HEIGHT + PART_GAP
+        _draw_chart(canvas.part(0, top, PANEL_WIDTH, CHART_HEIGHT), panel, i, scales)
 
 
-def _scales(panels: Sequence[FlownPanel]) -> Scales:
-    if not panels:
-        raise ValueError("a film needs at least one panel")
-    if len({panel.follows for panel in panels}) > 1:
-        raise ValueError("flights along a reference and through a point have no scales in common: film them apart")
-    return Scales.of(panels)
-
-
-def _frame(panels: Sequence[FlownPanel], t: float, scales: Scales) -> Picture:
-    width = 2 * MARGIN + WIDTH * len(panels) + GUTTER * (len(panels) - 1)
-    canvas = Canvas(width + width % 2, (2 * MARGIN + HEIGHT - 12) // 2 * 2)
-    for k, panel in enumerate(panels):
-        part = canvas.part(MARGIN + k * (WIDTH + GUTTER), MARGIN - 12, WIDTH, HEIGHT)
-        _draw_panel(part, panel, t, scales)
-    return canvas.pixels
-
-
-def _draw_panel(canvas: Canvas, panel: FlownPanel, t: float, scales: Scales) -> None:
-    """A panel as it is at t s; after its end it stands still."""
-    i = panel.instant(t)
-    headline(canvas, TITLE - 14, WIDTH, panel.title, f"t = {panel.times[i]:5.2f} s")
-    top = TITLE
-    scene = canvas.part(0, top, WIDTH, SCENE)
-    draw_close_up(scene, panel, i, scales)
-    _draw_verdict(scene, panel, i, scales)
-    scene.frame(0, 0, WIDTH, SCENE)
-    top += SCENE + GAP
-    side, wide = BOX, WIDTH - 2 * BOX - 2 * 12
-    draw_overview(canvas.part(0, top, wide, BOX), panel, i, scales)
-    boxes = (((0, 1), "from above"), ((0, 2), "from the side"))
-    if not panel.follows:
-        boxes = (((-1, 2), "target, from behind"), ((0, 2), "from the side"))
-    for k, (axes, name) in enumerate(boxes):
-        left = wide + 12 + k * (side + 12)
-        draw_box(canvas.part(left, top, side, BOX), panel, i, scales, axes, name)
-    top += BOX + GAP
-    _draw_readings(canvas.part(0, top, WIDTH, READINGS), panel, i, scales)
-    top += READINGS + GAP
-    _draw_commands(canvas.part(0, top, WIDTH, BARS), panel, i)
-    top += BARS + GAP
-    _draw_chart(canvas.part(0, top, WIDTH, CHART), panel, i, scales)
-
-
-def _draw_verdict(canvas: Canvas, panel: FlownPanel, i: int, scales: Scales) -> None:
-    """How far off the flight is; and how it failed, if it did by now."""
+def _draw_distance(canvas: Canvas, panel: FlightPanel, i: int, scales: FlightScales) -> None:
+    """The flight's distance from its course; a banner instead once it has failed."""
     t, failed = panel.times[i], panel.failed
     if failed is not None and t >= failed - 1e-6:
         if not panel.run.survived and i == len(panel.times) - 1:
             canvas.fade(0.6)
-            said = f"LOST at t = {panel.end:.2f} s"
+            text = f"LOST at t = {panel.end:.2f} s"
         else:
-            said = f"STRAYED at t = {failed:.2f} s" if panel.follows else f"MISSED by {_length(panel.worst)}"
-        banner(canvas, WIDTH / 2, 32, said)
+            text = f"STRAYED at t = {failed:.2f} s" if panel.follows else f"MISSED by {_length(panel.worst)}"
+        banner(canvas, canvas.width / 2, 32, text)
         return
     if panel.follows:
-        said, away = f"{_length(panel.away[i])} off", panel.away[i]
+        text, away = f"{_length(panel.away[i])} off", panel.away[i]
     elif t >= panel.passed:
-        said, away = f"passed {_length(panel.worst)} off", panel.worst
+        text, away = f"passed {_length(panel.worst)} off", panel.worst
     else:
         return
-    canvas.text(14, 34, said, 22, scales.colour(float(away)), bold=True)
+    canvas.text(14, 34, text, 22, scales.colour(float(away)), bold=True)
 
 
-def _draw_readings(canvas: Canvas, panel: FlownPanel, i: int, scales: Scales) -> None:
-    force = float(np.linalg.norm(panel.force[i]))
-    far, so_far = _split(panel.away[i]), _split(panel.scored(i))
+def _draw_readings(canvas: Canvas, panel: FlightPanel, i: int, scales: FlightScales) -> None:
+    force, width = float(np.linalg.norm(panel.force[i])), canvas.width
+    away, so_far = _split(panel.away[i]), _split(panel.scored(i))
     names = ("off the reference", "mean so far") if panel.follows else ("to the target", "nearest so far")
     reading(canvas, 0, "speed", f"{panel.speed[i]:.2f}", "m/s")
-    reading(canvas, 0.22 * WIDTH, names[0], *far)
-    open_still = not panel.follows and panel.times[i] < panel.passed
-    reading(canvas, 0.5 * WIDTH, names[1], *so_far, INK if open_still else scales.colour(panel.scored(i)))
-    reading(canvas, 0.755 * WIDTH, "hidden force", f"{force:.2f}", "N", VIOLET if force >= 0.005 else MUTED)
+    reading(canvas, 0.22 * width, names[0], *away)
+    undecided = not panel.follows and panel.times[i] < panel.passed
+    reading(canvas, 0.5 * width, names[1], *so_far, INK if undecided else scales.colour(panel.scored(i)))
+    reading(canvas, 0.755 * width, "hidden force", f"{force:.2f}", "N", VIOLET if force >= 0.005 else MUTED)
 
 
-def _draw_commands(canvas: Canvas, panel: FlownPanel, i: int) -> None:
-    names = COMMANDS.get(panel.vehicle.name, tuple(variable.name for variable in panel.vehicle.actions))
-    live = panel.row(i) < len(panel.run.episode.time) - 1
-    for k, (name, value) in enumerate(zip(names, panel.command(i), strict=True)):
-        part = canvas.part(k % 2 * (WIDTH // 2 + 14), k // 2 * 36, WIDTH // 2 - 14, 36)
-        bar(part, 10, WIDTH / 2 - 14, name, float(value) if live else None, 1.0, "", BLUE)
+def _draw_commands(canvas: Canvas, panel: FlightPanel, i: int) -> None:
+    last, half = panel.row(i) == len(panel.run.episode.time) - 1, canvas.width // 2
+    for k, (variable, value) in enumerate(zip(panel.vehicle.actions, panel.command(i), strict=True)):
+        part = canvas.part(k % 2 * (half + 14), k // 2 * 36, half - 14, 36)
+        label = COMMAND_LABELS.get(variable.name, variable.name)
+        bar(part, 10, half - 14, label, None if last else float(value), 1.0, "", BLUE)
 
 
-def _draw_chart(canvas: Canvas, panel: FlownPanel, i: int, scales: Scales) -> None:
-    """The distance until now, and its mean, or the nearest, until now."""
-    plot = Plot(WIDTH, CHART, scales.duration, left=34.0 if panel.follows else 48.0)
-    step = ceiling(scales.duration / 7)
-    ticks = [float(t) for t in np.arange(0, scales.duration * 1.0001, step)]
+def _draw_chart(canvas: Canvas, panel: FlightPanel, i: int, scales: FlightScales) -> None:
+    """The distance up to an instant, and the score up to it: the mean distance, or the least."""
+    plot = Plot(canvas.width, canvas.height, scales.duration, left=34.0 if panel.follows else 48.0)
     if panel.follows:
-        name, said = "distance to the reference, cm", f"mean {_length(panel.scored(i))}"
+        name, text = "distance to the reference, cm", f"mean {_length(panel.scored(i))}"
         levels = {share: f"{100 * share * scales.far:g}" for share in (0.0, 0.5, 1.0)}
     else:
-        name, said = "distance to the target", f"nearest {_length(panel.scored(i))}"
-        levels = {k / 5: said for k, said in enumerate(("1 mm", "1 cm", "10 cm", "1 m", "10 m", "100 m"))}
+        name, text = "distance to the target", f"nearest {_length(panel.scored(i))}"
+        levels = {k / 5: label for k, label in enumerate(("1 mm", "1 cm", "10 cm", "1 m", "10 m", "100 m"))}
 
     def height(away: Floats) -> Floats:
         if panel.follows:
@@ -162,18 +141,17 @@ def _draw_chart(canvas: Canvas, panel: FlownPanel, i: int, scales: Scales) -> No
         return np.asarray((np.log10(away.clip(1e-3, 1e4)) + 3) / 5)
 
     canvas.text(0, 12, name, 12, TEAL, bold=True)
-    canvas.text(WIDTH, 12, said, 12, INK, bold=True, align="right")
-    plot.axes(canvas, levels, ticks)
+    canvas.text(canvas.width, 12, text, 12, INK, bold=True, align="right")
+    plot.axes(canvas, levels)
     if panel.earlier is not None:
         other = panel.earlier
-        plot.line(canvas, plot.place(other.times, height(other.distances))[: i + 1], EARLIER, 2)
+        plot.line(canvas, plot.place(other.times, height(other.distances))[: i + 1], ROSE, 2)
     line = plot.place(panel.times, height(panel.distances))[: i + 1]
     plot.line(canvas, line, TEAL, 2)
     rows = panel.row(i) + 1
     times = np.arange(rows) * panel.task.period
     plot.line(canvas, plot.place(times, height(panel.score[:rows])), INK, 1)
-    lost = not panel.run.survived and i == len(panel.times) - 1
-    plot.cursor(canvas, line[-1], TEAL, lost)
+    plot.cursor(canvas, line[-1], TEAL, failed=not panel.run.survived and i == len(panel.times) - 1)
 
 
 def _length(metres: float) -> str:

@@ -1,4 +1,4 @@
-"""A flight as a film shows it: on a clock finer than the commands', with what it was to follow or fly through."""
+"""A flight as a film shows it: interpolated between its rows, beside the course that it was to fly."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from visadapt.evaluation.flight_score import FAR
-from visadapt.films.drawing3d import Floats
+from visadapt.films.canvas import Floats
 from visadapt.systems import RigidBody
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, VELOCITY, rotation
 from visadapt.targets.rollout import Run
@@ -20,23 +19,21 @@ from visadapt.tasks.follow import Follow
 from visadapt.tasks.reach import Reach
 from visadapt.tasks.references import cubic
 
-FINE = 0.02
-"""s between instants"""
-AFTER = 0.5
-"""s that a flight is shown for after it passed its target"""
-LIMIT = 1e4
-"""m, and m/s: a flight that strays further is shown as if it were there"""
+INSTANT_PERIOD_S = 0.02
+"""s between the instants at which a flight is interpolated"""
+LARGEST_DRAWN = 1e4
+"""m, m/s and N: positions, velocities and forces are clipped to +- this before they are drawn"""
 
 
 @dataclass(frozen=True)
-class FlownPanel:
-    """A flight, and the task that it flew.
+class FlightPanel:
+    """A flight and its task.
 
-    Between rows, positions are cubics through the rows' positions and velocities, attitudes and forces are
-    interpolated, and commands are held. Arrays are over instants (N, ...), FINE apart, unless they say otherwise.
+    Between rows, positions are cubic Hermite splines of the rows' positions and velocities, attitudes and forces are
+    linear, and commands are held. Arrays are over instants (N, ...), INSTANT_PERIOD_S apart, unless stated otherwise.
 
     Raises:
-        ValueError: a run without states of a rigid body, or longer than its reference; a task of another kind.
+        ValueError: a run without states of a rigid body, or longer than its reference; a course of another kind.
     """
 
     title: str
@@ -45,37 +42,40 @@ class FlownPanel:
     task: FlightTask
     """`Follow`, or `Reach`"""
     task_state: Tensor
-    """in which the flight began: one of `FlightTarget.first`"""
-    earlier: FlownPanel | None = None
-    """a flight to compare with, drawn faintly"""
+    """in which the flight began, in the task's own numbers: the first row of the episode's `task_state`"""
+    earlier: FlightPanel | None = None
+    """another flight, drawn faintly for comparison"""
 
     def __post_init__(self) -> None:
         if not isinstance(self.task, Follow | Reach):
-            raise ValueError(f"panel {self.title!r}: no picture is known of a task {type(self.task).__name__}")
+            raise ValueError(
+                f"panel {self.title!r}: no picture is known of a task {type(self.task).__name__}; "
+                "Follow and Reach can be filmed"
+            )
         state = self.run.episode.state
         if state is None or state.shape[1] != len(self.vehicle.states):
             raise ValueError(f"panel {self.title!r}: the run has no states of a {self.vehicle.name} to show")
         if isinstance(self.task, Follow) and len(state) > self.task.steps + 1:
             raise ValueError(
-                f"panel {self.title!r}: the run has {len(state)} rows, its reference {self.task.steps + 1}"
+                f"panel {self.title!r}: the run has {len(state)} rows, its reference only {self.task.steps + 1}"
             )
 
     @property
     def follows(self) -> bool:
-        """Whether the flight is to follow a reference, and not to fly through a point."""
+        """True where the course is a reference to follow, False where it is a point to fly through."""
         return isinstance(self.task, Follow)
 
     @cached_property
     def states(self) -> Floats:
-        """(rows, 13) that are shown: those of a flight through a point end soon after it is passed."""
+        """(rows, 13) that are shown: a flight through a point is shown until 0.5 s after it passed the point."""
         state = self.run.episode.state
         assert state is not None
-        held = np.array(state, float)
-        held[:, : VELOCITY.stop] = held[:, : VELOCITY.stop].clip(-LIMIT, LIMIT)
+        clipped = np.array(state, float)
+        clipped[:, : VELOCITY.stop] = clipped[:, : VELOCITY.stop].clip(-LARGEST_DRAWN, LARGEST_DRAWN)
         if self.follows:
-            return held
-        nearest = int(self._misses(held).argmin()) if len(held) > 1 else 0
-        return held[: nearest + 2 + round(AFTER / self.task.period)]
+            return clipped
+        nearest = int(self._misses(clipped).argmin()) if len(clipped) > 1 else 0
+        return clipped[: nearest + 2 + round(0.5 / self.task.period)]
 
     @property
     def end(self) -> float:
@@ -85,11 +85,11 @@ class FlownPanel:
     @cached_property
     def times(self) -> Floats:
         """(N,) s"""
-        return np.arange(round(self.end / FINE) + 1) * FINE
+        return np.arange(round(self.end / INSTANT_PERIOD_S) + 1) * INSTANT_PERIOD_S
 
     def instant(self, t: float) -> int:
         """The last instant at or before t s."""
-        return min(max(int(t / FINE + 1e-6), 0), len(self.times) - 1)
+        return min(max(int(t / INSTANT_PERIOD_S + 1e-6), 0), len(self.times) - 1)
 
     def row(self, instant: int) -> int:
         """The last row at or before an instant."""
@@ -110,32 +110,33 @@ class FlownPanel:
     def attitude(self) -> Floats:
         """(N, 3, 3) from body to world axes"""
         turns = self.states[:, ATTITUDE]
-        # A quaternion and its negative are one attitude: take those that are near each other.
+        # A quaternion and its negative are the same attitude: choose signs so that neighbouring rows are close.
         flips = np.where((turns[1:] * turns[:-1]).sum(1) < 0, -1.0, 1.0)
         turns = turns * np.concatenate([[1.0], flips.cumprod()])[:, None]
         return rotation(torch.from_numpy(self._between(turns))).numpy()
 
     @cached_property
     def force(self) -> Floats:
-        """(N, 3) N"""
-        told = self.run.force[: len(self.states)]
-        known = told if told.ndim == 2 else np.zeros((len(told), 3))  # of a target that does not tell
-        return self._between(known.clip(-LIMIT, LIMIT))
+        """(N, 3) N, zeros where the target does not know its disturbance"""
+        force = self.run.force[: len(self.states)]
+        if force.ndim == 1:
+            force = np.zeros((len(force), 3))
+        return self._between(force.clip(-LARGEST_DRAWN, LARGEST_DRAWN))
 
     def command(self, instant: int) -> Floats:
-        """(4,), held from a row to the next"""
+        """(4,) in [-1, 1], held from a row to the next"""
         return np.asarray(self.run.episode.action[self.row(instant)])
 
     @cached_property
     def reference(self) -> Floats:
-        """(M, 3) m, the whole reference from its start, FINE apart; or the straight line to the point, (2, 3)."""
+        """(M, 3) m, the whole reference, INSTANT_PERIOD_S apart; or (2, 3), start and end of the line to the point."""
         if isinstance(self.task, Reach):
             return np.stack([self.states[0, POSITION], self.task_state.double().numpy()])
         whole, which = self._along.references, int(self.task_state[0])
         rows = slice(int(self.task_state[1]), None)
         positions, velocities = (part[which, rows].double().numpy() for part in (whole.positions, whole.velocities))
-        count = round((len(positions) - 1) * whole.period / FINE) + 1
-        return self._smooth(positions, velocities, np.arange(count) * FINE)
+        count = round((len(positions) - 1) * whole.period / INSTANT_PERIOD_S) + 1
+        return self._smooth(positions, velocities, np.arange(count) * INSTANT_PERIOD_S)
 
     @cached_property
     def goal(self) -> Floats:
@@ -151,9 +152,9 @@ class FlownPanel:
 
     @cached_property
     def score(self) -> Floats:
-        """(rows,) m up to each row, as flights are scored: the mean distance, or the nearest that it came."""
+        """(rows,) m, the score up to each row: the mean distance to the reference, or the least to the point."""
         if self.follows:
-            every = round(self.task.period / FINE)
+            every = round(self.task.period / INSTANT_PERIOD_S)
             away = self.away[::every]
             mean: Floats = away[1:].cumsum() / np.arange(1, len(away))
             return np.concatenate([away[:1], mean])
@@ -165,7 +166,7 @@ class FlownPanel:
 
     @cached_property
     def distances(self) -> Floats:
-        """(N,) m, to the goal, that of the instant of passing a target being how far it was missed"""
+        """(N,) m, to the goal; at the instant that is nearest to a point, the distance by which it was missed"""
         out = self.away.copy()
         if not self.follows:
             out[out.argmin()] = self.worst
@@ -173,7 +174,7 @@ class FlownPanel:
 
     @cached_property
     def nearest(self) -> Floats:
-        """(3,) m: where the path, taken as straight between rows, came nearest to the target"""
+        """(3,) m: where the path, straight between rows, came nearest to the point"""
         row = int(self.score.argmin())
         start, end = self.states[max(row - 1, 0), POSITION], self.states[row, POSITION]
         way = end - start
@@ -182,12 +183,12 @@ class FlownPanel:
 
     @cached_property
     def passed(self) -> float:
-        """s at which a flight came nearest to its target"""
+        """s at which the flight came nearest to its point"""
         return float(self.score.argmin() * self.task.period)
 
     @cached_property
     def failed(self) -> float | None:
-        """s at which the flight is known to have failed; None where it did not."""
+        """s at which the flight failed, more than FAR off or lost; None where it did not."""
         lost = None if self.run.survived else self.end
         if self.follows:
             far = np.flatnonzero(self.away > FAR)
@@ -205,12 +206,12 @@ class FlownPanel:
         return self.task
 
     def _misses(self, states: Floats) -> Floats:
-        """(rows - 1,) m: how near each step of a flight came to its target."""
+        """(rows - 1,) m: the least distance to the point over each step."""
         steps = torch.from_numpy(np.stack([states[:-1], states[1:]], 1))
         return np.asarray(self.task.misses(steps, self.task_state.double().expand(len(steps), 3))[:, 0])
 
     def _smooth(self, values: Floats, slopes: Floats, times: Floats) -> Floats:
-        """Values (M, n) at times (M,) of the cubics through values and slopes (rows, n)."""
+        """Values (M, n) at times (M,) of the cubic Hermite splines of values and slopes (rows, n)."""
         if len(values) == 1:
             return values
         rows = torch.arange(len(values)).double() * self.task.period
@@ -221,5 +222,4 @@ class FlownPanel:
         at = self.times / self.task.period
         row = np.minimum(at.astype(int), max(len(values) - 2, 0))
         share = (at - row).reshape(-1, *[1] * (values.ndim - 1))
-        following: NDArray[np.intp] = np.minimum(row + 1, len(values) - 1)
-        return np.asarray(values[row] * (1 - share) + values[following] * share)
+        return np.asarray(values[row] * (1 - share) + values[np.minimum(row + 1, len(values) - 1)] * share)

@@ -1,4 +1,4 @@
-"""Pictures of numbers: the losses of the joint loop, and what was measured over the samples that were counted."""
+"""Plots: the losses of the joint loop, and results over the number of counted target samples."""
 
 from __future__ import annotations
 
@@ -14,26 +14,30 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
+from visadapt.films import colours
 from visadapt.learning.joint import Round
 from visadapt.storage.atomic_files import replacing
 
-BLUE, ORANGE, TEAL, INK, MUTED, HAIRLINE = "#2f67c9", "#de7416", "#0e7a70", "#1f2933", "#6e7a88", "#d8dde3"
-PAPER_VALUE = (1000, 0.29)
-"""Samples and m/s: the paper's image policy in the target after adaptation, its checkpoint chosen on the target."""
+BLUE, ORANGE, TEAL, INK, MUTED, HAIRLINE = (
+    colours.hexadecimal(colour)
+    for colour in (colours.BLUE, colours.ORANGE, colours.TEAL, colours.INK, colours.MUTED, colours.HAIRLINE)
+)
+REFERENCE_LEVELS = (("target", "before adaptation", ORANGE), ("source", "in the source", MUTED))
+"""Domains of results without adaptation, drawn as levels: label and colour."""
 
 
 def plot_losses(path: str | os.PathLike[str], rounds: Sequence[Round]) -> None:
-    """Both losses over the iterations of the joint loop, in the order in which they were run.
+    """Write a PNG of grounding and policy losses over the iterations of the joint loop, in the order they were run.
 
-    A round grounds the simulator first, then tunes the policy, so the two curves take turns. A linear residual is
-    solved for: its loss falls in one step, drawn straight down to a dot.
+    A round grounds the simulator first, then tunes the policy, so the two curves alternate. A linear residual is
+    solved in one step: its loss is drawn as a vertical line down to a dot.
     """
     if not rounds:
         raise ValueError("no rounds to plot")
     figure = Figure(figsize=(9.0, 5.4), dpi=150, layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
     start = 0.0
-    whole = sum(_span([row[0] for row in each.grounding]) + _span(range(len(each.policy))) for each in rounds)
+    whole = sum(_iterations(each) + len(each.policy) for each in rounds)
     for i, each in enumerate(rounds):
         first = i == 0
         for axes in (upper, lower):
@@ -48,18 +52,17 @@ def plot_losses(path: str | os.PathLike[str], rounds: Sequence[Round]) -> None:
             fontsize=8,
         )
         for column, colour, name in ((1, BLUE, "training data"), (2, ORANGE, "held out")):
-            points = np.array([_floats(row[0], row[column]) for row in each.grounding]).reshape(-1, 2)
+            points = np.array([(row[0], row[column]) for row in each.grounding], float).reshape(-1, 2)
             label = name if first else None
             solved = len(points) == 2
-            if solved:  # beside each other, or one would hide the other
+            if solved:  # slightly apart, or one would hide the other
                 points[:, 0] = 0.008 * column * whole
             dot = "o" if solved else None
             x = start + points[:, 0]
             upper.plot(x, points[:, 1], color=colour, linewidth=1.4, label=label, marker=dot, ms=4, markevery=[-1])
-        start += _span([row[0] for row in each.grounding])
-        points = np.array([_floats(*row) for row in enumerate(each.policy)]).reshape(-1, 2)
-        lower.plot(start + points[:, 0], points[:, 1], color=TEAL, linewidth=1.4)
-        start += _span(range(len(each.policy)))
+        start += _iterations(each)
+        lower.plot(start + np.arange(len(each.policy)), each.policy, color=TEAL, linewidth=1.4)
+        start += len(each.policy)
     for axes, title in ((upper, "grounding loss"), (lower, "policy loss")):
         _scale(axes)
         _dress(axes, title)
@@ -70,16 +73,18 @@ def plot_losses(path: str | os.PathLike[str], rounds: Sequence[Round]) -> None:
 
 
 def plot_curve(
-    path: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]], paper: tuple[int, float] | None = PAPER_VALUE
+    path: str | os.PathLike[str], rows: Sequence[Mapping[str, Any]], paper: tuple[int, float] | None = (1000, 0.29)
 ) -> None:
-    """Mean cart speed after adaptation over counted target samples, with the spread over seeds and the survivors.
+    """Write a PNG of the mean cart speed after adaptation over counted target samples.
+
+    Bands are the spread over seeds; each point is labelled with the share of the episodes that survived.
 
     Args:
         path: of the PNG.
         rows: of one table under results/ (numbers may be strings): `domain` (adapted; target is before adaptation,
             source is drawn for comparison), `samples`, `mean` and `std` in m/s (empty or nan where none survived),
             `episodes`, `failed`, and `method`, one line each.
-        paper: the paper's samples and m/s, drawn as a level line; None draws none.
+        paper: samples and m/s of the paper's image policy after adaptation, drawn as a level line; None draws none.
     """
     adapted: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:
@@ -92,14 +97,14 @@ def plot_curve(
     for line, (method, members) in enumerate(adapted.items()):
         members.sort(key=lambda row: float(row["samples"]))
         _draw_method(axes, method, members, (TEAL, BLUE, ORANGE, INK)[line % 4], -12 if line % 2 else 5)
-    for domain, said, colour in (("target", "before adaptation", ORANGE), ("source", "in the source", MUTED)):
+    for domain, label, colour in REFERENCE_LEVELS:
         for row in [row for row in rows if row["domain"] == domain][:1]:
             up = 1 - float(row["failed"]) / float(row["episodes"])
             mean = _number(row["mean"])
             if np.isfinite(mean):
-                _level(axes, mean, f"{said}: {mean:.2f} m/s, {up:.0%} up", colour)
+                _level(axes, mean, f"{label}: {mean:.2f} m/s, {up:.0%} up", colour)
             else:
-                axes.plot([], [], color=colour, linestyle="--", label=f"{said}: none stays up")
+                axes.plot([], [], color=colour, linestyle="--", label=f"{label}: none stays up")
     if paper is not None:
         _level(axes, paper[1], f"the paper at {paper[0]:,}: {paper[1]:.2f} m/s", INK, ":")
     ticks = sorted({float(row["samples"]) for members in adapted.values() for row in members})
@@ -114,44 +119,44 @@ def plot_curve(
 
 
 @dataclass(frozen=True)
-class Panel:
-    """One measure over counted samples."""
+class Chart:
+    """One measure over counted target samples."""
 
     title: str
     label: str
     """of the measure, with its unit"""
     rows: Sequence[Mapping[str, Any]]
     """of a table under results/ (numbers may be strings): a line for each `method`, a band of `std` about its `mean`;
-    rows of no samples are levels, those of the `domain` target before adaptation, those of source for comparison"""
+    rows with 0 samples are drawn as levels: `domain` target is before adaptation, source is for comparison"""
 
 
-def plot_panels(path: str | os.PathLike[str], panels: Sequence[Panel], columns: int = 1) -> None:
-    """Panels side by side, `columns` in a line, each logarithmic; a method has its colour in all of them."""
-    methods = dict.fromkeys(row["method"] for panel in panels for row in panel.rows if float(row["samples"]) > 0)
+def plot_charts(path: str | os.PathLike[str], charts: Sequence[Chart], columns: int = 1) -> None:
+    """Write a PNG of charts, `columns` in a row, on logarithmic axes; a method has the same colour in all of them."""
+    methods = dict.fromkeys(row["method"] for chart in charts for row in chart.rows if float(row["samples"]) > 0)
     if not methods:
         raise ValueError("no rows of counted samples to plot")
-    colours = {method: (TEAL, BLUE, INK)[k % 3] for k, method in enumerate(methods)}
-    lines = -(-len(panels) // columns)
+    method_colours = {method: (TEAL, BLUE, INK)[k % 3] for k, method in enumerate(methods)}
+    lines = -(-len(charts) // columns)
     figure = Figure(figsize=(4.8 * max(columns, 1.5), 0.6 + 3.0 * lines), dpi=150, layout="constrained")
     grid = figure.subplots(lines, columns, squeeze=False)
     places = list(grid.flat)
-    for axes, panel in zip(places, panels, strict=False):
-        _draw_panel(axes, panel, colours)
-    for spare in places[len(panels) :]:
+    for axes, chart in zip(places, charts, strict=False):
+        _draw_chart(axes, chart, method_colours)
+    for spare in places[len(charts) :]:
         figure.delaxes(spare)
-    told = {name: line for axes in grid.flat for line, name in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(told.values(), told, loc="outside lower center", ncols=len(told), frameon=False, fontsize=9)
+    keys = {name: line for axes in grid.flat for line, name in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(keys.values(), keys, loc="outside lower center", ncols=len(keys), frameon=False, fontsize=9)
     _save(figure, path)
 
 
-def _draw_panel(axes: Axes, panel: Panel, colours: Mapping[str, str]) -> None:
-    before = [row for row in panel.rows if float(row["samples"]) == 0]
-    for domain, said, colour in (("target", "before adaptation", ORANGE), ("source", "in the source", MUTED)):
+def _draw_chart(axes: Axes, chart: Chart, method_colours: Mapping[str, str]) -> None:
+    before = [row for row in chart.rows if float(row["samples"]) == 0]
+    for domain, label, colour in REFERENCE_LEVELS:
         for row in [row for row in before if row["domain"] == domain]:
-            _level(axes, _number(row["mean"]), said, colour)
+            _level(axes, _number(row["mean"]), label, colour)
     bands = []
-    counted = sorted((row for row in panel.rows if float(row["samples"]) > 0), key=lambda row: float(row["samples"]))
-    for method, colour in colours.items():
+    counted = sorted((row for row in chart.rows if float(row["samples"]) > 0), key=lambda row: float(row["samples"]))
+    for method, colour in method_colours.items():
         rows = [row for row in counted if row["method"] == method]
         samples, mean, std = (np.array([_number(row[key]) for row in rows]) for key in ("samples", "mean", "std"))
         mean[~np.isfinite(mean)] = np.nan
@@ -159,8 +164,8 @@ def _draw_panel(axes: Axes, panel: Panel, colours: Mapping[str, str]) -> None:
         bands.append((samples, mean - std, mean + std))
     _scale(axes)
     bottom = axes.get_ylim()[0]
-    for (samples, low, high), colour in zip(bands, colours.values(), strict=True):
-        low = np.where(low > 0, low, bottom)  # there is no zero on a logarithmic axis
+    for (samples, low, high), colour in zip(bands, method_colours.values(), strict=True):
+        low = np.where(low > 0, low, bottom)  # a logarithmic axis has no zero
         axes.fill_between(samples, low, high, color=colour, alpha=0.16, linewidth=0)
     ticks = sorted({float(row["samples"]) for row in counted})
     if ticks[-1] > 10 * ticks[0]:
@@ -168,8 +173,8 @@ def _draw_panel(axes: Axes, panel: Panel, colours: Mapping[str, str]) -> None:
     axes.set_xticks(ticks, [f"{tick:,.0f}" for tick in ticks])
     axes.set_xticks([], minor=True)
     axes.set_xlabel("counted target samples", color=INK)
-    _dress(axes, panel.label)
-    axes.set_title(panel.title, color=INK, fontsize=10)
+    _dress(axes, chart.label)
+    axes.set_title(chart.title, color=INK, fontsize=10)
 
 
 def _draw_method(axes: Axes, method: str, rows: Sequence[Mapping[str, Any]], colour: str, offset: float) -> None:
@@ -186,8 +191,8 @@ def _draw_method(axes: Axes, method: str, rows: Sequence[Mapping[str, Any]], col
 
 
 def _scale(axes: Axes) -> None:
-    """A logarithmic axis with plain numbers, where there is anything to show on one."""
-    curves = [line for line in axes.get_lines() if line.get_zorder() > 0]  # and not the marks of the rounds
+    """Make the y axis logarithmic with plain numbers, if any curve has a positive value."""
+    curves = [line for line in axes.get_lines() if line.get_zorder() > 0]  # the lines that mark rounds have 0
     if not any(np.any(np.asarray(line.get_ydata(), float) > 0) for line in curves):
         return
     axes.set_yscale("log", nonpositive="mask")
@@ -221,10 +226,6 @@ def _number(value: Any) -> float:
     return float("nan") if value in (None, "") else float(value)
 
 
-def _floats(*values: float | None) -> tuple[float, ...]:
-    return tuple(float("nan") if value is None else float(value) for value in values)
-
-
-def _span(iterations: Sequence[int]) -> float:
-    """Iterations that a phase took, its first one being number 0 or 1."""
-    return float(max(iterations) + 1) if iterations else 0.0
+def _iterations(each: Round) -> float:
+    """Iterations of a round's grounding, the first of which is number 0 or 1."""
+    return float(max((row[0] for row in each.grounding), default=-1) + 1)

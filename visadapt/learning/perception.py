@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from visadapt.history import LENGTH, History
 from visadapt.policies.networks import FrameEncoder
 from visadapt.progress import Progress
-from visadapt.storage.training_state import EVERY, Training
+from visadapt.storage.training_state import CHECKPOINT_ITERATIONS, TrainingState
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class PerceptionSettings:
 
 
 def scale(settings: PerceptionSettings, period: float) -> Tensor:
-    """(KINEMATICS,) units in which an encoder taught under `settings` gives positions and changes."""
+    """(N_KINEMATICS,) units in which an encoder taught under `settings` gives positions and changes."""
     return torch.cat((settings.cart.scale(period), settings.pole.scale(period)))
 
 
@@ -91,7 +91,7 @@ def learn_to_see(
         optimiser, settings.learning_rate, total_steps=settings.iterations, pct_start=0.1
     )
     unit = scale(settings, period)
-    training = Training(encoder, optimiser, schedule, generator)
+    training = TrainingState(encoder, optimiser, schedule, generator)
     losses: list[float] = []
     if checkpoint is not None and checkpoint.exists():
         losses, _ = training.resume(checkpoint)
@@ -117,6 +117,6 @@ def learn_to_see(
         losses.append(float(loss.detach()))
         if progress is not None:
             progress(iteration + 1, settings.iterations, losses[-1])
-        if checkpoint is not None and (iteration + 1) % EVERY == 0:
+        if checkpoint is not None and (iteration + 1) % CHECKPOINT_ITERATIONS == 0:
             training.keep(checkpoint, losses, {})
     return losses

@@ -23,7 +23,7 @@ from visadapt.learning.windows import Observe, Windows
 from visadapt.policies import Policy
 from visadapt.progress import Progress
 from visadapt.storage.checkpoints import load_network, save_network
-from visadapt.storage.training_state import EVERY, Training
+from visadapt.storage.training_state import CHECKPOINT_ITERATIONS, TrainingState
 from visadapt.tasks.base import Task
 from visadapt.world import World, WorldState
 
@@ -83,7 +83,7 @@ def tune(
         observe: the camera through which the policy sees, differentiable for the sake of a residual that reads frames;
             None for a policy on states, which sees what the world's sensors measure.
         windows: recorded starts, where settings.recorded asks for them, and the times at which other starts begin.
-        checkpoint: file of the training state, written every `EVERY` iterations and resumed from.
+        checkpoint: file of the training state, written every `CHECKPOINT_ITERATIONS` iterations and resumed from.
 
     Raises:
         DivergedError: the loss is not finite.
@@ -93,7 +93,7 @@ def tune(
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, settings.learning_rate, total_steps=settings.iterations, pct_start=0.1
     )
-    training = Training(policy, optimiser, schedule, generator)
+    training = TrainingState(policy, optimiser, schedule, generator)
     task = settings.task
     running = StreamSettings(settings.streams or settings.batch, settings.longest, settings.recorded)
     streams = Streams(world, task, observe, windows, running)
@@ -133,7 +133,7 @@ def tune(
         losses.append(float(loss.detach()))
         if progress is not None:
             progress(iteration + 1, settings.iterations, losses[-1])
-        if checkpoint is not None and (iteration + 1) % EVERY == 0:
+        if checkpoint is not None and (iteration + 1) % CHECKPOINT_ITERATIONS == 0:
             kept = {"now": streams.now.tree(), "age": streams.age}
             training.keep(checkpoint, losses, kept if past is None else {**kept, "past": past.tree()})
     policy.eval()

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from visadapt.history import HORIZON, LENGTH, History
 from visadapt.policies.base import Policy, ignore_correction
-from visadapt.policies.networks import FEATURES, FrameEncoder, mlp
+from visadapt.policies.networks import N_FEATURES, FrameEncoder, mlp
 
 
 class ImagePolicy(Policy):
@@ -26,7 +26,7 @@ class ImagePolicy(Policy):
         super().__init__(n_state, n_action, given)
         self.perception = perception
         self.encoder = FrameEncoder(background, contrast, n_action)
-        self.hidden = nn.Linear(FEATURES + n_state, 64)
+        self.hidden = nn.Linear(N_FEATURES + n_state, 64)
         self.out = nn.Linear(64, HORIZON * n_action)
         ignore_correction(self.hidden, n_state)
 

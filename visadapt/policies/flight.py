@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from visadapt.history import HORIZON, History
 from visadapt.policies.base import Policy, ignore_correction
-from visadapt.policies.networks import TOLD, FlightResidualNetwork, mlp
+from visadapt.policies.networks import N_DISTURBANCE, FlightResidualNetwork, mlp
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY, RigidBody, rotation, times
 
 
@@ -30,9 +30,9 @@ class FlightPolicy(Policy):
         self.rest = mlp(width, width, width)
         self.out = nn.Linear(width, HORIZON * n_action)
         self.straight = nn.Linear(15 + n_aim, HORIZON * n_action, bias=False)
-        # The layers that hear what pushes come last, so that the others are drawn as they were without them.
-        self.hearing = nn.Linear(TOLD, width, bias=False)
-        self.answer = nn.Linear(TOLD, HORIZON * n_action, bias=False)
+        # Last, so that the initial weights of the other layers do not depend on these.
+        self.hearing = nn.Linear(N_DISTURBANCE, width, bias=False)
+        self.answer = nn.Linear(N_DISTURBANCE, HORIZON * n_action, bias=False)
         ignore_correction(self.first, self.n_state)
         with torch.no_grad():
             self.out.weight.mul_(0.1)
@@ -48,20 +48,20 @@ class FlightPolicy(Policy):
         state, goal = shown[:, : self.n_state], shown[:, self.n_state :]
         velocity, turned = state[:, VELOCITY], rotation(state[:, ATTITUDE])
         own = (velocity, times(turned.mT, velocity), turned[:, :, :2].flatten(1), state[:, RATES])
-        return torch.cat((*own, self.aim(state, goal), self.told(history)), 1)
+        return torch.cat((*own, self.aim(state, goal), self.disturbance(history)), 1)
 
-    def told(self, history: History) -> Tensor:
-        """What pushes and how that changes, (B, TOLD): a plan of a second needs to know where a force is going."""
+    def disturbance(self, history: History) -> Tensor:
+        """The residual's disturbance estimate and its rate, (B, N_DISTURBANCE), by which a plan foresees a force."""
         network = None if self.residual is None else self.residual.network
         if not isinstance(network, FlightResidualNetwork):
-            return history.actions.new_zeros(len(history.actions), TOLD)
+            return history.actions.new_zeros(len(history.actions), N_DISTURBANCE)
         with torch.no_grad():
-            return network.told(history.acting(self._nothing(history)))
+            return network.disturbance(history.acting(self._nothing(history)))
 
     def plan(self, features: Tensor, correction: Tensor) -> Tensor:
-        own, told = features[:, :-TOLD], features[:, -TOLD:]
-        hidden = self.rest((self.first(torch.cat((own, correction), 1)) + self.hearing(told)).tanh()).tanh()
-        out: Tensor = self.out(hidden) + self.straight(own) + self.answer(told)
+        own, disturbance = features[:, :-N_DISTURBANCE], features[:, -N_DISTURBANCE:]
+        hidden = self.rest((self.first(torch.cat((own, correction), 1)) + self.hearing(disturbance)).tanh()).tanh()
+        out: Tensor = self.out(hidden) + self.straight(own) + self.answer(disturbance)
         return out
 
 

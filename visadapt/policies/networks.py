@@ -1,4 +1,4 @@
-"""Network bodies that policies and residuals share."""
+"""Networks: the frame encoder that policies and residuals share, and the residual networks."""
 
 from __future__ import annotations
 
@@ -13,30 +13,31 @@ from visadapt.history import LENGTH, History
 from visadapt.systems import System
 from visadapt.systems.rigid_body import ATTITUDE, RATES, VELOCITY, RigidBody, rotation
 
-CHANNELS = (8, 16, 32, 32)
-FEATURES = 128
-CHANGE_GAIN = 2.0
-EXPECTED = 2.0
-"""m/s2 and rad/s2: unexplained accelerations are given to a residual's head in units of this"""
-FELT = 0.2
-"""m/s2 and rad/s2: the same, of vehicles. Small, so that ridge regression trusts a rule by which the unexplained goes
-on, from its past, before velocities and attitudes that happened to go with it."""
-TOLD = 12
-"""What `FlightResidualNetwork.told` tells."""
+N_FEATURES = 128
+"""Width of the frame encoder's features."""
+N_KINEMATICS = 2 * LENGTH
+"""Width of the encoder's readout: latest position and its LENGTH - 1 changes, of cart and pole."""
+N_DISTURBANCE = 12
+"""Width of `FlightResidualNetwork.disturbance`."""
+ACCELERATION_UNIT = 2.0
+"""m/s2 and rad/s2, unit of the unexplained accelerations that a network reads"""
+HISTORY_ACCELERATION_UNIT = 0.2
+"""m/s2 and rad/s2, their unit in the history that a vehicle's residual reads. The small unit makes these inputs large,
+so that ridge regression predicts the disturbance from its own history rather than from velocities and attitudes that
+happen to be correlated with it."""
 Predict = Callable[[Tensor, Tensor], Tensor]
-"""States and actions to the states a period later."""
-KINEMATICS = 2 * LENGTH
-"""The latest position and its LENGTH - 1 changes, for each of the two things that move: cart and pole."""
+"""States and actions to the states one period later."""
 
 
 class FrameEncoder(nn.Module):
-    """Four convolutions, kernel 3, stride 2, ReLU (the paper, section 3.2.3) over the last frames; actions join after.
+    """Four convolutions, kernel 3, stride 2, ReLU (the paper, section 3.2.3) over the last frames, then the actions.
 
-    The frames enter as the latest one less the background, and the differences of neighbours, magnified: a
-    fixed invertible linear map of the same pixels, without which velocities are lost beside the still stream.
+    The frames enter as the latest one minus the background, and twice the differences of successive frames: a fixed
+    invertible linear map of the pixels, without which motion is lost against the constant background.
 
     Args:
-        background: (H, W) mean frame in [0, 1]; it is saved with the weights, as is `contrast`, their spread.
+        background: (H, W) mean frame in [0, 1], saved with the weights.
+        contrast: standard deviation of the frames about it, saved with the weights.
         n_action: width of an action.
     """
 
@@ -48,15 +49,15 @@ class FrameEncoder(nn.Module):
         self.n_action = n_action
         self.register_buffer("background", background.clone())
         self.register_buffer("contrast", torch.as_tensor(contrast, dtype=background.dtype))
-        layers = [nn.Conv2d(i, o, 3, stride=2, padding=1) for i, o in pairwise((LENGTH, *CHANNELS))]
+        layers = [nn.Conv2d(i, o, 3, stride=2, padding=1) for i, o in pairwise((LENGTH, 8, 16, 32, 32))]
         self.convolutions = nn.ModuleList(layers).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         rows, columns = (-(-size // 2 ** len(layers)) for size in background.shape)
-        width = CHANNELS[-1] * rows * columns
-        self.join = nn.Sequential(nn.Linear(width + LENGTH * n_action, FEATURES), nn.ReLU())
-        self.readout = nn.Linear(FEATURES, KINEMATICS)
+        width = 32 * rows * columns
+        self.join = nn.Sequential(nn.Linear(width + LENGTH * n_action, N_FEATURES), nn.ReLU())
+        self.readout = nn.Linear(N_FEATURES, N_KINEMATICS)
 
     def forward(self, history: History) -> Tensor:
-        """Features (B, FEATURES) of frames (B, LENGTH, H, W) in [0, 1] and actions (B, LENGTH, n_action)."""
+        """Features (B, N_FEATURES) of frames (B, LENGTH, H, W) in [0, 1] and actions (B, LENGTH, n_action)."""
         frames = history.observations
         if frames.shape[-2:] != self.background.shape:
             raise ValueError(
@@ -69,20 +70,20 @@ class FrameEncoder(nn.Module):
         return self.join(torch.cat((seen.flatten(1), history.actions.flatten(1)), 1))
 
     def kinematics(self, history: History) -> Tensor:
-        """Positions and angles seen, (B, KINEMATICS), in units of `learning.perception.Paths.scale`."""
+        """Positions and angles in the frames, (B, N_KINEMATICS), in units of `learning.perception.Paths.scale`."""
         out: Tensor = self.readout(self(history))
         return out
 
     def _first(self, frames: Tensor) -> Tensor:
-        """The first convolution, of the latest frame less the background and twice the differences of neighbours.
+        """The first convolution: of the latest frame minus background, and twice the differences of successive frames.
 
-        That map of the frames is linear, so it is folded into the kernel: the big tensors are touched once.
+        Since that map of the frames is linear, it is folded into the kernel, which saves a pass over large tensors.
         """
         first = self.convolutions[0]
         mix = frames.new_zeros(LENGTH, LENGTH)
         mix[0, -1] = 1.0
         for k in range(1, LENGTH):
-            mix[k, k], mix[k, k - 1] = CHANGE_GAIN, -CHANGE_GAIN
+            mix[k, k], mix[k, k - 1] = 2.0, -2.0
         kernel = torch.einsum("ocij,cf->ofij", first.weight, mix / self.contrast)
         still = F.conv2d(self.background[None, None], first.weight[:, :1] / self.contrast, stride=2, padding=1)
         return F.conv2d(frames, kernel, first.bias, stride=2, padding=1) - still
@@ -97,10 +98,10 @@ def mlp(*widths: int) -> nn.Sequential:
 
 
 class ResidualNetwork(nn.Module):
-    """Base of residual networks: what is seen, and a head on it that grounding fits. It begins at zero.
+    """Base of residual networks: fixed inputs, and a head on them that grounding fits. Its output is zero at first.
 
     Args:
-        head: either linear, or layers whose last one is linear.
+        head: a linear layer, or layers of which the last is linear.
     """
 
     def __init__(self, head: nn.Linear | nn.Sequential) -> None:
@@ -111,12 +112,12 @@ class ResidualNetwork(nn.Module):
             nn.init.zeros_(weight)
 
     def embed(self, history: History) -> Tensor:
-        """What the head reads, (B, inputs)."""
+        """The head's inputs (B, inputs)."""
         raise NotImplementedError
 
-    def informed(self, seen: Tensor) -> Tensor:
-        """(B,) whether what the head reads (B, inputs) can tell what moves the target: it is fitted to these alone."""
-        return seen.new_ones(len(seen), dtype=torch.bool)
+    def informed(self, inputs: Tensor) -> Tensor:
+        """(B,) whether the head's inputs (B, inputs) have a complete history; it is fitted to these rows alone."""
+        return inputs.new_ones(len(inputs), dtype=torch.bool)
 
     def forward(self, history: History) -> Tensor:
         """Corrections (B, n_state) in units of the residual's scale."""
@@ -127,23 +128,24 @@ class ResidualNetwork(nn.Module):
 class ImageResidualNetwork(ResidualNetwork):
     """A 4-layer CNN on the last 5 frames and 5 actions (the paper, section 3.2.3).
 
-    Between the convolutions and the head stand the positions and angles that the frames show, read as
-    `learning.perception` taught it in the source: a few hundred samples are too few to learn to see as well. The
-    head reads them, the actions, and the accelerations that the source does not explain (`unexplained`). It is linear
-    and knows no constant: where the source explains everything it has nothing to say. An MLP in its place learns from
-    a few hundred samples where along the track the target happened to push, and is wrong on the next episode.
+    The encoder reads positions and angles from the frames, which `learning.perception` trained it to do in the source:
+    a few hundred target samples are too few to learn that too. The head's inputs are these, the actions, and the
+    accelerations that the source does not explain (`unexplained`). The head is linear without a bias, so that it adds
+    nothing where the source explains everything. An MLP instead learns from a few hundred samples where along the
+    track the target happened to push, and is wrong in the next episode.
 
     Args:
+        background, contrast: those of `FrameEncoder`.
         system: the source physics, whose states are x, x_dot, theta, theta_dot.
         period: s between frames.
-        scale: (KINEMATICS,) units of the encoder's readout.
+        scale: (N_KINEMATICS,) units of the encoder's readout.
     """
 
     scale: Tensor
 
     def __init__(self, background: Tensor, contrast: float, system: System, period: float, scale: Tensor) -> None:
         n_action = len(system.actions)
-        inputs = KINEMATICS + LENGTH * n_action + 2 * (LENGTH - 2)
+        inputs = N_KINEMATICS + LENGTH * n_action + 2 * (LENGTH - 2)
         super().__init__(nn.Linear(inputs, len(system.states), bias=False))
         self.encoder = FrameEncoder(background, contrast, n_action)
         self.system = system
@@ -152,15 +154,18 @@ class ImageResidualNetwork(ResidualNetwork):
 
     def embed(self, history: History) -> Tensor:
         kinematics = self.encoder.kinematics(history)
-        unexplained = self.unexplained(kinematics * self.scale, history.actions) / EXPECTED
+        unexplained = self.unexplained(kinematics * self.scale, history.actions) / ACCELERATION_UNIT
         return torch.cat((kinematics, history.actions.flatten(1), unexplained.flatten(1)), 1)
 
     def unexplained(self, kinematics: Tensor, actions: Tensor) -> Tensor:
-        """Accelerations of cart and pole beyond the source's, (B, LENGTH - 2, 2), at all frames but first and last.
+        """Accelerations of cart and pole minus the source's, (B, LENGTH - 2, 2), at all frames but the first and last.
 
-        At a frame the measured acceleration is the second difference of positions. Over the two periods around it
-        the source's is the mean of those under the action before and the action after.
-        `kinematics` (B, KINEMATICS) is in SI units, latest positions and changes; actions are (B, LENGTH, n_action).
+        The measured acceleration at a frame is the second difference of positions; the source's is the mean of those
+        under the action before and the action after the frame.
+
+        Args:
+            kinematics: (B, N_KINEMATICS) latest positions and their changes, SI units.
+            actions: (B, LENGTH, n_action).
         """
         latest = kinematics[:, [0, LENGTH]]
         changes = torch.stack((kinematics[:, 1:LENGTH], kinematics[:, LENGTH + 1 :]), -1)
@@ -178,8 +183,8 @@ class ImageResidualNetwork(ResidualNetwork):
 class StateResidualNetwork(ResidualNetwork):
     """The paper's MLP with two hidden layers of 64, tanh (3.2.1), on state and action, or on 5 of each (3.2.2).
 
-    On a history, given the source's `system` and the `period` in s, it also reads the accelerations that the source
-    leaves unexplained between the states: a force that changes shows there and nowhere else.
+    On a history, for which it needs the source's `system` and the `period` in s, it also reads the accelerations
+    between the states that the source does not explain, the only inputs that show a force that changes.
     """
 
     def __init__(self, n_state: int, n_action: int = 1, system: System | None = None, period: float = 0.0) -> None:
@@ -193,13 +198,13 @@ class StateResidualNetwork(ResidualNetwork):
         states, actions = history.observations, history.actions
         if self.system is None:
             return torch.cat((states[:, -1], actions[:, -1]), 1)
-        unexplained = self.unexplained(self.system, states, actions) / EXPECTED
+        unexplained = self.unexplained(self.system, states, actions) / ACCELERATION_UNIT
         return torch.cat((states.flatten(1), actions.flatten(1), unexplained.flatten(1)), 1)
 
     def unexplained(self, system: System, states: Tensor, actions: Tensor) -> Tensor:
-        """Mean accelerations beyond the source's over the periods between states, (B, LENGTH - 1, n_state / 2).
+        """Mean accelerations minus the source's over the periods between states, (B, LENGTH - 1, n_state / 2).
 
-        The source's is the mean of those at both ends of a period, under the action held over it.
+        The source's is the mean of those at both ends of a period, under the action held in between.
         """
         load = states.new_zeros(*states.shape[:-1], len(system.loads))[:, 1:]
         ends = [system.derivative(part, actions[:, :-1], load) for part in (states[:, :-1], states[:, 1:])]
@@ -208,16 +213,16 @@ class StateResidualNetwork(ResidualNetwork):
 
 
 class FlightResidualNetwork(ResidualNetwork):
-    """Linear in what moves a rigid body: velocity, rotation, rates and action now; no position, no network to overfit.
+    """A linear map of a vehicle's velocity, rotation matrix, rates and action; few weights and no position to overfit.
 
-    Drag, wind, weight and weak motors are linear in these to first order, and a few hundred samples fit them. With a
-    history it also reads the changes of velocity and rates that the source left unexplained over the last periods: a
-    force that changes shows there and nowhere else.
+    Drag, wind, weight and weak motors are linear in these to first order, and a few hundred samples suffice to fit
+    them. With a history it also reads the changes of velocity and rates over the last periods that the source does
+    not explain, the only inputs that show a force that changes.
 
     Args:
         system: the vehicle.
         period: s between actions.
-        predict: the source's step, (B, 13) and (B, n_action) to (B, 13); without it, there is no history.
+        predict: the source's step, (B, 13) and (B, n_action) to (B, 13); None uses no history.
     """
 
     def __init__(self, system: RigidBody, period: float, predict: Predict | None = None) -> None:
@@ -236,40 +241,40 @@ class FlightResidualNetwork(ResidualNetwork):
             return own
         return torch.cat((own, self.unexplained(self.predict, states, history.actions)), 1)
 
-    def informed(self, seen: Tensor) -> Tensor:
-        """All but the first of a flight, whose past is not whole: a rule learnt from them holds nowhere else."""
+    def informed(self, inputs: Tensor) -> Tensor:
+        """All rows but the first LENGTH - 1 of a flight, whose history is incomplete."""
         if self.predict is None:
-            return super().informed(seen)
-        past = seen[:, -6 * (LENGTH - 1) :].unflatten(1, (LENGTH - 1, 6))
+            return super().informed(inputs)
+        past = inputs[:, -6 * (LENGTH - 1) :].unflatten(1, (LENGTH - 1, 6))
         return past.diff(dim=1).any(2).all(1)
 
-    def told(self, history: History) -> Tensor:
-        """What pushes a vehicle and how that changes, (B, TOLD): unexplained accelerations, and their rates.
+    def disturbance(self, history: History) -> Tensor:
+        """The disturbance estimate (B, N_DISTURBANCE): unexplained accelerations (6) and their rates of change (6).
 
-        The last action of the history is the one being executed, as for `forward`; it does not matter here.
-        Of velocity and rates each, in units of EXPECTED and of EXPECTED a second; zeros where there is no history.
+        In ACCELERATION_UNIT, and ACCELERATION_UNIT per second; zeros without `predict`. The last action of the
+        history, the one being executed, is not used.
         """
         states = history.observations[..., : self.n_state]
         if self.predict is None:
-            return states.new_zeros(len(states), TOLD)
+            return states.new_zeros(len(states), N_DISTURBANCE)
         past = self.unexplained(self.predict, states, history.actions).unflatten(1, (LENGTH - 1, -1))
-        past = past * (FELT / EXPECTED)
+        past = past * (HISTORY_ACCELERATION_UNIT / ACCELERATION_UNIT)
         change = (past[:, -1] - past[:, 0]) / ((LENGTH - 2) * self.period)
         return torch.cat((past[:, -1], change), 1)
 
     def unexplained(self, predict: Predict, states: Tensor, actions: Tensor) -> Tensor:
-        """Changes of velocity and rates beyond the source's over the periods between states, (B, 6 (LENGTH - 1)).
+        """Changes of velocity and rates minus the source's over the periods between states, (B, 6 (LENGTH - 1)).
 
-        In units of FELT times a period. Before a flight begins its first state stands still, which says nothing:
-        there stands what the first period of the flight said.
+        In units of HISTORY_ACCELERATION_UNIT times a period. Periods before a flight begins, over which its first state
+        is repeated, take the values of the flight's first period.
         """
         before, after = states[:, :-1].flatten(0, 1), states[:, 1:].flatten(0, 1)
         left = after - predict(before, actions[:, :-1].flatten(0, 1))
-        moving = torch.cat((left[:, VELOCITY], left[:, RATES]), 1) / (FELT * self.period)
+        moving = torch.cat((left[:, VELOCITY], left[:, RATES]), 1) / (HISTORY_ACCELERATION_UNIT * self.period)
         known = (after != before).any(1, keepdim=True)
         periods = (len(states), LENGTH - 1)
-        found, told = moving.unflatten(0, periods).unbind(1), known.unflatten(0, periods).unbind(1)
-        past = [found[-1] * told[-1]]
-        for change, is_known in zip(found[-2::-1], told[-2::-1], strict=True):
-            past.append(torch.where(is_known, change, past[-1]))
+        changes, flying = moving.unflatten(0, periods).unbind(1), known.unflatten(0, periods).unbind(1)
+        past = [changes[-1] * flying[-1]]
+        for change, is_flying in zip(changes[-2::-1], flying[-2::-1], strict=True):
+            past.append(torch.where(is_flying, change, past[-1]))
         return torch.cat(past[::-1], 1)

@@ -1,4 +1,4 @@
-"""Recordings: lists of episodes, and how they are kept on disk."""
+"""Recordings: lists of episodes, and their files."""
 
 from visadapt.recordings.csv import write_csv
 from visadapt.recordings.episode import Episode, RecordingError

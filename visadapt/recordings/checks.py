@@ -1,7 +1,6 @@
-"""Whether numbers can be what their column's name says: units, ranges, and columns that changed places.
+"""Checks that a column's numbers fit its name: units, ranges, and columns that were exchanged.
 
-These are heuristics, and each speaks up only where the numbers cannot be right: a recording that is merely strange is
-for the diagnosis.
+These are heuristics that raise only where the numbers cannot be right; a recording that is merely unusual passes.
 """
 
 from __future__ import annotations
@@ -13,173 +12,173 @@ from itertools import combinations, product
 import numpy as np
 from numpy.typing import NDArray
 
-from visadapt.recordings.clock import Note, Rows
+from visadapt.recordings.clock import Note, RawEpisode
 from visadapt.recordings.episode import RecordingError
-from visadapt.recordings.physics import DEGREE, are_degrees, changed_places
+from visadapt.recordings.physics import DEGREE, DIFFERENCE_S, are_degrees, exchanged
 from visadapt.systems import System, Variable
 
 TURN = 2 * math.pi
 
-STRIDE = 0.05
-"""s over which rates are taken from differences: over less, noise would outweigh motion."""
-TOO_FAST = 3.0
-"""Times the range that a system states for a rate at which the unit must be another."""
-ALONG, NOT_ALONG = 0.8, 0.3
-"""Correlations above which one column evidently is another's rate of change, and below which it evidently is not."""
+MOST_RATE_RANGES = 3.0
+"""Rates above this multiple of the system's stated range are taken to be in another unit."""
+IS_RATE_CORRELATION, NOT_RATE_CORRELATION = 0.8, 0.3
+"""Correlation of a column with the change of another above which it is its rate, and below which it is not."""
 
 
-def check_finite(rows: Rows, states: Sequence[str], actions: Sequence[str]) -> None:
-    """Raises RecordingError at the first cell that is not finite."""
-    table = np.column_stack([rows.time, rows.state, rows.action])
+def check_finite(raw: RawEpisode, states: Sequence[str], actions: Sequence[str]) -> None:
+    """Raises RecordingError that names the first cell that is not finite."""
+    table = np.column_stack([raw.time, raw.state, raw.action])
     bad = ~np.isfinite(table)
     if bad.any():
         row, column = np.argwhere(bad)[0]
         name = ("time", *states, *actions)[column]
         raise RecordingError(
-            f"{rows.source}: {rows.place(int(row))}, {rows.column(name)} is {table[row, column]}; a finite number is "
-            "right (a row without a measurement is better left out)"
+            f"{raw.source}: {raw.place(int(row))}, {raw.column(name)} is {table[row, column]}; a finite number is "
+            "right (leave out rows without a measurement)"
         )
 
 
-def check_commands(rows: Sequence[Rows], actions: Sequence[Variable], note: Note) -> None:
-    """Commands lie in the range that the system states; few may be a little outside.
+def check_commands(episodes: Sequence[RawEpisode], actions: Sequence[Variable], note: Note) -> None:
+    """Check that commands lie in the system's range; notes those outside, and commands that never change.
 
     Raises:
-        RecordingError: most commands lie outside, or one lies outside twice over.
+        RecordingError: most commands lie outside, or one is more than twice as large as the range allows.
     """
     for column, variable in enumerate(actions):
-        every = np.concatenate([one.action[:, column] for one in rows])
+        every = np.concatenate([raw.action[:, column] for raw in episodes])
         share = float(((every < variable.low) | (every > variable.high)).mean())
         if share == 0:
             if np.ptp(every) == 0:
                 note(
-                    f"{variable.name} never changes: what acts between command and motor (gain, delay, lag, "
-                    "dead zone) cannot be told from nothing, nor a bias from a constant force",
+                    f"{variable.name} never changes: effects between command and motor (gain, delay, lag, dead zone) "
+                    "cannot be identified, and a bias looks like a constant force",
                     "the recording",
                 )
             continue
         scale = max(-variable.low, variable.high)
-        one = max(rows, key=lambda one: float(np.abs(one.action[:, column]).max()))
-        row = int(np.abs(one.action[:, column]).argmax())
-        largest = one.action[row, column]
+        raw = max(episodes, key=lambda raw: float(np.abs(raw.action[:, column]).max()))
+        row = int(np.abs(raw.action[:, column]).argmax())
+        largest = raw.action[row, column]
         right = f"within [{variable.low:g}, {variable.high:g}] is right"
         if share > 0.5 or abs(largest) > 2 * scale:
             raise RecordingError(
-                f"{one.source}: {one.place(row)}, {one.column(variable.name)} is {largest:g}, and {share:.0%} of the "
+                f"{raw.source}: {raw.place(row)}, {raw.column(variable.name)} is {largest:g}, and {share:.0%} of the "
                 f"column lie outside; {right} (name a column in N 'force')"
             )
         note(f"{share:.1%} of {variable.name} lie outside, up to {largest:g}; {right}", "the recording")
 
 
-def check_units(rows: Rows, measured: Sequence[str], system: System) -> None:
-    """Raises RecordingError where angles evidently are in degrees, lengths in mm, or columns changed places."""
+def check_units(raw: RawEpisode, measured: Sequence[str], system: System) -> None:
+    """Raises RecordingError where angles are evidently in degrees, lengths in cm or mm, or columns exchanged."""
     variables = {variable.name: variable for variable in system.states}
-    if len(rows.time) < 8:
+    if len(raw.time) < 8:
         return
-    columns = dict(zip(measured, rows.state.T, strict=True))
+    columns = dict(zip(measured, raw.state.T, strict=True))
     for name, values in columns.items():
         if variables[name].unit == "rad":
-            _check_jumps(rows, name, values)
-    _check_places(rows, columns, variables)
+            _check_jumps(raw, name, values)
+    _check_exchanged(raw, columns, variables)
     for name, values in columns.items():
         rate_name = f"{name}_dot"
         if rate_name in variables:
-            _check_rate(rows, variables[name], values, variables[rate_name], columns.get(rate_name))
+            _check_rate(raw, variables[name], values, variables[rate_name], columns.get(rate_name))
     angles = [name for name in columns if variables[name].unit == "rad"]
-    if are_degrees(rows, measured, system):
+    if are_degrees(raw, measured, system):
         name, values = angles[0], columns[angles[0]]
         raise RecordingError(
-            f"{rows.source}: {rows.column(name)} goes from {values.min():.3g} to {values.max():.3g} and answers the "
+            f"{raw.source}: {raw.column(name)} goes from {values.min():.3g} to {values.max():.3g} and answers the "
             f"command as if in degrees; radians are right"
         )
     for name, other in product((name for name in columns if variables[name].unit == "m"), angles):
-        if changed_places(rows, measured, system, name, other):
+        if exchanged(raw, measured, system, name, other):
             raise RecordingError(
-                f"{rows.source}: {rows.column(name)} answers the command as {other} should, and "
-                f"{rows.column(other)} as {name}: they have changed places "
+                f"{raw.source}: {raw.column(name)} answers the command as {other} should, and "
+                f"{raw.column(other)} as {name}: they are exchanged "
                 f"(or the command's sign is wrong: positive pushes towards +x)"
             )
 
 
 def rates(time: NDArray[np.float64], values: NDArray[np.float64], angle: bool) -> NDArray[np.float64]:
-    """Rates of change (T - 1,) between rows; an angle may jump by a turn."""
+    """Rates of change (T - 1,) between rows; jumps of an angle by a turn are removed."""
     steps = np.diff(values)
     if angle:
         steps = np.where(np.abs(np.abs(steps) - TURN) < 0.5 * math.pi, steps - np.sign(steps) * TURN, steps)
     return steps / np.diff(time)
 
 
-def _check_jumps(rows: Rows, name: str, values: NDArray[np.float64]) -> None:
+def _check_jumps(raw: RawEpisode, name: str, values: NDArray[np.float64]) -> None:
     steps = np.abs(np.diff(values))
     if steps.max() > 1.25 * TURN:
         row = int(steps.argmax()) + 1
         raise RecordingError(
-            f"{rows.source}: {rows.place(row)}, {rows.column(name)} jumps from {values[row - 1]:g} to {values[row]:g}; "
+            f"{raw.source}: {raw.place(row)}, {raw.column(name)} jumps from {values[row - 1]:g} to {values[row]:g}; "
             "radians are right (these look like degrees)"
         )
 
 
 def _check_rate(
-    rows: Rows,
+    raw: RawEpisode,
     variable: Variable,
     values: NDArray[np.float64],
     rate: Variable,
-    given: NDArray[np.float64] | None,
+    measured: NDArray[np.float64] | None,
 ) -> None:
-    """Compares a variable's change, and its rate as given, with each other and with what the system can do."""
+    """Compares a variable's change with its measured rate, and both with the range that the system states."""
     angle = variable.unit == "rad"
     looks = "degrees" if angle else "centimetres or millimetres"
     right = "radians are right" if angle else "metres are right"
-    change = rates(rows.time, values, angle)
-    stride = max(1, round(STRIDE / float(np.median(np.diff(rows.time)))))
+    change = rates(raw.time, values, angle)
+    stride = max(1, round(DIFFERENCE_S / float(np.median(np.diff(raw.time)))))
     coarse = np.convolve(change, np.ones(stride) / stride, "valid")
     fast = float(np.quantile(np.abs(coarse), 0.9))
-    limit = TOO_FAST * rate.high
+    limit = MOST_RATE_RANGES * rate.high
     beyond = angle and float(np.abs(values).max()) > TURN
     if fast > (rate.high if beyond else limit):
         row = int(np.abs(values).argmax())
         raise RecordingError(
-            f"{rows.source}: {rows.place(row)}, {rows.column(variable.name)} is {values[row]:g} {variable.unit}, and "
+            f"{raw.source}: {raw.place(row)}, {raw.column(variable.name)} is {values[row]:g} {variable.unit}, and "
             f"it changes by up to {np.abs(coarse).max():.3g} {rate.unit}; {right} (these look like {looks})"
         )
-    if given is None:
+    if measured is None:
         return
-    if float(np.quantile(np.abs(given), 0.9)) > limit:
-        row = int(np.abs(given).argmax())
+    if float(np.quantile(np.abs(measured), 0.9)) > limit:
+        row = int(np.abs(measured).argmax())
         raise RecordingError(
-            f"{rows.source}: {rows.place(row)}, {rows.column(rate.name)} is {given[row]:g} {rate.unit}; "
+            f"{raw.source}: {raw.place(row)}, {raw.column(rate.name)} is {measured[row]:g} {rate.unit}; "
             f"{right} (these look like {looks})"
         )
-    between = 0.5 * (given[1:] + given[:-1])
-    if angle and _correlation(change, between) > ALONG:
+    between = 0.5 * (measured[1:] + measured[:-1])
+    if angle and _correlation(change, between) > IS_RATE_CORRELATION:
         ratio = float(change.std() / between.std()) * DEGREE
         for wrong, factor in ((variable, ratio), (rate, DEGREE**2 / ratio)):
             if 0.5 < factor < 2:
                 raise RecordingError(
-                    f"{rows.source}: {rows.column(wrong.name)} is {1 / DEGREE:.0f} times what the other says "
+                    f"{raw.source}: {raw.column(wrong.name)} is {1 / DEGREE:.0f} times what the other says "
                     f"({variable.name} changes by {change.std():.3g} {rate.unit}, {rate.name} is {between.std():.3g} "
                     f"{rate.unit}, root mean square); {right} (these look like {looks})"
                 )
 
 
-def _check_places(rows: Rows, columns: dict[str, NDArray[np.float64]], variables: dict[str, Variable]) -> None:
-    """Raises RecordingError where two columns evidently changed places."""
+def _check_exchanged(raw: RawEpisode, columns: dict[str, NDArray[np.float64]], variables: dict[str, Variable]) -> None:
+    """Raises RecordingError where two columns are evidently exchanged."""
     bases = [name for name in columns if f"{name}_dot" in variables]
-    changes = {name: rates(rows.time, columns[name], variables[name].unit == "rad") for name in bases}
-    given = {name: columns[f"{name}_dot"] for name in bases if f"{name}_dot" in columns}
-    for name, rate in given.items():
-        crossed = _correlation(rates(rows.time, rate, False), columns[name][1:])
-        if crossed > ALONG and _correlation(changes[name], rate[1:]) < NOT_ALONG:
+    changes = {name: rates(raw.time, columns[name], variables[name].unit == "rad") for name in bases}
+    measured = {name: columns[f"{name}_dot"] for name in bases if f"{name}_dot" in columns}
+    for name, rate in measured.items():
+        crossed = _correlation(rates(raw.time, rate, False), columns[name][1:])
+        if crossed > IS_RATE_CORRELATION and _correlation(changes[name], rate[1:]) < NOT_RATE_CORRELATION:
             raise RecordingError(
-                f"{rows.source}: {rows.column(name)} and {rows.column(f'{name}_dot')} have evidently changed places: "
+                f"{raw.source}: {raw.column(name)} and {raw.column(f'{name}_dot')} are evidently exchanged: "
                 "the first is the second's rate of change"
             )
-    for name, other in combinations(given, 2):
-        crossed = min(_correlation(changes[name], given[other][1:]), _correlation(changes[other], given[name][1:]))
-        own = max(_correlation(changes[one], given[one][1:]) for one in (name, other))
-        if crossed > ALONG and own < NOT_ALONG:
+    for name, other in combinations(measured, 2):
+        crossed = min(
+            _correlation(changes[name], measured[other][1:]), _correlation(changes[other], measured[name][1:])
+        )
+        own = max(_correlation(changes[one], measured[one][1:]) for one in (name, other))
+        if crossed > IS_RATE_CORRELATION and own < NOT_RATE_CORRELATION:
             raise RecordingError(
-                f"{rows.source}: {rows.column(name)} and {rows.column(other)} have evidently changed places: "
+                f"{raw.source}: {raw.column(name)} and {raw.column(other)} are evidently exchanged: "
                 f"{name} changes as {other}_dot says, and {other} as {name}_dot says"
             )
     for name in bases:
@@ -188,8 +187,8 @@ def _check_places(rows: Rows, columns: dict[str, NDArray[np.float64]], variables
         wraps = abs(steps[row] - TURN) < 0.5 and np.abs(columns[name]).max() < 0.55 * TURN
         if variables[name].unit == "m" and wraps:
             raise RecordingError(
-                f"{rows.source}: {rows.place(row + 1)}, {rows.column(name)} jumps by {steps[row]:.3g} m, as an angle "
-                "does that wraps; metres are right (did two columns change places?)"
+                f"{raw.source}: {raw.place(row + 1)}, {raw.column(name)} jumps by {steps[row]:.3g} m, like an angle "
+                "that wraps; metres are right (are two columns exchanged?)"
             )
 
 

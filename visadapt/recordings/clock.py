@@ -1,4 +1,4 @@
-"""The rows' clock: a steady one is taken at its mean period, gaps split an episode, an irregular one is resampled."""
+"""The clock of a recording: jitter is removed, irregular rows are resampled, missing rows split an episode."""
 
 from __future__ import annotations
 
@@ -12,43 +12,43 @@ from numpy.typing import NDArray
 from visadapt.recordings.episode import RecordingError
 
 Note = Callable[[str, str], None]
-"""Called with (what was changed or left out, where)."""
+"""Called with (what was changed or left out, where in the recording)."""
 
-GAP = 1.5
-"""Periods between two rows from which on a row is missing."""
-IRREGULAR = 0.05
-"""Share of gaps from which on the clock has no period, rather than a row missing here and there."""
-JITTER = 0.1
-"""Periods that the rows of a steady clock are off it, root mean square: a real rig's are off by 0.01."""
-TOLERANCE = 0.02
-"""Share by which the periods of two episodes of one recording may differ."""
-LONGEST = 3.0
-"""Periods over which an irregular clock is still interpolated."""
+GAP_PERIODS = 1.5
+"""Two rows further apart than this have a missing row between them."""
+MOST_GAPS = 0.05
+"""Share of gaps among the steps above which a clock is irregular; below it, rows are missing."""
+MOST_JITTER_PERIODS = 0.1
+"""Root mean square by which the rows of a steady clock may deviate from it; a real rig's deviate by about 0.01."""
+PERIOD_TOLERANCE = 0.02
+"""Relative difference that the periods of two episodes of one recording may have."""
+INTERPOLATED_PERIODS = 3.0
+"""Longest step of an irregular clock that is interpolated; at longer ones the episode is split."""
 
 
 @dataclass(frozen=True)
-class Rows:
-    """Rows as read, before their clock is looked at."""
+class RawEpisode:
+    """The rows of an episode as they were read: clock, order of columns and units are not checked yet."""
 
     source: str
-    """for messages: the file, and the episode where it has several"""
+    """the file, and the episode if the file has several, for messages"""
     time: NDArray[np.float64]
-    """(T,) s, as read; from `steadied` on, since the episode began"""
+    """(T,) s, as in the file; `steadied` makes it start at 0"""
     action: NDArray[np.float64]
     """(T, n_action)"""
     state: NDArray[np.float64]
     """(T, n_measured)"""
     place: Callable[[int], str]
-    """how a row, counted from 0, is called in messages"""
+    """the name in messages of a row, counted from 0"""
     names: Mapping[str, str] = field(default_factory=dict)
-    """what the file calls our variables, where it calls them something else"""
+    """the file's names of the variables that it names differently"""
 
     def column(self, name: str) -> str:
-        """How the column of one of our variables is called in messages."""
+        """The name in messages of a variable's column."""
         return f"column {self.names[name]!r} ({name})" if name in self.names else f"column {name!r}"
 
-    def part(self, start: int, end: int) -> Rows:
-        """The rows from `start` up to `end`, not included."""
+    def part(self, start: int, end: int) -> RawEpisode:
+        """The rows from `start` up to, but not including, `end`."""
         rows = slice(start, end)
         return replace(
             self,
@@ -58,49 +58,49 @@ class Rows:
             place=lambda row: self.place(start + row),
         )
 
-    def named(self, source: str) -> Rows:
+    def named(self, source: str) -> RawEpisode:
         """The same rows, from `source`."""
         return replace(self, source=source)
 
 
-def check_forward(rows: Rows) -> None:
-    """Raises RecordingError where the clock repeats itself or runs backward."""
-    steps = np.diff(rows.time)
+def check_forward(raw: RawEpisode) -> None:
+    """Raises RecordingError where two rows have the same time or a later row an earlier one."""
+    steps = np.diff(raw.time)
     if (steps <= 0).any():
         row = int((steps <= 0).argmax())
-        before, after = rows.time[row], rows.time[row + 1]
+        before, after = raw.time[row], raw.time[row + 1]
         problem = "repeats itself" if before == after else "runs backward"
         raise RecordingError(
-            f"{rows.source}: {rows.place(row + 1)}, {rows.column('time')}: the clock {problem} (from {before:.9g} s to "
-            f"{after:.9g} s); a rising one is right, and a column 'episode' where several episodes follow each other"
+            f"{raw.source}: {raw.place(row + 1)}, {raw.column('time')}: the clock {problem} (from {before:.9g} s to "
+            f"{after:.9g} s); each row must be later than the one before; mark several episodes by a column 'episode'"
         )
 
 
-def steadied(rows: Rows, note: Note) -> list[Rows]:
-    """Parts whose rows are one period apart; `time` is since the episode began, in later parts too."""
-    rows = replace(rows, time=rows.time - rows.time[0])
-    steps = np.diff(rows.time)
+def steadied(raw: RawEpisode, note: Note) -> list[RawEpisode]:
+    """The episode in parts whose rows are one period apart; `time` counts from the start of the whole episode."""
+    raw = replace(raw, time=raw.time - raw.time[0])
+    steps = np.diff(raw.time)
     if len(steps) == 0:
-        return [rows]
+        return [raw]
     period = float(np.median(steps))
-    gaps = steps > GAP * period
-    irregular = gaps.mean() > IRREGULAR and gaps.sum() > 1
-    cuts = np.flatnonzero(steps > (LONGEST if irregular else GAP) * period)
+    gaps = steps > GAP_PERIODS * period
+    irregular = gaps.mean() > MOST_GAPS and gaps.sum() > 1
+    cuts = np.flatnonzero(steps > (INTERPOLATED_PERIODS if irregular else GAP_PERIODS) * period)
     for cut in cuts:
-        note("rows are missing here; the episode was split", f"{rows.source}, {rows.place(int(cut) + 1)}")
-    edges = [0, *(int(cut) + 1 for cut in cuts), len(rows.time)]
-    parts = [rows.part(start, end) for start, end in pairwise(edges)]
+        note("rows are missing here; the episode was split", f"{raw.source}, {raw.place(int(cut) + 1)}")
+    edges = [0, *(int(cut) + 1 for cut in cuts), len(raw.time)]
+    parts = [raw.part(start, end) for start, end in pairwise(edges)]
     return [_one_clock(part, period, note) for part in parts]
 
 
-def _one_clock(part: Rows, nominal: float, note: Note) -> Rows:
-    """The part at a steady clock: its own, where it has one, or else resampled at the period `nominal`."""
+def _one_clock(part: RawEpisode, nominal: float, note: Note) -> RawEpisode:
+    """The part on a steady clock: its own if it jitters little, else resampled with the period `nominal`."""
     index = np.arange(len(part.time))
     if len(index) < 3:
         return part
     period, start = np.polyfit(index, part.time, 1)
     off = part.time - (start + period * index)
-    if np.sqrt(np.mean(off**2)) <= JITTER * period:
+    if np.sqrt(np.mean(off**2)) <= MOST_JITTER_PERIODS * period:
         return replace(part, time=part.time[0] + period * index)
     note(f"an irregular clock; resampled to one row every {nominal:.4g} s", part.source)
     time = np.arange(part.time[0], part.time[-1] + 1e-9, nominal)
@@ -110,15 +110,15 @@ def _one_clock(part: Rows, nominal: float, note: Note) -> Rows:
     return replace(part, time=time, action=part.action[held], state=state)
 
 
-def alike(parts: list[Rows], note: Note) -> tuple[list[Rows], float]:
-    """The parts that share the recording's period, and that period in s; parts of at least two rows each."""
+def alike(parts: list[RawEpisode], note: Note) -> tuple[list[RawEpisode], float]:
+    """The parts that have the period of most rows, and that period in s; every part needs at least two rows."""
     periods = np.array([np.diff(part.time).mean() for part in parts])
     order = np.argsort(periods)
     rows = np.cumsum([len(parts[index].time) for index in order])
     period = float(periods[order][np.searchsorted(rows, rows[-1] / 2)])
     kept = []
     for part, own in zip(parts, periods, strict=True):
-        if abs(own / period - 1) <= TOLERANCE:
+        if abs(own / period - 1) <= PERIOD_TOLERANCE:
             kept.append(part)
         else:
             note(f"left out, since its rows are not {period:.4g} s apart as most are", part.source)

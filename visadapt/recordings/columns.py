@@ -1,4 +1,4 @@
-"""Which column of a file is which of our variables: by our own names, by well-known others, or as the user says."""
+"""Which column of a file is which variable: by our names, by other common names, or by the user's mapping."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from visadapt.systems import System
 
 LOG = logging.getLogger(__name__)
 
-CLOCK = {"time": ("t", "timestamp"), "episode": ()}
-"""Other names of the columns that every system has."""
+CLOCK_NAMES = {"time": ("t", "timestamp"), "episode": ()}
+"""Other common names of the columns that every system has."""
 
-OTHER_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
+VARIABLE_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
     "cartpole": {
         "x": ("position", "cart_position", "pos", "s"),
         "x_dot": ("positionD", "velocity", "cart_velocity"),
@@ -23,14 +23,14 @@ OTHER_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
         "command": ("action", "u", "Q", "control", "input", "force"),
     }
 }
-"""Other names of a system's variables; compared without regard to case."""
+"""Other common names of a system's variables, in any case."""
 
-FORCE = "force"
-"""A command's column of this name may be in N."""
+FORCE_NAME = "force"
+"""A command column of this name may be in N."""
 
 
 def needed(system: System) -> tuple[str, ...]:
-    """What a recording must have: the clock, the actions, and the states; rates of change (`_dot`) may be missing."""
+    """Columns that a recording must have: time, actions and states; rates of change (`_dot`) may be missing."""
     names = {variable.name for variable in system.states}
     states = [name for name in names if name.removesuffix("_dot") == name or name.removesuffix("_dot") not in names]
     ordered = [variable.name for variable in system.states if variable.name in states]
@@ -41,11 +41,11 @@ def match(path: Path, header: tuple[str, ...], system: System, given: Mapping[st
     """The index of each of our variables in a file's header; `given` maps our names to the file's.
 
     Raises:
-        RecordingError: a needed column is missing, a name is there twice or could be two things, or `given` names
-            what neither side has.
+        RecordingError: a needed column is missing, several columns could be one variable, or `given` names a variable
+            or a column that does not exist.
     """
     lower = [name.lower() for name in header]
-    others = CLOCK | OTHER_NAMES.get(system.name, {})
+    others = CLOCK_NAMES | VARIABLE_NAMES.get(system.name, {})
     ours = ["episode", "time", *(variable.name for variable in (*system.states, *system.actions))]
     for name in given:
         if name not in ours:

@@ -1,7 +1,7 @@
 """Recordings of states as CSV: columns `episode,time,<states>,<actions>`, SI units, one row per instant.
 
-The column `episode` may be missing: a file is one episode then. Rates of change may be missing. Names, separators and
-clocks of other people's are understood as far as they are evident; see `columns.py`, `table.py` and `clock.py`.
+Without a column `episode` the file is one episode. Rates of change may be missing. Other common names, separators and
+clocks are understood too; see `columns.py`, `table.py` and `clock.py`.
 """
 
 from __future__ import annotations
@@ -14,19 +14,21 @@ from pathlib import Path
 
 import numpy as np
 
-from visadapt.recordings.clock import Rows
-from visadapt.recordings.columns import FORCE, match
+from visadapt.recordings.clock import RawEpisode
+from visadapt.recordings.columns import FORCE_NAME, match
 from visadapt.recordings.episode import Episode, RecordingError
 from visadapt.recordings.table import Table
 from visadapt.storage.atomic_files import replacing
 from visadapt.systems import System
 
 
-def read_rows(path: Path, system: System, given: Mapping[str, str]) -> tuple[list[Rows], tuple[str, ...], bool]:
-    """The episodes of one file as they stand there, the states that were measured, and whether the command may be in N.
+def read_rows(path: Path, system: System, given: Mapping[str, str]) -> tuple[list[RawEpisode], tuple[str, ...], bool]:
+    """The episodes of a file, the names of its states, and whether its command may be in N.
+
+    `given` maps our names of columns to the file's, where these are not evident.
 
     Raises:
-        RecordingError: no such file, no such columns, or cells that are no numbers.
+        RecordingError: the file or a column is missing, or a cell is not a number.
     """
     table = Table.open(path)
     found = match(path, table.header, system, given)
@@ -38,13 +40,13 @@ def read_rows(path: Path, system: System, given: Mapping[str, str]) -> tuple[lis
     state = np.column_stack([values[name] for name in measured])
     action = np.column_stack([values[name] for name in actions])
     names = {name: table.header[found[name]] for name in found if table.header[found[name]].lower() != name}
-    whole = Rows(str(path), values["time"], action, state, table.place, names)
-    force = any(table.header[found[name]].lower() == FORCE for name in actions)
+    whole = RawEpisode(str(path), values["time"], action, state, table.place, names)
+    force = any(table.header[found[name]].lower() == FORCE_NAME for name in actions)
     if "episode" not in found:
         return [whole], measured, force
     label = values["episode"]
     if np.isnan(label).any():
-        raise RecordingError(f"{path}: {table.place(int(np.isnan(label).argmax()))}, column 'episode' is no number")
+        raise RecordingError(f"{path}: {table.place(int(np.isnan(label).argmax()))}, column 'episode' is not a number")
     edges = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1), len(label)]
     parts = []
     for start, end in pairwise(edges):
@@ -56,7 +58,7 @@ def read_rows(path: Path, system: System, given: Mapping[str, str]) -> tuple[lis
 def write_csv(
     path: str | os.PathLike[str], episodes: Sequence[Episode], states: Sequence[str], actions: Sequence[str]
 ) -> None:
-    """Write episodes that hold states; numbers come back exactly. The file appears under its name once it is whole.
+    """Write episodes that hold states, atomically and with all digits, so that numbers are read back exactly.
 
     Args:
         path: of the file.
@@ -66,7 +68,7 @@ def write_csv(
 
     Raises:
         RecordingError: no episodes, one without states, or names that do not fit the columns.
-        DiskFullError: the disk is full; what stood at `path` before stays.
+        DiskFullError: the disk is full; a file that was at `path` before is unchanged.
     """
     if not episodes:
         raise RecordingError(f"{path}: a recording needs at least one episode")
@@ -75,7 +77,7 @@ def write_csv(
         writer.writerow(["episode", "time", *states, *actions])
         for number, episode in enumerate(episodes):
             if episode.state is None:
-                raise RecordingError(f"{path}: episode {number} has no states; HDF5 holds frames")
+                raise RecordingError(f"{path}: episode {number} has no states; write frames as HDF5")
             if (episode.state.shape[1], episode.action.shape[1]) != (len(states), len(actions)):
                 raise RecordingError(
                     f"{path}: episode {number} has {episode.state.shape[1]} columns of state and "

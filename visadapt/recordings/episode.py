@@ -1,4 +1,4 @@
-"""The episode: what was measured and commanded, row by row."""
+"""The episode: measurements and commands, row by row."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ class RecordingError(ValueError):
 
 @dataclass(frozen=True)
 class Episode:
-    """One uninterrupted run of T rows, state or frame or both.
+    """One uninterrupted run of T rows with states, frames, or both.
 
     Row t holds what was measured at t and the action commanded from t to t + 1; the action of the last row was
     not executed, so T rows are T - 1 samples.
 
     Raises:
-        RecordingError: arrays of another shape or type, rows that do not match, a clock that does not run forward,
-            or a value that is not finite.
+        RecordingError: an array of another shape, type or number of rows, times that do not rise, or a value that is
+            not finite.
 
     >>> import numpy as np, visadapt as va
     >>> episode = va.Episode(time=0.05 * np.arange(3), action=np.zeros((3, 1)), state=np.zeros((3, 4)))
@@ -38,7 +38,7 @@ class Episode:
     frame: NDArray[np.uint8] | None = None
     """(T, H, W)"""
     task_state: NDArray[np.floating] | None = None
-    """(T, n_task_state) how far it was in its task, in the task's own numbers: training goes on from there"""
+    """(T, n_task_state) progress in its task, in the task's own numbers, from which policy learning can continue"""
 
     def __post_init__(self) -> None:
         if self.state is None and self.frame is None:

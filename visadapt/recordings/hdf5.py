@@ -1,4 +1,4 @@
-"""Recordings as HDF5: one group for each episode, and in it the datasets time, action, state, frame and task_state.
+"""Recordings as HDF5: one group for each episode, with the datasets time, action, state, frame and task_state.
 
     /                       attributes format, version, state_names (optional), action_names (optional)
     /episode_00000/time     (T,) s, floating point
@@ -7,7 +7,7 @@
     /episode_00000/frame    (T, H, W) uint8, gzip
     /episode_00000/task_state  (T, n_task_state) floating point, where the target has a task
 
-All datasets carry a checksum (Fletcher-32), so that damaged bytes are an error and not data.
+All datasets carry a checksum (Fletcher-32), so that damaged bytes are reported and not read as data.
 """
 
 from __future__ import annotations
@@ -26,9 +26,8 @@ from visadapt.recordings.episode import Episode, RecordingError
 from visadapt.storage.atomic_files import replacing
 
 FORMAT, VERSION = "visadapt recording", 1
-
 FRAMES_IN_CHUNK = 16
-"""Frames compressed together: reading one unpacks no more than these."""
+"""Frames that are compressed together, so that reading one decompresses at most this many."""
 
 
 def write_recording(
@@ -37,20 +36,20 @@ def write_recording(
     state_names: Sequence[str] | None = None,
     action_names: Sequence[str] | None = None,
 ) -> None:
-    """Write episodes of unequal length; the file appears under its name once it is whole.
+    """Write episodes of any lengths, atomically.
 
     Raises:
-        RecordingError: no episodes, episodes that do not belong together, or names that do not fit their columns.
-        DiskFullError: the disk is full; what stood at `path` before stays.
+        RecordingError: no episodes, episodes of different widths or contents, or names that do not fit the columns.
+        DiskFullError: the disk is full; a file that was at `path` before is unchanged.
 
     >>> import pathlib, tempfile, torch, visadapt as va
     >>> target = va.SyntheticTarget(va.constant_force(2.0))
     >>> policy = va.load_policy(va.shipped("cartpole_states"))
-    >>> runs = va.run(target, policy, 2, 30, torch.Generator().manual_seed(0), exploration=0.3)
+    >>> runs = va.run(target, policy, 4, 60, torch.Generator().manual_seed(0), exploration=0.3)
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.h5"
     >>> va.write_recording(path, [run.episode for run in runs], ["x", "x_dot", "theta", "theta_dot"], ["command"])
     >>> len(va.read_recording(path))
-    2
+    4
     """
     path = Path(path)
     _check_alike(path, episodes)
@@ -60,8 +59,8 @@ def write_recording(
     for kind, given in names.items():
         if given is not None and len(given) != widths[kind]:
             raise RecordingError(f"{path}: {len(given)} names for {widths[kind]} columns of {kind}")
-    # In memory first: HDF5 takes the whole process down when the disk fills up below it. The episodes are in memory
-    # anyway, and larger.
+    # In memory first, since HDF5 aborts the process when the disk fills up. The episodes are in memory already, and
+    # uncompressed.
     with h5py.File("recording", "w", driver="core", backing_store=False) as file:
         file.attrs["format"] = FORMAT
         file.attrs["version"] = VERSION
@@ -77,18 +76,18 @@ def write_recording(
 
 
 def read_names(path: str | os.PathLike[str]) -> tuple[list[str] | None, list[str] | None]:
-    """The names of the columns of state and of action, None where a file has none; raises as `read_recording`."""
+    """Names of the columns of state and of action, None where the file has none; raises like `read_recording`."""
     with _opened(Path(path)) as file:
         state, action = (file.attrs.get(f"{kind}_names") for kind in ("state", "action"))
         return None if state is None else list(state), None if action is None else list(action)
 
 
 def read_recording(path: str | os.PathLike[str], frames: bool = True) -> list[Episode]:
-    """All episodes of a file that `write_recording` wrote, in order; with `frames` False, of their states alone.
+    """All episodes of a file that `write_recording` wrote, in order; without their frames if `frames` is False.
 
     Raises:
-        RecordingError: the file is missing, torn, of another format or version, or its rows make no episode;
-            the message is one line that says which file and episode, and what would be right.
+        RecordingError: the file is missing, incomplete, or of another format or version, or its rows are not valid
+            episodes; the message is one line that says which file and episode, and what would be right.
 
     >>> import numpy as np, pathlib, tempfile, visadapt as va
     >>> episode = va.Episode(time=0.05 * np.arange(3), action=np.zeros((3, 1)), state=np.zeros((3, 4)))
@@ -113,9 +112,9 @@ def _opened(path: Path) -> Iterator[h5py.File]:
             _check_version(path, file)
             yield file
     except OSError as error:
-        # The message of HDF5 is for its own developers, and may be several lines.
+        # HDF5's own message describes its internals and may be several lines long.
         raise RecordingError(
-            f"{path}: not a readable HDF5 file, or cut short; a recording written by visadapt was expected"
+            f"{path}: not a readable HDF5 file, or cut short; a recording written by visadapt is right"
         ) from error
 
 
@@ -173,7 +172,7 @@ def _read(where: str, group: h5py.Group, name: str) -> NDArray[Any] | None:
 
 
 def _check_alike(path: Path, episodes: Sequence[Episode]) -> None:
-    """All episodes hold the same things, of the same width."""
+    """Raises RecordingError unless all episodes have the same datasets, of the same widths."""
     if not episodes:
         raise RecordingError(f"{path}: a recording needs at least one episode")
     for name in ("action", "state", "frame", "task_state"):

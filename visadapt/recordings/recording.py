@@ -1,4 +1,4 @@
-"""A recording that is ready to be diagnosed: episodes in the system's names and units, and what was wrong with them."""
+"""A checked recording: episodes in the system's names and units, and warnings about what was changed."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class Recording:
     """
 
     episodes: tuple[Episode, ...]
-    """`state` holds the columns `measured`, no others; `action` all of the system's, in its order"""
+    """`state` has the columns `measured`, `action` all actions of the system, in its order"""
     measured: tuple[str, ...]
-    """the states that were measured, in the system's order"""
+    """names of the measured states, in the system's order"""
     period: float
     """s between rows: the median of the episodes'"""
     sources: tuple[str, ...]
-    """for each episode, where it comes from, for messages: "run3.csv, episode 2" """
+    """where each episode comes from, for messages: "run3.csv, episode 2" """
     warnings: tuple[str, ...] = ()
     """what was changed or left out, a line each"""
 

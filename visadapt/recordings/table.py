@@ -1,4 +1,4 @@
-"""Tables of numbers as text, with a line of names: separated by commas or semicolons, as spreadsheets write them."""
+"""Tables of numbers as text with a header line, separated by commas or semicolons, as spreadsheets write them."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from visadapt.recordings.episode import RecordingError
 
 @dataclass(frozen=True)
 class Table:
-    """One file's text, split into its names and its rows, which are not yet numbers.
+    """A file's text, split into the header and the rows, which are not parsed yet.
 
-    Rows are counted from 1 without the line of names, comments (lines that begin with #) and blank lines; lines are
-    counted from 1 as an editor does.
+    Row numbers start from 1 and leave out the header, comments (lines that begin with #) and blank lines; line numbers
+    are those of an editor.
     """
 
     path: Path
@@ -28,14 +28,14 @@ class Table:
     separator: str
     body: str
     first_line: int
-    """of the body"""
+    """line number of the body's first line"""
 
     @classmethod
     def open(cls, path: Path) -> Table:
-        """Read a file as far as its line of names.
+        """Read a file and parse its header.
 
         Raises:
-            RecordingError: the file is missing, unreadable, no text, empty, or has no line of names.
+            RecordingError: the file is missing, unreadable, not text, empty, or has no header.
         """
         try:
             text = path.read_text(encoding="utf-8-sig")  # line ends of any kind become \n
@@ -61,11 +61,11 @@ class Table:
         return cls(path, header, separator, text[start:], line + 1)
 
     def numbers(self, columns: Sequence[int]) -> NDArray[np.float64]:
-        """The rows of some columns (rows, len(columns)); other columns may hold anything.
+        """Some columns (rows, len(columns)); the other columns may hold anything.
 
         Raises:
-            RecordingError: no rows, a row of another length than the names', or a cell that is no number;
-                says which row, line and column.
+            RecordingError: no rows, a row with more or fewer cells than the header, or a cell that is not a number;
+                the message names row, line and column.
         """
         if next(self._lines(), None) is None:
             raise RecordingError(f"{self.path}: has no rows below its line of names")
@@ -80,14 +80,14 @@ class Table:
         return values
 
     def place(self, row: int) -> str:
-        """How a row, counted from 0, is called in messages."""
+        """The name in messages of a row, counted from 0."""
         for index, (line, _) in enumerate(self._lines()):
             if index == row:
                 return f"row {row + 1} (line {line})"
         return f"row {row + 1}"
 
     def _lines(self) -> Iterator[tuple[int, str]]:
-        """The rows' lines, each with its number."""
+        """Number and text of each row's line."""
         start, number = 0, self.first_line
         while start < len(self.body):
             end = self.body.find("\n", start) + 1 or len(self.body)
@@ -97,14 +97,14 @@ class Table:
             start, number = end, number + 1
 
     def _numbers_one_by_one(self, columns: Sequence[int]) -> NDArray[np.float64]:
-        """Slower, but it knows about quotes, and which cell is wrong."""
+        """Like `numbers`; slower, but it accepts quoted cells and finds the cell that is wrong."""
         rows = []
         for row, (number, line) in enumerate(self._lines()):
             cells = next(csv.reader([line], delimiter=self.separator))
             where = f"{self.path}: row {row + 1} (line {number})"
             if len(cells) < len(self.header):
                 raise RecordingError(
-                    f"{where} is cut short: {len(cells)} of {len(self.header)} cells; is the file torn?"
+                    f"{where} is cut short: {len(cells)} of {len(self.header)} cells; is the file incomplete?"
                 )
             if len(cells) > len(self.header):
                 raise RecordingError(f"{where} has {len(cells)} cells, the line of names {len(self.header)}")
@@ -126,7 +126,7 @@ def _is_number(cell: str) -> bool:
 def _complaint(cell: str) -> str:
     cell = cell.strip()
     if not cell:
-        return "is empty; a number is right (a row without a measurement is better left out)"
+        return "is empty; a number is right (leave out rows without a measurement)"
     if _is_number(cell.replace(",", ".", 1)) and math.isfinite(float(cell.replace(",", ".", 1))):
         return f"is {cell!r}; a decimal point is right"
     return f"is {cell[:40]!r}; a number is right"

@@ -1,1 +1,1 @@
-"""Atomic files, checkpoints, run folders."""
+"""Files that are written whole or not at all: atomic files, checkpoints, run folders."""

@@ -1,4 +1,4 @@
-"""Writing files so that nothing half-written ever stands under its final name."""
+"""Atomic writing: a file appears under its name only once it is complete."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-LITTLE = 2**18
-"""Bytes free on a disk at which a writer that failed for reasons it did not tell is taken to have run out of room."""
+FULL_DISK_BYTES = 2**18
+"""With fewer bytes free than this, a write that failed without naming its cause is taken to have filled the disk."""
 
 
 class DiskFullError(OSError):
@@ -20,27 +20,27 @@ class DiskFullError(OSError):
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary name beside `path` to write to; the file takes the name `path` once it is whole.
+    """Gives a temporary path beside `path` to write to; the file is renamed to `path` when the block ends.
 
         with replacing("film.mp4") as temporary:
             write_film(temporary, frames)
 
-    The temporary name is hidden and keeps the suffix, since many writers choose a format by it. Missing folders
-    are made. Where the block raises, or is interrupted, the temporary is removed and what stood at `path` stays.
+    The temporary file is hidden and keeps the suffix, since many writers choose a format by it. Missing folders are
+    made. If the block raises or is interrupted, the temporary file is removed and a file at `path` stays as it was.
 
     Raises:
         DiskFullError: the disk, or the user's quota on it, is full.
-        OSError: anything else that the writing raised.
+        Exception: whatever else the block raised.
     """
     final = Path(path)
     temporary = final.with_name(f".{final.stem[:100]}.{uuid.uuid4().hex[:12]}{final.suffix}")
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
-        _settle(temporary)
+        _flush(temporary)
         temporary.replace(final)
     except BaseException as error:
-        # Asked before the temporary, which may be what fills the disk, is gone.
+        # Before the temporary file, which may be what fills the disk, is removed.
         full = isinstance(error, Exception) and _is_full(error, final.parent)
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -49,14 +49,14 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
 
 
-def _settle(path: Path) -> None:
-    """Push the file to the disk, so that a full disk or a power cut shows before the old file is replaced."""
+def _flush(path: Path) -> None:
+    """Force the file onto the disk, so that a full disk or a power cut cannot cost the old file."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
 
 
 def _is_full(error: BaseException, folder: Path) -> bool:
-    """Whether the disk was full: some libraries chain the system's error, some quote it, and some hide it."""
+    """Whether the disk was full. Some libraries chain the system's error, some quote it, some report neither."""
     codes = {errno.ENOSPC, errno.EDQUOT}
     link: BaseException | None = error
     while link is not None:
@@ -65,8 +65,8 @@ def _is_full(error: BaseException, folder: Path) -> bool:
         if any(os.strerror(code) in str(link) for code in codes):
             return True
         link = link.__cause__ or link.__context__
-    # torch.save says "unexpected pos", ffmpeg breaks its pipe.
+    # torch.save reports "unexpected pos", ffmpeg a broken pipe.
     if isinstance(error, OSError | RuntimeError):
         with suppress(OSError):
-            return shutil.disk_usage(folder).free < LITTLE
+            return shutil.disk_usage(folder).free < FULL_DISK_BYTES
     return False

@@ -17,38 +17,43 @@ from torch import Tensor, nn
 
 from visadapt.storage.atomic_files import replacing
 
-TREE = "visadapt.tree"
+TREE_KEY = "visadapt.tree"
+"""Key of the JSON in the header of the safetensors file."""
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that cannot be read or does not fit; the message says which file, which key and what is wrong."""
+    """A checkpoint that cannot be read or does not fit; the message names the file, the key and what is wrong."""
 
 
 def save_tree(path: Path, tree: Any) -> None:
-    """Write a tree to `path`, whole or not at all."""
+    """Write a tree to `path`, atomically."""
     tensors: dict[str, Tensor] = {}
     skeleton = _strip(tree, tensors)
     with replacing(path) as temporary:
-        save_file(tensors, temporary, {TREE: json.dumps(skeleton)})
+        save_file(tensors, temporary, {TREE_KEY: json.dumps(skeleton)})
 
 
 def load_tree(path: Path) -> Any:
-    """Read a tree; raises CheckpointError where the file is missing, torn, or of another kind."""
+    """Read a tree; raises CheckpointError if the file is missing, incomplete, or not written by `save_tree`."""
     if not path.is_file():
         raise CheckpointError(f"{path}: there is no such checkpoint")
     try:
         with safe_open(path, framework="pt") as file:
-            skeleton = json.loads((file.metadata() or {})[TREE])
+            skeleton = json.loads((file.metadata() or {})[TREE_KEY])
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path}: not a whole safetensors file ({error})") from error
+        raise CheckpointError(f"{path}: not a complete safetensors file ({error})") from error
     except KeyError:
         raise CheckpointError(f"{path}: a safetensors file, but not one that visadapt wrote") from None
     return _restore(skeleton, tensors)
 
 
 def load_weights(module: nn.Module, weights: Mapping[str, Tensor], origin: Path) -> None:
-    """Load weights into a module; raises CheckpointError naming the first misfit, both shapes and dtypes."""
+    """Load weights into a module, all of them or none.
+
+    Raises:
+        CheckpointError: a key is missing or extra, or differs in shape or dtype; the message names it and `origin`.
+    """
     own = module.state_dict()
     for key, value in own.items():
         if key not in weights:
@@ -65,12 +70,16 @@ def load_weights(module: nn.Module, weights: Mapping[str, Tensor], origin: Path)
 
 
 def save_network(path: Path, network: nn.Module, settings: Mapping[str, Any]) -> None:
-    """Write a network's weights and buffers (its normalisers among them) with the settings it was trained under."""
+    """Write a network's weights and buffers, which include its normalisers, and the settings of its training."""
     save_tree(path, {"class": type(network).__name__, "settings": dict(settings), "weights": network.state_dict()})
 
 
 def load_network(path: Path, network: nn.Module) -> dict[str, Any]:
-    """Load what `save_network` wrote into a network of the same class; returns the settings."""
+    """Load what `save_network` wrote into a network of the same class; returns the settings of its training.
+
+    Raises:
+        CheckpointError: the file is missing, incomplete, or holds another class or architecture.
+    """
     tree = load_tree(path)
     if not isinstance(tree, dict) or tree.keys() != {"class", "settings", "weights"}:
         raise CheckpointError(f"{path}: a checkpoint, but not of a network")

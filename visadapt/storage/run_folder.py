@@ -1,4 +1,4 @@
-"""A run's folder: its settings, seeds and versions beside its results, and stages that are done only once."""
+"""A run's folder: its settings, seeds and versions beside its results, and results that are computed only once."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from typing import Any
 
 from visadapt.storage.atomic_files import replacing
 
-PACKAGES = ("visadapt", "torch", "numpy", "opencv-python-headless", "gymnasium", "mujoco")
+RECORDED_PACKAGES = ("visadapt", "torch", "numpy", "opencv-python-headless", "gymnasium", "mujoco")
 
 
 class RunError(ValueError):
-    """A folder that a run cannot be continued in; the message is one line that says why."""
+    """A folder in which a run cannot be continued; the message is one line that says why."""
 
 
 def open_run(folder: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Begin a run in `folder`, or go on with the one that is there; returns its settings and versions.
+    """Begin a run in `folder`, or continue the one that is there; returns its settings and versions.
 
     Raises:
         RunError: the folder holds a run with other settings.
@@ -40,9 +40,9 @@ def open_run(folder: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that results depend on, as far as they are installed."""
+    """Versions of Python and of those packages that results depend on and that are installed."""
     found = {"python": platform.python_version()}
-    for package in PACKAGES:
+    for package in RECORDED_PACKAGES:
         try:
             found[package] = version(package)
         except PackageNotFoundError:
@@ -51,23 +51,23 @@ def versions() -> dict[str, str]:
 
 
 def once(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What `make` gives as JSON in `path`, made only where it is not there yet."""
+    """The JSON object in `path`; if there is no such file, `make` is called and its result written there first."""
     if not path.exists():
         write_json(path, make())
     return read_json(path)
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object; raises RunError where the file is torn."""
+    """The JSON object in a file; raises RunError if the file is incomplete."""
     try:
         content: dict[str, Any] = json.loads(path.read_text())
     except json.JSONDecodeError as error:
-        raise RunError(f"{path}: not whole JSON ({error}): remove it and run again") from error
+        raise RunError(f"{path}: not complete JSON ({error}): remove it and run again") from error
     return content
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON object, whole or not at all; what is not finite is written as null, as strict readers ask."""
+    """Write a JSON object, atomically; numbers that are not finite become null, since JSON has none."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 

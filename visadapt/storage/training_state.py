@@ -1,4 +1,4 @@
-"""Training that can be interrupted: everything an optimisation needs to go on to the same numbers."""
+"""Training that can be interrupted: all the state that is needed to continue to the same numbers."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from torch import nn
 
 from visadapt.storage.checkpoints import load_tree, load_weights, save_tree
 
-EVERY = 100
+CHECKPOINT_ITERATIONS = 100
 """Iterations between two checkpoints."""
 
 
 @dataclass
-class Training:
-    """A network in training, its optimiser and schedule, and where randomness comes from."""
+class TrainingState:
+    """A network in training, its optimiser, learning-rate schedule and random generator."""
 
     network: nn.Module
     optimiser: torch.optim.Optimizer
@@ -25,7 +25,7 @@ class Training:
     generator: torch.Generator
 
     def keep(self, path: Path, losses: list[float], more: dict[str, Any]) -> None:
-        """Write all of it to `path`, with the losses so far and whatever else the loop needs."""
+        """Write the state to `path`, with the losses so far and `more`, whatever else the loop needs."""
         tree = {
             "network": self.network.state_dict(),
             "optimiser": self.optimiser.state_dict(),
@@ -37,7 +37,7 @@ class Training:
         save_tree(path, tree)
 
     def resume(self, path: Path) -> tuple[list[float], dict[str, Any]]:
-        """Take up what `keep` wrote: the losses so far and the rest; raises CheckpointError where it does not fit."""
+        """Restore what `keep` wrote; returns the losses and `more`; raises CheckpointError where it does not fit."""
         tree = load_tree(path)
         load_weights(self.network, tree["network"], path)
         self.optimiser.load_state_dict(tree["optimiser"])

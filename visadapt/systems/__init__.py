@@ -1,4 +1,4 @@
-"""Systems: the source physics, in continuous time."""
+"""Systems: the physics of the source simulator, in continuous time."""
 
 from visadapt.systems.base import System, Variable
 from visadapt.systems.cartpole import CartPole

@@ -1,4 +1,4 @@
-"""What every system states about itself: its variables, its parameters and its continuous-time derivative."""
+"""Base of systems: variables, physical parameters and continuous-time derivative."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Variable:
-    """One entry of a state or action vector: its name, SI unit and the range a run is expected to stay in.
+    """One entry of a state or action vector: its name, SI unit and expected range.
 
     >>> import visadapt as va
     >>> va.Variable("theta", "rad", -0.3, 0.3).unit
@@ -25,10 +25,10 @@ class Variable:
 
 
 class System(ABC):
-    """Source physics in continuous time, batched and differentiable.
+    """Physics of the source simulator in continuous time, batched and differentiable.
 
-    Subclasses are frozen dataclasses whose fields are the physical parameters in SI units: numbers, or tensors, () or
-    (B,), where an effect has changed them.
+    Subclasses are frozen dataclasses whose fields are the physical parameters in SI units: each a number or a tensor,
+    () or (B,), which an effect may have changed.
 
     >>> from dataclasses import dataclass
     >>> import torch, visadapt as va
@@ -57,14 +57,14 @@ class System(ABC):
         """Time derivative (B, n_state) of a state (B, n_state) under a command (B, n_action) and a load (B, n_load)."""
 
     def to(self, like: Tensor) -> Self:
-        """The same system, parameters that are tensors with the device and dtype of `like`."""
-        itself: Any = self  # a dataclass, which this base is not
+        """The same system; parameters that are tensors get the device and dtype of `like`."""
+        itself: Any = self  # subclasses are dataclasses, this base is not
         values = {field.name: getattr(self, field.name) for field in fields(itself)}
         return replace(itself, **{k: value.to(like) for k, value in values.items() if isinstance(value, Tensor)})
 
     @classmethod
     def index(cls, name: str) -> int:
-        """Column of the state called `name`; raises KeyError naming the states there are."""
+        """Column of the state `name`; raises KeyError, which lists the states, if there is none."""
         names = [variable.name for variable in cls.states]
         if name not in names:
             raise KeyError(f"{cls.name} has no state {name!r}; its states are {', '.join(names)}")
@@ -72,5 +72,5 @@ class System(ABC):
 
 
 def holds(condition: bool | Tensor) -> bool:
-    """Whether a condition on a parameter, a number or a tensor, holds in every row."""
+    """Whether a condition on a parameter holds: if it is a tensor, in every row."""
     return bool(condition.all()) if isinstance(condition, Tensor) else condition

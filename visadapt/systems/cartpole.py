@@ -1,8 +1,8 @@
 """A pole hinged on a cart that a motor pushes along a track.
 
 Barto, Sutton and Anderson (1983), "Neuronlike adaptive elements that can solve difficult learning control
-problems", appendix, without their friction terms (friction is an effect). Positive force and command push
-towards +x; a positive angle leans towards +x; 0 is upright.
+problems", appendix, without their friction terms (friction is an effect). A positive force or command pushes towards
++x; a positive angle leans towards +x; 0 is upright.
 """
 
 from __future__ import annotations

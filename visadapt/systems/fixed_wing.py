@@ -5,18 +5,18 @@ linear (section 4.2); rates count as c q / (2 V), b p / (2 V) and b r / (2 V); m
 span (roll, yaw). Coefficients have the book's signs and axes, x forward, y right, z down; state, force and torque are
 in the body's, y left, z up.
 
-Two things differ from the book. Thrust is a force along the body's x axis that follows the command at once, as in the
-paper. And coefficients, which are those of attached flow, are held where angle of attack or sideslip leave
+Two things differ from the book. Thrust is a force along the body's x axis that follows the command without delay, as in
+the paper. And the coefficients, which hold for attached flow, stay constant where angle of attack or sideslip exceed
 `linear_range`: past the stall lift stays near its maximum instead of growing without bound, and drag stays positive.
-Separated flow itself is not modelled (the book's flat plate, equation 4.9, needs numbers that the source lacks), so
-that drag is too small in a deep stall or a spin.
+Separated flow is not modelled (the book's flat plate, equation 4.9, needs numbers that are not published for this
+aircraft), so drag is too small in a deep stall or a spin.
 
 Numbers: the perching aircraft of Waldock, Greatwood, Salama and Richardson (2018), "Learning to perform a perched
 landing on the ground using deep reinforcement learning", J. Intell. Robot. Syst. 92, as the paper's authors list them
-(github.com/lis-epfl/apg_trajectory_tracking, neural_control/dynamics/config_fixed_wing.json); Waldock's own table was
-not at hand to compare. All inertias, sizes and coefficients are from that file, none scaled or guessed; the 10 degrees
-of `linear_range` are the bound in the code beside it, ranges of commands are the paper's. Left out: a thrust line
-tilted down by 0.165 rad.
+(github.com/lis-epfl/apg_trajectory_tracking, neural_control/dynamics/config_fixed_wing.json); they were not compared
+with Waldock's own table. All inertias, sizes and coefficients are that file's values; the 10 degrees of `linear_range`
+are the bound in the code beside it; ranges of commands are the paper's. Not modelled: that file's thrust line, tilted
+down by 0.165 rad.
 """
 
 from __future__ import annotations
@@ -34,20 +34,21 @@ from visadapt.systems.rigid_body import POSITION, VELOCITY, RigidBody, beside, f
 _EFFECTS = ("drag", "side", "lift", "roll", "pitch", "yaw")
 _CAUSES = ("zero", "sideslip", "attack", "elevator", "aileron", "rudder", "roll_rate", "pitch_rate", "yaw_rate")
 _DEGREE = math.pi / 180
-_FLOOR = 1e-6
-"""m/s; slower than this, air has no direction"""
+_LEAST_AIRSPEED = 1e-6
+"""m/s in the x-z plane; below it the angle of attack is undefined and taken as 0"""
 
 
 @dataclass(frozen=True)
 class FixedWing(RigidBody):
     """Defaults are Waldock's aircraft and the paper's ranges of commands (0.05 s between commands; starts at 11.5 m/s).
 
-    A thrust command of -1 is none and 1 is `max_thrust`. A positive elevator (trailing edge down) pushes the nose
+    A thrust command of -1 is no thrust and 1 is `max_thrust`. A positive elevator (trailing edge down) pushes the nose
     down, a positive aileron the left wing down, a positive rudder (trailing edge left) the nose to the left.
-    Coefficients are dimensionless, or 1/rad. Those called `<force or moment>_<cause>` say how much of the first the
-    second brings; `zero` is what is there without a cause, and 0 sideways for an aircraft that is its own mirror image.
+    Coefficients are dimensionless, or 1/rad. `<force or moment>_<cause>` is the slope of the first over the second;
+    `<force or moment>_zero` is the value without any cause, which is 0 sideways for a symmetric aircraft.
 
-    Roll rate decays at 1.95 V a second, which RK4 bears in steps of 0.05 s up to 28 m/s: a dive needs shorter ones.
+    Roll rate decays with a rate of 1.95 V in 1/s at an airspeed V in m/s. RK4 with steps of 0.05 s is stable for that
+    up to 28 m/s; a dive needs shorter steps.
 
     >>> import torch, visadapt as va
     >>> state, command = va.FixedWing().trim(torch.tensor([11.5]))
@@ -176,14 +177,14 @@ class FixedWing(RigidBody):
         wind = (self.wind_x, self.wind_y, self.wind_z)
         if not any(isinstance(value, Tensor) or value for value in wind):
             return super().derivative(state, command, load)
-        # All but the change of place is as it would be if the air stood still and the wing flew at its airspeed.
+        # All derivatives but the position's are those in still air at the velocity relative to the air.
         velocity = state[:, VELOCITY]
         airborne = torch.cat((state[:, POSITION], velocity - beside(wind, state), state[:, VELOCITY.stop :]), 1)
         change = super().derivative(airborne, command, load)
         return torch.cat((velocity, change[:, VELOCITY.start :]), 1)
 
     def inertia(self, like: Tensor) -> Tensor:
-        # With z up, the product of inertia has the other sign than in the book.
+        # With z up, the product of inertia has the opposite sign of the book's.
         x, y, z, xz = self.inertia_x, self.inertia_y, self.inertia_z, self.inertia_xz
         return beside((x, 0.0, xz, 0.0, y, 0.0, xz, 0.0, z), like).unflatten(-1, (3, 3))
 
@@ -191,11 +192,11 @@ class FixedWing(RigidBody):
         """Beard and McLain's section 4.2, and thrust; force and torque (B, 3) each."""
         table, limit = self._table(velocity)
         plane, speed = velocity[:, ::2], velocity.norm(dim=-1, keepdim=True)
-        in_plane = plane.norm(dim=-1, keepdim=True).clamp_min(_FLOOR)
-        ahead = torch.where(in_plane > _FLOOR, velocity[:, :1], 1.0)  # atan2 has no gradient at (0, 0)
-        # Minus sideslip and minus angle of attack, since y is left and z is up: the table has the sign.
+        in_plane = plane.norm(dim=-1, keepdim=True).clamp_min(_LEAST_AIRSPEED)
+        ahead = torch.where(in_plane > _LEAST_AIRSPEED, velocity[:, :1], 1.0)  # atan2 has no gradient at (0, 0)
+        # Minus sideslip and minus angle of attack, since y is left and z is up; the table's entries undo the sign.
         angles = torch.atan2(velocity[:, 1:], torch.cat((in_plane, ahead), -1)).clamp(-limit, limit)
-        # V^2 times a coefficient is V times this: rates, which count as c q / (2 V), then need no division by V.
+        # The causes times V. Forces are V times their sum: rates enter as c q / (2 V), and no division by V is left.
         causes = torch.cat((speed, speed * torch.cat((angles, command[:, 1:]), -1), rates), -1)
         effects = speed * times(table, causes)
         drag, side, lift = effects[:, :3].unbind(-1)

@@ -1,10 +1,10 @@
-"""A rig of one's own: the system's parameters, in a TOML file.
+"""The parameters of one's own machine, in a TOML file: a system with values other than its defaults.
 
     [parameters]
     cart_mass = 0.230
     pole_mass = 0.087
 
-Names and units are the system's own; what the file leaves out keeps the system's default.
+Names and SI units are those of the system's fields; parameters that the file does not name keep their defaults.
 """
 
 from __future__ import annotations
@@ -18,20 +18,19 @@ from typing import Any, TypeVar
 
 from visadapt.systems import System
 
-TABLE = "parameters"
-
 SystemT = TypeVar("SystemT", bound=System)
 
 
-class RigError(ValueError):
-    """A rig's file that cannot be used; the message is one line: which file and key, and what would be right."""
+class ParameterFileError(ValueError):
+    """A parameter file that cannot be used; the message is one line: which file, which key, and what would be right."""
 
 
 def load_parameters(path: str | os.PathLike[str], system_class: type[SystemT]) -> SystemT:
-    """The system with the parameters of a TOML file.
+    """The system with the parameters in a TOML file.
 
     Raises:
-        RigError: no such file, no TOML, no table `[parameters]`, an unknown key, or an impossible value.
+        ParameterFileError: the file is missing or not TOML, has no table `[parameters]`, or has an unknown key or an
+            impossible value.
 
     >>> import pathlib, tempfile, visadapt as va
     >>> rig = pathlib.Path(tempfile.mkdtemp()) / "rig.toml"
@@ -42,28 +41,30 @@ def load_parameters(path: str | os.PathLike[str], system_class: type[SystemT]) -
     try:
         content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
-        raise RigError(f"{path}: cannot be read: {error.strerror}") from error
+        raise ParameterFileError(f"{path}: cannot be read: {error.strerror}") from error
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise RigError(f"{path}: not TOML: {error}") from error
+        raise ParameterFileError(f"{path}: not TOML: {error}") from error
     names = list(inspect.signature(system_class).parameters)
     known = ", ".join(names)
-    parameters = content.pop(TABLE, None)
+    parameters = content.pop("parameters", None)
     if not isinstance(parameters, dict):
-        raise RigError(f"{path}: the table [{TABLE}] is missing; it may hold {known}")
+        raise ParameterFileError(f"{path}: the table [parameters] is missing; it may hold {known}")
     if content:
-        raise RigError(f"{path}: unknown key {next(iter(content))!r} outside [{TABLE}], which may hold {known}")
+        raise ParameterFileError(
+            f"{path}: unknown key {next(iter(content))!r} outside [parameters], which may hold {known}"
+        )
     for key, value in parameters.items():
         if key not in names:
-            raise RigError(f"{path}: unknown key {key!r} in [{TABLE}]; there are {known}")
+            raise ParameterFileError(f"{path}: unknown key {key!r} in [parameters]; there are {known}")
         _check_number(path, key, value)
     try:
         return system_class(**{key: float(value) for key, value in parameters.items()})
     except ValueError as error:
-        raise RigError(f"{path}: {error}") from error
+        raise ParameterFileError(f"{path}: {error}") from error
 
 
 def _check_number(path: str | os.PathLike[str], key: str, value: Any) -> None:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise RigError(f"{path}: {key} must be a number in SI units, got {value!r}")
+        raise ParameterFileError(f"{path}: {key} must be a number in SI units, got {value!r}")
     if not math.isfinite(value):
-        raise RigError(f"{path}: {key} must be finite, got {value!r}")
+        raise ParameterFileError(f"{path}: {key} must be finite, got {value!r}")

@@ -1,8 +1,8 @@
-"""A quadrotor that takes a collective thrust and body rates, as a flight controller's rate loop carries them out.
+"""A quadrotor commanded by collective thrust and body rates, with the rate loop of its flight controller.
 
 The model of Flightmare: Song, Naji, Kaufmann, Loquercio and Scaramuzza (2020), arXiv:2009.00563. A command is the
-mass-normalised thrust and three body rates; an inner loop turns the error of the rates into a torque and undoes the
-gyroscopic torque. Rotors are fast beside the period of the commands, and follow at once.
+mass-normalised thrust and three body rates; an inner loop turns the error of the rates into a torque and compensates
+the gyroscopic torque. Rotors are much faster than the period of the commands and are taken to follow without delay.
 """
 
 from __future__ import annotations
@@ -47,35 +47,35 @@ class Quadrotor(RigidBody):
     torque_to_thrust: float | Tensor = 0.016
     """m, a rotor's torque about its axis for each newton of its thrust"""
 
-    # What the flight controller does not know of. Nothing of it is there unless an effect, or a rig's file, says so.
+    # Deviations that the flight controller does not know of; none by default. Effects and parameter files set them.
     payload: float | Tensor = 0.0
-    """kg, the part of `mass` that hangs at the centre"""
+    """kg, the part of `mass` that is a load at the centre"""
     centre_x: float | Tensor = 0.0
-    """m, how far ahead of the rotors' middle the centre of mass lies"""
+    """m, position of the centre of mass ahead of the rotors' centre"""
     centre_y: float | Tensor = 0.0
-    """m, how far to the left of it"""
+    """m, to the left of it"""
     inertia_scale_x: float | Tensor = 1.0
-    """moment of inertia about x, as a share of the one that the rate loops count on"""
+    """true moment of inertia about x over the one that the rate loops assume"""
     inertia_scale_y: float | Tensor = 1.0
     """the same about y"""
     inertia_scale_z: float | Tensor = 1.0
     """the same about z"""
     damping_x: float | Tensor = 0.0
-    """1/s, torque of the air against a rate about x, by that rate and the inertia that the rate loops count on"""
+    """1/s, aerodynamic damping about x: torque against a rate, over that rate and the inertia the rate loops assume"""
     damping_y: float | Tensor = 0.0
     """the same about y"""
     damping_z: float | Tensor = 0.0
     """the same about z"""
     rotor_1: float | Tensor = 1.0
-    """share of the thrust asked of it that the rotor in front on the left gives"""
+    """thrust of the front left rotor over the thrust commanded of it"""
     rotor_2: float | Tensor = 1.0
-    """in front on the right"""
+    """of the front right rotor"""
     rotor_3: float | Tensor = 1.0
-    """behind on the right"""
+    """of the rear right rotor"""
     rotor_4: float | Tensor = 1.0
-    """behind on the left"""
+    """of the rear left rotor"""
     wind_x: float | Tensor = 0.0
-    """m/s, velocity of the air in world axes, for effects of the air: the vehicle itself feels none"""
+    """m/s, velocity of the air in world axes; only effects such as drag depend on it"""
     wind_y: float | Tensor = 0.0
     """m/s"""
     wind_z: float | Tensor = 0.0
@@ -90,17 +90,17 @@ class Quadrotor(RigidBody):
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name in _ANY:
+            if field.name in _EITHER_SIGN:
                 if not holds(abs(value) < math.inf):
                     raise ValueError(f"quadrotor: {field.name} must be finite, got {value!r}")
-            elif not holds(value >= (0.0 if field.name in _FROM_ZERO else torch.finfo(torch.float32).tiny)):
+            elif not holds(value >= (0.0 if field.name in _MAY_BE_ZERO else torch.finfo(torch.float32).tiny)):
                 raise ValueError(f"quadrotor: {field.name} must be positive, got {value!r}")
         if not holds(self.max_thrust > self.min_thrust):
             raise ValueError(
-                f"quadrotor: max_thrust must be beyond min_thrust, got {self.max_thrust!r} and {self.min_thrust!r}"
+                f"quadrotor: max_thrust must exceed min_thrust, got {self.max_thrust!r} and {self.min_thrust!r}"
             )
         if not holds(self.mass > self.payload):
-            raise ValueError(f"quadrotor: mass must be beyond payload, got {self.mass!r} and {self.payload!r}")
+            raise ValueError(f"quadrotor: mass must exceed payload, got {self.mass!r} and {self.payload!r}")
 
     def inertia(self, like: Tensor) -> Tensor:
         known = self.known_inertia(like)
@@ -108,9 +108,9 @@ class Quadrotor(RigidBody):
         return known * beside(scales, like)[..., None] if _differ(scales, 1.0) else known
 
     def known_inertia(self, like: Tensor) -> Tensor:
-        """Moments of inertia that the rate loops count on, kg m2: (3, 3), or (B, 3, 3).
+        """Moments of inertia that the rate loops assume, kg m2: (3, 3), or (B, 3, 3).
 
-        Of a plate with rotors, as Flightmare has it: m l^2 / 12 times (4.5, 4.5, 7) about x, y and z.
+        Flightmare's plate with rotors: m l^2 / 12 times (4.5, 4.5, 7) about x, y and z.
         """
         size = beside(((self.mass - self.payload) * self.arm_length**2 / 12,), like)
         return size[..., None] * torch.diag(like.new_tensor((4.5, 4.5, 7.0)))
@@ -121,13 +121,13 @@ class Quadrotor(RigidBody):
         return middle + half * command[:, 0]
 
     def wrench(self, velocity: Tensor, rates: Tensor, command: Tensor) -> tuple[Tensor, Tensor]:
-        asked = columns(self.max_rate) * command[:, 1:]
+        commanded = columns(self.max_rate) * command[:, 1:]
         gain = beside((self.roll_gain, self.roll_gain, self.yaw_gain), rates)
         inertia = self.known_inertia(rates)
-        torque = times(inertia, gain * (asked - rates)) + torch.linalg.cross(rates, times(inertia, rates))
+        torque = times(inertia, gain * (commanded - rates)) + torch.linalg.cross(rates, times(inertia, rates))
         thrust = (self.mass - self.payload) * self.thrust(command)
         if _differ((self.rotor_1, self.rotor_2, self.rotor_3, self.rotor_4), 1.0):
-            thrust, torque = self._given(thrust, torque)
+            thrust, torque = self._delivered(thrust, torque)
         if _differ((self.centre_x, self.centre_y), 0.0):
             torque = torque + thrust[:, None] * beside((-self.centre_y, self.centre_x, 0.0), torque)
         damping = (self.damping_x, self.damping_y, self.damping_z)
@@ -138,25 +138,25 @@ class Quadrotor(RigidBody):
         return force, torque
 
     def hover(self) -> float | Tensor:
-        """The thrust command that carries the weight, where every rotor gives what is asked."""
+        """The thrust command that balances the weight with rotors that deliver what is commanded."""
         middle, half = (self.max_thrust + self.min_thrust) / 2, (self.max_thrust - self.min_thrust) / 2
         return (self.gravity * (self.mass / (self.mass - self.payload)) - middle) / half
 
-    def _given(self, thrust: Tensor, torque: Tensor) -> tuple[Tensor, Tensor]:
-        """What the rotors give, each its share, of a thrust (B,) and a torque (B, 3) asked of all four together."""
+    def _delivered(self, thrust: Tensor, torque: Tensor) -> tuple[Tensor, Tensor]:
+        """Thrust (B,) and torque (B, 3) of rotors that each deliver a share of what the commanded ones need of them."""
         reach = self.arm_length / math.sqrt(2)
         levers = beside((1.0, reach, reach, self.torque_to_thrust), torque)
         mixer = torque.new_tensor(_MIXER)
         shares = beside((self.rotor_1, self.rotor_2, self.rotor_3, self.rotor_4), torque)
         # The mixer's rows are orthogonal and of length 2: its transpose is 4 times its inverse.
-        asked = torch.cat((thrust[:, None], torque), 1) / levers @ mixer / 4
-        given = (shares * asked) @ mixer.mT * levers
-        return given[:, 0], given[:, 1:]
+        commanded = torch.cat((thrust[:, None], torque), 1) / levers @ mixer / 4
+        delivered = (shares * commanded) @ mixer.mT * levers
+        return delivered[:, 0], delivered[:, 1:]
 
 
-_ANY = ("centre_x", "centre_y", "wind_x", "wind_y", "wind_z")
-"""Parameters of either sign."""
-_FROM_ZERO = (
+_EITHER_SIGN = ("centre_x", "centre_y", "wind_x", "wind_y", "wind_z")
+"""Parameters that may be negative."""
+_MAY_BE_ZERO = (
     *("min_thrust", "payload", "rotor_1", "rotor_2", "rotor_3", "rotor_4"),
     *("damping_x", "damping_y", "damping_z"),
 )
@@ -166,5 +166,5 @@ _MIXER = ((1.0, 1.0, 1.0, 1.0), (1.0, -1.0, -1.0, 1.0), (-1.0, -1.0, 1.0, 1.0), 
 
 
 def _differ(values: Sequence[float | Tensor], nominal: float) -> bool:
-    """Whether one of the parameters may differ from its nominal value; tensors are not looked into."""
+    """Whether one of the parameters may differ from its nominal value; a tensor always may."""
     return any(isinstance(value, Tensor) or value != nominal for value in values)

@@ -1,8 +1,8 @@
-"""A rigid body that flies: what the quadrotor and the fixed wing share.
+"""A flying rigid body: the equations of motion that quadrotor and fixed wing share.
 
 Frames follow ROS's REP 103: the world's z axis points up; the body's x axis points forward, y left, z up. Attitude
-is a quaternion (w, x, y, z) that turns body into world axes, so no attitude is singular. Only its direction counts:
-physics normalises it wherever it is used.
+is a quaternion (w, x, y, z) that rotates body into world axes, so no attitude is singular. It need not have length 1:
+it is normalised wherever it is used.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ POSITION, VELOCITY, ATTITUDE, RATES = slice(0, 3), slice(3, 6), slice(6, 10), sl
 
 
 def _bilinear(entries: dict[tuple[int, int], dict[int, float]], shape: tuple[int, int, int]) -> Tensor:
-    """A matrix that gives the third index from the products of the first two, flattened: few large operations
-    instead of many small ones, since a derivative is taken thousands of times a second."""
+    """A matrix (I J, K) that maps the flattened products of two vectors, (I,) and (J,), to a vector (K,).
+
+    One matrix product is faster than many small operations. `entries` are the coefficients: {(i, j): {k: value}}.
+    """
     out = torch.zeros(shape)
     for (i, j), results in entries.items():
         for k, value in results.items():
@@ -67,7 +69,7 @@ _TURNING = _bilinear(
 
 
 class RigidBody(System):
-    """Newton's and Euler's equations; a subclass says which force and torque act on the body.
+    """Newton's and Euler's equations; a subclass gives the force and torque on the body.
 
     Stevens, Lewis and Johnson (2016), Aircraft Control and Simulation, section 1.7 (flat earth).
     """
@@ -91,7 +93,7 @@ class RigidBody(System):
 
     @abstractmethod
     def wrench(self, velocity: Tensor, rates: Tensor, command: Tensor) -> tuple[Tensor, Tensor]:
-        """Force (B, 3) in N and torque (B, 3) in N m on the body, in its axes, weight left out.
+        """Force (B, 3) in N and torque (B, 3) in N m on the body, in body axes, without its weight.
 
         `velocity` (B, 3) and `rates` (B, 3) are in body axes, in m/s and rad/s.
         """
@@ -112,12 +114,12 @@ class RigidBody(System):
 
 
 def columns(value: float | Tensor) -> float | Tensor:
-    """A parameter, () or (B,), as a factor on what is (B, n)."""
+    """A parameter, () or (B,), in a shape that multiplies (B, n)."""
     return value[:, None] if isinstance(value, Tensor) and value.dim() else value
 
 
 def beside(values: Sequence[float | Tensor], like: Tensor) -> Tensor:
-    """Parameters side by side, (n,), or (B, n) where one of them is (B,)."""
+    """Parameters gathered in a tensor (n,), or (B, n) if one of them is (B,)."""
     tensors = {i: value for i, value in enumerate(values) if isinstance(value, Tensor)}
     gathered = like.new_tensor([0.0 if isinstance(value, Tensor) else value for value in values])
     if tensors:
@@ -133,7 +135,7 @@ def times(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def rotation(attitude: Tensor) -> Tensor:
-    """Matrices (B, 3, 3) that turn vectors from body to world axes, of attitudes (B, 4)."""
+    """Rotation matrices (B, 3, 3) from body to world axes, of attitudes (B, 4)."""
     products = (attitude[:, :, None] * attitude[:, None]).flatten(1)
     unit = products / attitude.square().sum(-1, keepdim=True)
     return (unit @ _ROTATION.to(attitude)).unflatten(-1, (3, 3))

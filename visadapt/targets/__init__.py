@@ -1,4 +1,4 @@
-"""Targets: anything that can be run."""
+"""Targets: machines and simulators on which a policy can be run."""
 
 from visadapt.targets.base import Observation, Target, TargetError
 from visadapt.targets.flight import FlightTarget

@@ -1,4 +1,4 @@
-"""What a gymnasium environment's numbers and frames mean to us: a small map, declared in code or in a TOML file."""
+"""The map between a gymnasium environment's numbers and frames and ours, declared in code or in a TOML file."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from visadapt.systems import System
 from visadapt.targets.base import TargetError
 
 ASPECT_TOLERANCE = 0.01
-"""A crop may differ by this share from the frame's aspect: more would bend a rigid pole as it turns."""
+"""Relative difference between the aspects of crop and frame; more would distort a turning pole."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry of the environment's observation or action vector, and the straight line between it and ours.
+    """One entry of the environment's observation or action vector, and the linear map between it and our variable.
 
     >>> import visadapt as va
     >>> va.Entry(index=2, scale=-1.0).offset
@@ -31,7 +31,7 @@ class Entry:
 
     index: int
     scale: float = 1.0
-    """a negative one turns the sign"""
+    """negative where the environment's sign is the opposite"""
     offset: float = 0.0
 
     def __post_init__(self) -> None:
@@ -41,15 +41,15 @@ class Entry:
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
                 raise TargetError(f"{name} must be a finite number, got {value!r}")
         if self.scale == 0:
-            raise TargetError("scale must not be 0: it would say nothing")
+            raise TargetError("scale must not be 0")
 
 
 @dataclass(frozen=True)
 class EnvMap:
-    """The declared map of an environment.
+    """The map of an environment.
 
-    In a TOML file it has the same names: tables `[states]` (`x = { index = 0 }`), `[limits]` and `[options]`, and
-    `actions`, `crop`, `contrast`, `width`, `height` above them.
+    A TOML file has the same names: `actions`, `crop`, `contrast`, `width`, `height` at its top, and below them the
+    tables `[states]` (`x = { index = 0 }`), `[limits]` and `[options]`.
 
     >>> import visadapt as va
     >>> states = {"x": va.Entry(0), "theta": va.Entry(1), "x_dot": va.Entry(2), "theta_dot": va.Entry(3)}
@@ -58,19 +58,19 @@ class EnvMap:
     """
 
     states: Mapping[str, Entry]
-    """our state called so = scale observation[index] + offset, in SI units"""
+    """by the name of our state: state = scale observation[index] + offset, in SI units"""
     actions: tuple[Entry, ...]
-    """action[index] = scale command + offset, one for each of our commands in [-1, 1]; entries not named get 0"""
+    """for each of our commands in [-1, 1]: action[index] = scale command + offset; the other entries are 0"""
     crop: tuple[int, int, int, int]
     """left, top, right, bottom in px of the environment's frame; right and bottom are the first px left out"""
     contrast: tuple[float, float] = (0.0, 255.0)
-    """grey levels that become black and white"""
+    """grey levels, 0 to 255, that become black and white"""
     limits: Mapping[str, float] = field(default_factory=dict)
-    """an episode ends where |state called so| exceeds this, beside where the environment itself ends it"""
+    """by the name of our state: its largest absolute value, beyond which an episode ends"""
     options: Mapping[str, Any] = field(default_factory=dict)
-    """what gymnasium.make is given besides: they decide the size of the frame and where its camera stands"""
+    """arguments of gymnasium.make, such as the size of the frame and the camera's place"""
     width: int = 120
-    """px of the frames that are shown"""
+    """px, of our frames"""
     height: int = 100
     """px"""
 
@@ -123,7 +123,7 @@ class EnvMap:
             raise TargetError(f"{path}: {error}") from error
 
     def check(self, name: str, system: type[System], n_observation: int, n_action: int) -> None:
-        """Whether the map fits the environment called `name` and our system; raises TargetError where it does not."""
+        """Raises TargetError unless the map fits the environment `name` and our system."""
         ours = [variable.name for variable in system.states]
         if sorted(self.states) != sorted(ours):
             raise TargetError(f"{name}: the map is of the states {', '.join(self.states)}; ours are {', '.join(ours)}")
@@ -147,14 +147,14 @@ class EnvMap:
                 )
 
     def state(self, observation: NDArray[np.floating], system: type[System]) -> NDArray[np.floating]:
-        """Our state (n_state,) in the order of our system."""
+        """Our state (n_state,), in our system's order, for an observation."""
         entries = [self.states[variable.name] for variable in system.states]
         return np.array([entry.scale * observation[entry.index] + entry.offset for entry in entries])
 
     def observation(
         self, state: NDArray[np.floating], system: type[System], rest: NDArray[np.floating]
     ) -> NDArray[np.floating]:
-        """The observation that means our state; entries that the map does not name are as in `rest`."""
+        """The observation for our state; entries that the map does not name are those of `rest`."""
         out = np.array(rest, dtype=float)
         for value, variable in zip(state, system.states, strict=True):
             entry = self.states[variable.name]
@@ -179,7 +179,7 @@ class EnvMap:
                 f"{name}: its frames are {picture.shape[1]} x {picture.shape[0]} px, "
                 f"but the crop reaches to column {right} and row {bottom}: change the crop or the frame's size"
             )
-        # In floating point, so that a contrast stretch of a dark picture does not leave steps between grey levels.
+        # In floating point, so that stretching the contrast of a dark picture does not leave gaps between grey levels.
         part = picture[top:bottom, left:right].astype(np.float32)
         grey = cv2.cvtColor(part, cv2.COLOR_RGB2GRAY) if part.ndim == 3 and part.shape[2] == 3 else part
         small = cv2.resize(grey, (self.width, self.height), interpolation=cv2.INTER_AREA)

@@ -18,24 +18,24 @@ from visadapt.targets.base import Observation, Target, TargetError
 from visadapt.targets.env_map import EnvMap
 from visadapt.targets.synthetic import Start
 
-INSTALL = "pip install 'visadapt[mujoco]'"
+HOW_TO_INSTALL = "pip install 'visadapt[mujoco]'"
 
 
 class GymnasiumTarget(Target):
-    """A batch of environments of one kind, made on demand and kept for the next reset.
+    """A batch of environments of one kind, created when first needed and kept for later resets.
 
     Args:
         env: the environment's id, or a function that makes one (with `render_mode="rgb_array"` and no time limit).
-        mapping: what its numbers and frames mean; `mapping.options` go to gymnasium.make, not to a function.
-        system: whose states and actions the mapping is to.
-        start: draws the state at the start of an episode in the place of the environment's own reset; only for
-            MuJoCo environments whose observation is all positions, then all velocities.
-        period: s between actions, where the environment does not say (`dt`, or `render_fps` of its metadata).
-        frames: whether frames are drawn at all.
+        mapping: the map between its numbers and frames and ours; `mapping.options` are for gymnasium.make alone.
+        system: the system whose states and actions the mapping gives.
+        start: draws the first state of an episode instead of the environment's own reset; only for MuJoCo
+            environments whose observation is all positions, then all velocities.
+        period: s between actions; by default the environment's `dt`, or 1 / `render_fps` of its metadata.
+        frames: whether frames are drawn.
 
     Raises:
-        TargetError: gymnasium is not installed, the environment is not to be had, has discrete actions, no
-            rgb_array, or no period, or the mapping does not fit it.
+        TargetError: gymnasium is not installed; the environment cannot be made, has discrete actions, no rgb_array,
+            or no period; or the mapping does not fit it.
 
     >>> import torch, visadapt as va
     >>> from visadapt.targets.inverted_pendulum import MAP
@@ -58,7 +58,7 @@ class GymnasiumTarget(Target):
         try:
             import gymnasium
         except ImportError as error:
-            raise TargetError(f"gymnasium is not installed: {INSTALL}") from error
+            raise TargetError(f"gymnasium is not installed: {HOW_TO_INSTALL}") from error
         self._gymnasium = gymnasium
         self._source = env
         self.mapping = mapping
@@ -85,7 +85,7 @@ class GymnasiumTarget(Target):
         """Start `batch` new episodes, each environment seeded from the generator.
 
         Raises:
-            TargetError: the environment shows something that is not finite, or no frame that the crop fits.
+            TargetError: an observation is not finite, or the crop does not fit the frame.
         """
         seeds = torch.randint(2**31 - 1, (batch,), generator=generator).tolist()
         starts = None if self.initial is None else self.initial.draw(batch, generator).double().numpy()
@@ -109,8 +109,8 @@ class GymnasiumTarget(Target):
         """Execute the action (B, n_action) for one period; an episode that has ended stays as it was.
 
         Raises:
-            TargetError: step before reset, an action of another shape or not finite, an environment that shows
-                something that is not finite or cuts its episodes short.
+            TargetError: step before reset, an action of another shape or not finite, an observation that is not
+                finite, or an episode that the environment truncates.
         """
         if action.shape != (len(self._alive), self.n_action) or not self._alive:
             wanted = f"({len(self._alive)}, {self.n_action})" if self._alive else "a reset first"
@@ -136,7 +136,7 @@ class GymnasiumTarget(Target):
         return self._observe()
 
     def close(self) -> None:
-        """Free the environments and what draws them; the target cannot be used afterwards."""
+        """Free the environments and their renderers; the target cannot be used afterwards."""
         envs, self._envs, self._alive = self._envs, [], []
         if envs and self._mujoco:
             mujoco_frames.close_all(envs)
@@ -145,7 +145,7 @@ class GymnasiumTarget(Target):
                 env.close()
 
     def show(self, states: NDArray[np.floating]) -> NDArray[np.uint8]:
-        """Frames (N, H, W) uint8 of chosen states (N, n_state): to train a renderer, without a step of the target.
+        """Frames (N, H, W) uint8 of chosen states (N, n_state), to train a renderer; takes no step of the target.
 
         Raises:
             TargetError: this environment cannot be put into a state.
@@ -163,7 +163,7 @@ class GymnasiumTarget(Target):
         gymnasium = self._gymnasium
         render_mode = "rgb_array" if self.frames else None
         try:
-            # Episodes end where the mapping says, not after so many steps.
+            # No time limit: episodes end where the mapping's limits or the environment say.
             return gymnasium.make(
                 self._source,
                 render_mode=render_mode,
@@ -172,21 +172,19 @@ class GymnasiumTarget(Target):
                 **self.mapping.options,
             )
         except gymnasium.error.DependencyNotInstalled as error:
-            advice = f"mujoco is not installed: {INSTALL}" if "mujoco" in str(error).lower() else _line(error)
+            advice = f"mujoco is not installed: {HOW_TO_INSTALL}" if "mujoco" in str(error).lower() else _line(error)
             raise TargetError(f"{self.name}: {advice}") from error
-        except (
-            Exception
-        ) as error:  # the constructor of anyone's environment: whatever it raises, the answer is one line
-            if mujoco_frames.is_blamed(error):
+        except Exception as error:  # whatever the environment's constructor raises becomes one line
+            if mujoco_frames.failed_to_import(error):
                 raise mujoco_frames.cannot_render(self.name, error) from error
             raise TargetError(f"{self.name}: cannot be made: {_line(error)}") from error
 
     def _check(self, env: Any) -> int:
-        """Raises TargetError where the environment cannot be a target; gives the length of its action."""
+        """The length of the environment's action; raises TargetError where it cannot be a target."""
         box = self._gymnasium.spaces.Box
         if not isinstance(env.action_space, box) or len(env.action_space.shape) != 1:
             raise TargetError(
-                f"{self.name}: its actions are {env.action_space}, but a policy here commands real numbers: "
+                f"{self.name}: its actions are {env.action_space}, but policies command real numbers: "
                 "take an environment whose action space is a one-dimensional Box, such as InvertedPendulum-v5"
             )
         if not isinstance(env.observation_space, box) or len(env.observation_space.shape) != 1:
@@ -207,11 +205,13 @@ class GymnasiumTarget(Target):
         period = getattr(env.unwrapped, "dt", None)
         rate = env.metadata.get("render_fps")
         if period is None and not rate:
-            raise TargetError(f"{self.name}: it does not say how long a step is; give `period` in s")
+            raise TargetError(
+                f"{self.name}: the environment states no step length (dt or render_fps); give `period` in s"
+            )
         return float(period) if period is not None else 1 / float(rate)
 
     def _place(self, env: Any, seen: NDArray[np.floating], state: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Put a MuJoCo environment into our state; its observation there."""
+        """Put a MuJoCo environment into our state; returns its observation there."""
         wanted = self.mapping.observation(state, self.system, seen)
         body = env.unwrapped
         n = getattr(getattr(body, "model", None), "nq", None)
@@ -242,13 +242,13 @@ class GymnasiumTarget(Target):
             if self._mujoco:
                 mujoco_frames.aim_viewer(env)
             picture = env.render()
-        except Exception as error:  # a renderer of anyone's: whatever it raises, the answer is one line
+        except Exception as error:  # whatever the renderer raises becomes one line
             if self._mujoco:
                 raise mujoco_frames.cannot_render(self.name, error) from error
             raise TargetError(f"{self.name}: render() failed: {_line(error)}") from error
         if not self._closed_at_exit:
-            # After the first frame, so that it runs before what the renderer registered while it drew: a viewer that
-            # is freed later than its display prints tracebacks.
+            # Registered after the first frame, so that it runs before the exit functions that the renderer registered
+            # while drawing: a viewer that is freed later than its display prints tracebacks.
             atexit.register(_close, weakref.ref(self))
             self._closed_at_exit = True
         return self.mapping.frame(self.name, picture)

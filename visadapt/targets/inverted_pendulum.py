@@ -7,22 +7,22 @@ from visadapt.targets.env_map import Entry, EnvMap
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.targets.synthetic import Start
 
-REACH = 0.9
-"""m, how far the cart may go either way: the rail ends at 1 m, the frame 1.0 m from its middle."""
+REACH_M = 0.9
+"""Largest |x| of the cart: rail and frame end at 1 m."""
 
 MAP = EnvMap(
     states={"x": Entry(0), "theta": Entry(1), "x_dot": Entry(2), "theta_dot": Entry(3)},
-    # Its control range is +-3 with a gear of 100: up to 300 N, 19 m/s2 on cart and pole, far too coarse to balance
-    # with. Our command 1 is its control 1, 100 N.
+    # Its control range is +-3 with a gear of 100: 300 N, or 19 m/s2 on cart and pole, too coarse for balancing. Our
+    # command of 1 is a control of 1, 100 N.
     actions=(Entry(0, scale=1.0),),
     crop=(0, 0, 240, 200),
-    # It has no light but the one at the camera: the brightest pixels have a grey level of about 130.
+    # The only light is the one at the camera: the brightest pixels have a grey level of about 130.
     contrast=(0.0, 150.0),
-    limits={"theta": 0.3, "x": REACH},
+    limits={"theta": 0.3, "x": REACH_M},
     options={
         "width": 240,
         "height": 200,
-        # Looks along +y from a point that does not move (body 0 is the world), so that +x is to the right.
+        # Looks along +y from a fixed point (body 0 is the world), so that +x is to the right.
         "default_camera_config": {
             "trackbodyid": 0,
             "distance": 2.0,
@@ -32,7 +32,7 @@ MAP = EnvMap(
         },
     },
 )
-"""The environment itself ends an episode at |theta| > 0.2 rad."""
+"""The environment itself ends an episode already at |theta| > 0.2 rad."""
 
 SOURCE = CartPole(
     cart_mass=10.471975511965976,
@@ -41,16 +41,16 @@ SOURCE = CartPole(
     max_force=100.0,
     gravity=9.81,
 )
-"""What an engineer reads off its model: masses, the pole's length, gear, gravity; a uniform rod without friction."""
+"""The published values of its model: masses, the pole's length, gear, gravity; a uniform rod without friction."""
 
 START = Start(x=0.2, x_dot=0.1, theta=0.1, theta_dot=0.1)
-"""Wider than the environment's own +-0.01, the same as the synthetic target's."""
+"""The same as the synthetic target's, and wider than the environment's own +-0.01."""
 
 
 def inverted_pendulum(start: Start | None = START, frames: bool = True) -> GymnasiumTarget:
-    """InvertedPendulum-v5, 0.04 s between actions; `start=None` keeps its own reset, +-0.01 of everything.
+    """InvertedPendulum-v5, 0.04 s between actions; `start=None` keeps its own reset, uniform within +-0.01.
 
     Raises:
-        TargetError: gymnasium or mujoco is not installed, or nothing can render off-screen.
+        TargetError: gymnasium or mujoco is not installed, or no off-screen renderer works.
     """
     return GymnasiumTarget("InvertedPendulum-v5", MAP, CartPole, start, frames=frames)

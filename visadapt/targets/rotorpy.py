@@ -1,8 +1,8 @@
-"""rotorpy's multirotor as a target: a quadrotor whose air, motors and rate loop no one here wrote.
+"""rotorpy's multirotor as a target: a quadrotor whose aerodynamics, motors and rate loop are not ours.
 
 Folk, Paulos and Kumar (2023), RotorPy: a Python-based multirotor simulator with aerodynamics, arXiv:2306.04485. The
-vehicle is its Crazyflie Brushless with propeller guards, as it stands there, flown by collective thrust and body rates
-(`cmd_ctbr`). `SOURCE` is the model that its published mass, arm and rate gain give.
+vehicle is its Crazyflie Brushless with propeller guards, unchanged, commanded by collective thrust and body rates
+(`cmd_ctbr`). `SOURCE` is the model from its published mass, arm length and rate gain.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from visadapt.targets.base import Observation, TargetError
 from visadapt.targets.flight import FlightTarget
 from visadapt.tasks.follow import Follow
 
-INSTALL = "pip install 'visadapt[rotorpy]'"
-TICK = 0.01
-"""s between runs of rotorpy's rate loop, its simulator's own default; thrusts are held for as long"""
+HOW_TO_INSTALL = "pip install 'visadapt[rotorpy]'"
+RATE_LOOP_PERIOD_S = 0.01
+"""s between runs of rotorpy's rate loop, its default; thrusts are held in between"""
 
 SOURCE = Quadrotor(
     mass=0.044,
@@ -34,22 +34,22 @@ SOURCE = Quadrotor(
     max_rate=1.0,
     torque_to_thrust=7.8e-10 / 4.052e-8,
 )
-"""What an engineer reads off the vehicle's parameters.
+"""The source model from the vehicle's published parameters.
 
-Thrusts are mass-normalised, so their range is the default's. Commands ask for rates twice as fast, since the default's
-rate loop is three times as stiff. Its inertia is that of a plate of that mass and arm: rate loops undo their own.
+Thrusts are mass-normalised, so their range is the default's. The largest rate is twice the default's, since this rate
+loop is a third as stiff. The inertia is that of a plate of this mass and arm length; it cancels in the rate loop.
 
-What it leaves out, on purpose: the drag of the rotors, and how thrust falls and rises with the air that flows through
-and across them; the wind; the motors' lag of 50 ms; the rate loop's tick; the gyroscopic torque, which rotorpy's rate
-loop does not undo.
+Deliberately not modelled: rotor drag, the change of thrust with the air flow through and across the rotors, wind, the
+motors' lag of 50 ms, the period of the rate loop, and the gyroscopic torque, for which rotorpy's rate loop does not
+compensate.
 """
 
 
 @dataclass(frozen=True)
 class Air:
-    """Wind in world axes: one steady velocity (rotorpy's ConstantWind), and one that swings (its SinusoidWind).
+    """Wind in world axes: a constant velocity (rotorpy's ConstantWind) plus a sinusoidal one (its SinusoidWind).
 
-    Every flight draws the phases of what swings, uniformly.
+    Phases of the sinusoids are drawn uniformly for every flight.
     """
 
     steady: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -64,19 +64,19 @@ BREEZE = Air(steady=(1.5, 0.0, 0.0), amplitude=(0.5, 1.0, 0.0))
 
 
 class RotorpyTarget(FlightTarget):
-    """A batch of rotorpy's multirotors along references: rotor drag, motor lag and wind on, 0.1 s between commands.
+    """A batch of rotorpy's multirotors along references, with rotor drag, motor lag and wind; 0.1 s between commands.
 
-    Thrust commands are forces in N of the same range as the source's, by the mass that both know; rates are rates.
-    States are rotorpy's in our order: its quaternion is (x, y, z, w). Rotors start at the speed of a hover.
+    Commands mean the same thrust in N and the same rates as the source's. States are rotorpy's in our order; its
+    quaternion is (x, y, z, w). Rotors start at hover speed.
 
     Args:
-        task: where flights start and what a policy is shown.
+        task: where flights start and the goals that policies are shown.
         air: the wind.
-        aero: whether the air acts at all.
-        changes: parameters of rotorpy's vehicle in the place of the published ones, by rotorpy's names.
+        aero: whether there are aerodynamic forces.
+        changes: parameters that replace rotorpy's published ones, by rotorpy's names.
 
     Raises:
-        TargetError: rotorpy, or what its batched multirotor needs, is not installed.
+        TargetError: rotorpy, or a package that its batched multirotor needs, is not installed.
     """
 
     def __init__(
@@ -94,9 +94,9 @@ class RotorpyTarget(FlightTarget):
         self.air = air
         self.aero = aero
         self._multirotors: Any = None
-        self._blowing: list[Any] = []
+        self._profiles: list[Any] = []
         self._state: dict[str, Tensor] = {}
-        self._ticks = 0
+        self._steps = 0
 
     def reset(self, batch: int, generator: torch.Generator) -> Observation:
         state, self.first = self.task.evaluation_start(batch, generator)
@@ -110,9 +110,9 @@ class RotorpyTarget(FlightTarget):
             "w": state[:, RATES],
             "rotor_speeds": state.new_full((batch, 4), hover),
         }
-        self._ticks = 0
-        self._blowing = self._wind(batch, generator)
-        self._blow()
+        self._steps = 0
+        self._profiles = self._wind(batch, generator)
+        self._set_wind()
         device = torch.device("cpu")
         parameters = self._physics.BatchedMultirotorParams([self.vehicle] * batch, batch, device)
         self._multirotors = self._physics.BatchedMultirotor(
@@ -129,10 +129,10 @@ class RotorpyTarget(FlightTarget):
             "cmd_w": SOURCE.max_rate * command[:, 1:],
         }
         with torch.no_grad():
-            for _ in range(round(self.period / TICK)):
-                self._state = self._multirotors.step(self._state, control, TICK)
-                self._ticks += 1
-                self._blow()
+            for _ in range(round(self.period / RATE_LOOP_PERIOD_S)):
+                self._state = self._multirotors.step(self._state, control, RATE_LOOP_PERIOD_S)
+                self._steps += 1
+                self._set_wind()
         self._task_state = self.task.advance(self._task_state)
         return self._observation()
 
@@ -153,7 +153,7 @@ class RotorpyTarget(FlightTarget):
         return {**drag, **damping, "lift": 4 * own["k_h"] / own["mass"], "lag": own["tau_m"], **wind}
 
     def _wind(self, batch: int, generator: torch.Generator) -> list[Any]:
-        """rotorpy's profiles, whose sum blows."""
+        """rotorpy's wind profiles, whose sum is the wind."""
         own = self.air
         amplitude, frequency = (torch.tensor([each] * batch).double() for each in (own.amplitude, own.frequency))
         delay = torch.rand(batch, 3, generator=generator, dtype=torch.double) / frequency
@@ -162,10 +162,10 @@ class RotorpyTarget(FlightTarget):
             self._winds.BatchedSinusoidWind(amplitude, frequency, delay),
         ]
 
-    def _blow(self) -> None:
-        """Tell the vehicles the wind at the next tick."""
-        now, where = self._ticks * TICK, self._state["x"]
-        self._state["wind"] = sum((each.update(now, where) for each in self._blowing), torch.zeros_like(where))
+    def _set_wind(self) -> None:
+        """Set the wind for the next step of the rate loop."""
+        now, where = self._steps * RATE_LOOP_PERIOD_S, self._state["x"]
+        self._state["wind"] = sum((each.update(now, where) for each in self._profiles), torch.zeros_like(where))
 
     def _observation(self) -> Observation:
         own = self._state
@@ -175,7 +175,7 @@ class RotorpyTarget(FlightTarget):
 
 
 def _import(module: str, *needs: str) -> Any:
-    """A module of rotorpy's, which passes over in silence what it `needs`."""
+    """A module of rotorpy; also imports the packages it `needs`, whose absence rotorpy itself does not report."""
     try:
         found = importlib.import_module(module)
         for each in needs:
@@ -183,4 +183,4 @@ def _import(module: str, *needs: str) -> Any:
         return found
     except ImportError as error:
         missing = (error.name or module).partition(".")[0]
-        raise TargetError(f"{missing} is not installed: {INSTALL}") from error
+        raise TargetError(f"{missing} is not installed: {HOW_TO_INSTALL}") from error

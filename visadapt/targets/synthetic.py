@@ -1,4 +1,4 @@
-"""Synthetic targets: a world whose effects the learner does not see, filmed by a camera that stands still."""
+"""Synthetic cart-poles: worlds whose effects the learner does not see, filmed by a fixed camera."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from visadapt.targets.base import Observation, Target, TargetError
 from visadapt.world import World, WorldState
 
 DrawEffects = Callable[[int, torch.Generator], Sequence[Effect]]
-"""Draws the effects of a batch of episodes: (batch, generator) to effects."""
+"""(batch, generator) to the effects of a batch of episodes."""
 
 
 def no_effects(batch: int, generator: torch.Generator) -> Sequence[Effect]:
-    """The source itself."""
+    """No effects: the target is the source."""
     return ()
 
 
 def sine_force(batch: int, generator: torch.Generator) -> Sequence[Effect]:
-    """Draws 2 (cos(t + phase) + 1) N on the cart (the paper, section 3.2.2), the phase uniform over a turn.
+    """A force of 2 (cos(t + phase) + 1) N on the cart (the paper, section 3.2.2), the phase uniform in [-pi, pi].
 
     >>> import torch, visadapt as va
     >>> va.sine_force(2, torch.Generator().manual_seed(0))[0].name
@@ -51,7 +51,7 @@ def constant_force(newtons: float) -> DrawEffects:
 
 @dataclass(frozen=True)
 class Start:
-    """Half-widths of the uniform distribution of the state at the start of an episode, around 0."""
+    """Half-widths of the uniform distribution, around 0, of an episode's first state."""
 
     x: float = 0.2
     """m"""
@@ -63,18 +63,18 @@ class Start:
     """rad/s"""
 
     def draw(self, batch: int, generator: torch.Generator) -> Tensor:
-        """States (batch, 4)."""
+        """First states (batch, 4)."""
         width = torch.tensor([self.x, self.x_dot, self.theta, self.theta_dot])
         return width * (2 * torch.rand(batch, 4, generator=generator) - 1)
 
 
 class SyntheticTarget(Target):
-    """A cart-pole with hidden effects, integrated by another method and more finely (1 ms) than any source.
+    """A cart-pole with hidden effects, integrated by the midpoint rule with steps of 1 ms, unlike any source.
 
     Args:
         draw_effects: draws the hidden effects of a batch of episodes.
-        camera: draws its frames; without one, only states are seen and no position ends an episode.
-        system: its physics.
+        camera: draws the frames; without one the target shows states only and the cart may go anywhere.
+        system: the physics.
         period: s between actions.
         angle_limit: rad; the episode ends beyond it.
 
@@ -131,7 +131,7 @@ class SyntheticTarget(Target):
         frame = None
         if self.camera is not None:
             alive &= state[:, 0].abs() <= self.camera.camera.reach
-            # A fallen cart-pole may be anywhere; the camera shows it at its last sensible place.
+            # The state of a fallen cart-pole may be huge or nan: it is drawn at finite values within +-10.
             shown = state.nan_to_num().clamp(-10, 10).double().numpy()
             frame = torch.from_numpy(self.camera(shown[:, 0], shown[:, 2]))
         return Observation(measured, alive, frame, force=self._world.load(self._at)[:, 0])

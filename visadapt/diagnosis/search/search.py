@@ -71,9 +71,22 @@ class ScoredModel:
 
 
 class Search:
-    """The sets fitted so far to one recording, and how to fit more."""
+    """The sets fitted so far to one recording, and how to fit more.
 
-    def __init__(self, system: System, rows: Segments, catalogue: Sequence[type[Effect]]) -> None:
+    Args:
+        system: the source.
+        rows: the recording.
+        catalogue: the effects that are searched.
+        source: the fit of the source to these rows, where it is known already.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        rows: Segments,
+        catalogue: Sequence[type[Effect]],
+        source: FitState | None = None,
+    ) -> None:
         self.system = system
         self.profile = profile_of(system)
         self.rows = rows
@@ -81,7 +94,10 @@ class Search:
         self.fitted: dict[frozenset[str], ScoredModel] = {}
         self._slopes: tuple[Tensor, Tensor] | None = None
         self._screened: dict[tuple[str, ...], tuple[FitState, list[Candidate]]] = {}
-        self.fit([((), first_fits(system, rows))], CAREFUL)
+        if source is None:
+            self.fit([((), first_fits(system, rows))], CAREFUL)
+        else:
+            self.fitted[frozenset()] = ScoredModel((), source, float(source.likelihood[0]))
 
     def run(self, progress: Progress | None = None) -> None:
         """Grow sets while that makes them more probable; then try their neighbours."""

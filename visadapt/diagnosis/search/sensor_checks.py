@@ -57,6 +57,8 @@ class Readings:
     defect: tuple[float, float] | None
     """rad, between which the angle sensor is defective, in the source's convention"""
     warnings: tuple[str, ...]
+    source: FitState | None = None
+    """the fit of the source to `rows`, where it was needed on the way"""
 
     @classmethod
     def of(cls, recording: Recording, system: System) -> Readings:
@@ -88,7 +90,7 @@ class Readings:
         rows, raw = windows(None, thinned)
         if not profile.doubted:
             return cls(rows, raw, holds, None, tuple(thinned))
-        source = Search(system, rows, ()).source.fits
+        every, source = rows, Search(system, rows, ()).source.fits
         defect = _contradicted(system, rows, source)
         band = None
         if defect is not None:
@@ -115,15 +117,17 @@ class Readings:
             f"{name} is {late:.3g} s late against the slope of its position: derived on the rig, not measured; left out"
             for name, late in derived.items()
         ]
-        rows, raw = rows.reading(kept), raw.reading(kept)
+        if derived:
+            rows, raw = rows.reading(kept), raw.reading(kept)
         # Velocities that lag would speak for the wrong sign.
-        turned = _turned(system, rows, source)
+        fitted = source if rows is every else None
+        turned = _turned(system, rows, source, fitted)
         if turned is not None:
             rows, raw = (_turn(each, turned, profile.held) for each in (rows, raw))
             if band is not None and turned.states < 0:
                 band = (-band[1], -band[0])
             warnings.append(f"{turned.what} has the other sign than the source's: it was turned round")
-        return cls(rows, raw, holds, band, tuple(warnings))
+        return cls(rows, raw, holds, band, tuple(warnings), fitted if turned is None else None)
 
 
 def _contradicted(system: System, rows: Segments, fits: FitState) -> tuple[float, float, bool] | None:
@@ -196,12 +200,12 @@ def _turn(rows: Segments, other: Convention, columns: Sequence[int]) -> Segments
     return replace(rows, measured=rows.measured * sign, command=rows.command * other.command)
 
 
-def _turned(system: System, rows: Segments, source: FitState) -> Convention | None:
+def _turned(system: System, rows: Segments, source: FitState, fitted: FitState | None) -> Convention | None:
     """The convention that the recording is in, if it is not the source's: one in which it is far likelier."""
     profile = profile_of(system)
     if not profile.conventions or float(source.log_process.max()) < WRONG:
         return None
-    own = Search(system, rows, ()).source.fits
+    own = fitted or Search(system, rows, ()).source.fits
     likelihoods = [
         float(Search(system, _turn(rows, other, profile.held), ()).source.fits.likelihood[0])
         for other in profile.conventions

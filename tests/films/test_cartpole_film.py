@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from visadapt.films.canvas import RED
-from visadapt.films.cartpole_panel import Panel, Scales
-from visadapt.films.video import still, write_clip, write_film, write_still
+from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
+from visadapt.films.colours import RED
 from visadapt.recordings import Episode
 from visadapt.targets.rollout import Run
 
@@ -32,10 +31,10 @@ def red_pixels(picture: np.ndarray) -> int:
 
 
 def test_a_film_is_decoded_as_it_was_drawn(tmp_path: Path):
-    panels = [Panel.redrawn("source", make_run()), Panel.redrawn("target", make_run(9, False, 0.4))]
+    panels = [CartPolePanel.redrawn("source", make_run()), CartPolePanel.redrawn("target", make_run(9, False, 0.4))]
     path = tmp_path / "new folder" / "film.mp4"
     done: list[tuple[int, int]] = []
-    write_film(path, panels, PERIOD, lambda now, total: done.append((now, total)))
+    CartPoleFilm(panels, PERIOD).write(path, lambda now, total, _: done.append((now, total)))
     reader = imageio_ffmpeg.read_frames(path)
     meta = next(reader)
     reader.close()
@@ -46,7 +45,7 @@ def test_a_film_is_decoded_as_it_was_drawn(tmp_path: Path):
     assert len(frames) == 21
     assert done == [(i, 21) for i in range(1, 22)]
     for i in (0, 10, 20):
-        drawn = still(panels, i * PERIOD)
+        drawn = CartPoleFilm(panels, PERIOD).still(i * PERIOD)
         assert frames[i].shape == drawn.shape
         assert drawn.shape[0] % 2 == drawn.shape[1] % 2 == 0
         assert np.abs(frames[i].astype(float) - drawn).mean() < 2
@@ -56,33 +55,36 @@ def test_a_film_is_decoded_as_it_was_drawn(tmp_path: Path):
 
 
 def test_the_end_of_an_episode_is_marked_and_the_scene_stands_still():
-    panel = Panel.redrawn("target", make_run(9, False, 0.4))
-    long = Panel.redrawn("source", make_run(21))
-    assert red_pixels(still([panel, long], 0.3)) == 0
-    after = still([panel, long], 0.5)
+    panel = CartPolePanel.redrawn("target", make_run(9, False, 0.4))
+    long = CartPolePanel.redrawn("source", make_run(21))
+    assert red_pixels(CartPoleFilm([panel, long], PERIOD).still(0.3)) == 0
+    after = CartPoleFilm([panel, long], PERIOD).still(0.5)
     assert red_pixels(after) > 2000
     half = after.shape[1] // 2
-    assert np.array_equal(after[:, :half], still([panel, long], 0.9)[:, :half])
+    assert np.array_equal(after[:, :half], CartPoleFilm([panel, long], PERIOD).still(0.9)[:, :half])
     assert red_pixels(after[:, half:]) == 0
 
 
 @pytest.mark.parametrize(
-    ("survived", "angle", "place", "verdict"),
+    ("survived", "angle", "place", "failure"),
     [(True, 0.0, 0.1, ""), (False, -0.35, 0.1, "FELL"), (False, 0.1, 1.6, "LEFT THE FRAME")],
 )
-def test_the_verdict_says_how_an_episode_ended(survived: bool, angle: float, place: float, verdict: str):
-    assert Panel.redrawn("target", make_run(9, survived, angle, place)).verdict == verdict
+def test_the_panel_says_how_an_episode_ended(survived: bool, angle: float, place: float, failure: str):
+    assert CartPolePanel.redrawn("target", make_run(9, survived, angle, place)).failure == failure
 
 
 def test_the_limit_of_the_angle_decides_what_a_fall_is():
     run = make_run(9, False, 0.25)
-    assert Panel.redrawn("target", run, angle_limit=0.2).verdict == "FELL"
+    assert CartPolePanel.redrawn("target", run, angle_limit=0.2).failure == "FELL"
 
 
 def test_the_force_is_drawn_at_the_cart_on_the_side_it_pushes_from():
     run = make_run()
     orange = [
-        still([Panel.redrawn("t", Run(run.episode, True, sign * run.force))], 0.5)[340:420, 28:508] for sign in (1, -1)
+        CartPoleFilm([CartPolePanel.redrawn("t", Run(run.episode, True, sign * run.force))], PERIOD).still(0.5)[
+            340:420, 28:508
+        ]
+        for sign in (1, -1)
     ]
     cart = 28 + 239.5 + 160 * run.episode.state[10, 0] - 28
     for picture, side in zip(orange, (1, -1), strict=True):
@@ -94,46 +96,44 @@ def test_the_force_is_drawn_at_the_cart_on_the_side_it_pushes_from():
 @pytest.mark.parametrize("shape", [(100, 120), (100, 120, 3), (480, 480, 3), (37, 211)])
 def test_pictures_of_any_size_fill_the_same_panel(shape: tuple[int, ...]):
     picture = np.full((21, *shape), 90, np.uint8)
-    panels = [Panel("a camera with a title too long for its panel " * 3, make_run(), picture, force_known=False)]
-    assert still(panels, 0.2).shape == still([Panel.redrawn("drawn", make_run())], 0.2).shape
+    panels = [
+        CartPolePanel("a camera with a title too long for its panel " * 3, make_run(), picture, force_known=False)
+    ]
+    assert (
+        CartPoleFilm(panels, PERIOD).still(0.2).shape
+        == CartPoleFilm([CartPolePanel.redrawn("drawn", make_run())], PERIOD).still(0.2).shape
+    )
 
 
 def test_an_episode_of_one_row_is_a_film_of_one_frame(tmp_path: Path):
-    write_film(tmp_path / "film.mp4", [Panel.redrawn("target", make_run(1))], PERIOD)
+    CartPoleFilm([CartPolePanel.redrawn("target", make_run(1))], PERIOD).write(tmp_path / "film.mp4")
     assert len(imageio.imread(tmp_path / "film.mp4", plugin="FFMPEG")) == 1
 
 
 def test_scales_are_shared_and_a_fall_does_not_squash_the_rest():
     run = make_run()
     run.episode.state[:, 1] *= 40
-    fallen = Panel.redrawn("fallen", Run(run.episode, False, run.force))
-    assert Scales.of([fallen]).speed >= 4
-    assert Scales.of([fallen, Panel.redrawn("upright", make_run())]).speed == 0.5
+    fallen = CartPolePanel.redrawn("fallen", Run(run.episode, False, run.force))
+    assert CartPoleFilm([fallen], PERIOD).full_speed >= 4
+    assert CartPoleFilm([fallen, CartPolePanel.redrawn("upright", make_run())], PERIOD).full_speed == 0.5
 
 
-def test_a_still_and_a_clip_are_pictures(tmp_path: Path):
-    panels = [Panel.redrawn("source", make_run())]
-    write_still(tmp_path / "still.png", panels, 0.3)
+def test_a_still_is_a_picture(tmp_path: Path):
+    panels = [CartPolePanel.redrawn("source", make_run())]
+    CartPoleFilm(panels, PERIOD).write_still(tmp_path / "still.png", 0.3)
     with Image.open(tmp_path / "still.png") as picture:
-        assert np.array_equal(np.asarray(picture), still(panels, 0.3))
-    write_clip(tmp_path / "clip.webp", panels, PERIOD, seconds=0.5, width=200)
-    with Image.open(tmp_path / "clip.webp") as clip:
-        assert clip.format == "WEBP"
-        assert clip.size[0] == 200
-        assert getattr(clip, "n_frames", 1) == 6
+        assert np.array_equal(np.asarray(picture), CartPoleFilm(panels, PERIOD).still(0.3))
 
 
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda run: Panel("a", run, np.zeros((20, 10, 10), np.uint8)), "21 rows, its picture 20"),
-        (lambda run: Panel("a", run, np.zeros((21, 10, 10))), "must be uint8"),  # type: ignore[arg-type]
-        (lambda run: Panel("a", run, np.zeros((21, 10, 10, 4), np.uint8)), "must be uint8"),
-        (lambda run: Panel("a", run, np.zeros((21, 10, 10), np.uint8), np.zeros((21, 2))), "cart's places"),
-        (lambda run: still([], 0.0), "at least one panel"),
-        (lambda run: write_film("never.mp4", [], PERIOD), "at least one panel"),
-        (lambda run: write_film("never.mp4", [Panel.redrawn("a", run)], 0.0), "must be positive"),
-        (lambda run: write_clip("never.webp", [Panel.redrawn("a", run)], PERIOD, start=5.0), "ends at 1 s"),
+        (lambda run: CartPolePanel("a", run, np.zeros((20, 10, 10), np.uint8)), "21 rows, but there are 20 pictures"),
+        (lambda run: CartPolePanel("a", run, np.zeros((21, 10, 10))), "must be uint8"),  # type: ignore[arg-type]
+        (lambda run: CartPolePanel("a", run, np.zeros((21, 10, 10, 4), np.uint8)), "must be uint8"),
+        (lambda run: CartPolePanel("a", run, np.zeros((21, 10, 10), np.uint8), np.zeros((21, 2))), "cart's places"),
+        (lambda run: CartPoleFilm([], PERIOD).write("never.mp4"), "at least one panel"),
+        (lambda run: CartPoleFilm([CartPolePanel.redrawn("a", run)], 0.0).write("never.mp4"), "must be positive"),
     ],
 )
 def test_bad_input_is_one_clear_line(make, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -148,18 +148,19 @@ def test_a_run_without_states_is_refused():
     frame = np.zeros((3, 10, 10), np.uint8)
     run = Run(Episode(np.arange(3.0), np.zeros((3, 1)), None, frame), True, np.zeros(3))
     with pytest.raises(ValueError, match="no states"):
-        Panel("a", run, frame)
+        CartPolePanel("a", run, frame)
 
 
 @pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="needs a limit on the size of files")
 def test_a_disk_that_fills_up_leaves_the_old_film(tmp_path: Path):
-    """A limit on the size of a file stands for a full disk: ffmpeg dies on it in the middle of writing."""
+    """A limit on the size of a file stands for a full disk: ffmpeg is stopped in the middle of writing."""
     old = tmp_path / "film.mp4"
     old.write_bytes(b"the film of yesterday")
     code = (
-        "import resource, sys; from tests.films.test_video import *; panels = [Panel.redrawn('a', make_run(10))]\n"
+        "import resource, sys; from tests.films.test_cartpole_film import *\n"
+        "panels = [CartPolePanel.redrawn('a', make_run(10))]\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
-        "try: write_film(sys.argv[1], panels, PERIOD)\n"
+        "try: CartPoleFilm(panels, PERIOD).write(sys.argv[1])\n"
         "except OSError as error: print(error); sys.exit(7)\n"
     )
     root = Path(__file__).parents[2]
@@ -172,11 +173,11 @@ def test_a_disk_that_fills_up_leaves_the_old_film(tmp_path: Path):
     assert list(tmp_path.iterdir()) == [old]
 
 
-def test_an_ffmpeg_that_finds_the_disk_full_is_told_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_ffmpeg_that_finds_the_disk_full_is_reported_as_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     fake = tmp_path / "ffmpeg"
     fake.write_text("#!/bin/sh\necho 'av_interleaved_write_frame(): No space left on device' >&2\nexit 228\n")
     fake.chmod(0o755)
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(fake))
     with pytest.raises(OSError, match=r"film\.mp4 was not written: disk full"):
-        write_film(tmp_path / "film.mp4", [Panel.redrawn("a", make_run(5))], PERIOD)
+        CartPoleFilm([CartPolePanel.redrawn("a", make_run(5))], PERIOD).write(tmp_path / "film.mp4")
     assert list(tmp_path.iterdir()) == [fake]

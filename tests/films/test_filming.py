@@ -1,0 +1,128 @@
+"""`film`, the one call, on every kind of target; what each film looks like is tested beside its class."""
+
+import math
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+
+from renderers import DrawnCartPole
+from tests.flying import push, small_flight
+from visadapt.films import film
+from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
+from visadapt.films.flight_film import FlightFilm
+from visadapt.films.flight_panel import FlightPanel
+from visadapt.films.swing_up_film import SwingUpFilm, SwingUpPanel
+from visadapt.policies import ImagePolicy, StatePolicy
+from visadapt.recordings import Episode
+from visadapt.targets import FlightTarget, Observation, Start, SyntheticTarget, Target, TargetError, sine_force
+from visadapt.targets.rollout import Run, run, see_frames, see_goals, see_states
+from visadapt.tasks.base import within_a_turn
+
+HANGING = Start(0.0, 0.0, math.pi, 0.0)
+
+
+def seeded():
+    return torch.Generator().manual_seed(3)
+
+
+def state_policy():
+    torch.manual_seed(0)
+    return StatePolicy(4).eval()
+
+
+def assert_shows(path: Path, expected) -> None:
+    """The film at `path` has the frames of `expected`, as far as the encoding keeps them."""
+    frames = imageio.imread(path, plugin="FFMPEG")
+    assert len(frames) == len(expected.times)
+    for i in (0, len(frames) // 2, -1):
+        drawn = expected.still(expected.times[i])
+        assert frames[i].shape == drawn.shape
+        assert np.abs(frames[i].astype(float) - drawn).mean() < 2
+
+
+class Camera(Target):
+    """A cart-pole that shows frames of its own and nothing of its system, as a target of a user's own may."""
+
+    name, period, n_action = "my rig", 0.05, 1
+
+    def __init__(self, columns: int = 4, frames: bool = True):
+        self.columns, self.frames = columns, frames
+
+    def reset(self, batch: int, generator: torch.Generator) -> Observation:
+        self.steps = 0
+        return self.step(torch.zeros(batch, 1))
+
+    def step(self, action: torch.Tensor) -> Observation:
+        self.steps += 1
+        frame = torch.full((len(action), 30, 40), 20 * self.steps, dtype=torch.uint8)
+        state, alive = torch.zeros(len(action), self.columns), torch.ones(len(action), dtype=torch.bool)
+        return Observation(state, alive, frame if self.frames else None)
+
+
+def test_policies_that_balance_are_drawn_side_by_side_from_the_same_start(tmp_path: Path):
+    target, policy = SyntheticTarget(sine_force), state_policy()
+    film({"one": policy, "two": policy}, target, tmp_path / "film.mp4", seconds=0.4, seed=3)
+    episode = run(target, policy, see_states, 1, 8, seeded())[0]
+    assert_shows(
+        tmp_path / "film.mp4", CartPoleFilm([CartPolePanel.redrawn(title, episode) for title in ("one", "two")], 0.05)
+    )
+
+
+def test_a_policy_on_frames_is_shown_them(tmp_path: Path):
+    camera = DrawnCartPole()
+    target, policy = SyntheticTarget(sine_force, camera), ImagePolicy(torch.full((100, 120), 0.9), 0.2).eval()
+    film(policy, target, tmp_path / "film.mp4", seconds=0.2, seed=3)
+    episode = run(target, policy, see_frames, 1, 4, seeded())[0]
+    assert_shows(
+        tmp_path / "film.mp4", CartPoleFilm([CartPolePanel.redrawn("synthetic cart-pole", episode, camera)], 0.05)
+    )
+
+
+def test_a_target_of_ones_own_is_shown_in_its_own_frames_or_drawn_from_its_states(tmp_path: Path):
+    film(state_policy(), Camera(), tmp_path / "frames.mp4", seconds=0.2)
+    scene = imageio.imread(tmp_path / "frames.mp4", plugin="FFMPEG")[:, 100:400, 100:400]
+    np.testing.assert_allclose(scene.mean((1, 2, 3)), [20, 40, 60, 80, 100], atol=3)
+    film(state_policy(), Camera(frames=False), tmp_path / "drawn.mp4", seconds=0.2)
+    assert imageio.imread(tmp_path / "drawn.mp4", plugin="FFMPEG")[0, 100:400, 100:400].mean() > 200
+
+
+def test_a_cart_pole_without_an_angle_limit_is_filmed_as_a_swing_up(tmp_path: Path):
+    target, policy = SyntheticTarget(start=HANGING, angle_limit=math.inf), state_policy()
+    film(policy, target, tmp_path / "film.mp4", seconds=0.4, seed=3, due=0.2)
+    episode = run(target, policy, lambda seen: within_a_turn(seen.state), 1, 8, seeded())[0]
+    assert_shows(tmp_path / "film.mp4", SwingUpFilm([SwingUpPanel("synthetic cart-pole", episode)], 0.2))
+
+
+def test_a_vehicle_is_filmed_with_its_course_to_its_end(tmp_path: Path):
+    flight = small_flight(rows=6)
+    target, policy = flight.target(push(1.0)), flight.policy().eval()
+    film(policy, target, tmp_path / "policy.mp4", seed=3)
+    flown = run(target, policy, see_goals, 1, 5, seeded())[0]
+    expected = FlightFilm([FlightPanel("synthetic vehicle", flown, target.system, target.course, target.first[0])])
+    assert expected.scales.duration == pytest.approx(0.5)
+    assert_shows(tmp_path / "policy.mp4", expected)
+    film(flown, target, tmp_path / "run.mp4")
+    assert_shows(tmp_path / "run.mp4", expected)
+
+
+def a_run(columns: int) -> Run:
+    time = np.arange(3) * 0.05
+    return Run(Episode(time, np.zeros((3, 1)), np.zeros((3, columns))), True, np.zeros(3))
+
+
+def test_what_cannot_be_filmed_is_one_line_and_leaves_no_file(tmp_path: Path):
+    flight: FlightTarget = small_flight(rows=6).target()
+    image = ImagePolicy(torch.full((100, 120), 0.9), 0.2)
+    for shown, target, says in (
+        ({}, SyntheticTarget(), "at least one panel"),
+        (a_run(2), Camera(), "panel 'my rig': a cart-pole's states"),
+        (a_run(13), flight, "does not hold its place on the course"),
+        (image, SyntheticTarget(), "give it a camera"),
+    ):
+        with pytest.raises((ValueError, TargetError), match=says) as caught:
+            film(shown, target, tmp_path / "film.mp4")
+        assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())

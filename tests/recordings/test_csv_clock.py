@@ -1,0 +1,93 @@
+import numpy as np
+import pytest
+
+from tests.recorded import HEADER, a_table, load, refuses, write
+
+
+class TestClock:
+    @pytest.mark.parametrize(("later", "problem"), [(0.2, "repeats itself"), (0.1, "runs backward")])
+    def test_a_clock_that_does_not_run_forward(self, file, later, problem):
+        table = a_table()
+        table["time"][5] = later
+        refuses(rf"row 6 \(line 7\), column 'time': the clock {problem}", write(file, table))
+
+    def test_a_clock_that_jitters_a_little_is_a_steady_one(self, file):
+        table = a_table(rows=200, period=0.0203)
+        table["time"] = 1234.5 + table["time"] + np.random.default_rng(0).normal(0, 0.0003, 200)
+        recording = load(write(file, table))
+        assert recording.period == pytest.approx(0.0203, rel=1e-3)
+        assert recording.warnings == ()
+        assert recording.episodes[0].time[0] == 0
+        np.testing.assert_allclose(np.diff(recording.episodes[0].time), recording.period)
+
+    def test_a_missing_row_splits_the_episode(self, file):
+        table = {name: np.delete(values, 30) for name, values in a_table(rows=81).items()}
+        recording = load(write(file, table))
+        assert [episode.samples for episode in recording.episodes] == [29, 49]
+        assert recording.episodes[1].time[0] == pytest.approx(31 * 0.05)
+        assert recording.warnings == (f"{file}, row 31 (line 32): rows are missing here; the episode was split",)
+
+    def test_an_irregular_clock_is_resampled(self, file):
+        rng = np.random.default_rng(0)
+        time = np.cumsum(rng.uniform(0.02, 0.08, 400))
+        table = {
+            "time": time,
+            "x": 0.3 * np.sin(2 * time),
+            "theta": 0.1 * np.sin(3 * time),
+            "command": np.where(time % 2 < 1, 0.5, -0.5),
+        }
+        recording = load(write(file, table))
+        assert "irregular clock; resampled to one row every" in " ".join(recording.warnings)
+        for episode in recording.episodes:
+            moments = episode.time + time[0]
+            np.testing.assert_allclose(episode.state[:, 1], 0.1 * np.sin(3 * moments), atol=1e-3)
+            assert set(np.unique(episode.action)) == {-0.5, 0.5}
+
+    def test_milliseconds(self, file):
+        table = a_table()
+        table["time"] = table["time"] * 1000
+        refuses("column 'time': rows are 50 s apart.*milliseconds", write(file, table))
+
+    def test_an_episode_of_another_period_is_left_out(self, tmp_path):
+        for number, period in enumerate((0.05, 0.02, 0.05)):
+            write(tmp_path / f"{number}.csv", a_table(period=period))
+        recording = load(tmp_path)
+        assert [source[-5:] for source in recording.sources] == ["0.csv", "2.csv"]
+        assert "left out, since its rows are not 0.05 s apart" in recording.warnings[0]
+
+
+class TestEpisodes:
+    def test_a_column_of_episodes(self, file):
+        first, second = a_table(), a_table(rows=31)
+        table = {"episode": [3] * 41 + [4] * 31, **{name: np.r_[first[name], second[name]] for name in HEADER}}
+        recording = load(write(file, table))
+        assert [episode.samples for episode in recording.episodes] == [40, 30]
+        assert recording.sources == (f"{file}, episode 3", f"{file}, episode 4")
+
+    def test_rows_are_counted_in_the_file(self, file):
+        first, second = a_table(), a_table(rows=31)
+        table = {"episode": [3] * 41 + [4] * 31, **{name: np.r_[first[name], second[name]] for name in HEADER}}
+        table["x"][50] = np.nan
+        refuses(r"episode 4: row 51 \(line 52\), column 'x' is nan", write(file, table))
+
+    def test_three_rows(self, file):
+        refuses("run.csv: too short: 3 rows, 0.1 s; .* at least 0.5 s", write(file, a_table(rows=3)))
+
+    def test_a_short_episode_is_left_out(self, tmp_path):
+        write(tmp_path / "a.csv", a_table())
+        write(tmp_path / "b.csv", a_table(rows=10))
+        recording = load(tmp_path)
+        assert len(recording.episodes) == 1
+        assert recording.warnings == (
+            f"{tmp_path / 'b.csv'}, from row 1 (line 2) on: shorter than 0.5 s, so it is left out",
+        )
+
+    def test_half_a_second_is_enough(self, file):
+        assert load(write(file, a_table(rows=11))).samples == 10
+
+    def test_warnings_of_one_kind_are_one_line(self, tmp_path):
+        write(tmp_path / "a.csv", a_table())
+        for name in "bcde":
+            write(tmp_path / f"{name}.csv", a_table(rows=10))
+        (warning,) = load(tmp_path).warnings
+        assert "b.csv, from row 1 (line 2) on and 3 more: " in warning

@@ -1,0 +1,123 @@
+import numpy as np
+import pytest
+
+from tests.recorded import HEADER, STATES, a_table, load, refuses, write
+
+
+class TestColumns:
+    def test_our_own_names(self, file):
+        table = a_table()
+        recording = load(write(file, table))
+        assert recording.measured == STATES
+        assert recording.period == pytest.approx(0.05)
+        assert recording.samples == 40
+        assert recording.warnings == ()
+        episode = recording.episodes[0]
+        np.testing.assert_array_equal(episode.state, np.column_stack([table[name] for name in STATES]))
+        np.testing.assert_array_equal(episode.action[:, 0], table["command"])
+        np.testing.assert_allclose(episode.time, table["time"], atol=1e-12)
+
+    def test_any_order_and_case_and_columns_of_no_interest(self, file):
+        table = a_table()
+        shuffled = {"Note": ["ok"] * 41, **{name.upper(): table[name] for name in reversed(HEADER)}}
+        np.testing.assert_array_equal(
+            load(write(file, shuffled)).episodes[0].state, np.column_stack([table[name] for name in STATES])
+        )
+
+    @pytest.mark.parametrize(
+        "names",
+        [
+            ("position", "positionD", "angle", "angleD", "Q"),
+            ("cart_position", "cart_velocity", "pole_angle", "angular_velocity", "control"),
+            ("s", "velocity", "ANGLE", "angled", "u"),
+        ],
+    )
+    def test_well_known_names(self, file, names):
+        table = a_table()
+        foreign = dict(zip(("time", *names), table.values(), strict=True))
+        assert load(write(file, foreign)).measured == STATES
+
+    def test_our_own_name_comes_before_a_well_known_one(self, file):
+        table = a_table()
+        recording = load(write(file, table | {"position": np.zeros(41)}))
+        np.testing.assert_array_equal(recording.episodes[0].state[:, 0], table["x"])
+
+    def test_names_that_the_user_gives(self, file):
+        table = a_table()
+        foreign = {
+            "when": table["time"],
+            "a": table["x"],
+            "b": table["theta"],
+            "theta": table["x"],
+            "c": table["command"],
+        }
+        recording = load(write(file, foreign), columns={"time": "when", "x": "a", "theta": "B", "command": "c"})
+        assert recording.measured == ("x", "theta")
+        np.testing.assert_array_equal(recording.episodes[0].state[:, 1], table["theta"])
+
+    @pytest.mark.parametrize("missing", ["time", "x", "theta", "command"])
+    def test_a_missing_column(self, file, missing):
+        table = a_table()
+        del table[missing]
+        refuses(f"run.csv: column '{missing}' is missing; it has .*--columns {missing}=", write(file, table))
+
+    def test_what_the_user_names_is_not_there(self, file):
+        write(file, a_table())
+        refuses("no column 'pos' for x; it has time, x", file, columns={"x": "pos"})
+        refuses("cartpole has no 'speed'; it has episode, time, x", file, columns={"speed": "x_dot"})
+
+    def test_two_columns_that_could_be_one(self, file):
+        table = a_table()
+        table["angle"] = table["pole_angle"] = table.pop("theta")
+        refuses("'angle', 'pole_angle' could each be theta; say which: --columns theta=", write(file, table))
+
+    def test_velocities_may_be_missing(self, file):
+        table = a_table()
+        del table["x_dot"], table["theta_dot"]
+        recording = load(write(file, table))
+        assert recording.measured == ("x", "theta")
+        assert recording.episodes[0].state.shape == (41, 2)
+
+    def test_a_force_in_newton(self, file):
+        table = a_table()
+        table["force"] = 30 * table.pop("command")
+        recording = load(write(file, table))
+        np.testing.assert_allclose(recording.episodes[0].action[:, 0], table["force"] / 30)
+        assert "divided by max_force, 30 N" in recording.warnings[0]
+
+    def test_a_force_that_never_exceeds_one_is_the_command(self, file):
+        table = a_table()
+        table["force"] = table.pop("command")
+        assert load(write(file, table)).warnings == ()
+
+
+class TestPaths:
+    def test_a_folder_several_files_and_one(self, tmp_path):
+        for name in "cab":
+            write(tmp_path / f"{name}.csv", a_table())
+        (tmp_path / "README.md").write_text("not a recording")
+        assert [source[-5:] for source in load(tmp_path).sources] == ["a.csv", "b.csv", "c.csv"]
+        assert [s[-5:] for s in load(tmp_path / "b.csv", tmp_path / "a.csv").sources] == ["b.csv", "a.csv"]
+
+    def test_a_folder_without_recordings(self, tmp_path):
+        refuses("a folder without recordings; files that end in .csv", tmp_path)
+
+    def test_a_path_that_is_not_there(self, tmp_path):
+        refuses("none.csv: there is no such file or folder", tmp_path / "none.csv")
+
+    def test_a_folder_with_one_torn_file(self, tmp_path):
+        for name in "abc":
+            write(tmp_path / f"{name}.csv", a_table())
+        torn = tmp_path / "b.csv"
+        torn.write_text(torn.read_text()[:-30])
+        refuses(r"b.csv: row 41 \(line 42\) is cut short", tmp_path)
+
+    def test_a_state_that_only_some_files_have_is_not_used(self, tmp_path):
+        whole, part = a_table(), a_table(seed=1)
+        del part["x_dot"]
+        recording = load(write(tmp_path / "a.csv", whole), write(tmp_path / "b.csv", part))
+        assert recording.measured == ("x", "theta", "theta_dot")
+        np.testing.assert_array_equal(recording.episodes[0].state[:, 1], whole["theta"])
+        assert recording.warnings == (
+            f"{tmp_path / 'b.csv'}: has no column 'x_dot', so that of the other files is not used",
+        )

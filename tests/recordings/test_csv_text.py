@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+
+from tests.recorded import HEADER, STATES, a_table, load, refuses, write
+
+
+class TestText:
+    @pytest.mark.parametrize(
+        "form",
+        [
+            {"separator": ";"},
+            {"end": "\r\n"},
+            {"encoding": "utf-8-sig"},
+            {"before": "# a rig\n\n# 0.05 s\n"},
+            {"separator": ";", "end": "\r\n", "encoding": "utf-8-sig", "before": "# a; b, c\r\n"},
+        ],
+    )
+    def test_forms_of_the_same_table(self, file, form):
+        table = a_table()
+        state = load(write(file, table, **form)).episodes[0].state
+        np.testing.assert_array_equal(state, np.column_stack([table[name] for name in STATES]))
+
+    def test_comments_between_rows_and_quotes(self, file):
+        lines = write(file, a_table()).read_text().splitlines()
+        lines.insert(20, "# paused, resumed")
+        file.write_text("\n".join(lines).replace("theta_dot", '"theta_dot"'))
+        assert load(file).samples == 40
+
+    @pytest.mark.parametrize(
+        ("cell", "message"),
+        [
+            ("nan", "column 'theta' is nan; a finite number is right"),
+            ("inf", "column 'theta' is inf"),
+            ("", "column 'theta' is empty"),
+            ("oops", "column 'theta' is 'oops'; a number is right"),
+            ('"0,12"', "column 'theta' is '0,12'; a decimal point is right"),
+        ],
+    )
+    def test_a_cell_that_is_no_number(self, file, cell, message):
+        table = {name: list(values) for name, values in a_table().items()}
+        table["theta"][6] = cell
+        refuses(rf"run.csv: row 7 \(line 9\), {message}", write(file, table, before="# a comment\n"))
+
+    def test_a_torn_last_line(self, file):
+        content = write(file, a_table()).read_text()
+        file.write_text(content[:-30])
+        refuses(r"row 41 \(line 42\) is cut short: 5 of 6 cells; is the file incomplete", file)
+
+    def test_a_row_that_is_too_long(self, file):
+        lines = write(file, a_table()).read_text().splitlines()
+        lines[5] += ",1"
+        file.write_text("\n".join(lines))
+        refuses(r"row 5 \(line 6\) has 7 cells, the line of names 6", file)
+
+    @pytest.mark.parametrize(
+        ("content", "message"),
+        [
+            (b"", "is empty"),
+            (b"\n# only a comment\n", "is empty"),
+            (b"time,x,theta,command\n", "has no rows"),
+            (b"0.0,1,2,3\n0.1,1,2,3\n", "line 1 holds numbers where the columns' names belong"),
+            (b"\xff\xfe\x00time", "not text in UTF-8"),
+        ],
+    )
+    def test_no_table_at_all(self, file, content, message):
+        file.write_bytes(content)
+        refuses(message, file)
+
+
+class TestSize:
+    def test_a_million_rows(self, file):
+        rows = 10**6
+        table = a_table(rows=1000, period=0.01)
+        block = np.column_stack([table[name] for name in HEADER[1:]])
+        line = "\n".join("{},%.9g,%.9g,%.9g,%.9g,%.9g" % tuple(row) for row in block)  # noqa: UP031
+        count = iter(range(rows))
+        body = "\n".join([line] * (rows // 1000)).split("\n")
+        file.write_text(
+            "episode,time,x,x_dot,theta,theta_dot,command\n"
+            + "\n".join(f"{n // 1000},{text.format(n % 1000 / 100)}" for n, text in zip(count, body, strict=True))
+        )
+        assert load(file).samples == rows - 1000

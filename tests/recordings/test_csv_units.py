@@ -1,0 +1,112 @@
+import numpy as np
+import pytest
+
+from tests.recorded import a_run, a_table, load, refuses, write
+
+
+class TestUnits:
+    @pytest.mark.parametrize("columns", [("theta",), ("theta_dot",), ("theta", "theta_dot")])
+    @pytest.mark.parametrize("start", [0.03, 0.2, 3.0])
+    @pytest.mark.parametrize("noise", [1e-3, 9e-3])
+    def test_degrees(self, file, columns, start, noise):
+        table = a_run(start=start, noise=noise)
+        for name in columns:
+            table[name] = np.degrees(table[name])
+        refuses("run.csv: .*theta.*radians are right", write(file, table))
+
+    @pytest.mark.parametrize("start", [0.03, 0.2, 3.0])
+    @pytest.mark.parametrize("noise", [1e-3, 9e-3])
+    @pytest.mark.parametrize("rates", [False, True])
+    def test_radians(self, file, start, noise, rates):
+        for seed in range(5):
+            table = a_run(start=start, noise=noise, seed=seed)
+            if not rates:
+                del table["x_dot"], table["theta_dot"]
+            assert load(write(file, table)).warnings == ()
+
+    @pytest.mark.parametrize("start", [0.03, 0.2, 3.0])
+    @pytest.mark.parametrize("noise", [1e-3, 9e-3])
+    def test_degrees_without_velocities(self, file, start, noise):
+        table = a_run(start=start, noise=noise)
+        table["theta"] = np.degrees(table["theta"])
+        del table["x_dot"], table["theta_dot"]
+        refuses("column 'theta' .*radians are right", write(file, table))
+
+    @pytest.mark.parametrize("scale", [100, 1000])
+    def test_lengths_in_smaller_units(self, file, scale):
+        table = a_table(rows=200)
+        table["x"] = table["x"] * scale
+        refuses("column 'x' is .* metres are right", write(file, table))
+
+    def test_a_pole_that_turns_over_is_unwrapped(self, file):
+        table = a_table(rows=200)
+        angle = np.pi * (1 + np.sin(1.5 * table["time"])) + 0.5
+        table["theta"] = (angle + np.pi) % (2 * np.pi) - np.pi
+        table["theta_dot"] = 1.5 * np.pi * np.cos(1.5 * table["time"])
+        state = load(write(file, table)).episodes[0].state[:, 2]
+        assert np.abs(np.diff(state)).max() < 1
+        np.testing.assert_allclose(np.cos(state), np.cos(angle), atol=1e-12)
+
+    def test_a_pole_that_was_swung_up_is_upright_at_0(self, file):
+        table = a_table(rows=200)
+        angle = -np.pi * (1.5 + 0.5 * np.tanh(table["time"] - 8))  # hangs for most of the time
+        table["theta"] = (angle + np.pi) % (2 * np.pi) - np.pi
+        del table["theta_dot"]
+        state = load(write(file, table)).episodes[0].state[:, 2]
+        assert abs(state[-1]) < 0.1
+
+    def test_an_angle_that_goes_round_several_times(self, file):
+        table = a_table(rows=200)
+        table["theta"], table["theta_dot"] = 3 * table["time"], np.full(200, 3.0)
+        assert load(write(file, table)).samples == 199
+
+    @pytest.mark.parametrize(("one", "other"), [("x", "theta"), ("x", "x_dot"), ("theta", "theta_dot")])
+    def test_columns_that_changed_places(self, file, one, other):
+        table = a_table(rows=200)
+        table[one], table[other] = table[other], table[one]
+        refuses(f"column '{one}' and column '{other}' are evidently exchanged", write(file, table))
+
+    @pytest.mark.parametrize("start", [0.03, 0.2])
+    @pytest.mark.parametrize("rates", [False, True])
+    def test_columns_that_changed_places_together(self, file, start, rates):
+        table = a_run(start=start, noise=1e-3)
+        table["x"], table["theta"] = table["theta"], table["x"]
+        table["x_dot"], table["theta_dot"] = table["theta_dot"], table["x_dot"]
+        if not rates:
+            del table["x_dot"], table["theta_dot"]
+        refuses("column 'x' answers the command as theta should, and column 'theta' as x", write(file, table))
+
+    def test_a_column_is_called_what_the_file_calls_it(self, file):
+        table = a_run(start=0.1, noise=1e-3)
+        table["pole_angle"] = np.degrees(table.pop("theta"))
+        refuses(r"column 'pole_angle' \(theta\) .* radians are right", write(file, table))
+
+    def test_metres_that_wrap(self, file):
+        table = a_table(rows=200)
+        angle = np.pi * np.sin(1.5 * table["time"]) + np.pi
+        table["theta"], table["x"] = table["x"], (angle + np.pi) % (2 * np.pi) - np.pi
+        del table["x_dot"], table["theta_dot"]
+        refuses("column 'x' jumps by .*are two columns exchanged", write(file, table))
+
+    def test_noise_is_no_reason_to_refuse(self, file):
+        load(write(file, a_table(rows=400, noise=9e-3)))
+
+
+class TestCommands:
+    def test_all_out_of_range(self, file):
+        table = a_table()
+        table["command"] = 30 * table["command"]
+        refuses(r"row \d+ \(line \d+\), column 'command' is -?\d.*within \[-1, 1\] is right", write(file, table))
+
+    def test_a_little_out_of_range(self, file):
+        table = a_table()
+        table["command"] = 1.1 * table["command"]
+        (warning,) = load(write(file, table)).warnings
+        assert "of command lie outside, up to" in warning
+
+    def test_never_changing(self, file):
+        table = a_table()
+        table["command"] = np.zeros(41)
+        (warning,) = load(write(file, table)).warnings
+        assert "command never changes" in warning
+        assert "cannot be identified" in warning

@@ -1,0 +1,121 @@
+"""One call that films policies or runs of any target: cart-poles that balance or swing up, and vehicles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
+from visadapt.films.encoding import StrPath
+from visadapt.films.film import Film
+from visadapt.films.flight_film import FlightFilm
+from visadapt.films.flight_panel import FlightPanel
+from visadapt.films.swing_up_film import SwingUpFilm, SwingUpPanel
+from visadapt.policies import Policy
+from visadapt.progress import Progress
+from visadapt.systems import CartPole
+from visadapt.targets import FlightTarget, Observation, SyntheticTarget, Target
+from visadapt.targets.gymnasium import GymnasiumTarget
+from visadapt.targets.rollout import Run, See, run
+from visadapt.tasks.balance import within_a_turn
+from visadapt.tasks.follow import Follow
+
+
+def film(
+    shown: Policy | Run | Mapping[str, Policy | Run],
+    target: Target,
+    path: StrPath,
+    *,
+    seconds: float = 10.0,
+    seed: int = 0,
+    see: See | None = None,
+    due: float = 5.0,
+    progress: Progress | None = None,
+) -> None:
+    """Write an mp4 of policies that run on a target, or of runs that were made on it, side by side.
+
+        film(policy, target, "film.mp4")
+        film({"before": old_policy, "after": new_policy}, target, "film.mp4")
+
+    A vehicle is shown in three dimensions with its course; a cart-pole whose target has no angle limit as a swing-up;
+    any other cart-pole in the target's own frames, or drawn from its states where the target is synthetic.
+
+    Args:
+        shown: a policy, a run, or several of them by the title of their panel. All policies start alike.
+        target: what policies run on; its steps for the film are free and not counted. Runs must be of this target.
+        path: of the mp4.
+        seconds: length of the policies' episodes; a flight ends with its course.
+        seed: of the starts, and of whatever else the target draws.
+        see: what policies are shown of an observation; by default what `Policy.shown` names.
+        due: s from when on a pole that swings up is to be up.
+        progress: called after each frame.
+
+    Raises:
+        ValueError: states of neither a cart-pole nor a vehicle, or a run that does not fit the target.
+        TargetError: the target shows no frames to a policy that sees frames.
+        DiskFullError: the disk is full; a file that was at `path` before is unchanged.
+        FilmError: ffmpeg failed for another reason; a file that was at `path` before is unchanged.
+
+    >>> import pathlib, tempfile, visadapt as va
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "film.mp4"
+    >>> va.film(va.load_policy(va.shipped("cartpole_states")), va.SyntheticTarget(), path, seconds=0.2)
+    >>> path.exists()
+    True
+    """
+    titled = shown if isinstance(shown, Mapping) else {target.name: shown}
+    runs = {
+        title: each if isinstance(each, Run) else _run(each, target, seconds, seed, see)
+        for title, each in titled.items()
+    }
+    _film(runs, target, due).write(path, progress)
+
+
+def _run(policy: Policy, target: Target, seconds: float, seed: int, see: See | None) -> Run:
+    steps = round(seconds / target.period)
+    if isinstance(target, FlightTarget):
+        steps = min(steps, target.task.steps)
+    if see is None and policy.shown == "state" and _swings_up(target):
+        see = _see_within_a_turn
+    generator = torch.Generator().manual_seed(seed)
+    return run(target, policy.eval(), 1, steps, generator, strict=False, see=see)[0]
+
+
+def _see_within_a_turn(observation: Observation) -> Tensor:
+    return within_a_turn(observation.state)
+
+
+def _swings_up(target: Target) -> bool:
+    return isinstance(target, SyntheticTarget) and math.isinf(target.angle_limit)
+
+
+def _film(runs: Mapping[str, Run], target: Target, due: float) -> Film:
+    if isinstance(target, FlightTarget):
+        return FlightFilm([_flight_panel(title, each, target) for title, each in runs.items()])
+    for title, each in runs.items():
+        state = each.episode.state
+        if state is None or state.shape[1] != len(CartPole.states):
+            raise ValueError(f"panel {title!r}: a cart-pole's states (rows, 4) are needed to film {target.name}")
+    if _swings_up(target):
+        return SwingUpFilm([SwingUpPanel(title, each) for title, each in runs.items()], due)
+    return CartPoleFilm([_cartpole_panel(title, each, target) for title, each in runs.items()], target.period)
+
+
+def _flight_panel(title: str, flown: Run, target: FlightTarget) -> FlightPanel:
+    if flown.episode.task_state is None:
+        raise ValueError(f"panel {title!r}: the run does not hold its progress in the task of {target.name}")
+    task_state = torch.as_tensor(flown.episode.task_state[0])
+    # References are chosen by whole numbers, points are positions.
+    task_state = task_state.long() if isinstance(target.task, Follow) else task_state
+    return FlightPanel(title, flown, target.system, target.task, task_state)
+
+
+def _cartpole_panel(title: str, each: Run, target: Target) -> CartPolePanel:
+    if isinstance(target, SyntheticTarget):
+        return CartPolePanel.redrawn(title, each, target.camera, target.angle_limit)
+    if each.episode.frame is None:
+        return CartPolePanel.redrawn(title, each)
+    limit = target.mapping.limits.get("theta", 0.3) if isinstance(target, GymnasiumTarget) else 0.3
+    return CartPolePanel(title, each, each.episode.frame, angle_limit=limit, force_known=False)
