@@ -89,10 +89,8 @@ def main(settings: Settings) -> None:
         film.write_still(out / "film.png", t=3.0)
         film.write(out / "film.mp4", staged(report, "film"))
     plot_losses(out / "losses.png", adapted.rounds)
-    write_json(
-        out / "metrics.json",
-        {"ledger": asdict(adapted.ledger), "scores": {name: asdict(each) for name, each in scores.items()}, **about},
-    )
+    numbers = {name: asdict(each) for name, each in scores.items()}
+    write_json(out / "metrics.json", {"ledger": asdict(adapted.ledger), "scores": numbers, **about})
     print(f"film.mp4, film.png, losses.png and metrics.json are in {out}")
 
 

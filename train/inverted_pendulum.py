@@ -99,6 +99,7 @@ class SeenSource(SyntheticTarget):
 
     def __init__(self, setup: Setup) -> None:
         super().__init__(system=SOURCE, period=setup.source.period, start=START, angle_limit=ANGLE_LIMIT)
+        assert setup.observe is not None
         self.observe = setup.observe
 
     def _observe(self) -> Observation:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from renderers import DrawnCartPole
-from tests.flying import push, small_flight
+from tests.flying import push, small_quadrotor
 from visadapt.films import film
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.films.flight_film import FlightFilm
@@ -17,9 +17,10 @@ from visadapt.films.flight_panel import FlightPanel
 from visadapt.films.swing_up_film import SwingUpFilm, SwingUpPanel
 from visadapt.policies import ImagePolicy, StatePolicy
 from visadapt.recordings import Episode
-from visadapt.targets import FlightTarget, Observation, Start, SyntheticTarget, Target, TargetError, sine_force
-from visadapt.targets.rollout import Run, run, see_frames, see_goals, see_states
-from visadapt.tasks.base import within_a_turn
+from visadapt.setups.flight import flight_target
+from visadapt.targets import Observation, Start, SyntheticTarget, Target, TargetError, sine_force
+from visadapt.targets.rollout import Run, run
+from visadapt.tasks.balance import within_a_turn
 
 HANGING = Start(0.0, 0.0, math.pi, 0.0)
 
@@ -65,7 +66,7 @@ class Camera(Target):
 def test_policies_that_balance_are_drawn_side_by_side_from_the_same_start(tmp_path: Path):
     target, policy = SyntheticTarget(sine_force), state_policy()
     film({"one": policy, "two": policy}, target, tmp_path / "film.mp4", seconds=0.4, seed=3)
-    episode = run(target, policy, see_states, 1, 8, seeded())[0]
+    episode = run(target, policy, 1, 8, seeded())[0]
     assert_shows(
         tmp_path / "film.mp4", CartPoleFilm([CartPolePanel.redrawn(title, episode) for title in ("one", "two")], 0.05)
     )
@@ -75,7 +76,7 @@ def test_a_policy_on_frames_is_shown_them(tmp_path: Path):
     camera = DrawnCartPole()
     target, policy = SyntheticTarget(sine_force, camera), ImagePolicy(torch.full((100, 120), 0.9), 0.2).eval()
     film(policy, target, tmp_path / "film.mp4", seconds=0.2, seed=3)
-    episode = run(target, policy, see_frames, 1, 4, seeded())[0]
+    episode = run(target, policy, 1, 4, seeded())[0]
     assert_shows(
         tmp_path / "film.mp4", CartPoleFilm([CartPolePanel.redrawn("synthetic cart-pole", episode, camera)], 0.05)
     )
@@ -92,16 +93,16 @@ def test_a_target_of_ones_own_is_shown_in_its_own_frames_or_drawn_from_its_state
 def test_a_cart_pole_without_an_angle_limit_is_filmed_as_a_swing_up(tmp_path: Path):
     target, policy = SyntheticTarget(start=HANGING, angle_limit=math.inf), state_policy()
     film(policy, target, tmp_path / "film.mp4", seconds=0.4, seed=3, due=0.2)
-    episode = run(target, policy, lambda seen: within_a_turn(seen.state), 1, 8, seeded())[0]
+    episode = run(target, policy, 1, 8, seeded(), see=lambda seen: within_a_turn(seen.state))[0]
     assert_shows(tmp_path / "film.mp4", SwingUpFilm([SwingUpPanel("synthetic cart-pole", episode)], 0.2))
 
 
 def test_a_vehicle_is_filmed_with_its_course_to_its_end(tmp_path: Path):
-    flight = small_flight(rows=6)
-    target, policy = flight.target(push(1.0)), flight.policy().eval()
+    setup = small_quadrotor(rows=6)
+    target, policy = flight_target(setup, push(1.0)), setup.policy().eval()
     film(policy, target, tmp_path / "policy.mp4", seed=3)
-    flown = run(target, policy, see_goals, 1, 5, seeded())[0]
-    expected = FlightFilm([FlightPanel("synthetic vehicle", flown, target.system, target.course, target.first[0])])
+    flown = run(target, policy, 1, 5, seeded())[0]
+    expected = FlightFilm([FlightPanel("synthetic vehicle", flown, target.system, target.task, target.first[0])])
     assert expected.scales.duration == pytest.approx(0.5)
     assert_shows(tmp_path / "policy.mp4", expected)
     film(flown, target, tmp_path / "run.mp4")
@@ -114,12 +115,12 @@ def a_run(columns: int) -> Run:
 
 
 def test_what_cannot_be_filmed_is_one_line_and_leaves_no_file(tmp_path: Path):
-    flight: FlightTarget = small_flight(rows=6).target()
+    flight = flight_target(small_quadrotor(rows=6))
     image = ImagePolicy(torch.full((100, 120), 0.9), 0.2)
     for shown, target, says in (
         ({}, SyntheticTarget(), "at least one panel"),
         (a_run(2), Camera(), "panel 'my rig': a cart-pole's states"),
-        (a_run(13), flight, "does not hold its place on the course"),
+        (a_run(13), flight, "does not hold its progress in the task"),
         (image, SyntheticTarget(), "give it a camera"),
     ):
         with pytest.raises((ValueError, TargetError), match=says) as caught:

@@ -13,7 +13,7 @@ from visadapt.learning.windows import Windows
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import Episode
 from visadapt.systems import CartPole
-from visadapt.tasks.base import Balance
+from visadapt.tasks.balance import Balance
 from visadapt.tasks.cost import PAPER_CARTPOLE
 from visadapt.world import World
 

@@ -199,7 +199,7 @@ class DynamicsEffect(Effect):
     ...         force = self.value("strength", state) * state[:, 0] ** 3
     ...         return torch.stack((force, torch.zeros_like(force)), 1)
     >>> world = va.World(va.CartPole(), [Magnet(strength=8.0)])
-    >>> float(world.load(world.start(torch.tensor([[0.5, 0.0, 0.0, 0.0]])))[0, 0])
+    >>> world.load(world.start(torch.tensor([[0.5, 0.0, 0.0, 0.0]])))[0, 0].item()
     1.0
     >>> _ = va.effects.EFFECTS.pop("doc_magnet")  # an effect of one's own stays registered; this one was an example
     """

@@ -33,7 +33,7 @@ class FlightPanel:
     linear, and commands are held. Arrays are over instants (N, ...), INSTANT_PERIOD_S apart, unless stated otherwise.
 
     Raises:
-        ValueError: a run without states of a rigid body, or longer than its reference; a course of another kind.
+        ValueError: a run without states of a rigid body, or longer than its reference; a task of another kind.
     """
 
     title: str
@@ -62,7 +62,7 @@ class FlightPanel:
 
     @property
     def follows(self) -> bool:
-        """True where the course is a reference to follow, False where it is a point to fly through."""
+        """True where the task is a reference to follow, False where it is a point to fly through."""
         return isinstance(self.task, Follow)
 
     @cached_property

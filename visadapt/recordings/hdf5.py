@@ -45,11 +45,11 @@ def write_recording(
     >>> import pathlib, tempfile, torch, visadapt as va
     >>> target = va.SyntheticTarget(va.constant_force(2.0))
     >>> policy = va.load_policy(va.shipped("cartpole_states"))
-    >>> runs = va.run(target, policy, 4, 60, torch.Generator().manual_seed(0), exploration=0.3)
+    >>> runs = va.run(target, policy, 2, 30, torch.Generator().manual_seed(0), exploration=0.3)
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.h5"
     >>> va.write_recording(path, [run.episode for run in runs], ["x", "x_dot", "theta", "theta_dot"], ["command"])
     >>> len(va.read_recording(path))
-    4
+    2
     """
     path = Path(path)
     _check_alike(path, episodes)

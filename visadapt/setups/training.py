@@ -157,7 +157,7 @@ def adapt(
         samples: steps of the target in all; every one is counted.
         folder: where a run is kept, its policy as policy.safetensors; an interrupted run goes on from there.
         round_samples: steps in a round; a fifth of `samples` without it, and at least 20.
-        iterations: of tuning (in each round), instead of the setup's own.
+        iterations: of tuning (in each round), instead of the setup's own; the residual is fitted in as many at most.
         renderer, references, with_history: as for `setup_for`.
 
     Returns:
@@ -171,15 +171,17 @@ def adapt(
     >>> source, target = va.World(va.CartPole()), va.SyntheticTarget(va.sine_force)
     >>> policy = va.load_policy(va.shipped("cartpole_states"))
     >>> tuned = va.adapt(policy, va.World(va.CartPole(), [va.effects.ViscousFriction(coefficient=2.0)]), iterations=2)
-    >>> result = va.adapt(policy, source, target, samples=40, iterations=2)
+    >>> result = va.adapt(policy, source, target, samples=20, iterations=2)
     >>> result.ledger.used
-    40
+    20
     """
     if references is None and isinstance(target, FlightTarget) and isinstance(target.task, Follow):
         references = target.task.references
     setup = setup_for(source, policy, renderer, references, with_history)
     if iterations is not None:
-        settings = replace(setup.settings, tuning=replace(setup.settings.tuning, iterations=iterations))
+        own = setup.settings
+        ground = replace(own.ground, steps=min(own.ground.steps, iterations))
+        settings = replace(own, tuning=replace(own.tuning, iterations=iterations), ground=ground)
         setup = replace(setup, settings=settings)
     policy = copy.deepcopy(policy)
     if target is None:
