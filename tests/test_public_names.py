@@ -25,7 +25,7 @@ def test_the_example_of_every_public_name_runs(name):
     examples = doctest.DocTestFinder(recurse=inspect.isclass(found)).find(found, name, globs={})
     assert examples[0].examples or ">>>" in (found.__doc__ or ""), f"{name} has no example"
     for example in examples:
-        report = []
+        report: list[str] = []
         doctest.DocTestRunner(optionflags=FLAGS).run(example, out=report.append)
         assert not report, "".join(report)
 
@@ -63,7 +63,7 @@ def test_from_a_diagnosis_to_a_better_policy(tmp_path):
     found = va.diagnose(va.load_recording(tmp_path / "run.h5", source.system), source, [va.effects.ConstantForce])
     assert "constant_force" in str(found)
     world = va.World(source.system, found.effects())
-    assert float(world.effects[0].force) == pytest.approx(2.0, abs=0.1)
+    assert world.effects[0].force.item() == pytest.approx(2.0, abs=0.1)
     tuned = va.adapt(policy, world, iterations=60)
     before, after = (va.score(each, target, episodes=10, steps=60).mean_speed for each in (policy, tuned))
     assert after < 0.7 * before

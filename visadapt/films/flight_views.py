@@ -48,7 +48,7 @@ class ChaseView:
 
     def camera(self, moving: Floats, size: tuple[int, int]) -> PinholeCamera:
         """The camera when what it moves with is at `moving` (3,), for a picture of (width, height)."""
-        return PinholeCamera.towards(moving + self.task_state, moving + self.looks_at, self.focal, size)
+        return PinholeCamera.towards(moving + self.place, moving + self.looks_at, self.focal, size)
 
 
 FOLLOWING_VIEW = ChaseView((-1.2, -2.6, 1.15), (0.0, 0.0, 0.0), 820.0)

@@ -90,11 +90,9 @@ def describe(world: World) -> dict[str, Any]:
 
 def _world(description: Mapping[str, Any], path: Path) -> World:
     """The world that `describe` described; raises CheckpointError where its system or an effect is not known."""
-    for name, known in (
-        (description["system"], SYSTEMS),
-        *((one["effect"], EFFECTS) for one in description["effects"]),
-    ):
-        if name not in known:
+    names = [description["system"], *(one["effect"] for one in description["effects"])]
+    for name in names:
+        if name not in SYSTEMS and name not in EFFECTS:
             raise CheckpointError(f"{path}: needs {name!r}, which is not known here: import the file that defines it")
     system = SYSTEMS[description["system"]](**description["parameters"])
     effects = []
