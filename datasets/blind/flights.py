@@ -200,8 +200,11 @@ def _gaps(flown: Flights, system: System, every: int = 4) -> Array:
     rows = range(0, ROWS - horizon, every)
     count = flown.states.shape[1]
     source = {name: np.full(len(rows) * count, value) for name, value in NEUTRAL.items()}
-    names = ("place", "velocity", "turned", "rates")
-    at = Motion(*(np.concatenate([getattr(flown.motions[row], name) for row in rows]) for name in names), RESTING)
+
+    def stacked(name: str) -> Array:
+        return np.concatenate([getattr(flown.motions[row], name) for row in rows])
+
+    at = Motion(stacked("place"), stacked("velocity"), stacked("turned"), stacked("rates"), RESTING)
     for k in range(horizon):
         command = np.concatenate([flown.commands[row + k] for row in rows])
         for _ in range(round(period / (5 * SUBSTEP))):
