@@ -226,7 +226,12 @@ def test_every_kind_acts(bare, kind):
 
 
 def test_every_effect_of_the_catalogue_is_drawn_once():
-    assert sorted(k.name for k in NAMED + REST) == sorted(effect.name for effect in catalogue(CartPole()))
+    assert sorted(k.name for k in NAMED + REST) == sorted(
+        # Tests register effects of their own.
+        effect.name
+        for effect in catalogue(CartPole())
+        if effect.__module__.startswith("visadapt.")
+    )
 
 
 def test_a_set_of_the_rest_has_what_no_recording_shows():
