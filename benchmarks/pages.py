@@ -16,7 +16,7 @@ from pathlib import Path
 from benchmarks import tables_adaptation as adaptation
 from benchmarks import tables_diagnosis as diagnosis
 from benchmarks.all import COMMANDS
-from visadapt.effects import EFFECTS, Effect, Stage
+from visadapt.effects.catalogue import catalogue_markdown
 from visadapt.evaluation.result_tables import read_rows
 from visadapt.storage.atomic_files import replacing
 from visadapt.systems import SYSTEMS
@@ -151,33 +151,7 @@ def columns() -> str:
     return markdown(rows)
 
 
-def catalogue() -> str:
-    """Every registered effect of the library, by stage."""
-    parts = []
-    for stage in Stage:
-        own = [
-            effect for effect in EFFECTS.values() if effect.stage == stage and effect.__module__.startswith("visadapt.")
-        ]
-        if own:
-            rows = [["effect", "acts on", "equation and source", "parameters", "passive data cannot tell it from"]]
-            rows += [_effect(effect) for effect in sorted(own, key=lambda effect: effect.name)]
-            parts.append(f"## {str(stage).capitalize()}\n\n{markdown(rows)}")
-    return "\n\n".join(parts)
-
-
-def _effect(effect: type[Effect]) -> list[str]:
-    systems = ", ".join(sorted(name for name, system in SYSTEMS.items() if issubclass(system, effect.systems)))
-    parameters = "; ".join(
-        f"`{one.name}`{'' if one.unit == '1' else f' {one.unit}'}, {one.low:g} to {one.high:g}"
-        + ("" if one.neutral is None else f", none at {one.neutral:g}")
-        for one in effect.table
-    )
-    about = f"{effect.equation} ({effect.source})".replace("|", "\\|")
-    others = ", ".join(f"`{name}`" for name in effect.indistinguishable_from)
-    return [f"`{effect.name}`", systems, about, parameters, others]
-
-
-GENERATED = {"commands": commands, "columns": columns, "effects": catalogue}
+GENERATED = {"commands": commands, "columns": columns, "effects": catalogue_markdown}
 """Blocks that come from code, not from results."""
 
 

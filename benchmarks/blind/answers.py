@@ -16,10 +16,10 @@ from visadapt.systems import SYSTEMS
 
 
 def answer_of(data: Data, fits: Sequence[Fit], verdict: str) -> Answer:
-    """The lowest BIC is the answer, its exponential the probabilities (up to a common factor); fits[0] is the source.
+    """The fit with the lowest BIC is the answer; probabilities go as exp(-BIC / 2); fits[0] is the source.
 
-    `closed` is in-sample and one step ahead, since the methods know nothing else: of the root mean squared residual
-    (1 is the noise) what the set takes away.
+    `closed` is in sample and one step ahead, as these methods predict no further: the share of the root mean squared
+    residual beyond the noise (1) that the fit removes.
     """
     ordered = sorted(fits, key=lambda f: f.bic)
     best, n = ordered[0], data.size
@@ -52,7 +52,7 @@ def answer_of(data: Data, fits: Sequence[Fit], verdict: str) -> Answer:
 
 
 def cause_of(effect: str, values: Values, deviations: Values, data: Data, probability: float) -> dict[str, Any]:
-    """One cause; its intervals are 1.645 standard deviations to each side, without any where nothing was fitted."""
+    """One cause; its intervals are 1.645 standard deviations to each side, and None where nothing was fitted."""
     own = {name.split(".")[1]: v for name, v in values.items() if name.startswith(f"{effect}.")}
     spread = {name.split(".")[1]: d for name, d in deviations.items() if name.startswith(f"{effect}.")}
     if effect == "periodic_force":

@@ -1,13 +1,14 @@
-"""Diagnosers to compare with: each takes the path of a recording's CSV and answers with the JSON of docs/diagnosis.md.
+"""Baseline diagnosers: each takes the path of a recording's CSV and returns an answer in the JSON of docs/diagnosis.md.
 
-- afternoon: what a careful engineer writes in an afternoon. One-step prediction error of source and one effect at a
-  time, least squares on the measured states, the noise known, BIC; a fit that stays poor is called unexplained.
+- afternoon: what a careful engineer writes in an afternoon. Least squares on the one-step prediction errors of the
+  source with one effect at a time, known noise, BIC; if the best fit is poor, the answer is unexplained.
 - greedy: forward selection by BIC on the same residuals, up to three effects.
-- refit: all parameters at once by one ridge least-squares step; names what exceeds three standard deviations.
+- refit: all parameters at once by one ridge least-squares step; names those beyond three standard deviations.
 - pysindy: sparse regression of the residual forces on a library of features, by the package pysindy.
-- chance: guesses by the mix of the sets.
+- chance: guesses with the mixture of the sets.
 
-Afternoon, greedy, refit and chance know the vehicles too.
+All know the core of the catalogue (`datasets.blind.kinds`); afternoon, greedy, refit and chance that of the vehicles
+too.
 """
 
 from __future__ import annotations
@@ -29,18 +30,18 @@ from benchmarks.blind.scoring import Answer
 from datasets.blind import flight_kinds
 from datasets.blind.kinds import NAMED
 
-POOR = 1.5
-"""chi-squared for each residual from which a fit is called poor"""
-SUSPECT = 3.0
-"""standard deviations from which refit names a parameter"""
-MIX, FLIGHT_MIX = (0.2, 0.3, 0.2, 0.1, 0.2), (0.165, 0.67, 0.0, 0.0, 0.165)
+POOR_FIT = 1.5
+"""chi-squared per residual above which a fit is called poor"""
+NAMED_FROM = 3.0
+"""standard deviations above which refit names a parameter"""
+CART_POLE_MIX, FLIGHT_MIX = (0.2, 0.3, 0.2, 0.1, 0.2), (0.165, 0.67, 0.0, 0.0, 0.165)
 """shares of recordings without effect, with one, two and three, and with a foreign one"""
 RIDGE = 1.0
 """prior precision of every parameter, in units of its 30 smallest steps"""
 
 
 def opened(path: Path) -> tuple[Data, list[Candidate]]:
-    """A recording, and the effects that may be in it."""
+    """A recording, and the effects that it may have."""
     if (system := system_of(path)) != "cartpole":
         return read_flights(path), flight_candidates(system)
     data = read_steps(path)
@@ -61,7 +62,7 @@ def afternoon(path: Path) -> Answer:
 
 
 def greedy(path: Path) -> Answer:
-    """One effect after the other, as long as BIC gains; all parameters are fitted anew each time."""
+    """Adds one effect at a time while BIC falls; all parameters are refitted each time."""
     data, pool = opened(path)
     seen = [fit(data, ())]
     best = seen[0]
@@ -77,19 +78,19 @@ def greedy(path: Path) -> Answer:
 
 
 def _judged(data: Data, fits: Sequence[Fit]) -> Answer:
-    """The set of the lowest BIC; none of them where even that fits poorly."""
+    """The set of the lowest BIC; unexplained where even that fits poorly."""
     best = min(fits, key=lambda f: f.bic)
-    if best.chi2 / data.size > POOR:
+    if best.chi2 / data.size > POOR_FIT:
         return answer_of(data, fits, "unexplained")
     return answer_of(data, fits, "identified" if best.members else "no_gap")
 
 
 def refit(path: Path) -> Answer:
-    """(J'J + ridge)^-1 J'r at the source, for all parameters that have a slope there; names what stands out."""
+    """(J'J + ridge)^-1 J'r at the source, for all parameters with a derivative there; names the significant ones."""
     data, every = opened(path)
     aliases = _ALIASES[data.system]
     pool = [_without_alias(c) for c in every if c.free and len(c.starts) <= 2 and c.effect not in aliases]
-    # A saturation at 1 and regions without width have no slope at the source; dropouts have no parameter.
+    # At the source a saturation of 1 and regions without width have no derivative; a dropout has no fitted parameter.
     free = [parameter for candidate in pool for parameter in candidate.free]
     base = data.residual(dict(data.neutral))
     keep = ~(data.rows_lost | data.angle_held)
@@ -109,7 +110,7 @@ def refit(path: Path) -> Answer:
     }
     deviations = {p.name: float(s) for p, s in zip(free, spread, strict=True)}
     outstanding = {p.name: abs(float(d / s)) for p, d, s in zip(free, change, spread, strict=True)}
-    named = [c for c in pool if max(outstanding[p.name] for p in c.free) > SUSPECT]
+    named = [c for c in pool if max(outstanding[p.name] for p in c.free) > NAMED_FROM]
     named.sort(key=lambda c: -max(outstanding[p.name] for p in c.free))
     chi2 = chi_squared(data, data.residual(values), ("dropout", "frozen_zone"))
     fits = [Fit((), dict(data.neutral), chi_squared(data, base, ()), 0.0, {})]
@@ -123,16 +124,17 @@ _ALIASES: dict[str, tuple[str, ...]] = {
     "quadrotor": ("payload", "wind"),
     "fixed_wing": (),
 }
-"""have the very columns of constant_force and actuator_delay; of thrust_gain and, at the source, of linear_drag"""
+"""left out, as their columns equal those of constant_force and actuator_delay (cart-pole), thrust_gain and, at the
+source, linear_drag (quadrotor)"""
 
 
 def _without_alias(candidate: Candidate) -> Candidate:
-    """A spring's pull is a constant force, too."""
+    """The candidate without a spring's pull, which equals a constant force."""
     return replace(candidate, free=tuple(p for p in candidate.free if p.name != "spring.pull"))
 
 
 def pysindy(path: Path) -> Answer:
-    """STLSQ on what the source leaves of the force on the cart and of the torque at the pivot, by finite differences.
+    """STLSQ on the force on the cart and the torque at the pivot that the source does not explain (finite differences).
 
     F = (mc + mp) x'' + mp l (theta'' cos - theta'^2 sin) - 30 u, tau = mp l x'' cos + 4/3 mp l^2 theta'' - mp g l sin.
     """
@@ -158,7 +160,7 @@ def pysindy(path: Path) -> Answer:
     few = 4 * np.sqrt(2 / len(v)) / PERIOD
     limits = few * 1.1 * data.noise[1], few * data.noise[3] / 30
     with warnings.catch_warnings():
-        # That nothing is left is an answer, too.
+        # An empty model is a valid answer.
         warnings.filterwarnings("ignore", "Sparsity parameter is too big")
         pushes = package.STLSQ(threshold=limits[0], alpha=1e-3).fit(library, force[:, None]).coef_[0]
         turning_sizes = np.array([np.sqrt(np.mean(rate**2)), np.sqrt(np.mean(angle**2))])
@@ -169,7 +171,7 @@ def pysindy(path: Path) -> Answer:
         values[name] = NEUTRAL[name] + float(coefficient) / size
     values["pole_damping.coefficient"] = float(turns[0])
     active = [(abs(c), name.split(".")[0]) for name, c in zip(features, pushes, strict=True) if c != 0]
-    # A torque in proportion to the angle is what a longer or heavier pole leaves; the former is the likelier.
+    # A longer or heavier pole leaves a torque proportional to the angle; the longer one is taken.
     active += [(abs(c) * 20, n) for n, c in zip(("pole_damping", "pole_length"), turns, strict=True) if c != 0]
     named = [effect for _, effect in sorted(active, reverse=True)]
     answer = answer_of(data, [Fit((), dict(NEUTRAL), 1.0, 0.0, {})], "identified" if named else "no_gap")
@@ -180,13 +182,13 @@ def pysindy(path: Path) -> Answer:
 
 
 def chance(path: Path) -> Answer:
-    """A guess that repeats for the same file name: nothing, something foreign, or one to three effects."""
+    """A guess, the same for the same file name: nothing, something foreign, or one to three effects."""
     rng = np.random.default_rng(
         int.from_bytes(hashlib.sha256(f"{path.parent.name}/{path.name}".encode()).digest()[:8], "big")
     )
     system = system_of(path)
     effects = core(system)
-    guess = int(rng.choice(5, p=MIX if system == "cartpole" else FLIGHT_MIX))
+    guess = int(rng.choice(5, p=CART_POLE_MIX if system == "cartpole" else FLIGHT_MIX))
     named = [str(n) for n in rng.choice(effects, guess, replace=False)] if guess < 4 else []
     rest = [[str(n)] for n in rng.choice(effects, 2, replace=False)]
     verdict = "unexplained" if guess == 4 else "identified" if named else "no_gap"
@@ -211,4 +213,4 @@ BASELINES: dict[str, Callable[[Path], Answer]] = {
 """by name"""
 
 FLYING = ("afternoon", "greedy", "refit", "chance")
-"""those that know the vehicles"""
+"""the baselines that also diagnose the vehicles"""

@@ -4,11 +4,10 @@
 
     python -m benchmarks.blind.diagnosis --system quadrotor --count 30 --seed 7
 
-Makes the recordings with datasets.blind.gaps, or datasets.blind.flights, where they are not there yet, hands every
-diagnoser the path of one CSV at a time, and opens the key only to score. Every answer is a line of a log, so an
-interrupted run goes on where it was; with --data a folder made elsewhere is scored. Writes results/blind_diagnosis.csv
-(one row per set, diagnoser and measure) and results/blind_confusion.csv; lines of diagnosers and sets that were not run
-this time stay.
+Makes the recordings with datasets.blind.gaps or datasets.blind.flights unless they exist, gives every diagnoser the
+path of one CSV at a time, and opens the key only for scoring. Every answer is appended to a log, so that an interrupted
+run resumes; with --data, recordings made elsewhere are scored. Writes results/blind_diagnosis.csv (one row per set,
+diagnoser and measure) and results/blind_confusion.csv, in which rows of other diagnosers and sets are kept.
 """
 
 from __future__ import annotations
@@ -39,42 +38,42 @@ from datasets.blind import gaps as blind_gaps
 from datasets.blind.kinds import Effects
 
 Kind = Literal["easy", "hard", "quadrotor", "fixed_wing"]
-"""A set of the cart-pole, or the one of a vehicle."""
+"""One of the two sets of the cart-pole, or the set of a vehicle."""
 System = Literal["cartpole", "quadrotor", "fixed_wing"]
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is scored, and where things are kept."""
+    """What is scored, and where files are."""
 
     system: System = "cartpole"
-    """what is recorded; of a vehicle there is one set"""
+    """the system that is recorded; a vehicle has one set"""
     count: int = 200
     """recordings of each set"""
     seed: int = 7
-    """of the recordings"""
+    """seed of the recordings"""
     kinds: tuple[Kind, ...] = ("easy", "hard")
     """which sets of the cart-pole"""
     effects: Effects = "core"
     """what the recordings are drawn from: the core of the catalogue, the rest of it, or all"""
     diagnosers: tuple[str, ...] = ("ours", *BASELINES)
-    """who is scored"""
+    """the diagnosers to score"""
     jobs: int = 1
-    """recordings at once, one core each"""
+    """recordings diagnosed in parallel, one core each"""
     data: Path | None = None
-    """folder of recordings made elsewhere, its key beside it as <folder>.key.json; --kinds then names its one set"""
+    """folder of recordings made elsewhere, with <folder>.key.json beside it; --kinds then names its set"""
     work: Path = Path("runs/blind_diagnosis")
     """folder for the answers"""
     out: Path = Path("results/blind_diagnosis.csv")
     """table to write"""
     fresh: bool = False
-    """forget the answers in the log: for a diagnoser that has changed"""
+    """discard the logged answers, after a change of the diagnoser"""
     wrong: int = 0
-    """list so many wrong answers of each diagnoser"""
+    """number of wrong answers of each diagnoser that are listed"""
 
     @property
     def sets(self) -> tuple[Kind, ...]:
-        """Those of the system."""
+        """The sets of the system."""
         return self.kinds if self.system == "cartpole" else (self.system,)
 
     @property
@@ -90,7 +89,7 @@ class Settings:
 
 def ours(path: Path) -> Answer:
     """What the command `visadapt diagnose` writes, run in this process."""
-    # By name, and here: a worker that runs a baseline need not load torch.
+    # Imported here: a worker that runs a baseline need not load the command line.
     cli = importlib.import_module("visadapt.cli.main")
     said = io.StringIO()
     with tempfile.TemporaryDirectory() as folder:
@@ -108,15 +107,15 @@ DIAGNOSERS: dict[str, Callable[[Path], Answer]] = {"ours": ours, **BASELINES}
 
 
 FAILED: Answer = {"verdict": "failed", "causes": [], "ranking": []}
-"""in place of an answer that ended in an error: it is wrong whatever the truth"""
+"""replaces an answer that ended in an error; wrong whatever the truth"""
 
 
 class Skipped(Exception):
-    """A diagnoser that cannot run here, and why."""
+    """A diagnoser cannot run here; the message says why."""
 
 
 def diagnose_one(name: str, path: Path) -> dict[str, Any]:
-    """A line of the log: the answer, or the error in its place, and the seconds that it took."""
+    """A line of the log: the answer or the error, and the duration in s."""
     begun = time.perf_counter()
     line: dict[str, Any] = {"file": path.name, "sha256": fingerprint(path)}
     try:
@@ -124,19 +123,19 @@ def diagnose_one(name: str, path: Path) -> dict[str, Any]:
     except ModuleNotFoundError as error:
         raise Skipped(f"{name}: skipped, {error}") from error
     except Exception as error:
-        # One recording that breaks a diagnoser must not cost the others; it is counted as failed.
+        # An error on one recording counts as failed and does not stop the others.
         line["error"] = f"{type(error).__name__}: {error}"
     line["seconds"] = round(time.perf_counter() - begun, 3)
     return line
 
 
 def fingerprint(path: Path) -> str:
-    """Says whether a logged answer is about the recording that now has its name."""
+    """SHA-256 of a recording, to check that a logged answer belongs to it."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def read_log(path: Path) -> dict[str, dict[str, Any]]:
-    """The answers by file. An error is tried again; the last line may have been torn by an interrupt."""
+    """The answers by file, without errors, which are retried, and without a last line cut off by an interrupt."""
     lines: dict[str, dict[str, Any]] = {}
     if path.exists():
         for text in path.read_text(encoding="utf-8").splitlines():
@@ -150,13 +149,13 @@ def read_log(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def run_one(name: str, recordings: list[Path], log: Path, jobs: int) -> dict[str, dict[str, Any]]:
-    """All answers of a diagnoser by file: those in the log, and new ones, which go to the log as they come."""
+    """All answers of a diagnoser by file: those in the log, and new ones, which are appended to it at once."""
     prints = {path.name: fingerprint(path) for path in recordings}
     known = {file: line for file, line in read_log(log).items() if line["sha256"] == prints.get(file)}
     left = [path for path in recordings if path.name not in known]
     if left:
         log.parent.mkdir(parents=True, exist_ok=True)
-        # Written anew without a torn line, which would otherwise spoil the next one.
+        # Rewritten without an incomplete line, which would corrupt the next one.
         log.write_text("".join(json.dumps(line) + "\n" for line in known.values()), encoding="utf-8")
         with log.open("a", encoding="utf-8") as file:
             for line in _answers(name, left, jobs):
@@ -170,7 +169,7 @@ def _answers(name: str, left: list[Path], jobs: int) -> Iterator[dict[str, Any]]
     if jobs == 1:
         yield from (diagnose_one(name, path) for path in left)
         return
-    # Threads of torch and BLAS would fight over the cores that the processes share; read when those are loaded.
+    # One thread for torch and BLAS, as the processes share the cores; read when a process loads them.
     os.environ["OMP_NUM_THREADS"] = "1"
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
         futures = [pool.submit(diagnose_one, name, path) for path in left]
@@ -182,7 +181,7 @@ def _answers(name: str, left: list[Path], jobs: int) -> Iterator[dict[str, Any]]
 
 
 def recordings_of(settings: Settings, kind: Kind) -> Path:
-    """The folder of a set, made where it is not there or not whole."""
+    """The folder of a set, made unless it exists and is complete."""
     if settings.data is not None:
         return settings.data
     folder = Path("data/blind") / f"{settings.label(kind)}-{settings.count}-{settings.seed}"
@@ -197,7 +196,7 @@ def recordings_of(settings: Settings, kind: Kind) -> Path:
 
 
 def key_of(folder: Path) -> Path:
-    """Where the answers to a folder lie."""
+    """File of the key of a folder."""
     return folder.with_name(folder.name + ".key.json")
 
 
@@ -208,7 +207,7 @@ def read_key(folder: Path) -> dict[str, Truth]:
 
 
 def show_wrong(name: str, judged: list[tuple[str, Truth, Answer, Score]], most: int) -> None:
-    """List answers that miss what they should have said."""
+    """List wrong answers beside the truth."""
     right = {"none": "no_gap", "foreign": "unexplained"}
     wrong = [j for j in judged if not (j[3].exact if j[3].exact is not None else j[3].verdict == right[j[3].kind])]
     for file, truth, answer, _ in wrong[:most]:
@@ -255,7 +254,7 @@ def main(settings: Settings) -> None:
 
 
 def write(out: Path, rows: list[Row], taken: list[dict[str, str | int]]) -> None:
-    """Both tables; lines of other sets and diagnosers stay."""
+    """Write both tables; rows of other sets and diagnosers are kept."""
     run = {(row.kind, row.diagnoser) for row in rows}
 
     def others(path: Path) -> list[dict[str, Any]]:

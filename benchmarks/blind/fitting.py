@@ -1,4 +1,4 @@
-"""Least squares on one-step residuals: which effects the baselines try, from where, and what comes of it."""
+"""Least squares on one-step residuals: the effects that the baselines try, their starting points, and the fits."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class Data(Protocol):
 
     @property
     def neutral(self) -> Values:
-        """Every parameter where it does nothing."""
+        """Every parameter at the value without effect."""
 
     @property
     def size(self) -> int:
-        """How many residuals there are."""
+        """Number of residuals."""
 
     @property
     def rows_lost(self) -> NDArray[np.bool_]:
@@ -33,7 +33,7 @@ class Data(Protocol):
 
     @property
     def angle_held(self) -> NDArray[np.bool_]:
-        """(n,) whether an angle of either does, and the position does not."""
+        """(n,) whether an angle of either repeats, and the position does not."""
 
     def residual(self, p: Values) -> Array:
         """(channels, n) in standard deviations of the noise."""
@@ -48,22 +48,22 @@ class Free:
     low: float
     high: float
     step: float
-    """for the difference quotient, and about the smallest change that matters"""
+    """of the difference quotient; about the smallest change that matters"""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect, its free parameters, and the points that the fit starts from."""
+    """An effect, its free parameters, and the starting points of its fit."""
 
     effect: str
     free: tuple[Free, ...]
     starts: tuple[Values, ...]
     counted: int
-    """parameters that BIC counts, those on the grid included"""
+    """number of parameters for BIC, including those on the grid"""
 
 
 def one(name: str, low: float, high: float, step: float, *starts: float) -> Candidate:
-    """An effect with one parameter, and where its fit starts."""
+    """An effect with one parameter, and the starting points of its fit."""
     effect = name.split(".")[0]
     return Candidate(effect, (Free(name, low, high, step),), tuple({name: start} for start in starts), 1)
 
@@ -83,7 +83,7 @@ def on_any(*limits: float) -> list[Candidate]:
 
 
 def candidates(data: Steps) -> list[Candidate]:
-    """All effects of the catalogue that leave a trace, with a grid for places, times and frequencies."""
+    """The core of the catalogue, with grids of places, times and frequencies."""
     longest = float(data.time.max())
     reach = float(np.percentile(data.state[0], 2)), float(np.percentile(data.state[0], 98))
     times, places = np.linspace(0, longest, 9), np.linspace(*reach, 8)
@@ -145,12 +145,12 @@ class Fit:
 
     @property
     def effects(self) -> list[str]:
-        """Names, in the order in which they came."""
+        """Names, in the order in which they were added."""
         return [member.effect for member in self.members]
 
 
 def chi_squared(data: Data, residual: Array, effects: Sequence[str]) -> float:
-    """Steps that an effect of the set holds count as their expectation."""
+    """Sum of squared residuals; steps held by a dropout or frozen zone of the set count with their expectation."""
     out = np.zeros(residual.shape[1], bool)
     if "dropout" in effects:
         out |= data.rows_lost
@@ -162,7 +162,7 @@ def chi_squared(data: Data, residual: Array, effects: Sequence[str]) -> float:
 def fit(data: Data, members: Sequence[Candidate], start: Values | None = None, thorough: bool = True) -> Fit:
     """Gauss-Newton from every point of the last member's grid, all parameters together.
 
-    A grid is first gone through with one step each, and the best three points are taken to the end.
+    On a grid, one step is made from every point, and the best three are continued to convergence.
     """
     base = {**data.neutral, **(start or {})}
     starts = [{**base, **point} for point in members[-1].starts] if members else [base]
@@ -186,7 +186,7 @@ def _descend(data: Data, members: Sequence[Candidate], start: Values, rounds: in
     for _ in range(rounds if free else 0):
         slopes = np.stack([_slope(data, values, parameter, residual)[:, keep].ravel() for parameter in free], 1)
         normal = slopes.T @ slopes
-        # A parameter without any slope here (a limit that is never met) stays where it is.
+        # A parameter without a derivative here (a limit that is never reached) does not move.
         inverse = np.asarray(np.linalg.pinv(normal + 1e-9 * np.diag(np.diag(normal) + 1e-12)), np.float64)
         move = -inverse @ (slopes.T @ residual[:, keep].ravel())
         for share in (1.0, 0.3, 0.1):

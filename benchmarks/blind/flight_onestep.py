@@ -1,7 +1,7 @@
-"""One step of a quadrotor or a fixed wing with every effect of the sealed check: the model of the baselines there.
+"""One step of a quadrotor or a fixed wing with the core of the catalogue: the model of the baselines on flights.
 
-The physics are those that the recordings were made with (`datasets.blind.flight_plants`), which no diagnoser would
-have: they can only make the baselines better. All 13 states are measured, and the noise is known.
+The physics are those that made the recordings (`datasets.blind.flight_plants`), which a diagnoser would not have: that
+favours the baselines. All 13 states are measured, and the noise is known.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ NEUTRAL: Values = {
     "periodic_force.frequency": 1.0,
     "periodic_wind.frequency": 1.0,
 }
-"""every parameter where it does nothing"""
+"""every parameter at the value without effect"""
 
 
 @dataclass
@@ -60,7 +60,7 @@ class FlightSteps:
 
     @property
     def size(self) -> int:
-        """How many residuals there are."""
+        """Number of residuals."""
         return int(self.state.size)
 
     @property
@@ -86,7 +86,7 @@ class FlightSteps:
         parameters = {name: np.full(len(state), value) for name, value in own.items()}
         at = _motion(state)
         for k in range(SUBSTEPS):
-            # The plants take the time of one instant or of every row.
+            # The plants accept one time or a time for every row.
             time: float = (self.where[1] * period + k * h).astype(np.float64)  # type: ignore[assignment]
             at = step(PLANTS[self.system], parameters, time, at, inputs[:, k], h)
         return as_states(at, state[:, 6:10])
@@ -106,7 +106,7 @@ def _motion(state: Array) -> Motion:
 
 
 def system_of(path: Path) -> str:
-    """The system that a recording is of, by the names of its commands."""
+    """The system of a recording, by the names of its commands."""
     with path.open(encoding="utf-8") as file:
         columns = set(file.readline().strip().split(","))
     return next((name for name, actions in ACTIONS.items() if columns.issuperset(actions)), "cartpole")
@@ -126,7 +126,7 @@ def read_flights(path: Path) -> FlightSteps:
         state = _columns(episode, STATES)
         commands[number, : len(episode)] = _columns(episode, ACTIONS[system])
         states.append(state[:-1])
-        # Of the two signs of a quaternion the one that goes on.
+        # Of the two signs of a quaternion, the one nearer to the row before.
         signs = np.where((state[1:, 6:10] * state[:-1, 6:10]).sum(1) < 0, -1.0, 1.0)
         afters.append(np.concatenate([state[1:, :6], state[1:, 6:10] * signs[:, None], state[1:, 10:]], 1))
         places.append(np.stack([np.full(len(state) - 1, number), np.arange(len(state) - 1)]))
@@ -139,7 +139,7 @@ def _columns(lines: Sequence[dict[str, str]], names: Sequence[str]) -> Array:
 
 
 def flight_candidates(system: str) -> list[Candidate]:
-    """The effects that the check draws from, with a grid for frequencies, phases and directions."""
+    """The core of the catalogue, with grids of frequencies, phases and directions."""
     frequencies = [float(f) for f in np.geomspace(0.2, 2.5, 10)]
     force = tuple(Free(f"periodic_force.{name}", -10, 10, 0.001) for name in ("cosine", "sine", "offset"))
     drag = 0.0 if system == "fixed_wing" else 0.3
@@ -161,7 +161,7 @@ def flight_candidates(system: str) -> list[Candidate]:
         Free("periodic_wind.phase", -7.0, 7.0, 0.001),
         Free("periodic_wind.direction", -1.6, 1.6, 0.001),
     )
-    # The wing feels the wind without a drag.
+    # On the wing, wind acts without a drag coefficient.
     dragging = ("wind", "periodic_wind") if drag else ()
     coefficients = tuple(Free(f"{name}.coefficient", 0.0, 3.0, 0.0001) for name in dragging)
     steady = tuple(Free(f"wind.velocity_{axis}", -10.0, 10.0, 0.001) for axis in "xyz")

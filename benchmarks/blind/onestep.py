@@ -1,9 +1,8 @@
-"""One step of a cart-pole with every effect of the catalogue: the model of the baselines (numpy alone).
+"""One step of a cart-pole with the core of the catalogue: the model of the baselines (numpy alone).
 
-From the measured state at row t it predicts the one at row t + 1. Velocities that were not measured are central
-differences, freed of what the known jumps of the command do to them. Effects are parameters of one model; where all
-are at `NEUTRAL`, it is the source. What holds a reading (dropout, frozen_zone) is seen from rows that repeat exactly,
-and takes their steps out of the sum.
+From the measured state at row t it predicts the state at row t + 1. Velocities that were not measured are central
+differences, corrected for the known jumps of the command. Effects are parameters of one model; at `NEUTRAL` it is the
+source. Held readings (dropout, frozen_zone) show as rows that repeat exactly, and are left out of the sum.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ Values = dict[str, float]
 
 PERIOD = 0.05
 SUBSTEPS = 5
-ALL = [0, 1, 2, 3]
+ALL_STATES = [0, 1, 2, 3]
 
 NEUTRAL: Values = {
     "actuator_gain.scale": 1.0,
@@ -58,7 +57,7 @@ NEUTRAL: Values = {
     "sensor_scale.position": 1.0,
     "sensor_scale.angle": 1.0,
 }
-"""every parameter where it does nothing"""
+"""every parameter at the value without effect"""
 
 
 @dataclass
@@ -76,17 +75,17 @@ class Steps:
     rows_lost: NDArray[np.bool_]
     """(n,): whether either row repeats the one before"""
     angle_held: NDArray[np.bool_]
-    """(n,): whether an angle of either does, and the position does not"""
+    """(n,): whether an angle of either repeats, and the position does not"""
     rate: float
-    """share of rows that repeat the one before"""
+    """share of rows that repeat the row before"""
     zone: tuple[float, float] | None
-    """rad: the angles in between which readings hold"""
+    """rad: the angles between which readings hold"""
     noise: Array
     """(4,) standard deviations of the states, known"""
     channels: list[int]
-    """of the state that are predicted: those measured, since the noise of a central difference is that of its rows"""
+    """columns of the state that are predicted: the measured ones, as a central difference has its rows' noise"""
     scale: Array = field(init=False)
-    """`deviations`, once"""
+    """`deviations`, computed once"""
     system: str = "cartpole"
     neutral: Values = field(default_factory=lambda: dict(NEUTRAL))
 
@@ -102,8 +101,8 @@ class Steps:
     def deviations(self) -> Array:
         """(channels, 1) standard deviations of the source's one-step error, by the noise of both rows."""
         deviations: Array
-        if self.channels != ALL:
-            # What is missed of x_(t+1) is then half the second difference: noise of 1 - 2 + 1 over 2.
+        if self.channels != ALL_STATES:
+            # The error of x_(t+1) is then half a second difference, with weights (1, -2, 1) / 2 on the noise.
             deviations = self.noise[self.channels] * 1.5**0.5
             return deviations[:, None]
         small, still = 1e-4, np.zeros((1, SUBSTEPS))
@@ -113,7 +112,7 @@ class Steps:
 
     @property
     def size(self) -> int:
-        """How many residuals there are."""
+        """Number of residuals."""
         return len(self.channels) * self.state.shape[1]
 
     def residual(self, p: Values) -> Array:
@@ -128,7 +127,7 @@ class Steps:
 def actuate(commands: Array, p: Values, period: float = PERIOD, substeps: int = SUBSTEPS) -> Array:
     """Motor inputs (episodes, rows, substeps) in units of the command.
 
-    What is measured late is a state that moves as if commanded late: the two delays add up.
+    A delayed measurement is equivalent to a delayed command: the two delays add up.
     """
     u: Array = np.repeat(commands, substeps, 1)
     delay = (p["actuator_delay.delay"] + p["measurement_delay.delay"]) * substeps / period
@@ -179,7 +178,7 @@ def rates(s: Array, u: Array, t: Array, p: Values) -> Array:
         + p["periodic_force.offset"]
         + p["gust.force"] * ((t >= p["gust.start"]) & (t < p["gust.end"]))
         - p["viscous_friction.coefficient"] * v
-        # Smooth within 1 cm/s, or the fit would see no slope.
+        # Smoothed within 1 cm/s, so that it has a derivative.
         - p["coulomb_friction.force"] * np.tanh(v / 0.01)
         - p["quadratic_drag.coefficient"] * v * np.abs(v)
         - p["friction_patch.coefficient"] * v * ((x >= p["friction_patch.start"]) & (x < p["friction_patch.end"]))
@@ -195,7 +194,7 @@ def rates(s: Array, u: Array, t: Array, p: Values) -> Array:
 
 
 def read_steps(path: Path) -> Steps:
-    """Read one recording; the noise is that of the set, which the columns give away."""
+    """Read one recording; its noise is that of its set, which the columns identify."""
     with path.open(newline="", encoding="utf-8") as file:
         lines = list(csv.DictReader(file))
     episodes: dict[str, list[dict[str, str]]] = {}
@@ -222,12 +221,12 @@ def read_steps(path: Path) -> Steps:
             lowest, highest = min(lowest, between.min()), max(highest, between.max())
         s = np.stack((x, v, theta, w))
         if not fast:
-            # A central difference takes the command's jump at its middle for a ramp: v_t + P/4 (a_t - a_(t-1)).
+            # The error of a central difference from the command's jump at its middle: P/4 (a_t - a_(t-1)).
             now, before = (
                 rates(s, u, np.zeros(len(x)), NEUTRAL) for u in (column["command"], _late(column["command"]))
             )
             s[[1, 3]] -= PERIOD / 4 * (now - before)[[1, 3]]
-        # Central differences do not reach the ends, and carry a repeated row to its neighbours.
+        # Central differences are undefined at the ends, and affected by a repeated row on either side.
         margin = 0 if fast else 1
         first = np.arange(margin, len(x) - 1 - margin)
         parts.append((np.full(len(first), number), first))
@@ -248,7 +247,7 @@ def read_steps(path: Path) -> Steps:
         float(np.concatenate(repeats).mean()),
         (float(lowest), float(highest)) if highest >= lowest else None,
         np.array([x_noise, v_noise, theta_noise, w_noise]),
-        ALL if fast else [0, 2],
+        ALL_STATES if fast else [0, 2],
     )
 
 
@@ -257,5 +256,5 @@ def _late(command: Array) -> Array:
 
 
 def _touched(same: NDArray[np.bool_], margin: int) -> NDArray[np.bool_]:
-    """Whether a pair that begins at a row uses a repeated row, itself or through a difference."""
+    """Whether a pair that begins at a row uses a repeated row, directly or through a central difference."""
     return np.array([same[max(0, k - margin) : k + 2 + margin].any() for k in range(len(same))])

@@ -1,8 +1,8 @@
-"""What a diagnosis of a blind recording is worth: answers (the JSON of docs/diagnosis.md) against the sealed key.
+"""Scores of answers to blind recordings (the JSON of docs/diagnosis.md) against the sealed key.
 
-An answer names classes. With verdict `identified` each cause is one by itself; with `ambiguous` causes that are listed
-as indistinguishable from one another form one class, of which one member is meant. A true effect is found where a
-class of at most 3 has it; several true effects need a class each.
+An answer names classes of effects. With the verdict `identified` each cause is a class; with `ambiguous`, causes listed
+as indistinguishable from one another form a class, one member of which is claimed to act. A true effect is found if a
+class of at most 3 contains it; several true effects need a class each.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ class Score:
     verdict: str
     """of the answer"""
     found: bool | None = None
-    """every true effect has a class (named kinds only)"""
+    """whether every true effect has a class (named kinds only)"""
     exact: bool | None = None
-    """and there is no class besides"""
+    """whether, besides, there is no other class"""
     top3: bool | None = None
-    """the true set is among the first three of the ranking"""
+    """whether the true set is among the first three of the ranking"""
     strength: float | None = None
-    """of a single"""
+    """of a single effect"""
     closed: float | None = None
     """gap.closed of an identified answer"""
     probability: float | None = None
@@ -61,17 +61,17 @@ class Score:
     first_right: bool | None = None
     """whether that set is the true one, or of its class"""
     errors: list[float] = field(default_factory=list)
-    """|estimate - truth| / |truth| of the sizes of rightly named causes"""
+    """|estimate - truth| / |truth| of the sizes of correctly named causes"""
     deviations: list[float] = field(default_factory=list)
-    """the same relative to how far the truth is from doing nothing; differs for scales alone"""
+    """the same relative to the truth's distance from its neutral value; differs where that is not 0"""
     covered: list[bool] = field(default_factory=list)
-    """whether a 90 % interval holds the truth, for every parameter of rightly named causes"""
+    """whether a 90 % interval contains the truth, for every parameter of correctly named causes"""
     overlaps: list[float] = field(default_factory=list)
-    """intersection over union of the region of a patch, gust or frozen zone with the answer's; 0 where it has none"""
+    """intersection over union of the region of a patch, gust or frozen zone with the answer's; 0 if it has none"""
 
 
 def classes(answer: Answer) -> list[set[str]]:
-    """What the answer claims to act: one of each set."""
+    """The sets of effects that the answer names; it claims that one of each acts."""
     if answer["verdict"] not in ("identified", "ambiguous"):
         return []
     merged: list[set[str]] = []
@@ -102,7 +102,7 @@ def region_of(effect: str) -> tuple[str, str, str] | None:
 
 
 def matches(effects: set[str], groups: list[set[str]]) -> bool:
-    """Whether every effect finds a class of its own that is small enough."""
+    """Whether every effect is in a class of its own that is small enough."""
     small = [group for group in groups if len(group) <= LARGEST_CLASS]
     names = sorted(effects)
     return any(
@@ -116,13 +116,13 @@ def score(truth: Truth, answer: Answer) -> Score:
     result = Score(truth.kind, answer["verdict"])
     if answer["verdict"] == "identified":
         result.closed = (answer.get("gap") or {}).get("closed")
-    # Nothing is to be found of what no recording can show.
+    # An effect that no recording can show is not to be found.
     groups, effects = classes(answer), set() if truth.kind == "none" else set(truth.effects)
     ranking = answer.get("ranking") or []
     if truth.kind != "foreign" and ranking and ranking[0].get("probability") is not None:
         result.probability = float(ranking[0]["probability"])
         first = set(ranking[0]["effects"])
-        # One of a class that the data forces counts as the true one.
+        # A first set that differs from the true one within the answer's classes counts as right.
         right = bool(effects) and len(groups) == len(effects) == len(first) and matches(effects, groups)
         result.first_right = first == effects or (right and matches(first, groups))
     if truth.kind in ("none", "foreign"):
@@ -146,7 +146,7 @@ def score(truth: Truth, answer: Answer) -> Score:
 
 def _parameters(result: Score, cause: dict[str, Any], true: dict[str, float]) -> None:
     neutral = sizes(cause["effect"])
-    # Of several sizes the one that is furthest from doing nothing.
+    # Of several sizes, the one furthest from its neutral value.
     name = max(neutral, key=lambda n: abs(true[n] - neutral[n]), default="")
     phases = {p.name for p in EFFECTS[cause["effect"]].table if p.role is Role.PHASE}
     for parameter, estimate in cause["parameters"].items():
@@ -160,13 +160,13 @@ def _parameters(result: Score, cause: dict[str, Any], true: dict[str, float]) ->
         if interval and None not in interval:
             low, high = interval
             if parameter in phases:
-                # The turn that lies nearest to the interval.
+                # Modulo a turn: the value nearest to the interval.
                 truth += 2 * math.pi * round(((low + high) / 2 - truth) / (2 * math.pi))
             result.covered.append(bool(low <= truth <= high))
 
 
 def _overlap(answer: Answer, variable: str, start: float, end: float) -> float:
-    """With the region of that variable that has the largest share of the gap."""
+    """Intersection over union with the answer's region of that variable that has the largest share of the gap."""
     regions = (answer.get("where") or {}).get("regions") or []
     own = [region for region in regions if region["variable"] == variable]
     if not own:

@@ -1,4 +1,4 @@
-"""The tables of the blind check: shares with Wilson intervals, medians, calibration, who was taken for whom."""
+"""The tables of the blind check: shares with Wilson intervals, medians, calibration, and confusion."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from benchmarks.blind.scoring import Answer, Score, Truth, classes
 from visadapt.evaluation.intervals import wilson
 from visadapt.storage.atomic_files import replacing
 
-STRENGTHS = (0.0, 1.0, 1.5, 2.5, 4.0, 8.0, 15.0, np.inf)
+STRENGTH_EDGES = (0.0, 1.0, 1.5, 2.5, 4.0, 8.0, 15.0, np.inf)
 """edges of the bins of strength"""
-PROBABILITIES = (0.0, 0.5, 0.7, 0.9, 0.97, 1.0)
+PROBABILITY_EDGES = (0.0, 0.5, 0.7, 0.9, 0.97, 1.0)
 """edges of the bins of probability"""
 
 
@@ -33,13 +33,13 @@ class Row:
     """easy or hard, of the cart-pole, or a vehicle"""
     diagnoser: str
     measure: str
-    """what is counted, as docs/results.md describes"""
+    """what is measured; docs/results.md explains it"""
     value: float
     low: float
     """Wilson's 95 % for shares; the quartiles for medians; empty otherwise"""
     high: float
     n: int
-    """recordings, parameters or intervals that it is over"""
+    """number of recordings, parameters or intervals"""
 
 
 def tabulate(kind: str, diagnoser: str, scores: Sequence[Score], seconds: Sequence[float]) -> list[Row]:
@@ -89,7 +89,7 @@ def tabulate(kind: str, diagnoser: str, scores: Sequence[Score], seconds: Sequen
     middle("region overlap, median", overlaps)
     if overlaps:
         number("region overlap, mean", float(np.mean(overlaps)), len(overlaps))
-    for low, high in pairwise(STRENGTHS):
+    for low, high in pairwise(STRENGTH_EDGES):
         inside = [s for s in of("single") if s.strength is not None and low <= s.strength < high]
         share(f"single: named, nothing else, strength {low:g} to {high:g}", [s.exact for s in inside])
     _calibration(scores, share, number)
@@ -99,31 +99,31 @@ def tabulate(kind: str, diagnoser: str, scores: Sequence[Score], seconds: Sequen
 
 
 def _calibration(scores: Sequence[Score], share: Share, number: Number) -> None:
-    """Brier's score and the expected calibration error of the first set's probability, and how often bins were right.
+    """Brier score and expected calibration error of the first set's probability, and the share of right ones by bin.
 
-    Brier: mean (p - right)^2. ECE: sum over bins of their share times |mean p - share right|. Foreign recordings have
-    no right set and are left out.
+    Brier: mean (p - right)^2. ECE: sum over bins of their share times |mean p - share right|. Foreign recordings,
+    which have no right set, are left out.
     """
     stated = np.array([(s.probability, s.first_right) for s in scores if s.probability is not None], float)
     if not len(stated):
         return
     probability, right = stated.T
     number("Brier score", float(np.mean((probability - right) ** 2)), len(stated))
-    bins = np.clip(np.digitize(probability, PROBABILITIES) - 1, 0, len(PROBABILITIES) - 2)
+    bins = np.clip(np.digitize(probability, PROBABILITY_EDGES) - 1, 0, len(PROBABILITY_EDGES) - 2)
     error = sum(abs(float((probability - right)[bins == b].sum())) for b in set(bins)) / len(stated)
     number("expected calibration error", error, len(stated))
-    for b, (low, high) in enumerate(pairwise(PROBABILITIES)):
+    for b, (low, high) in enumerate(pairwise(PROBABILITY_EDGES)):
         share(f"right where probability {low:g} to {high:g}", [bool(hit) for hit in right[bins == b]])
 
 
 def label(answer: Answer) -> str:
-    """What an answer says, in a word or two."""
+    """A short form of an answer: its classes, or its verdict."""
     groups = classes(answer)
     return " + ".join(sorted("/".join(sorted(group)) for group in groups)) if groups else str(answer["verdict"])
 
 
 def confusion(kind: str, diagnoser: str, pairs: Iterable[tuple[Truth, Answer]]) -> list[dict[str, str | int]]:
-    """Who was taken for whom: singles, none and foreign recordings by what the answer said, most frequent first."""
+    """Counts of answers by truth, for singles, none and foreign recordings, the most frequent first."""
     counts: Counter[tuple[str, str]] = Counter()
     for truth, answer in pairs:
         if truth.kind == "none" or len(truth.effects) == 1:
@@ -136,7 +136,7 @@ def confusion(kind: str, diagnoser: str, pairs: Iterable[tuple[Truth, Answer]]) 
 
 
 def write_table(path: Path, rows: Sequence[Row], others: Iterable[dict[str, str | int]] = ()) -> None:
-    """One line a row, after lines that stay; numbers to four digits, what does not apply is empty."""
+    """Write the rows after the lines that are kept; numbers to four digits, empty where not applicable."""
     shown = [
         {name: _shown(value) if isinstance(value, float) else value for name, value in asdict(row).items()}
         for row in rows
@@ -149,7 +149,7 @@ def _shown(value: float) -> str:
 
 
 def write_csv(path: Path, columns: Sequence[str], lines: Iterable[dict[str, str | int]]) -> None:
-    """A CSV that is whole or not there."""
+    """Write a CSV atomically."""
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
@@ -157,7 +157,7 @@ def write_csv(path: Path, columns: Sequence[str], lines: Iterable[dict[str, str 
 
 
 def read_table(path: Path) -> list[dict[str, str]]:
-    """The lines of a table that is there already."""
+    """The lines of an existing table; none if there is no file."""
     if not path.exists():
         return []
     with path.open(newline="", encoding="utf-8") as file:

@@ -1,8 +1,9 @@
-"""Actuation and sensing of the blind recordings: what lies between a command and the force, a state and its reading.
+"""Actuation and sensing of the blind recordings: from a command to the motor's input, from a state to its reading.
 
 The actuation chain runs delay, backlash, dead zone, saturation, gain, bias, lag; the sensing chain runs delay, scale,
-offset, noise, and then what holds a reading. Widths, limits and offsets of the former are in units of the command.
-Before an episode the commands were zero, the lag had settled on the bias, and the machine stood in its first state.
+offset, noise, and last the effects that hold a reading. Widths, limits and offsets of the actuation chain are in units
+of the command. Before an episode commands are zero, the lag has settled on the bias, and the machine rests in its
+first state.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import numpy as np
 
 from datasets.blind.plant import PERIOD, Array, Parameters
 
-NONE: dict[str, float] = {
+NEUTRAL: dict[str, float] = {
     "actuator_delay.delay": 0.0,
     "actuator_backlash.width": 0.0,
     "actuator_deadzone.width": 0.0,
@@ -37,11 +38,11 @@ NONE: dict[str, float] = {
     "angle_drift.rate": 0.0,
     "angle_quantisation.step": 0.0,
 }
-"""every parameter of both chains where it does nothing: s, units of the command, m, rad, 1/s, rad/s"""
+"""every parameter of both chains at the value without effect: s, units of the command, m, rad, 1/s, rad/s"""
 
 
 class Actuation:
-    """The chains of n machines, with their memory."""
+    """The actuation chains of n machines, with their memory."""
 
     def __init__(self, parameters: Parameters, n: int) -> None:
         self.p = parameters
@@ -50,14 +51,14 @@ class Actuation:
         self.commands = np.zeros((0, n))
 
     def push(self, command: Array) -> None:
-        """Take the command of the next period, (n,)."""
+        """Append the commands (n,) of the next period."""
         self.commands = np.concatenate((self.commands, command[None]))
 
     def __call__(self, t: float, h: float) -> Array:
-        """Mean over [t, t + h] of what reaches the motor, (n,)."""
+        """Mean of the motor's input over [t, t + h], (n,)."""
         p = self.p
         u = self._delayed(t, h)
-        # The play: the output stays until the input has crossed the gap, of which `width` is the whole.
+        # Backlash: the output holds until the input has crossed the play, whose full width is `width`.
         half = 0.5 * p["actuator_backlash.width"]
         u = self.play = np.minimum(np.maximum(self.play, u - half), u + half)
         u = np.sign(u) * np.maximum(np.abs(u) - p["actuator_deadzone.width"], 0.0)
@@ -67,12 +68,12 @@ class Actuation:
         u = p["actuator_gain.scale"] * u + p["actuator_bias.offset"]
         constant = np.maximum(p["actuator_lag.time_constant"], 1e-12)
         before, self.lagged = self.lagged, u + (self.lagged - u) * np.exp(-h / constant)
-        # Mean of an exponential over the substep; without a lag that is u itself.
+        # Mean of an exponential over the substep; without a lag, u itself.
         return u + constant / h * (before - self.lagged)
 
     def _delayed(self, t: float, h: float) -> Array:
         shifted = t - self.p["actuator_delay.delay"]
-        # 1e-9: a time that rounding left just before its period belongs to it.
+        # 1e-9: a time that rounding put just before the start of a period belongs to it.
         first = np.floor(shifted / PERIOD + 1e-9).astype(int)
         last = np.floor((shifted + h) / PERIOD - 1e-9).astype(int)
         share = np.where(last > first, np.clip((last * PERIOD - shifted) / h, 0.0, 1.0), 1.0)
@@ -84,11 +85,11 @@ class Actuation:
 
 
 class Sensing:
-    """The sensors of n machines, with the states and readings of the past."""
+    """The sensors of n machines, with past states and readings."""
 
     def __init__(self, parameters: Parameters, start: Array, h: float) -> None:
         self.p, self.h = parameters, h
-        # As many substeps as the longest delay reaches back, newest first.
+        # States over the longest delay, newest first.
         reach = int(np.ceil(parameters["measurement_delay.delay"].max() / h)) + 2
         self.past = np.repeat(start[None, :4], reach, 0)
         self.delayed = bool(reach > 2)
@@ -96,12 +97,12 @@ class Sensing:
         self.clean = start[:4]
 
     def pass_by(self, state: Array) -> None:
-        """Take the state at the end of a substep, (4, n)."""
+        """Append the states (4, n) at the end of a substep."""
         if self.delayed:
             self.past = np.concatenate((state[None, :4], self.past[:-1]))
 
     def noiseless(self, t: float, state: Array) -> Array:
-        """Reading before noise and holds, (4, n) in m, m/s, rad, rad/s."""
+        """Readings without noise and holds, (4, n) in m, m/s, rad, rad/s."""
         p = self.p
         y = state[:4]
         if self.delayed:
@@ -119,12 +120,12 @@ class Sensing:
         y[2] += p["angle_drift.rate"] * t
         return y
 
-    def read(self, t: float, state: Array, noise: Array, lottery: Array) -> tuple[Array, Array]:
-        """Reading (4, n), and the same with the noise taken off again where it is not held from an earlier row.
+    def read(self, t: float, state: Array, noise: Array, loss_draws: Array) -> tuple[Array, Array]:
+        """Readings (4, n), and readings without noise.
 
         While the true angle is inside a frozen zone, the angle's reading holds, and with `holds_rate` the angular
-        velocity's too (the effect's definition allows either); a dropout holds the whole row. `lottery` (n,) is
-        uniform on [0, 1). The first row of an episode has nothing to hold and is read as it is.
+        velocity's too; a dropout holds the whole row. `loss_draws` (n,) are uniform on [0, 1). The first row of an
+        episode is never held.
         """
         p, clean = self.p, self.noiseless(t, state)
         step = p["angle_quantisation.step"]
@@ -134,7 +135,7 @@ class Sensing:
         clean[2] = np.where(step > 0, y[2] - noise[2], clean[2])
         if self.reading is not None:
             frozen = (state[2] >= p["frozen_zone.start"]) & (state[2] < p["frozen_zone.end"])
-            lost = lottery < p["dropout.rate"]
+            lost = loss_draws < p["dropout.rate"]
             holds = (lost, lost, frozen | lost, frozen & (p["frozen_zone.holds_rate"] > 0) | lost)
             for channel, held in enumerate(holds):
                 y[channel] = np.where(held, self.reading[channel], y[channel])

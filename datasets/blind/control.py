@@ -1,6 +1,6 @@
-"""Who drives the blind recordings: a stabilising controller with an observer, and excitation on top.
+"""The controller of the blind recordings: state feedback with an observer, and an excitation added to the command.
 
-The controller knows the source, linearised and sampled at the period: s' = A s + B u, y = C s. Its gain K solves the
+It is designed for the source, linearised and sampled at the period: s' = A s + B u, y = C s. Its gain K solves the
 discrete Riccati equation for drawn weights; its observer is the Kalman filter for drawn noise. The command is
 u = -K (s_hat - s_ref) + e, clipped to [-1, 1], with e a sum of sines, random steps or a chirp.
 """
@@ -39,13 +39,13 @@ class Driver:
     gain: Array
     """(4,)"""
     observer: Array | None
-    """(4, measured channels); None: the controller sees the true state"""
+    """(4, measured channels); None: the controller is given the true state"""
     start: Array
     """(4, episodes): first states"""
     excitation: Array
     """(rows, episodes) in units of the command"""
     reference: Array
-    """(rows, episodes): where the cart should be, m"""
+    """(rows, episodes): reference of x, m"""
     description: dict[str, str | float]
     """for the key"""
 
@@ -53,7 +53,7 @@ class Driver:
 def draw_driver(
     rng: np.random.Generator, episodes: int, rows: int, noise: Array, velocities: bool, strength: float
 ) -> Driver:
-    """Draw a controller; `strength` weakens the excitation where earlier draws left the track or fell."""
+    """Draw a controller; `strength` < 1 scales the excitation down after earlier draws left the track or fell."""
     a, b = linearised()
     weights = np.array([3.0, 0.5, 20.0, 0.5]) * np.exp(rng.normal(0, 0.5, 4))
     gain = riccati(a, b, np.diag(weights), np.array([[np.exp(rng.uniform(np.log(20.0), np.log(200.0)))]]))[0]
@@ -78,7 +78,7 @@ def draw_driver(
 
 
 def _excite(rng: np.random.Generator, kind: str, rows: int) -> Array:
-    """A signal of about unit size, (rows,)."""
+    """A signal (rows,) of about unit root mean square."""
     time = np.arange(rows) * PERIOD
     if kind == "sines":
         frequencies = np.exp(rng.uniform(np.log(0.2), np.log(3.0), 4))[:, None]
@@ -92,7 +92,7 @@ def _excite(rng: np.random.Generator, kind: str, rows: int) -> Array:
 
 
 class Controllers:
-    """The drivers of several recordings side by side, their episodes in one row of machines."""
+    """The controllers of several recordings, whose episodes are the columns of one batch."""
 
     def __init__(self, drivers: list[Driver], velocities: bool) -> None:
         counts = [driver.start.shape[1] for driver in drivers]
@@ -105,23 +105,23 @@ class Controllers:
         self.a, self.b = linearised()
         self.channels = [0, 1, 2, 3] if velocities else [0, 2]
         self.gain = np.repeat([driver.gain for driver in drivers], counts, 0).T
-        blind = np.zeros((4, len(self.channels)))
-        observers = [blind if driver.observer is None else driver.observer for driver in drivers]
+        none = np.zeros((4, len(self.channels)))
+        observers = [none if driver.observer is None else driver.observer for driver in drivers]
         self.observer = np.repeat(observers, counts, 0)
-        self.sighted = np.repeat([driver.observer is None for driver in drivers], counts)
+        self.sees_state = np.repeat([driver.observer is None for driver in drivers], counts)
         self.excitation, self.reference = laid_out("excitation"), laid_out("reference")
         self.start = np.concatenate([driver.start for driver in drivers], 1)
-        self.guess: Array | None = None
+        self.estimate: Array | None = None
 
     def __call__(self, row: int, state: Array, reading: Array) -> Array:
         """Command for the period that begins at `row`, from true states and readings (4, n)."""
-        if self.guess is None:
-            self.guess = reading * np.array([1.0, 0.0, 1.0, 0.0])[:, None]
-        # riccati gives the observer in its one-step form: s_hat' = A s_hat + B u + L (y - C s_hat).
-        seen = np.where(self.sighted, state, self.guess)
+        if self.estimate is None:
+            self.estimate = reading * np.array([1.0, 0.0, 1.0, 0.0])[:, None]
+        # The observer in its one-step form: s_hat' = A s_hat + B u + L (y - C s_hat).
+        seen = np.where(self.sees_state, state, self.estimate)
         error = seen - np.array([1.0, 0.0, 0.0, 0.0])[:, None] * self.reference[row]
         command = np.clip(self.excitation[row] - (self.gain * error).sum(0), -1.0, 1.0)
-        surprise = (reading - self.guess)[self.channels]
-        self.guess = self.a @ self.guess + self.b * command + np.einsum("nij,jn->in", self.observer, surprise)
-        self.guess = np.clip(self.guess, -20.0, 20.0)
+        innovation = (reading - self.estimate)[self.channels]
+        self.estimate = self.a @ self.estimate + self.b * command + np.einsum("nij,jn->in", self.observer, innovation)
+        self.estimate = np.clip(self.estimate, -20.0, 20.0)
         return np.asarray(command)

@@ -1,4 +1,4 @@
-"""How the blind flights are flown: controllers with random steps beside them, and what acts of their commands."""
+"""Control of the blind flights: controllers with random steps added to their commands, and the actuation chain."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ PERIODS = {"quadrotor": 0.1, "fixed_wing": 0.05}
 
 
 class Flyers:
-    """Controllers of N episodes: they see the true state, and add steps of their own to every command."""
+    """Controllers of N episodes, on the true state, with steps added to every command."""
 
     def __init__(self, steps: Array, targets: Array, first: Array) -> None:
         self.steps = steps
-        """(rows, N, 4) beside the commands"""
+        """(rows, N, 4) added to the commands"""
         self.targets = targets
-        """(rows, N, 3) where to go"""
+        """(rows, N, 3) target positions, m"""
         self.first = first
-        """(N, 9) first place, velocity and roll, pitch, yaw about x, y, z, away from the usual ones"""
+        """(N, 9) deviations of the first position, velocity, and roll, pitch, yaw (about x, y, z) from the trim"""
 
     def command(self, row: int, state: Array) -> Array:
         """Commands (N, 4) in a state (N, 13)."""
         raise NotImplementedError
 
 
-def _lean(state: Array) -> tuple[Array, Array, Array]:
+def _euler_angles(state: Array) -> tuple[Array, Array, Array]:
     """Roll, pitch (nose down) and yaw (N,) in rad."""
     w, x, y, z = state[:, 6:10].T
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x**2 + y**2))
@@ -37,12 +37,12 @@ def _lean(state: Array) -> tuple[Array, Array, Array]:
 
 
 class QuadrotorFlyers(Flyers):
-    """To random places that change, by accelerations that thrust and tilt give."""
+    """To random targets, by thrust and tilt for a wanted acceleration."""
 
     def command(self, row: int, state: Array) -> Array:
         wanted = 1.2 * (self.targets[row] - state[:, :3]) - 1.6 * state[:, 3:6]
         wanted = np.clip(wanted, -3.0, 3.0)
-        roll, pitch, yaw = _lean(state)
+        roll, pitch, yaw = _euler_angles(state)
         # In the axes of the heading, a pitch forward and a roll to the right.
         ahead = np.cos(yaw) * wanted[:, 0] + np.sin(yaw) * wanted[:, 1]
         left = -np.sin(yaw) * wanted[:, 0] + np.cos(yaw) * wanted[:, 1]
@@ -53,10 +53,10 @@ class QuadrotorFlyers(Flyers):
 
 
 class WingFlyers(Flyers):
-    """Along x at random heights, level but for the steps."""
+    """Along x at random heights, wings level except for the steps."""
 
     def command(self, row: int, state: Array) -> Array:
-        roll, pitch, yaw = _lean(state)
+        roll, pitch, yaw = _euler_angles(state)
         down = np.clip(0.1 * (state[:, 2] - self.targets[row, :, 2]) + 0.1 * state[:, 5], -0.25, 0.25)
         rates = state[:, 10:13]
         thrust = -0.486 + 0.3 * (11.5 - np.linalg.norm(state[:, 3:6], axis=1))
@@ -67,8 +67,8 @@ class WingFlyers(Flyers):
         return np.asarray(np.clip(command + self.steps[row], -1, 1))
 
 
-def _held(rng: np.random.Generator, rows: int, episodes: int, sizes: Sequence[float], last: tuple[int, int]) -> Array:
-    """(rows, episodes, n) values that stay for a while and then jump."""
+def _steps(rng: np.random.Generator, rows: int, episodes: int, sizes: Sequence[float], last: tuple[int, int]) -> Array:
+    """(rows, episodes, n) values that are constant for random numbers of rows."""
     out = np.empty((rows, episodes, len(sizes)))
     for episode in range(episodes):
         for k, size in enumerate(sizes):
@@ -86,8 +86,8 @@ def _flyers(
     def draw(generators: Sequence[np.random.Generator], rows: int, episodes: int) -> Flyers:
         parts = [
             (
-                _held(rng, rows, episodes, steps, last),
-                _held(rng, rows, episodes, goals, (25, 50)),
+                _steps(rng, rows, episodes, steps, last),
+                _steps(rng, rows, episodes, goals, (25, 50)),
                 rng.normal(size=(episodes, 9)) * np.array(start),
             )
             for rng in generators
@@ -109,7 +109,7 @@ CONTROLLERS = {
 
 
 def starts(system: str, fly: Flyers) -> Motion:
-    """Where the episodes begin: at rest, or in level flight at 11.5 m/s, each a little away from that."""
+    """First states of the episodes: near rest, or near level flight at 11.5 m/s."""
     first = fly.first
     velocity = first[:, 3:6] + (np.array([11.5, 0.0, 0.0]) if system == "fixed_wing" else 0.0)
     (cr, cp, cy), (sr, sp, sy) = np.cos(first[:, 6:].T), np.sin(first[:, 6:].T)
@@ -125,7 +125,7 @@ def starts(system: str, fly: Flyers) -> Motion:
 
 
 class Chain:
-    """What acts of the commands: delay, backlash, dead zone, saturation, gain, bias, lag, in this order."""
+    """The actuation chain: delay, backlash, dead zone, saturation, gain, bias, lag, in this order."""
 
     def __init__(self, p: Parameters, count: int) -> None:
         self._p = {name.split(".")[0]: values[:, None] for name, values in p.items() if name.startswith("actuator")}
@@ -135,12 +135,12 @@ class Chain:
         self._now = 0.0
 
     def push(self, command: Array) -> None:
-        """The controller's command from now on."""
-        # No delay reaches further back.
+        """Append the controller's command for the next period."""
+        # The longest delay reaches back no further.
         self._past = [*self._past[-5:], (self._now, command)]
 
     def __call__(self, time: float, h: float) -> Array:
-        """The mean (N, 4) of what acts from `time` to `time` + h."""
+        """The mean (N, 4) of the chain's output from `time` to `time` + h."""
         self._now = time + h
         given = np.zeros_like(self._follows)
         for begins, command in self._past:

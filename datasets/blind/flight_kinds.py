@@ -1,6 +1,6 @@
-"""What can stand between a blind flight and the source: the catalogue's effects on vehicles, and foreign ones.
+"""The effects that blind flights may have: those of the catalogue on vehicles, and foreign ones.
 
-Each kind draws its shape once and has one size, a positive number that its strength grows with.
+Each kind draws its shape once and has one size, a positive number with which its strength grows.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ NEUTRAL: dict[str, float] = {
         1.0,
     ),
 }
-"""Every parameter of every effect, and its value where the effect is not there."""
+"""Every parameter of every effect at the value without effect."""
 
 
 def _sign(rng: np.random.Generator, _: float = 0.0) -> Shape:
@@ -81,7 +81,7 @@ def _scale(size: float, shape: Shape) -> Shape:
 
 
 def _directed(names: tuple[str, ...]) -> Draw:
-    """A direction in the space of some parameters."""
+    """Draws a direction in the space of some parameters."""
 
     def draw(rng: np.random.Generator, _: float) -> Shape:
         direction = rng.normal(size=len(names))
@@ -92,7 +92,7 @@ def _directed(names: tuple[str, ...]) -> Draw:
 
 
 def _slowing(names: tuple[str, ...]) -> Draw:
-    """The same among positive parameters."""
+    """Draws a direction with positive components."""
     return lambda rng, _: {name: abs(value) for name, value in _directed(names)(rng, 0.0).items()}
 
 
@@ -105,7 +105,7 @@ def _scales(size: float, shape: Shape) -> Shape:
 
 
 def _one_weak(names: tuple[str, ...]) -> Draw:
-    """One of several parts is weaker than the source's, the others are as they are."""
+    """Draws which one of several parts is weaker than the source's."""
     return lambda rng, _: {name: -float(k == 0) for k, name in enumerate(rng.permutation(names).tolist())}
 
 
@@ -115,7 +115,7 @@ def _periodic(rng: np.random.Generator, _: float) -> Shape:
 
 
 def _windy(least: float, most: float) -> Draw:
-    """A direction of the wind, and the drag by which it acts."""
+    """Draws the direction of a wind, and the drag coefficient through which it acts."""
 
     def draw(rng: np.random.Generator, _: float) -> Shape:
         direction = _directed(("velocity_x", "velocity_y", "velocity_z"))(rng, 0.0)
@@ -129,7 +129,7 @@ def _wind(size: float, shape: Shape) -> Shape:
 
 
 def _wavy(least: float, most: float) -> Draw:
-    """The same of a wind that comes and goes."""
+    """The same for a wind that oscillates."""
 
     def draw(rng: np.random.Generator, _: float) -> Shape:
         direction, drag = float(rng.uniform(-np.pi / 2, np.pi / 2)), float(rng.uniform(least, most))
@@ -148,7 +148,7 @@ SURFACES = ("elevator", "aileron", "rudder")
 NAMED: tuple[tuple[Kind, tuple[str, ...]], ...] = (
     (Kind("actuator_gain", "actuation", 0.01, 0.6, _scale, _sign), BOTH),
     (Kind("actuator_bias", "actuation", 0.001, 0.2, _signed("offset"), _sign), BOTH),
-    # Whole steps of the integration.
+    # A multiple of the integration step.
     (Kind("actuator_delay", "actuation", 0.005, 0.15, lambda s, _: {"delay": 0.005 * max(1, round(s / 0.005))}), BOTH),
     (Kind("actuator_lag", "actuation", 0.005, 0.2, _plain("time_constant")), BOTH),
     (Kind("actuator_deadzone", "actuation", 0.003, 0.2, _plain("width")), BOTH),
@@ -158,7 +158,7 @@ NAMED: tuple[tuple[Kind, tuple[str, ...]], ...] = (
     (Kind("periodic_force", "dynamics", 0.02, 4.0, lambda s, f: {"amplitude": s, "offset": 0.0, **f}, _periodic), BOTH),
     (Kind("linear_drag", "dynamics", 0.01, 1.0, _plain("coefficient")), BOTH),
     (Kind("quadratic_drag", "dynamics", 0.005, 1.0, _plain("coefficient")), BOTH),
-    # The wing feels the wind without a drag of its own.
+    # On the wing, wind acts without a drag coefficient.
     (Kind("wind", "dynamics", 0.5, 5.0, _wind, _windy(0.1, 0.5)), QUADROTOR),
     (Kind("wind", "dynamics", 0.05, 5.0, _wind, _windy(0.0, 0.0)), WING),
     (Kind("periodic_wind", "dynamics", 0.5, 6.0, _waves, _wavy(0.1, 0.5)), QUADROTOR),
@@ -191,7 +191,7 @@ REST: tuple[tuple[Kind, tuple[str, ...]], ...] = (
         Kind("rate_damping", "dynamics", 0.1, 18.0, _along, _slowing(tuple(f"rate_{axis}" for axis in "xyz"))),
         QUADROTOR,
     ),
-    # The ground lies below nearly all of the places that are flown to.
+    # The ground is below nearly all targets.
     (
         Kind(
             "ground_effect",
@@ -215,7 +215,7 @@ FOREIGN: tuple[tuple[Kind, tuple[str, ...]], ...] = (
     (Kind("crossed_rates", "dynamics", 0.02, 1.0, _signed("share"), _sign), QUADROTOR),
     (Kind("crossed_surfaces", "dynamics", 0.02, 1.0, _signed("share"), _sign), WING),
 )
-"""What no name of the catalogue stands for."""
+"""Kinds that no effect of the catalogue describes."""
 
 
 def named(effects: Effects, system: str) -> list[Kind]:

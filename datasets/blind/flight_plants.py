@@ -1,7 +1,7 @@
-"""A quadrotor and a fixed wing apart from the library's: what the blind flights are made with (numpy alone, float64).
+"""The quadrotor and fixed wing that make the blind flights: code of its own, not the library's (numpy alone, float64).
 
-N vehicles fly side by side, each with effects of its own: every effect is always in the equations, with neutral
-parameters (N,) where it is not there. Attitude is a rotation matrix. The quadrotor's axes are x forward, y left, z up.
+A batch of N vehicles, each with its own effects: every effect is always in the equations, with neutral parameters (N,)
+where it does not act. Attitude is a rotation matrix. The quadrotor's axes are x forward, y left, z up.
 The wing's equations are the book's (Beard and McLain 2012, chapters 3 and 4): x forward, y right, z down; its states
 are turned into the other axes, and back, by a half turn about x.
 """
@@ -25,7 +25,7 @@ FLIP = np.array([1.0, -1.0, -1.0])
 
 @dataclass
 class Motion:
-    """N rigid bodies: places and velocities in world axes (z up), rotations from body to world axes, body rates."""
+    """N rigid bodies: positions and velocities in world axes (z up), rotations from body to world axes, body rates."""
 
     place: Array
     """(N, 3) m"""
@@ -54,14 +54,14 @@ Plant = Callable[[Parameters, float, Motion, Array], Motion]
 
 
 def step(plant: Plant, p: Parameters, time: float, at: Motion, command: Array, h: float) -> Motion:
-    """The classical Runge-Kutta method, and rotations made rotations again."""
+    """One step of the classical Runge-Kutta method; the rotation matrices are then made orthogonal again."""
     a = plant(p, time, at, command)
     b = plant(p, time + h / 2, at.plus(a, h / 2), command)
     c = plant(p, time + h / 2, at.plus(b, h / 2), command)
     d = plant(p, time + h, at.plus(c, h), command)
     for slope, weight in ((a, 1), (b, 2), (c, 2), (d, 1)):
         at = at.plus(slope, h * weight / 6)
-    # One round of Newton's iteration towards the nearest rotation: the error of a step squared is left.
+    # One Newton iteration towards the nearest rotation, which leaves the square of the step's error.
     at.turned = at.turned @ (3 * np.eye(3) - at.turned.swapaxes(1, 2) @ at.turned) / 2
     return at
 
@@ -86,7 +86,7 @@ def _wind(p: Parameters, t: float) -> Array:
 
 
 def _pushes(p: Parameters, t: float, at: Motion) -> Array:
-    """(N, 3) N in world axes: drags, forces along x, and what is foreign to the catalogue."""
+    """(N, 3) N in world axes: drags, forces along x, and foreign forces."""
     air = at.velocity - _wind(p, t)
     linear = p["linear_drag.coefficient"] + p["wind.coefficient"] + p["periodic_wind.coefficient"]
     speed = np.linalg.norm(air, axis=1)
@@ -94,7 +94,7 @@ def _pushes(p: Parameters, t: float, at: Motion) -> Array:
     force[:, 0] += p["constant_force.force"] + p["periodic_force.offset"]
     angle = 2 * np.pi * p["periodic_force.frequency"] * t + p["periodic_force.phase"]
     force[:, 0] += p["periodic_force.amplitude"] * np.cos(angle)
-    # Foreign: wind that changes its strength at random, drag to one side only, a sway with two lines, a force field.
+    # Foreign: drag to one side only, a force with two spectral lines, a force field in a layer of heights.
     force[:, 1] -= p["one_way_drag.coefficient"] * np.maximum(at.velocity[:, 1], 0.0)
     force[:, 0] += p["beating_force.amplitude"] * np.cos(9.0 * t) * np.cos(1.9 * t + 1.0)
     away = at.place[:, 2] - 0.2
@@ -106,13 +106,13 @@ ARM, RATE_GAINS = 0.2, np.array([16.6, 16.6, 5.0])
 LEAST, MOST = 2.21, 17.31
 """m/s2 of thrust at commands of -1 and 1"""
 RESTING = np.array([[(LEAST + MOST) / 2, 0.0, 0.0, 0.0]])
-"""thrust and torques of motors that a command of 0 has driven for long"""
+"""thrust and torques of motors that have settled at a command of 0"""
 INERTIA = ARM**2 / 12 * np.array([4.5, 4.5, 7.0])
 """kg m2 of a mass of 1 kg"""
 ROLL = np.array([1.0, -1.0, -1.0, 1.0]) * ARM / np.sqrt(2)
 PITCH = np.array([-1.0, -1.0, 1.0, 1.0]) * ARM / np.sqrt(2)
 YAW = np.array([1.0, -1.0, 1.0, -1.0]) * 0.016
-"""m: what 1 N of each rotor turns; front left, front right, rear right, rear left"""
+"""m: torques per N of each rotor; front left, front right, rear right, rear left"""
 ALLOCATION = np.linalg.inv(np.stack([np.ones(4), ROLL, PITCH, YAW]))
 """thrust and torques to rotors"""
 
@@ -130,7 +130,7 @@ def quadrotor(p: Parameters, t: float, at: Motion, command: Array) -> Motion:
     motors = np.where(constant > 0, (driven - at.motors) / np.maximum(constant, 1e-9), 0.0)
     given = np.where(constant > 0, at.motors, driven)
     thrust, torque = given[:, 0], given[:, 1:]
-    thrust = thrust * p["thrust_gain.scale"] * np.exp(-p["battery_sag.rate"] * t) * _cushion(p, at)
+    thrust = thrust * p["thrust_gain.scale"] * np.exp(-p["battery_sag.rate"] * t) * _ground_factor(p, at)
     scales = np.stack([p[f"rotor_efficiency.scale_{k}"] for k in (1, 2, 3, 4)], -1)
     rotors = scales * (np.concatenate([thrust[:, None], torque], 1) @ ALLOCATION.T)
     thrust = rotors.sum(1)
@@ -148,7 +148,7 @@ def quadrotor(p: Parameters, t: float, at: Motion, command: Array) -> Motion:
     return Motion(at.velocity, acceleration, _spun(at.turned, w), turning, motors)
 
 
-def _cushion(p: Parameters, at: Motion) -> Array:
+def _ground_factor(p: Parameters, at: Motion) -> Array:
     """The ground's factor on thrust: 1 / (1 - x) with x = (radius / 4 height)^2, which is kept below 1/4.
 
     The bound, x / (1 + (4 x)^4)^(1/4), is written so that neither a radius nor a height of 0 is divided by.
@@ -165,7 +165,7 @@ J_INVERSE = np.linalg.inv(J)
 SURFACES = np.deg2rad([20.0, 2.5, 20.0])
 """elevator, aileron, rudder at a command of 1"""
 HELD = np.deg2rad(10.0)
-"""rad, where coefficients stop growing with angle of attack and sideslip"""
+"""rad, beyond which coefficients no longer grow with angle of attack and sideslip"""
 
 
 def fixed_wing(p: Parameters, t: float, at: Motion, command: Array) -> Motion:

@@ -2,11 +2,12 @@
 
     python -m datasets.blind.flights --out data/blind_quadrotor --system quadrotor --count 30 --seed 7
 
-Writes one CSV a recording, and the key (effects, parameters, strengths) in a file apart, whose SHA-256 is printed
-before any recording is written. What diagnoses must never open the key. None of the library's physics is used.
+Writes one CSV per recording and a separate key file (effects, parameters, strengths), whose SHA-256 is printed before
+any recording is written. A diagnoser must never open the key. None of the library's physics is used.
 
-Sizes are set by strength: the root mean square, over rows and over the 13 readings, of what an effect does to half a
-second of prediction by the source from the true states, in units of the measurement noise.
+Effects are scaled to a drawn strength: the root mean square, over rows and over the 13 readings, of the change that an
+effect makes to the source's prediction half a second ahead from the true states, in units of the measurement noise; for
+a dropout, of the change in the readings.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from datasets.blind.flight_control import CONTROLLERS, PERIODS, Chain, Flyers, s
 from datasets.blind.flight_kinds import FOREIGN, NEUTRAL, named
 from datasets.blind.flight_plants import PLANTS, RESTING, Array, Motion, step
 from datasets.blind.kinds import Effects, Kind, Shape
-from datasets.blind.sealing import names, place_of_key, seal
+from datasets.blind.sealing import key_path, names, seal
 
 System = Literal["quadrotor", "fixed_wing"]
 
@@ -32,7 +33,7 @@ ROWS, EPISODES = 100, 10
 SUBSTEP = 0.005
 """s, of the integration"""
 HORIZON = 0.5
-"""s of prediction that strengths are measured over"""
+"""s of prediction over which strengths are measured"""
 NOISE = np.repeat((0.01, 0.02, 0.0025, 0.005), (3, 3, 4, 3))
 """standard deviations: m, m/s, quaternion, rad/s"""
 STRENGTHS = (1.5, 15.0)
@@ -48,7 +49,7 @@ ACTIONS = {
 
 @dataclass(frozen=True)
 class Settings:
-    """What is made, and where it is written."""
+    """Which recordings are made, and where they are written."""
 
     out: Path
     """folder for the recordings"""
@@ -57,7 +58,7 @@ class Settings:
     count: int = 30
     """how many recordings"""
     seed: int = 0
-    """of everything that is drawn"""
+    """seed of all random numbers"""
     key: Path | None = None
     """file for the answers; by default beside the folder, <out>.key.json"""
     effects: Effects = "core"
@@ -80,7 +81,7 @@ class Draft:
     size: float = 0.0
     strength: float = 0.0
     """at that size"""
-    lottery: Array | None = None
+    loss_draws: Array | None = None
     """(ROWS, EPISODES), uniform: which rows a dropout loses"""
     readings: Array | None = None
     """(ROWS, EPISODES, 13)"""
@@ -95,7 +96,7 @@ class Draft:
 
 @dataclass(frozen=True)
 class Flights:
-    """What came of N episodes."""
+    """N simulated episodes."""
 
     motions: list[Motion]
     """ROWS"""
@@ -111,7 +112,7 @@ def make(settings: Settings) -> list[Draft]:
         raise ValueError(f"count is {settings.count}, must be at least 1")
     place = list(PLANTS).index(settings.system)
     seeds = np.random.SeedSequence([settings.seed, place, 17]).spawn(settings.count + 1)
-    # Shares as even as the count allows, in an order that says nothing; kinds as even as that, too.
+    # Shares and kinds as even as the count allows, in random order.
     order = np.random.default_rng(seeds[0])
     places = (np.arange(settings.count) + 0.5) / settings.count
     mixtures = np.array(list(MIX))[np.searchsorted(np.cumsum(list(MIX.values())), places)]
@@ -126,7 +127,7 @@ def make(settings: Settings) -> list[Draft]:
             draft.target = float(np.exp(draft.rng.uniform(*np.log(STRENGTHS))))
             draft.size = float(np.sqrt(own[k].low * own[k].high))
             if own[k].stage == "sensing":
-                draft.lottery = draft.rng.random((ROWS, EPISODES))
+                draft.loss_draws = draft.rng.random((ROWS, EPISODES))
     fly = CONTROLLERS[settings.system]([draft.rng for draft in drafts], ROWS, EPISODES)
     _seek([draft for draft in drafts if draft.kind is not None], drafts, settings.system, fly)
     flown = _flown(drafts, settings.system, fly, SUBSTEP)
@@ -139,13 +140,13 @@ def make(settings: Settings) -> list[Draft]:
 
 
 def _seek(searched: list[Draft], drafts: list[Draft], system: System, fly: Flyers, rounds: int = 5) -> None:
-    """Bring strengths to their targets: sizes in proportion, within what is sensible."""
+    """Bring strengths to their targets: sizes in proportion, within the bounds of their kinds."""
     for _ in range(rounds):
         flown = _flown(drafts, system, fly, 2 * SUBSTEP)
         gaps = _gaps(flown, system).reshape(len(drafts), EPISODES)
         for k, (draft, own) in enumerate(zip(drafts, gaps, strict=True)):
             draft.strength = float(np.sqrt(np.mean(own)))
-            if draft.lottery is not None:
+            if draft.loss_draws is not None:
                 states = flown.states[:, k * EPISODES : (k + 1) * EPISODES]
                 draft.strength = float(np.sqrt(np.mean(((_read(draft, states) - states) / NOISE) ** 2)))
         for draft in searched:
@@ -179,10 +180,10 @@ def _flown(drafts: list[Draft], system: System, fly: Flyers, h: float) -> Flight
 
 
 def _read(draft: Draft, rows: Array) -> Array:
-    """Rows (ROWS, EPISODES, 13) as they are read: one that a dropout loses repeats the one before."""
-    if draft.lottery is None:
+    """Readings (ROWS, EPISODES, 13) of rows: one that a dropout loses repeats the one before."""
+    if draft.loss_draws is None:
         return rows
-    out, lost = rows.copy(), draft.lottery < _value(draft, "dropout.rate", 0.0)
+    out, lost = rows.copy(), draft.loss_draws < _value(draft, "dropout.rate", 0.0)
     for row in range(1, ROWS):
         out[row] = np.where(lost[row][:, None], out[row - 1], rows[row])
     return out
@@ -194,14 +195,17 @@ def _value(draft: Draft, name: str, neutral: float) -> float:
 
 
 def _gaps(flown: Flights, system: System, every: int = 4) -> Array:
-    """(N,) mean square of what half a second of prediction by the source misses, in units of the noise."""
+    """(N,) mean square error of the source's prediction half a second ahead, in units of the noise."""
     period = PERIODS[system]
     horizon = round(HORIZON / period)
     rows = range(0, ROWS - horizon, every)
     count = flown.states.shape[1]
     source = {name: np.full(len(rows) * count, value) for name, value in NEUTRAL.items()}
-    names = ("place", "velocity", "turned", "rates")
-    at = Motion(*(np.concatenate([getattr(flown.motions[row], name) for row in rows]) for name in names), RESTING)
+
+    def stacked(name: str) -> Array:
+        return np.concatenate([getattr(flown.motions[row], name) for row in rows])
+
+    at = Motion(stacked("place"), stacked("velocity"), stacked("turned"), stacked("rates"), RESTING)
     for k in range(horizon):
         command = np.concatenate([flown.commands[row + k] for row in rows])
         for _ in range(round(period / (5 * SUBSTEP))):
@@ -216,7 +220,7 @@ def as_states(at: Motion, near: Array | None) -> Array:
     r = at.turned
     w = np.sqrt(np.maximum(0.0, 1 + r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2])) / 2
     if w.min() < 0.1:
-        raise RuntimeError("a vehicle turned over; another seed will do")
+        raise RuntimeError("a vehicle turned over; try another seed")
     x, y, z = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
     q = np.stack([w, x / (4 * w), y / (4 * w), z / (4 * w)], -1)
     if near is not None:
@@ -250,7 +254,7 @@ def lines(draft: Draft, system: System) -> Iterator[str]:
 
 def main(settings: Settings) -> None:
     """Make the recordings, print the key's SHA-256, then write the key and the recordings."""
-    key = place_of_key(settings.out, settings.key)
+    key = key_path(settings.out, settings.key)
     drafts = make(settings)
     seal(settings.out, key, key_text(settings, drafts), (lines(draft, settings.system) for draft in drafts))
 

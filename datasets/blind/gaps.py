@@ -2,12 +2,13 @@
 
     python -m datasets.blind.gaps --out data/blind_hard --kind hard --count 200 --seed 7
 
-Writes one CSV a recording, and the key (effects, parameters, strengths) in a file apart, whose SHA-256 is printed
-before any recording is written. What diagnoses must never open the key. None of the library's physics is used.
+Writes one CSV per recording and a separate key file (effects, parameters, strengths), whose SHA-256 is printed before
+any recording is written. A diagnoser must never open the key. None of the library's physics is used.
 
-Sizes are set by strength: the root mean square, over rows and over x and theta, of what an effect does to half a second
-of prediction by the source from the true states, in units of the measurement noise; for an effect on sensing, of what
-it does to the readings. Each member of a pair or triple has its strength by itself, under the same controller.
+Effects are scaled to a drawn strength: the root mean square, over rows and over x and theta, of the change that an
+effect makes to the source's prediction half a second ahead from the true states, in units of the measurement noise; for
+an effect on sensing, of the change in the readings. In a pair or triple, each effect has its strength when it acts
+alone under the same controller.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ import tyro
 from datasets.blind.control import draw_driver
 from datasets.blind.kinds import FOREIGN, INSEPARABLE, KINDS, NAMED, REST, Effects, Shape
 from datasets.blind.plant import PERIOD, Array
-from datasets.blind.sealing import names, place_of_key, seal
+from datasets.blind.sealing import key_path, names, seal
 from datasets.blind.simulation import Case, Run, simulate
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is made, and where it is written."""
+    """Which recordings are made, and where they are written."""
 
     out: Path
     """folder for the recordings"""
@@ -39,7 +40,7 @@ class Settings:
     count: int = 200
     """how many recordings"""
     seed: int = 0
-    """of everything that is drawn"""
+    """seed of all random numbers"""
     strengths: tuple[float, float] | None = None
     """weakest and strongest effect, in units of the noise; by default 2 to 30 (easy) or 0.7 to 6 (hard)"""
     key: Path | None = None
@@ -50,12 +51,12 @@ class Settings:
 
 @dataclass(frozen=True)
 class Difficulty:
-    """What sets the two sets apart."""
+    """Settings that differ between the two sets."""
 
     rows: int
-    """of a recording, about"""
+    """rows of a recording, approximately"""
     episodes: tuple[int, int]
-    """fewest and most"""
+    """smallest and largest number of episodes"""
     noise: tuple[float, float, float, float]
     """standard deviations, m, m/s, rad, rad/s"""
     velocities: bool
@@ -75,7 +76,7 @@ DIFFICULTIES = {
         (2.0, 30.0),
         {"single": 0.5, "pair": 0.2, "none": 0.15, "foreign": 0.15},
     ),
-    # Nobody measures the velocities of the hard set; a controller does without them, too.
+    # In the hard set velocities are not measured, and a controller with an observer does not have them either.
     "hard": Difficulty(
         400,
         (4, 8),
@@ -87,18 +88,18 @@ DIFFICULTIES = {
 }
 """the two sets"""
 
-SIZES = {"none": 0, "single": 1, "pair": 2, "triple": 3, "foreign": 1}
-"""effects in a recording"""
+EFFECTS_IN = {"none": 0, "single": 1, "pair": 2, "triple": 3, "foreign": 1}
+"""number of effects in a recording"""
 
 COLUMNS = ("x", "x_dot", "theta", "theta_dot")
 """of the state"""
 
-ROUGH = 20
-"""substeps of 2.5 ms while sizes are sought"""
-FINE = 50
-"""substeps of 1 ms for what is written"""
+SEARCH_SUBSTEPS = 20
+"""substeps of 2.5 ms in a period while sizes are searched"""
+RECORDING_SUBSTEPS = 50
+"""substeps of 1 ms in a period of the recordings that are written"""
 CART_REACH, POLE_REACH = 1.5, 0.3
-"""m and rad that a recording stays within"""
+"""m and rad: |x| and |theta| of a recording never exceed these"""
 
 
 @dataclass
@@ -106,7 +107,7 @@ class Draft:
     """A recording in the making."""
 
     rng: np.random.Generator
-    """its own random numbers, so that one redrawn recording leaves all others alone"""
+    """its own random numbers, so that redrawing one recording does not change the others"""
     mixture: str
     """single, pair, triple, none (that a recording could show) or foreign"""
     case: Case | None = None
@@ -131,7 +132,7 @@ def make(settings: Settings) -> list[Draft]:
         # No recording shows these effects: the right answer is that of a recording without any.
         difficulty = replace(difficulty, mix={"none": 1.0})
     seeds = np.random.SeedSequence([settings.seed, list(DIFFICULTIES).index(settings.kind)]).spawn(settings.count + 1)
-    # Shares as even as the count allows, in an order that says nothing.
+    # Shares as exact as the count allows, in random order.
     edges = np.cumsum(list(difficulty.mix.values()))
     places = (np.arange(settings.count) + 0.5) / settings.count
     mixtures = np.array(list(difficulty.mix))[np.searchsorted(edges, places)]
@@ -142,15 +143,15 @@ def make(settings: Settings) -> list[Draft]:
         if not pending:
             return drafts
         _attempt(pending, difficulty, settings.effects, 0.95 ** (attempt // 2))
-    raise RuntimeError("some recordings could not be kept on the track; another seed will do")
+    raise RuntimeError("some recordings could not be kept on the track; try another seed")
 
 
 def _attempt(drafts: list[Draft], difficulty: Difficulty, effects: Effects, excitation: float) -> None:
-    """Draw each draft anew, seek the sizes, run it, and keep what stayed up and has the strengths it should."""
+    """Redraw and run the drafts; keep those that stay on the track upright and reach their strengths."""
     deviations = np.array(difficulty.noise)[[0, 2]]
     cases = [_draw_case(draft.rng, difficulty, excitation) for draft in drafts]
-    # Most that leaves the track does so without any effect, and is found out cheaply.
-    bare = simulate(cases, difficulty.velocities, ROUGH)
+    # Most recordings that leave the track do so even without effects: these are dropped before the costly search.
+    bare = simulate(cases, difficulty.velocities, SEARCH_SUBSTEPS)
     kept = [(draft, case) for draft, case, run in zip(drafts, cases, bare, strict=True) if _stayed(run)]
     parts: list[list[Job]] = []
     for draft, case in kept:
@@ -163,7 +164,7 @@ def _attempt(drafts: list[Draft], difficulty: Difficulty, effects: Effects, exci
         if all(0.9 * weakest <= job.strength <= 1.1 * strongest for job in own):
             case.effects = {job.name: job.parameters for job in own}
             ready.append((draft, case, own))
-    runs = simulate([case for _, case, _ in ready], difficulty.velocities, FINE) if ready else []
+    runs = simulate([case for _, case, _ in ready], difficulty.velocities, RECORDING_SUBSTEPS) if ready else []
     for (draft, case, own), run in zip(ready, runs, strict=True):
         if _stayed(run):
             draft.case, draft.run, draft.strengths = case, run, {job.name: job.strength for job in own}
@@ -179,7 +180,7 @@ def _draw_kinds(rng: np.random.Generator, mixture: str, effects: Effects) -> lis
         return [REST[int(rng.integers(len(REST)))].name]
     kinds = FOREIGN if mixture == "foreign" else NAMED
     while True:
-        chosen = [kinds[i].name for i in rng.choice(len(kinds), SIZES[mixture], replace=False)]
+        chosen = [kinds[i].name for i in rng.choice(len(kinds), EFFECTS_IN[mixture], replace=False)]
         if not any(together <= set(chosen) for together in INSEPARABLE):
             return chosen
 
@@ -194,12 +195,12 @@ def _draw_case(rng: np.random.Generator, difficulty: Difficulty, excitation: flo
 
 @dataclass
 class Job:
-    """One effect whose size is sought: alone in its recording."""
+    """The search for the size of one effect, alone in its recording."""
 
     name: str
     """of the effect"""
     shape: Shape
-    """that stays"""
+    """fixed during the search"""
     case: Case
     """the recording with this effect alone"""
     target: float
@@ -219,12 +220,12 @@ def _draw_job(rng: np.random.Generator, name: str, case: Case, difficulty: Diffi
     kind = KINDS[name]
     shape = kind.draw(rng, case.shape[0] * PERIOD)
     target = float(np.exp(rng.uniform(*np.log(difficulty.strengths))))
-    alone = Case(case.driver, {}, case.noise, case.lottery)
+    alone = Case(case.driver, {}, case.noise, case.loss_draws)
     return Job(name, shape, alone, target, float(np.sqrt(kind.low * kind.high)))
 
 
 def _seek(jobs: list[Job], velocities: bool, deviations: Array, rounds: int = 8) -> None:
-    """Bring every job's strength to its target: in proportion where that falls into the bracket, else by bisection."""
+    """Bring every job's strength to its target: by proportion within the bracket, else by bisection."""
     low = [np.log(KINDS[job.name].low) for job in jobs]
     high = [np.log(KINDS[job.name].high) for job in jobs]
     trial = [np.log(job.size) for job in jobs]
@@ -234,11 +235,11 @@ def _seek(jobs: list[Job], velocities: bool, deviations: Array, rounds: int = 8)
             return
         for i in open_:
             jobs[i].case.effects = {jobs[i].name: KINDS[jobs[i].name].build(float(np.exp(trial[i])), jobs[i].shape)}
-        runs = simulate([jobs[i].case for i in open_], velocities, ROUGH)
+        runs = simulate([jobs[i].case for i in open_], velocities, SEARCH_SUBSTEPS)
         for i, run in zip(open_, runs, strict=True):
             job, sensing = jobs[i], KINDS[jobs[i].name].stage == "sensing"
             strength = run.sensed_gap(deviations) if sensing else run.predicted_gap(deviations)
-            # A fallen pole says nothing about strength, only that the size is too large.
+            # A fallen pole gives no strength; the size is too large.
             fallen = run.reach[1] >= 0.9 or run.reach[0] >= 4.9
             if not fallen and (job.strength == 0 or _miss(strength, job.target) < _miss(job.strength, job.target)):
                 job.size, job.strength = float(np.exp(trial[i])), strength
@@ -286,7 +287,7 @@ def lines(draft: Draft, velocities: bool) -> Iterator[str]:
 
 def main(settings: Settings) -> None:
     """Make the recordings, print the key's SHA-256, then write the key and the recordings."""
-    key = place_of_key(settings.out, settings.key)
+    key = key_path(settings.out, settings.key)
     drafts = make(settings)
     seal(
         settings.out,

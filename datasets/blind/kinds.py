@@ -1,7 +1,7 @@
-"""What can stand between a blind recording and the source: the catalogue's effects and foreign ones.
+"""The effects that blind recordings of the cart-pole may have: those of the catalogue, and foreign ones.
 
-Each kind draws its shape (direction, places, times, frequencies) once and has one size, a positive number that its
-strength grows with. Names and parameters of the named kinds are those of docs/effects.md.
+Each kind draws its shape (direction, places, times, frequencies) once and has one size, a positive number with which
+its strength grows. Names and parameters of the named kinds are those of docs/effects.md.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ class Kind:
     """One kind of effect."""
 
     name: str
-    """standard name, or a name of its own for a foreign one"""
+    """the catalogue's name, or for a foreign kind a name of its own"""
     stage: str
     """actuation, dynamics or sensing"""
     low: float
     """smallest size"""
     high: float
-    """largest size that is still sensible physically"""
+    """largest size that is physically plausible"""
     build: Build
     """(size, shape) -> parameters"""
     draw: Draw = lambda rng, length: {}
@@ -93,7 +93,7 @@ NAMED: tuple[Kind, ...] = (
     Kind("actuator_delay", "actuation", 0.001, 0.15, _plain("delay")),
     Kind("actuator_lag", "actuation", 0.001, 0.25, _plain("time_constant")),
     Kind("actuator_deadzone", "actuation", 0.001, 0.3, _plain("width")),
-    # A size of 0 leaves commands up to 1 alone; 3.5 caps them at 0.03.
+    # A size of 0 would limit commands to 1, which they never exceed; 3.5 limits them to 0.03.
     Kind("actuator_saturation", "actuation", 0.05, 3.5, lambda size, shape: {"limit": float(np.exp(-size))}),
     Kind("actuator_backlash", "actuation", 0.002, 0.5, _plain("width")),
     Kind("constant_force", "dynamics", 0.02, 8.0, _signed("force"), _sign),
@@ -225,7 +225,7 @@ FOREIGN: tuple[Kind, ...] = (
     Kind("directional_gain", "actuation", 0.01, 0.7, _signed("share"), _sign),
     Kind("even_motor", "actuation", 0.02, 4.0, _signed("coefficient"), _sign),
     Kind("fading_gain", "actuation", 0.002, 0.15, _plain("rate")),
-    # A drift of the position at a steady rate would be another inertial frame, which no data show.
+    # No drift of the position: at a constant rate, it is a change of the inertial frame, which no recording shows.
     Kind(
         "encoder_ripple",
         "sensing",
@@ -237,7 +237,7 @@ FOREIGN: tuple[Kind, ...] = (
     Kind("angle_drift", "sensing", 0.0003, 0.05, _signed("rate"), _sign),
     Kind("angle_quantisation", "sensing", 0.002, 0.15, _plain("step")),
 )
-"""what no name of the catalogue stands for"""
+"""kinds that no effect of the catalogue describes"""
 
 INSEPARABLE: tuple[frozenset[str], ...] = (
     frozenset({"actuator_bias", "constant_force"}),
@@ -246,7 +246,7 @@ INSEPARABLE: tuple[frozenset[str], ...] = (
     frozenset({"track_tilt", "angle_offset", "constant_force"}),
     frozenset({"track_tilt", "angle_offset", "actuator_bias"}),
 )
-"""never together in one recording: other sizes of some of them, or of fewer, make the same data"""
+"""never together in one recording, since other sizes of some or all of them give the same data"""
 
 KINDS: dict[str, Kind] = {kind.name: kind for kind in NAMED + REST + FOREIGN}
 """by name"""

@@ -1,4 +1,4 @@
-"""A cart-pole apart from the library's: what the blind recordings are made with (numpy alone, float64).
+"""The cart-pole that makes the blind recordings: code of its own, not the library's (numpy alone, float64).
 
 Equations of motion by the mass matrix, with q = (x in m, theta in rad), positive towards +x, 0 = upright:
 
@@ -93,7 +93,7 @@ Table = list[tuple[NDArray[np.intp], Parameters, Load]]
 
 @dataclass
 class Plant:
-    """n cart-poles side by side, each with loads of its own."""
+    """A batch of n cart-poles, each with its own loads."""
 
     cart_mass: Array
     """kg, (n,)"""
@@ -153,7 +153,7 @@ class Plant:
         return after
 
     def _rub(self, t: float, before: Array, after: Array, h: float) -> Array:
-        """Take from the velocities what dry friction can, at most to a standstill, and from the positions likewise."""
+        """Apply the impulse of dry friction, at most to a standstill, to velocities and positions."""
         zero = np.zeros_like(after[0])
         for axis, table in ((1, self.dry_forces), (3, self.dry_torques)):
             if not table:

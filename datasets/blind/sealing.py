@@ -1,4 +1,4 @@
-"""Sealed recordings: the key's hash is told before anything is written, and the key lies apart from the recordings."""
+"""Sealed recordings: the key is kept outside their folder, and its hash is printed before anything is written."""
 
 from __future__ import annotations
 
@@ -12,8 +12,12 @@ def names(count: int) -> list[str]:
     return [f"{i:04d}.csv" for i in range(count)]
 
 
-def place_of_key(folder: Path, key: Path | None) -> Path:
-    """Where the key goes: beside the folder of the recordings unless told; raises ValueError where that is within."""
+def key_path(folder: Path, key: Path | None) -> Path:
+    """File of the key: beside the folder of the recordings unless given.
+
+    Raises:
+        ValueError: it lies in that folder.
+    """
     place = key or folder.with_name(folder.name + ".key.json")
     if folder.resolve() in place.resolve().parents:
         raise ValueError(f"{place}: the key must not lie in the folder of the recordings")

@@ -1,4 +1,4 @@
-"""Runs many blind recordings at once: every episode of every one is a column of the same arrays."""
+"""Simulates many blind recordings at once: every episode of each is a column of the same arrays."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from datasets.blind.chain import NONE, Actuation, Sensing
+from datasets.blind.chain import NEUTRAL, Actuation, Sensing
 from datasets.blind.control import Controllers, Driver
 from datasets.blind.kinds import Shape
 from datasets.blind.plant import (
@@ -27,12 +27,12 @@ from datasets.blind.plant import (
 )
 
 HORIZON = 10
-"""steps of prediction that an effect's strength is measured over (half a second)"""
+"""periods of prediction over which an effect's strength is measured (half a second)"""
 
 
 @dataclass
 class Case:
-    """One recording to be."""
+    """What determines a recording."""
 
     driver: Driver
     """controller, excitation and first states"""
@@ -40,19 +40,19 @@ class Case:
     """parameters by name of the effect"""
     noise: Array
     """(rows, 4, episodes): m, m/s, rad, rad/s"""
-    lottery: Array
+    loss_draws: Array
     """(rows, episodes), uniform: which rows a dropout loses"""
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and episodes."""
-        rows, episodes = self.lottery.shape
+        rows, episodes = self.loss_draws.shape
         return rows, episodes
 
 
 @dataclass
 class Run:
-    """What came of a case: (rows, 4, episodes), commands (rows, episodes)."""
+    """A simulated case: (rows, 4, episodes), commands (rows, episodes)."""
 
     true: Array
     """states"""
@@ -61,7 +61,7 @@ class Run:
     clean: Array
     """readings without it"""
     commands: Array
-    """as the controller gave them"""
+    """of the controller"""
 
     @property
     def reach(self) -> tuple[float, float]:
@@ -71,8 +71,8 @@ class Run:
     def predicted_gap(self, deviations: Array, every: int = 2) -> float:
         """Strength of an effect on commands or states.
 
-        Root mean square, over rows and over x and theta, of what half a second of prediction by the source from the
-        true states misses, in units of the measurement noise (`deviations`, m and rad).
+        Root mean square, over rows and over x and theta, of the error of the source's prediction of the true states
+        half a second ahead, in units of the measurement noise (`deviations`, m and rad).
         """
         rows = np.arange(0, len(self.true) - HORIZON, every)
         start = self.true[rows].transpose(1, 0, 2).reshape(4, -1)
@@ -81,7 +81,7 @@ class Run:
         return _strength((end - predict(start, commands))[[0, 2]], deviations)
 
     def sensed_gap(self, deviations: Array) -> float:
-        """Strength of an effect on readings: what it changes in x and theta, in units of the noise."""
+        """Strength of an effect on readings: the change in x and theta (rms), in units of the noise."""
         return _strength((self.clean - self.true)[:, [0, 2]].transpose(1, 0, 2).reshape(2, -1), deviations)
 
 
@@ -93,14 +93,14 @@ def _strength(difference: Array, deviations: Array) -> float:
 def simulate(cases: list[Case], velocities: bool, substeps: int) -> list[Run]:
     """Run the cases in closed loop, `substeps` of the plant between commands.
 
-    A pole beyond 1 rad or a cart beyond 5 m stops where it is, which the caller sees from `Run.reach`.
+    A pole beyond 1 rad or a cart beyond 5 m is stopped there, and `Run.reach` shows it.
     """
     columns = np.cumsum([0, *(case.shape[1] for case in cases)])
     spans = [slice(int(a), int(b)) for a, b in pairwise(columns)]
     n, rows, h = int(columns[-1]), max(case.shape[0] for case in cases), PERIOD / substeps
-    noise, lottery = np.zeros((rows, 4, n)), np.ones((rows, n))
+    noise, loss_draws = np.zeros((rows, 4, n)), np.ones((rows, n))
     for case, span in zip(cases, spans, strict=True):
-        noise[: case.shape[0], :, span], lottery[: case.shape[0], span] = case.noise, case.lottery
+        noise[: case.shape[0], :, span], loss_draws[: case.shape[0], span] = case.noise, case.loss_draws
     drive = Controllers([case.driver for case in cases], velocities)
     chain = _chain(cases, spans, n)
     plant = _plant(cases, spans, n, rows)
@@ -112,7 +112,7 @@ def simulate(cases: list[Case], velocities: bool, substeps: int) -> list[Run]:
     for row in range(rows):
         time = row * PERIOD
         true[row] = state[:4]
-        measured[row], clean[row] = sensing.read(time, state, noise[row], lottery[row])
+        measured[row], clean[row] = sensing.read(time, state, noise[row], loss_draws[row])
         commands[row] = drive(row, state[:4], measured[row])
         actuation.push(commands[row])
         for k in range(substeps):
@@ -128,7 +128,7 @@ def simulate(cases: list[Case], velocities: bool, substeps: int) -> list[Run]:
 
 
 def _chain(cases: list[Case], spans: list[slice], n: int) -> Parameters:
-    chain = {name: np.full(n, value) for name, value in NONE.items()}
+    chain = {name: np.full(n, value) for name, value in NEUTRAL.items()}
     for case, span in zip(cases, spans, strict=True):
         for effect, parameters in case.effects.items():
             for name, value in parameters.items():
@@ -167,7 +167,7 @@ def _plant(cases: list[Case], spans: list[slice], n: int, rows: int) -> Plant:
 
 
 MASSES = {"cart_mass": "cart_mass", "pole_mass": "pole_mass", "pole_length": "half_length"}
-"""effects that scale a parameter of the plant"""
+"""the plant's parameter that an effect scales"""
 
 NDArrayInt = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 
@@ -184,7 +184,7 @@ def _together(effect: str, members: list[tuple[NDArrayInt, Shape, int]], rows: i
 
 
 def _paths(effect: str, shape: Shape, episodes: int, samples: int) -> Array:
-    """Random force paths of unit size, (episodes, samples) every 10 ms; the same for any number of samples."""
+    """Random force paths of unit size, (episodes, samples) every 10 ms; fewer samples are the start of the same."""
     paths = np.zeros((episodes, samples))
     for episode in range(episodes):
         rng = np.random.default_rng([int(shape["path_seed"]), episode])
@@ -194,7 +194,7 @@ def _paths(effect: str, shape: Shape, episodes: int, samples: int) -> Array:
             while (time := time + float(rng.exponential(shape["interval"]))) * 100 < samples:
                 paths[episode, int(time * 100) : int(time * 100) + 3] = rng.choice((-1.0, 1.0))
         else:
-            # Ornstein-Uhlenbeck, started from its stationary law.
+            # Ornstein-Uhlenbeck, started from its stationary distribution.
             keep = np.exp(-0.01 / shape["correlation"])
             steps = rng.standard_normal(samples)
             value = steps[0]

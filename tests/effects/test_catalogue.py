@@ -8,7 +8,7 @@ NAMED = sorted(EFFECTS.keys() - {"residual"})
 
 
 def test_a_system_has_the_effects_that_act_on_it():
-    assert {effect.name for effect in catalogue()} == set(NAMED)
+    assert set(NAMED) <= {effect.name for effect in catalogue()}
     for kind in SYSTEMS.values():
         own = catalogue(kind())
         assert {ConstantForce, ActuatorDelay, Dropout} <= set(own)
@@ -41,7 +41,7 @@ def test_every_effect_is_on_the_pages_with_all_that_it_states(name):
 def test_the_text_of_an_effect():
     assert catalogue_text(CartPole()).split("\n\n")[5].splitlines() == [
         "actuator_bias (actuation)",
-        "  A command that is there when none is given; a force of max_force * offset.",
+        "  A constant added to every command; on a cart-pole, a force of max_force * offset.",
         "  u = command + offset",
         "  offset: -0.35 to 0.35, no effect at 0",
         "  systems: cartpole, quadrotor, fixed_wing",

@@ -281,7 +281,7 @@ class TestSmoothContract:
 
 def test_an_effect_without_gradient_says_why():
     assert {name: EFFECTS[name].no_gradient for name in NAMED if EFFECTS[name].no_gradient} == {
-        "dropout": "whether a row is lost is drawn, yes or no"
+        "dropout": "whether a row is lost is a random yes or no"
     }
 
 

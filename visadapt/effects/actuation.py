@@ -1,9 +1,9 @@
 """Effects on the command between the controller and the motor.
 
-The command is held constant over each substep. An effect may change it inside one (a delay of half a substep, a lag);
-what acts then is its mean over the substep: exact for the impulse, and smooth in the parameters. Widths, limits and
-offsets are in units of the command. The textbook forms of the piecewise linear ones (dead zone, saturation,
-backlash) are kept: they are continuous in command and parameter, with one-sided derivatives at their kinks.
+The command is held constant over each substep. Where an effect changes it inside a substep (a delay of half a substep,
+a lag), the mean over the substep acts: its impulse is exact, and it is smooth in the parameters. Widths, limits and
+offsets are in units of the command. Dead zone, saturation and backlash keep their piecewise linear textbook forms,
+which are continuous in command and parameter, with one-sided derivatives at their kinks.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from visadapt.effects.base import ActuationEffect, Parameter
 class ActuatorDelay(ActuationEffect):
     """A pure delay of any length, also a fraction of a substep.
 
-    A delayed command can change inside a substep; what acts is its mean over the substep. That is exact in the limit
-    of fine substeps and differentiable in the delay. Against measurement_delay only the begin of an episode could
-    tell, and there only if its first state were known without noise and not at rest.
+    A delayed command can change inside a substep; its mean over the substep acts, which is exact in the limit of fine
+    substeps and differentiable in the delay. Only the start of an episode could separate it from measurement_delay,
+    and only if the first state were known without noise and not at rest.
     """
 
     name = "actuator_delay"
@@ -61,7 +61,7 @@ class ActuatorDelay(ActuationEffect):
         return self.value("delay", commands) / substep
 
     def _reach(self, commands: Tensor, substep: float) -> int:
-        """Substeps of the past that the delay can reach."""
+        """Number of past substeps that the delay can reach."""
         shift = self._shift(commands, substep).detach()
         if not bool((shift >= 0).all()):
             raise ValueError(f"actuator_delay: delay must not be negative, got {float(shift.min()) * substep:g} s")
@@ -94,7 +94,7 @@ class ActuatorBacklash(ActuationEffect):
 
 
 class ActuatorDeadzone(ActuationEffect):
-    """Commands too small to move anything (static friction in a gear, a valve's overlap); larger ones lose `width`."""
+    """Commands up to `width` do nothing (static friction in a gear, a valve's overlap); larger ones lose `width`."""
 
     name = "actuator_deadzone"
     order = 30
@@ -108,7 +108,7 @@ class ActuatorDeadzone(ActuationEffect):
 
 
 class ActuatorSaturation(ActuationEffect):
-    """The largest command that the motor follows: a supply or a current limit. Commands end at 1 anyway."""
+    """A limit on the command that the motor follows: of its supply or its current. Commands are limited to 1 anyway."""
 
     name = "actuator_saturation"
     order = 40
@@ -124,7 +124,7 @@ class ActuatorSaturation(ActuationEffect):
 class ActuatorGain(ActuationEffect):
     """A motor stronger or weaker than the source's.
 
-    Cart and pole both heavier by a factor look like the gain divided by it.
+    If cart and pole are both heavier by a factor, the motion is that of a gain divided by this factor.
     """
 
     name = "actuator_gain"
@@ -144,7 +144,7 @@ class ActuatorGain(ActuationEffect):
 
 
 class ActuatorBias(ActuationEffect):
-    """A command that is there when none is given; a force of max_force * offset."""
+    """A constant added to every command; on a cart-pole, a force of max_force * offset."""
 
     name = "actuator_bias"
     order = 60
@@ -164,7 +164,7 @@ class ActuatorBias(ActuationEffect):
 
 
 class ActuatorLag(ActuationEffect):
-    """A motor that follows its command as a first-order system does: its current, its electronics."""
+    """A motor that follows its command as a first-order system, because of its current or its electronics."""
 
     name = "actuator_lag"
     order = 70
@@ -179,8 +179,8 @@ class ActuatorLag(ActuationEffect):
         ratio = self.column("time_constant", commands) / substep
         # exp(-1000) is 0 in every precision, and so are its derivatives: the limit is exact, and nothing divides by 0.
         rate = ratio.clamp_min(1e-3).reciprocal()
-        left = (-rate).exp()  # of an old value after a substep
-        # u after each substep, if it were 0 at first: all prefixes of a linear recurrence in log2(S) rounds.
+        left = (-rate).exp()  # share of the old value that remains after a substep
+        # u after each substep from an initial 0: all prefixes of a linear recurrence in log2(S) rounds.
         after = -(-rate).expm1() * commands
         reach, weight = 1, left
         while reach < commands.shape[1]:

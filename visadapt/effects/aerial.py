@@ -1,6 +1,6 @@
-"""Forces of the air on vehicles that fly: drag, what flows through rotors, and wind.
+"""Forces of the air on flying vehicles: drag, forces on rotors, and wind.
 
-All of them follow the velocity against the air: where there is wind too, it acts on every one. They add.
+All depend on the velocity relative to the air, so that a wind changes each of them. Their forces add.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, beside, rotation, ti
 
 Vehicle: TypeAlias = Quadrotor | FixedWing
 VEHICLES: tuple[type[System], ...] = (Quadrotor, FixedWing)
-"""The systems around which the air can move."""
+"""The systems that have a wind."""
 
 
 def expect_vehicle(system: System, effect: Effect) -> Vehicle:
@@ -41,7 +41,7 @@ def airspeed(state: Tensor, vehicle: Vehicle) -> Tensor:
 
 
 class AirDrag(DynamicsEffect):
-    """Drag in proportion to the velocity against the air."""
+    """Drag proportional to the velocity relative to the air."""
 
     systems = VEHICLES
 
@@ -51,7 +51,7 @@ class AirDrag(DynamicsEffect):
 
 
 class LinearDrag(AirDrag):
-    """Drag in proportion to the speed, as rotors in forward flight have it.
+    """Drag proportional to the speed, as of rotors in forward flight.
 
     The paper's v' = v' - r v, with r = 0.3 1/s, is coefficient = r mass, on both vehicles.
     """
@@ -63,10 +63,10 @@ class LinearDrag(AirDrag):
 
 
 class RotorDrag(DynamicsEffect):
-    """Drag of the rotors in proportion to the velocity against the air, another one along each axis of the body.
+    """Drag of the rotors proportional to the velocity relative to the air, with a coefficient for each body axis.
 
-    Level, blades that flap and bend drag; along their axis, air that flows in takes thrust. Where all three are the
-    same it is linear_drag.
+    In the rotor plane it comes from flapping and bending blades, along the rotor axis from inflow that reduces thrust.
+    With three equal coefficients it is linear_drag.
     """
 
     name = "rotor_drag"
@@ -85,7 +85,7 @@ class RotorDrag(DynamicsEffect):
 
 
 class TranslationalLift(DynamicsEffect):
-    """Thrust that air across the rotors adds: it brings them more air, so that they push it down less."""
+    """Additional thrust in forward flight: air that flows across the rotors raises their mass flow."""
 
     name = "translational_lift"
     equation = "T = T_asked + coefficient (v_x^2 + v_y^2), v the velocity against the air in body axes"
@@ -105,9 +105,9 @@ class TranslationalLift(DynamicsEffect):
 class Wind(AirDrag):
     """Air that moves at a steady velocity.
 
-    The wing's aerodynamics are those of its velocity against the air. The quadrotor has none, so wind needs a drag
-    to act by, and brings one: a coefficient of the vehicle's own would be 0 in the source, and wind alone would
-    silently do nothing. On the wing, and beside a drag effect, which feels the wind too, a coefficient of 0 will do.
+    The wing's aerodynamics use its velocity relative to the air. The source's quadrotor has no drag, so that wind
+    alone would not act on it; this effect therefore has a drag coefficient of its own. On the wing, or together with a
+    drag effect, which the wind changes too, the coefficient may be 0.
     """
 
     name = "wind"
@@ -135,9 +135,9 @@ class Wind(AirDrag):
 
 
 class PeriodicWind(AirDrag):
-    """Level wind that comes and goes, to and fro along one direction; its drag is as that of wind.
+    """Horizontal wind that oscillates along one direction; it acts through a drag, as `wind` does.
 
-    Phases count from the start of the episode; a direction of 0 is along x, of pi/2 along y.
+    The phase is that at the start of the episode; a direction of 0 is along x, of pi/2 along y.
     """
 
     name = "periodic_wind"

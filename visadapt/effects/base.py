@@ -1,13 +1,13 @@
 """The one idea: everything that separates the target from the source is an Effect.
 
-An effect acts at one stage along a step (actuation, dynamics, sensing, camera, or any). It states, in one place,
-its equation, its source, its parameters with unit and searched range, and what it cannot be told apart from.
-Subclasses register themselves by name, so adding an effect is adding a class.
+An effect acts at one stage along a step (actuation, dynamics, sensing, camera, or any). Its class states all that the
+rest of the library must know of it: equation, source, parameters with unit, searched range and role, its place among
+the effects of its stage, and which effects it is indistinguishable from. Subclasses register themselves by name, so
+adding an effect means adding one class.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -49,10 +49,10 @@ class Role(StrEnum):
 class Parameter:
     """One parameter of an effect: its unit, the range searched, and the value at which the effect vanishes.
 
-    `neutral` is None for a parameter (a phase, say) that shapes the effect and cannot switch it off; where several
-    have one, the effect vanishes when all of them take it. `linear` holds where what the effect adds (to the load,
-    the command or the measured value) is proportional to value - neutral while its nonlinear parameters are fixed;
-    what several linear parameters add is a sum.
+    `neutral` is None for a parameter (a phase, for example) that shapes the effect and cannot switch it off; where
+    several parameters have a neutral value, the effect vanishes when all of them take it. `linear` states that what
+    the effect adds (to the load, the command or the reading) is proportional to value - neutral while its nonlinear
+    parameters are fixed; the contributions of several linear parameters add up.
 
     >>> import visadapt as va
     >>> va.effects.ViscousFriction.table[0].unit
@@ -90,17 +90,17 @@ class Effect(nn.Module):
     name: ClassVar[str]
     stage: ClassVar[Stage]
     systems: ClassVar[tuple[type[System], ...]] = (System,)
-    """What it acts on; any system, unless it says which."""
+    """The systems that it acts on; every system by default."""
     equation: ClassVar[str]
     source: ClassVar[str]
     table: ClassVar[tuple[Parameter, ...]] = ()
     indistinguishable_from: ClassVar[tuple[str, ...]] = ()
-    """Effects that passive data cannot separate from this one."""
+    """Names of the effects that passive data (without a dedicated experiment) cannot separate from this one."""
     separable_on: ClassVar[tuple[type[System], ...]] = ()
-    """Systems whose passive data do separate it from those, since there the two act on different motions."""
+    """Systems on which passive data do separate it from those effects."""
     settled_by: ClassVar[Mapping[str, str]] = {}
     """The experiment that tells this effect from another one, by the other's name; stated on one of the two."""
-    order: ClassVar[float] = math.inf
+    order: ClassVar[int] = 1000
     """Position among the effects of its stage, which act in ascending order; without one, it acts last."""
     abrupt: ClassVar[bool] = False
     """Whether it changes suddenly within a control period, which must then be integrated in several substeps."""
@@ -167,20 +167,20 @@ class ActuationEffect(Effect):
     abrupt = True
 
     def acting_on(self, system: System) -> Self:
-        """The effect with what it takes from the altered system's parameters; itself, where it takes nothing."""
+        """The effect bound to parameters of the altered system that it needs; itself where it needs none."""
         return self
 
     def memory(self, commands: Tensor, substep: float) -> Tensor:
-        """What the effect remembers at the start of an episode, (B, any, n_action).
+        """The effect's memory at the start of an episode, (B, any, n_action).
 
         `commands` (B, S, n_action) gives shape and dtype; before an episode begins the command was zero.
         """
         return commands[:, :0]
 
     def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
-        """What acts of the commands (B, S, n_action) over the S substeps, each `substep` s long, and the new memory.
+        """The changed commands (B, S, n_action) over S substeps, each `substep` s long, and the new memory.
 
-        S may be one period's substeps or a whole episode's: the result is the same.
+        S may cover one period or a whole episode: the result is the same.
         """
         raise NotImplementedError
 
@@ -207,20 +207,20 @@ class DynamicsEffect(Effect):
     stage = Stage.DYNAMICS
 
     def alter(self, system: System) -> System:
-        """The system with the parameters that this effect gives it; its fields may then be tensors, () or (B,)."""
+        """The system with the parameters that this effect changes; its fields may then be tensors, () or (B,)."""
         return system
 
     def vary(self, system: System, time: Tensor, state: Tensor) -> System:
         """The altered system at the time (B,) since the start of the episode, in a state (B, n_state).
 
-        For parameters that change under way. Called for every derivative, where `alter` is called once a period.
+        For parameters that change within an episode: called at every derivative, `alter` only once a period.
         """
         return system
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         """Load (B, n_load) at the time (B,) since the start of the episode, in a state (B, n_state).
 
-        `system` is the one that all effects have altered and varied.
+        `system` has been altered and varied by all effects.
         """
         return torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)
 
@@ -238,18 +238,18 @@ class SensingEffect(Effect):
     stage = Stage.SENSING
 
     def memory(self, state: Tensor, period: float) -> Tensor:
-        """What the effect remembers before the first row of an episode that begins in `state` (B, n_state).
+        """The effect's memory (B, any, any) before the first row of an episode that begins in `state` (B, n_state).
 
-        (B, any, any); before an episode begins, its first state was measured.
+        Before the episode, its first state is taken as measured.
         """
         return state[:, None, :0]
 
     def apply_to(
         self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """What is read of one row (B, n_state), the rows being `period` s apart, and the new memory.
+        """The reading of one row (B, n_state) and the new memory; rows are `period` s apart.
 
-        `generator` is needed by random effects alone.
+        Only random effects need the `generator`.
         """
         raise NotImplementedError
 

@@ -36,15 +36,17 @@ def twins(effect: type[Effect], effects: Iterable[type[Effect]], system: System)
 
 
 def catalogue_text(system: System | None = None) -> str:
-    """The catalogue for a terminal: a paragraph an effect, sorted by stage and name."""
+    """The catalogue for a terminal: a paragraph per effect, in the order of the chain."""
     return "\n\n".join("\n".join(_lines(effect)) for effect in _sorted(system))
 
 
-def catalogue_markdown(system: System | None = None) -> str:
-    """The catalogue as a Markdown page: a section a stage, a subsection an effect, a table of its parameters."""
+def catalogue_markdown() -> str:
+    """The library's own effects in Markdown: a section per stage, a subsection per effect, a table of parameters."""
     lines: list[str] = []
     stage = None
-    for effect in _sorted(system):
+    for effect in _sorted(None):
+        if not effect.__module__.startswith("visadapt."):
+            continue
         if effect.stage is not stage:
             stage = effect.stage
             lines += [f"## {stage.value.capitalize()}", ""]
@@ -54,7 +56,7 @@ def catalogue_markdown(system: System | None = None) -> str:
             low, high, neutral = _numbers(parameter)
             lines.append(f"| {parameter.name} | {parameter.unit} | {low} to {high} | {neutral} |")
         lines += ["", *(f"- {name}: {value}" for name, value in _facts(effect).items()), ""]
-    return "\n".join(lines)
+    return "\n".join(lines).rstrip()
 
 
 def _sorted(system: System | None) -> list[type[Effect]]:

@@ -1,4 +1,4 @@
-"""Forces that do not come from rubbing: along x on any system, the rest on a cart-pole. Positive pushes towards +x."""
+"""Forces other than friction: two along x on any system, the others on a cart-pole. Positive forces act towards +x."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from visadapt.systems import CartPole, RigidBody, System
 
 
 class ForceAlongX(DynamicsEffect):
-    """A force along x and nothing else: on the cart, or on a vehicle along the world's x; subclasses give its size."""
+    """A force along x alone, on the cart or along the world's x on a vehicle; subclasses give its size."""
 
     systems: ClassVar[tuple[type[System], ...]] = (CartPole, RigidBody)
 
@@ -34,15 +34,15 @@ class CartForce(ForceAlongX):
     systems = (CartPole,)
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        # A cart-pole's two loads, so that it does not fit a vehicle, whose columns `push` would misread.
+        # The two loads of a cart-pole: on a vehicle, where `push` would read wrong columns, the shapes do not fit.
         push = self.push(time, state, system)
         return torch.stack((push, torch.zeros_like(push)), -1)
 
 
 class ConstantForce(ForceAlongX):
-    """A push along x that never lets up: a cable's weight, say.
+    """A constant force along x, such as a cable's pull.
 
-    On a cart-pole it cannot be told from actuator_bias; on a vehicle, whose commands push elsewhere, it can.
+    On a cart-pole it is indistinguishable from actuator_bias; on a vehicle it is not, since commands act elsewhere.
     """
 
     name = "constant_force"
@@ -57,9 +57,9 @@ class ConstantForce(ForceAlongX):
 
 
 class PeriodicForce(ForceAlongX):
-    """A push along x that comes and goes.
+    """A sinusoidal force along x, with an offset.
 
-    Phases count from the start of the episode; 2 (sin t + 1) N is amplitude 2, offset 2, phase -pi/2;
+    The phase is that at the start of the episode. 2 (sin t + 1) N is amplitude 2, offset 2, phase -pi/2;
     2 cos t N is amplitude 2, offset 0, phase 0; both have frequency 1/(2 pi).
     """
 
@@ -79,10 +79,10 @@ class PeriodicForce(ForceAlongX):
 
 
 class Gust(CartForce):
-    """A push between two times since the start of the episode.
+    """A constant force between two times, counted from the start of the episode.
 
-    Its edges are logistic, 10 % to 90 % in 18 ms, so that an integrator's steps of 12.5 ms see where they lie; its
-    impulse, force (end - start), is that of sharp ones.
+    Its edges are logistic, 10 % to 90 % in 18 ms, so that integration steps of 12.5 ms resolve them; its impulse,
+    force (end - start), is that of sharp edges.
     """
 
     name = "gust"
@@ -104,7 +104,7 @@ class Gust(CartForce):
 
 
 class Spring(CartForce):
-    """A cable or a rubber band that draws the cart to one place."""
+    """A spring, such as a cable or a rubber band, that pulls the cart to its rest position."""
 
     name = "spring"
     equation = "F = -stiffness (x - rest)"
@@ -121,8 +121,8 @@ class Spring(CartForce):
 class TrackTilt(DynamicsEffect):
     """A track that rises towards +x by `angle`; theta is still measured from the track's normal.
 
-    Gravity has a part along the track, so cart and pole roll down, and the pole stands where it is vertical, at
-    theta = angle: that separates it from a constant force.
+    Gravity has a component along the track, which accelerates cart and pole downhill, and the pole is in equilibrium
+    where it is vertical, at theta = angle; that separates a tilt from a constant force.
     """
 
     name = "track_tilt"

@@ -1,4 +1,4 @@
-"""Friction on a cart-pole, and drag: forces against the motion."""
+"""Friction on a cart-pole, and drag of the air: forces against the motion."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from visadapt.systems import CartPole, System
 
 
 class ViscousFriction(CartForce):
-    """Friction in proportion to the cart's speed."""
+    """Friction proportional to the cart's speed."""
 
     name = "viscous_friction"
     equation = "F = -coefficient x_dot"
@@ -37,11 +37,11 @@ class ViscousFriction(CartForce):
 class CoulombFriction(CartForce):
     """Dry friction of the cart on its track, the same at every speed.
 
-    The sign is made smooth: below 1.5 widths the force falls to 0, so that a cart which should stick creeps by up to
-    that speed. The width is the least that a Runge-Kutta step of 12.5 ms bears, and therefore grows with the force:
-    6 mm/s at 1 N, 33 mm/s at 6 N. Against the event-exact solution, half a second ahead under a stabilising
-    controller, x is off by 0.4 mm (rms) at 0.5 N, 0.8 mm at 1 N, 1.5 mm at 2 N and 7 mm at 6 N: 1 % of what the
-    friction does.
+    The sign is smoothed: below a speed of 1.5 widths the force falls to 0, so that a cart that should stick creeps at
+    up to that speed. The width is the smallest for which Runge-Kutta steps of 12.5 ms are stable, and so it grows with
+    the force: 6 mm/s at 1 N, 33 mm/s at 6 N. Half a second ahead under a stabilising controller, x departs from the
+    event-exact solution by 0.4 mm (rms) at 0.5 N, 0.8 mm at 1 N, 1.5 mm at 2 N and 7 mm at 6 N: 1 % of the effect of
+    the friction.
     """
 
     name = "coulomb_friction"
@@ -58,7 +58,7 @@ class CoulombFriction(CartForce):
     def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         cart_pole = expect(system, CartPole, self)
         force = self.value("force", state)
-        # What the motor moves while the pole is near upright and free to turn.
+        # The effective mass that a force on the cart accelerates while the pole is near upright and free to turn.
         mass = cart_pole.cart_mass + cart_pole.pole_mass / 4
         width = self.SLOWEST + force / (self.RATE * mass)
         # A cubic of slope 1 at rest, flat from 1.5 widths on.
@@ -82,10 +82,10 @@ class QuadraticDrag(DynamicsEffect):
 
 
 class FrictionPatch(CartForce):
-    """Viscous friction between two places of the track only: dirt, a worn stretch of the rail.
+    """Viscous friction on a stretch of the track: dirt, or a worn rail.
 
-    Its edges are logistic, 10 % to 90 % in 18 mm, so that an integrator's steps of 12.5 ms see where they lie; the
-    speed lost in crossing, coefficient (end - start) / mass, is that of sharp ones.
+    Its edges are logistic, 10 % to 90 % in 18 mm, so that integration steps of 12.5 ms resolve them; the speed lost in
+    crossing, coefficient (end - start) / mass, is that of sharp edges.
     """
 
     name = "friction_patch"
@@ -107,7 +107,7 @@ class FrictionPatch(CartForce):
 
 
 class PoleDamping(DynamicsEffect):
-    """Friction in the hinge, in proportion to the pole's angular velocity."""
+    """Friction in the hinge, proportional to the pole's angular velocity."""
 
     name = "pole_damping"
     equation = "Q_theta = -coefficient theta_dot"

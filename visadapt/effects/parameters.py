@@ -1,4 +1,4 @@
-"""Effects that change parameters of a system. Each scales some and leaves the others as they are."""
+"""Effects that scale some parameters of a system and leave the others unchanged."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from visadapt.systems import CartPole, System
 
 
 class ParameterScale(DynamicsEffect):
-    """Factors on parameters of the one system that a subclass acts on; adds no load."""
+    """Scale factors on parameters of the system that a subclass acts on; adds no load."""
 
     scaled: ClassVar[dict[str, str]]
     """the system's parameter for each of the effect's"""

@@ -1,4 +1,4 @@
-"""The effect without a name: a network that can stand for anything and explains nothing.
+"""The residual: a learnt correction, which can represent any gap and names none.
 
 Delta_phi of the paper (equation 10): the grounded model is f_hat(s, a) + Delta(history, phi).
 """
@@ -12,7 +12,7 @@ from visadapt.history import History
 
 
 class Residual(Effect):
-    """Adds what a network reads from the last observations and actions to the state after each period.
+    """Adds to the state after each period a correction that a network computes from recent observations and actions.
 
     Args:
         network: maps a `History`, whose last action is the one being executed, to (B, n_state) in units of `scale`;

@@ -1,4 +1,4 @@
-"""Effects on what is measured of a state: all but dropout on that of a cart-pole (x, x_dot, theta, theta_dot)."""
+"""Effects on measurements: dropout on those of any system, the others on a cart-pole's (x, x_dot, theta, theta_dot)."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from visadapt.systems import CartPole
 
 
 class MeasurementDelay(SensingEffect):
-    """Measurements that arrive late, by any length.
+    """Measurements that arrive late, by any delay.
 
-    Between two rows the trajectory is the cubic through their positions with their velocities (Hermite), and the
-    velocity is that cubic's slope. Before the episode its first state was measured.
+    Between two rows, positions are interpolated by the cubic with the rows' positions and velocities (Hermite), and
+    velocities are its slope. Before the episode, its first state is taken as measured.
     """
 
     name = "measurement_delay"
@@ -33,7 +33,7 @@ class MeasurementDelay(SensingEffect):
         shift = self._shift(state, period).detach()
         if not bool((shift >= 0).all()):
             raise ValueError(f"measurement_delay: delay must not be negative, got {float(shift.min()) * period:g} s")
-        # Behind each row its number, so that none from before the episode is interpolated.
+        # Each row carries its number, so that no row from before the episode is interpolated.
         row = torch.cat((state, torch.full_like(state[:, :1], -1)), 1)
         return row[:, None].expand(-1, int(shift.max().floor()) + 1, -1)
 
@@ -68,8 +68,8 @@ class MeasurementDelay(SensingEffect):
 class FrozenZone(SensingEffect):
     """A worn potentiometer: while the angle is between start and end, the reading holds its last value from outside.
 
-    Angle and angular velocity both hold. The edges are logistic, 10 % to 90 % in 4.4 mrad, where the reading is a
-    mixture; an empty zone does nothing.
+    Angle and angular velocity both hold. The edges are logistic, 10 % to 90 % in 4.4 mrad, across which the reading is
+    a weighted mean; an empty zone does nothing.
     """
 
     name = "frozen_zone"
@@ -102,7 +102,7 @@ class FrozenZone(SensingEffect):
 
 
 class SensorScale(SensingEffect):
-    """Encoders with other counts per metre or turn than assumed; a velocity scales with its position."""
+    """Encoders whose counts per metre or turn differ from those assumed; velocities scale with their positions."""
 
     name = "sensor_scale"
     order = 30
@@ -150,10 +150,10 @@ class AngleOffset(SensorOffset):
 
 
 class PositionOffset(SensorOffset):
-    """A track whose zero lies elsewhere.
+    """A position sensor whose zero is off.
 
-    A cart-pole's physics do not know where the cart is: no data show this offset, unless another effect (a spring,
-    a patch) is tied to a known place.
+    A cart-pole moves alike at every position, so that no recording shows this offset unless another effect (a spring,
+    a friction patch) acts at a known position.
     """
 
     name = "position_offset"
@@ -165,9 +165,9 @@ class PositionOffset(SensorOffset):
 
 
 class Dropout(SensingEffect):
-    """Rows that are lost: with probability `rate`, all of a row repeats the row measured last.
+    """Lost rows: with probability `rate`, a row repeats the whole row before it.
 
-    The first row of an episode is never lost: there is none before it.
+    The first row of an episode is never lost, as there is none before it.
     """
 
     name = "dropout"
@@ -176,10 +176,10 @@ class Dropout(SensingEffect):
     equation = "measured_k = measured_(k-1) with probability rate"
     source = "Schenato et al. (2007), Foundations of control and estimation over lossy networks, section II"
     table = (Parameter("rate", "1", 0.0, 0.5, 0.0),)
-    no_gradient = "whether a row is lost is drawn, yes or no"
+    no_gradient = "whether a row is lost is a random yes or no"
 
     def memory(self, state: Tensor, period: float) -> Tensor:
-        # Behind the row measured last, whether there is one.
+        # The row measured last, then a flag: 1 if there is one.
         return torch.cat((state, torch.zeros_like(state[:, :1])), 1)[:, None]
 
     def apply_to(

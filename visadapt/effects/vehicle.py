@@ -1,8 +1,7 @@
-"""Effects on what drives a vehicle, and on the body of a quadrotor.
+"""Effects on the propulsion of a vehicle, and on the body of a quadrotor.
 
-The quadrotor's flight controller knows of none of them: it asks for the thrust and the torques that the vehicle
-without them would need. They act in the order of the world's list where that matters, which is nowhere: factors
-multiply, and masses and offsets add.
+The quadrotor's flight controller does not account for any of them: it commands the thrust and the torques that the
+source vehicle would need. Their order does not matter: factors multiply, and masses and offsets add.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ def with_thrust(vehicle: Vehicle, factor: Tensor) -> Vehicle:
 
 
 class ThrustGain(DynamicsEffect):
-    """Rotors or a propeller that give more or less thrust than is asked; torques stay as they are."""
+    """Rotors or a propeller that give more or less thrust than commanded; torques are unchanged."""
 
     name = "thrust_gain"
     equation = "T = scale T_asked"
@@ -49,12 +48,12 @@ class ThrustGain(DynamicsEffect):
 
 
 class MotorLag(ActuationEffect):
-    """Motors whose thrusts follow what is asked of them as first-order systems do: thrust and torques lag alike.
+    """Motors whose thrusts follow their commands as first-order systems: thrust and torques have the same lag.
 
-    An actuator_lag is on the way to the flight controller; this lag is inside its rate loop, whose error w_asked - w
-    the torque then follows late. What acts is the command a = w + d that turns a vehicle as much without lag, d being
-    the lagging torque by inertia and gain. The w in it is that of a vehicle that is turned by its loop, with the
-    inertia that it has, and by rate_damping; what else turns it, the loop undoes at once.
+    An actuator_lag is before the flight controller; this lag is inside its rate loop, whose torque follows the error
+    w_asked - w late. It is modelled as the rate command a = w + d by which a vehicle without lag would turn as much,
+    where d is the lagging torque divided by inertia and gain. The rate w in it is that of a vehicle with its actual
+    inertia and rate_damping under its loop alone; the loop is taken to cancel other torques at once.
     """
 
     name = "motor_lag"
@@ -70,7 +69,7 @@ class MotorLag(ActuationEffect):
     systems = (Quadrotor,)
 
     loops: tuple[tuple[float | Tensor, ...], tuple[float | Tensor, ...]] | None = None
-    """1/s, gain and damping of the loop around each command: the thrust has none, and nor has any command by itself"""
+    """1/s, gain and damping of the loop around each command: 0 for the thrust; None (no loop) until bound"""
 
     def acting_on(self, system: System) -> Self:
         own = expect(system, Quadrotor, self)
@@ -107,7 +106,7 @@ class MotorLag(ActuationEffect):
         return commands + ratio * (before - after[..., 1]), after[:, -1].movedim(2, 1)
 
     def _of_a_substep(self, ratio: Tensor, substep: float, commands: Tensor) -> tuple[Tensor, Tensor]:
-        """What a substep leaves of (w, d), (B or 1, 1, n_action, 2, 2), and what a command of 1 brings, (..., 2)."""
+        """Over a substep: the transition of (w, d), (B or 1, 1, n_action, 2, 2), and the response to 1, (..., 2)."""
         none = (0.0,) * commands.shape[2]
         gain, damping = (substep * beside(values, commands) for values in self.loops or (none, none))
         # As in actuator_lag: with exp(-1000) the limit is exact, and nothing divides by 0.
@@ -120,9 +119,10 @@ class MotorLag(ActuationEffect):
 
 
 class RateDamping(DynamicsEffect):
-    """Air that brakes every turn: an arm that goes down meets air from below, which adds to its rotor's thrust.
+    """Aerodynamic damping of rotations: an arm that moves down meets air from below, which raises its rotor's thrust.
 
-    By moment of inertia, as flight dynamics has its derivatives L_p, M_q and N_r, so that vehicles of any size compare.
+    Rates are per moment of inertia, like the derivatives L_p, M_q and N_r of flight dynamics, so that they compare
+    between vehicles of any size.
     """
 
     name = "rate_damping"
@@ -146,7 +146,7 @@ class RateDamping(DynamicsEffect):
 
 
 class BatterySag(DynamicsEffect):
-    """A battery whose voltage falls, and the collective thrust with it, from the start of the episode on."""
+    """A battery whose voltage, and with it the collective thrust, decays from the start of the episode."""
 
     name = "battery_sag"
     equation = "T = exp(-rate t) T_asked"
@@ -159,10 +159,10 @@ class BatterySag(DynamicsEffect):
 
 
 class GroundEffect(DynamicsEffect):
-    """More thrust near the ground, whose air cannot give way.
+    """Additional thrust near the ground, where the rotors' wake is deflected.
 
-    Cheeseman and Bennett's ratio holds from about a radius above the ground and has a pole at a quarter of one. Here it
-    rises to 4/3 at the ground and stays there below: with x = (radius / 4 height)^2, the x of the formula is
+    Cheeseman and Bennett's ratio holds above a height of about one radius and has a pole at a quarter of a radius. Here
+    it rises to 4/3 at the ground and keeps that value below: with x = (radius / 4 height)^2, the x of the formula is
     x / (1 + (4 x)^4)^(1/4), which at a height of one radius is x to 0.1 %.
     """
 
@@ -175,7 +175,7 @@ class GroundEffect(DynamicsEffect):
     systems = (Quadrotor,)
 
     LEAST: ClassVar[float] = 1e-30
-    """m8, under a root where nothing else is: at the ground, without a radius"""
+    """m8, keeps the root positive where both height and radius are 0"""
 
     def vary(self, system: System, time: Tensor, state: Tensor) -> System:
         vehicle = expect(system, Quadrotor, self)
@@ -187,14 +187,13 @@ class GroundEffect(DynamicsEffect):
 
 
 class RotorEfficiency(ParameterScale):
-    """Rotors of an X that each give a share of the thrust asked of them: chipped blades, a failing motor.
+    """Rotors of an X configuration that each give a share of their commanded thrust: chipped blades, a failing motor.
 
-    Rotors count from the one in front on the left, clockwise seen from above. With unequal shares thrust turns into
-    torque and torque into thrust.
+    Rotors are numbered from the front left, clockwise seen from above. Unequal shares couple thrust and torques.
     """
 
     name = "rotor_efficiency"
-    equation = "f_i = scale_i f_i_asked, f_asked the thrusts that the mixer finds for T and the torques"
+    equation = "f_i = scale_i f_i_asked, f_asked the rotor thrusts that the mixer computes from T and the torques"
     source = "Mahony, Kumar and Corke (2012), Multirotor aerial vehicles; numbers: Song et al. (2020), Flightmare"
     table = tuple(Parameter(f"scale_{k}", "1", 0.1, 1.5, 1.0) for k in (1, 2, 3, 4))
     systems = (Quadrotor,)
@@ -202,7 +201,7 @@ class RotorEfficiency(ParameterScale):
 
 
 class Inertia(ParameterScale):
-    """Moments of inertia that differ from those that the rate loops' torques count on."""
+    """Moments of inertia that differ from those that the rate loops assume."""
 
     name = "inertia"
     equation = "J = diag(scale_x, scale_y, scale_z) J_known"
@@ -213,10 +212,10 @@ class Inertia(ParameterScale):
 
 
 class Payload(DynamicsEffect):
-    """A point mass at the quadrotor's centre of which the flight controller does not know.
+    """A point mass at the quadrotor's centre that the flight controller does not account for.
 
-    Weight and translational inertia grow, the force of the rotors does not. Without other forces that is a
-    thrust_gain of m / (m + mass), to the last digit; only a gain above 1 is no payload.
+    Weight and translational inertia grow, the rotors' force does not. Without other forces the motion is exactly that
+    of a thrust_gain of m / (m + mass); only a gain above 1 cannot be a payload.
     """
 
     name = "payload"
@@ -234,10 +233,10 @@ class Payload(DynamicsEffect):
 
 
 class CenterOfMassOffset(DynamicsEffect):
-    """A centre of mass that does not lie amid the rotors: x ahead, y to the left.
+    """A centre of mass beside the centre of the rotors: x ahead, y to the left.
 
-    The state is that of the centre of mass, where the weight acts, so thrust alone has a lever. Moments of inertia
-    stay as they are: they would change by the offset's square.
+    The state is that of the centre of mass, where the weight acts, so only thrust has a lever arm. Moments of inertia
+    are unchanged, as they would change with the square of the offset.
     """
 
     name = "center_of_mass_offset"

@@ -13,7 +13,7 @@ from visadapt.systems import FixedWing, System
 
 
 class Mass(ParameterScale):
-    """A wing heavier or lighter than the source's, of the same moments of inertia."""
+    """An aircraft heavier or lighter than the source's, with the same moments of inertia."""
 
     name = "mass"
     equation = "m = scale m_source"
@@ -24,7 +24,7 @@ class Mass(ParameterScale):
 
 
 class LiftSlope(ParameterScale):
-    """Lift that grows faster or slower with the angle of attack; lift at an angle of 0 stays."""
+    """Lift that grows faster or slower with the angle of attack; lift at an angle of 0 is unchanged."""
 
     name = "lift_slope"
     equation = "C_Lalpha = scale C_Lalpha_source"
@@ -35,9 +35,9 @@ class LiftSlope(ParameterScale):
 
 
 class Drag(ParameterScale):
-    """A wing with more or less drag at an angle of attack of 0: ice, dirt, something that hangs out.
+    """More or less drag at an angle of attack of 0: ice, dirt, an extended part.
 
-    It grows with the square of the airspeed, as the wing's own. The paper's drag, in proportion to the velocity, is
+    It grows with the square of the airspeed, like the source's drag. The paper's drag, proportional to the velocity, is
     linear_drag, on both vehicles.
     """
 
@@ -50,7 +50,7 @@ class Drag(ParameterScale):
 
 
 class ControlEffectiveness(ParameterScale):
-    """Surfaces that do more or less than expected: damaged, or deflected by other angles than asked."""
+    """Control surfaces more or less effective than modelled: damaged, or deflected by wrong angles."""
 
     name = "control_effectiveness"
     equation = "deflection_i = scale_i deflection_i_asked, i the elevator, the ailerons, the rudder"
@@ -61,10 +61,9 @@ class ControlEffectiveness(ParameterScale):
 
 
 class TrimOffset(DynamicsEffect):
-    """Surfaces that stand at an angle when none is asked: linkages out of trim.
+    """Control surfaces deflected at a command of 0: linkages out of trim.
 
-    An angle of a surface adds the same to each coefficient whatever the command, so the offsets go into the
-    coefficients that are there without a cause.
+    Coefficients are linear in the deflections, so that an offset adds a constant to each of them.
     """
 
     name = "trim_offset"
