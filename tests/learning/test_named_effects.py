@@ -32,6 +32,7 @@ HIDDEN = {
     "spring": {"stiffness": 8.0, "rest": 0.1},
     "friction_patch": {"start": -0.1, "end": 0.2, "coefficient": 8.0},
     "ground_effect": {"radius": 0.3, "ground": 0.2},
+    "quadratic_drag": {"coefficient": 0.2},
     "measurement_delay": {"delay": 0.07},
     "frozen_zone": {"start": -0.02, "end": 0.05},
     "sensor_scale": {"position": 1.1, "angle": 0.9},

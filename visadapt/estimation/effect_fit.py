@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from visadapt.effects import EFFECTS, Dropout, Effect, FrozenZone, MeasurementDelay, SensingEffect
+from visadapt.effects import EFFECTS, Dropout, Effect, FrozenZone, MeasurementDelay, Role, SensingEffect
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import (
     CAREFUL,
@@ -36,9 +36,6 @@ from visadapt.estimation.screening import screen
 from visadapt.estimation.segments import Segments, cut
 from visadapt.systems import System
 from visadapt.world import World
-
-READ_OFF: Effects = (Dropout, FrozenZone)
-"""Effects that are read off repeated readings."""
 
 SMOOTHED = 1 / 3
 """Standard deviation of a smoothed angle, in standard deviations of a measured one."""
@@ -77,7 +74,7 @@ def fit_effects(
         ValueError: an effect that can be neither fitted nor read off, or two effects that stand for each other.
     """
     kinds = [type(effect) for effect in effects]
-    fitted_as = {kind: stand_in(kind) for kind in kinds if kind not in READ_OFF}
+    fitted_as = {kind: stand_in(kind) for kind in kinds if not kind.repeats_readings}
     fitted = tuple(dict.fromkeys(fitted_as.values()))
     if len(fitted) < len(fitted_as) or len(set(kinds)) < len(kinds):
         raise ValueError(
@@ -167,7 +164,7 @@ def _best(
 
 def _within_a_turn(effect: type[Effect], values: Tensor) -> Tensor:
     """The parameters (P,) with phases between -pi and pi: during a fit they may go further."""
-    turns = torch.tensor([float(p.name == "phase") for p in effect.table]) * (values / (2 * math.pi)).round()
+    turns = torch.tensor([float(p.role is Role.PHASE) for p in effect.table]) * (values / (2 * math.pi)).round()
     return values - 2 * math.pi * turns
 
 
