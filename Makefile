@@ -20,7 +20,7 @@ demo-from-scratch: $(INSTALLED)
 	$(RUN) -m train.demo --from-scratch
 
 test: $(INSTALLED)
-	$(RUN) -m pytest
+	$(RUN) -m pytest -n auto --dist loadfile
 
 lint: $(INSTALLED)
 	$(RUN) -m ruff check .

@@ -15,16 +15,34 @@ MAY_IMPORT = {
 }
 
 
-def imported(path):
+def modules(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module:
-            yield node.module.partition(".")[0]
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
         if isinstance(node, ast.Import):
-            yield from (alias.name.partition(".")[0] for alias in node.names)
+            yield from (alias.name for alias in node.names)
+
+
+def imported(path):
+    return {name.partition(".")[0] for name in modules(path)}
 
 
 @pytest.mark.parametrize("room", MAY_IMPORT)
 def test_a_room_imports_none_that_is_not_below_it(room):
     others = MAY_IMPORT.keys() - MAY_IMPORT[room] - {room}
     for path in (ROOT / room).rglob("*.py"):
-        assert not others & set(imported(path)), path
+        assert not others & imported(path), path
+
+
+def test_the_rooms_of_the_library_import_each_other_one_way():
+    """Otherwise no order of the rooms exists in which a newcomer could read them."""
+    below = {}
+    for path in (ROOT / "visadapt").rglob("*.py"):
+        room, *inner = path.relative_to(ROOT / "visadapt").with_suffix("").parts
+        if room != "__init__":
+            names = {name for name in modules(path) if name.startswith("visadapt.")}
+            below.setdefault(room, set()).update({name.split(".")[1] for name in names} - {room})
+    while below:
+        lowest = {room for room in below if not below[room] & below.keys()}
+        assert lowest, f"these rooms import each other: {', '.join(sorted(below))}"
+        below = {room: below[room] for room in below.keys() - lowest}

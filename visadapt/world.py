@@ -100,6 +100,12 @@ class World(nn.Module):
         """The parameters of all effects, in the order of the effects."""
         return [parameter for effect in self._named for parameter in effect.table]
 
+    @property
+    def values(self) -> Tensor:
+        """(P,) present values of the parameters in `table`, which must be scalars."""
+        values = [getattr(effect, parameter.name) for effect in self._named for parameter in effect.table]
+        return torch.stack(values) if values else torch.zeros(0)
+
     def with_values(self, values: Tensor) -> World:
         """The same world with other values of the parameters of its effects.
 

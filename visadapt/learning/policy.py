@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from visadapt.estimation.linearise import linearise_step
 from visadapt.history import HORIZON, History
 from visadapt.learning.streams import Streams, StreamSettings, StreamState, look
 from visadapt.learning.windows import Observe, Windows
@@ -60,11 +61,12 @@ def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None
 
     `scale` (n_state,) is the residual's, the unit of the corrections that the policy reads.
     """
-    rest = source.start(torch.zeros(1, policy.n_state).to(scale))
-    still = torch.zeros(1, policy.n_action).to(scale)
-    push = torch.autograd.functional.jacobian(lambda action: source.step(rest, action).state[0], still)[:, 0]
+    rest = torch.zeros(1, policy.n_state, dtype=torch.float64, device=scale.device)
+    still = rest.new_zeros(1, source.substeps, policy.n_action)
     with torch.no_grad():
-        policy.feedforward.weight.copy_(-torch.linalg.pinv(push / scale[:, None]).repeat(HORIZON, 1))
+        step = linearise_step(source, source.values.to(rest), rest[:, 0], rest, still, by_state=False, by_command=True)
+        undo = -torch.linalg.pinv(step.by_command[0] / scale.to(rest)[:, None])
+        policy.feedforward.weight.copy_(undo.repeat(HORIZON, 1))
 
 
 def tune(
