@@ -13,8 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks import tables_adaptation as adaptation
-from benchmarks import tables_diagnosis as diagnosis
+from benchmarks import tables_adaptation as adaptation, tables_diagnosis as diagnosis
 from benchmarks.all import COMMANDS
 from visadapt.effects.catalogue import catalogue_markdown
 from visadapt.evaluation.result_tables import read_rows

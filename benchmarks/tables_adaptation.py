@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from benchmarks.cartpole_pixels import EXPERIMENT as PIXELS
-from benchmarks.cartpole_pixels import OURS as FRAMES_ALONE
+from benchmarks.cartpole_pixels import EXPERIMENT as PIXELS, OURS as FRAMES_ALONE
 from benchmarks.cartpole_states import CONSTANT, OURS, SINE
 
 Rows = list[dict[str, str]]

@@ -1,8 +1,6 @@
 """Every public name is listed once and documented with an example, which is run here."""
 
-import ast
 import doctest
-import importlib
 import inspect
 import subprocess
 import sys
@@ -30,24 +28,13 @@ def test_the_example_of_every_public_name_runs(name):
         assert not report, "".join(report)
 
 
-def test_what_type_checkers_see_is_what_is_there():
-    tree = ast.parse(Path(va.__file__).read_text())
-    imports = [
-        node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module.startswith("visadapt")
-    ]
-    seen = {alias.name: node.module for node in imports for alias in node.names}
-    assert sorted(seen) == va.__all__
-    for name, module in seen.items():
-        assert getattr(va, name) is getattr(importlib.import_module(module), name, sys.modules.get(f"{module}.{name}"))
-
-
 def test_the_package_itself_imports_neither_torch_nor_numpy():
     code = "import sys, visadapt; sys.exit(bool({'torch', 'numpy'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
 
 
 def test_a_name_that_is_not_there_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="has no attribute 'adopt'"):
+    with pytest.raises(AttributeError, match="No visadapt attribute adopt"):
         va.adopt  # noqa: B018
 
 

@@ -33,8 +33,7 @@ from benchmarks.blind.baselines import BASELINES, FLYING
 from benchmarks.blind.flight_onestep import system_of
 from benchmarks.blind.scoring import Answer, Score, Truth, score
 from benchmarks.blind.tables import Row, confusion, label, read_table, tabulate, write_csv, write_table
-from datasets.blind import flights as blind_flights
-from datasets.blind import gaps as blind_gaps
+from datasets.blind import flights as blind_flights, gaps as blind_gaps
 from datasets.blind.kinds import Effects
 
 Kind = Literal["easy", "hard", "quadrotor", "fixed_wing"]

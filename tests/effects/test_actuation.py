@@ -2,8 +2,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from tests.effects.test_effects import build, from_table, inputs, world_of
 from tests.worlds import Mass, columns, run

@@ -6,8 +6,7 @@ import pkgutil
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import visadapt.effects
 from visadapt.effects import EFFECTS, ConstantForce, Effect, Role, Stage

@@ -15,8 +15,7 @@ from tests.flying import PERIOD, seeded, straight, waves
 from train.rotorpy_quadrotor import explain
 from visadapt.recordings import Episode
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY
-from visadapt.targets import TargetError
-from visadapt.targets import rotorpy as ours
+from visadapt.targets import TargetError, rotorpy as ours
 from visadapt.targets.rotorpy import SOURCE, Air, RotorpyTarget
 from visadapt.tasks.follow import Follow
 from visadapt.tasks.references import Reference

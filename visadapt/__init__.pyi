@@ -1,0 +1,42 @@
+from . import effects as effects
+from .diagnosis.diagnose import diagnose as diagnose
+from .diagnosis.result import Diagnosis as Diagnosis
+from .effects.base import (
+    ActuationEffect as ActuationEffect,
+    DynamicsEffect as DynamicsEffect,
+    Effect as Effect,
+    Parameter as Parameter,
+    SensingEffect as SensingEffect,
+)
+from .effects.catalogue import catalogue as catalogue
+from .effects.residual import Residual as Residual
+from .evaluation.scoring import score as score
+from .films.filming import film as film
+from .learning.joint import Adapted as Adapted
+from .policies.base import Policy as Policy
+from .recordings.episode import Episode as Episode
+from .recordings.hdf5 import read_recording as read_recording, write_recording as write_recording
+from .recordings.loading import load_recording as load_recording
+from .recordings.recording import Recording as Recording
+from .setups.base import Setup as Setup
+from .setups.policy_file import load_policy as load_policy, save_policy as save_policy
+from .setups.training import adapt as adapt, setup_for as setup_for, train as train
+from .systems.base import System as System, Variable as Variable
+from .systems.cartpole import CartPole as CartPole
+from .systems.fixed_wing import FixedWing as FixedWing
+from .systems.parameter_file import load_parameters as load_parameters
+from .systems.quadrotor import Quadrotor as Quadrotor
+from .targets.base import Observation as Observation, Target as Target
+from .targets.env_map import Entry as Entry, EnvMap as EnvMap
+from .targets.flight import FlightTarget as FlightTarget
+from .targets.gymnasium import GymnasiumTarget as GymnasiumTarget
+from .targets.rollout import run as run
+from .targets.synthetic import (
+    SyntheticTarget as SyntheticTarget,
+    constant_force as constant_force,
+    sine_force as sine_force,
+)
+from .tasks.base import Task as Task
+from .tasks.references import read_reference as read_reference
+from .weights import shipped as shipped
+from .world import World as World
