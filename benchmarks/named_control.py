@@ -22,7 +22,7 @@ from pathlib import Path
 import torch
 import tyro
 
-from visadapt.effects import ActuatorDelay, Effect, FrictionPatch, PeriodicForce, ViscousFriction
+from visadapt.effects import ActuatorDelay, Effect, PeriodicForce, Spring, ViscousFriction
 from visadapt.estimation.fit_states import neutral
 from visadapt.evaluation.cartpole_score import Evaluation, evaluate
 from visadapt.evaluation.result_tables import say, speed_row, write_rows
@@ -44,7 +44,7 @@ HIDDEN: dict[str, Callable[[], Effect]] = {
     "steady": lambda: ViscousFriction(coefficient=5.0),
     "in time": lambda: PeriodicForce(amplitude=2.0, frequency=0.5, phase=1.0, offset=1.0),
     "with memory": lambda: ActuatorDelay(delay=0.08),
-    "in space": lambda: FrictionPatch(start=-0.3, end=0.1, coefficient=15.0),
+    "in space": lambda: Spring(stiffness=8.0, rest=0.2),
 }
 """kind of effect: what is hidden"""
 

@@ -1,10 +1,21 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from tests.scenes import image_residual_network, observing, small_renderer, state_residual_network
-from visadapt.effects import ConstantForce, QuadraticDrag, Residual, ViscousFriction
-from visadapt.learning.grounding import GroundSettings, fit_named, gap, ground, left_over, rescale, split
+from visadapt.effects import AngleOffset, ConstantForce, QuadraticDrag, Residual, ViscousFriction
+from visadapt.learning.grounding import (
+    GroundSettings,
+    fit_named,
+    gap,
+    ground,
+    left_over,
+    rescale,
+    split,
+    with_true_states,
+)
 from visadapt.learning.windows import Windows
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import Episode
@@ -222,6 +233,21 @@ class TestNamed:
         (effect,) = self.fitted(QuadraticDrag(coefficient=0.5)).effects
         # The force pushes the carts along; a drag that did would be negative.
         assert effect.coefficient.item() == QuadraticDrag.table[0].low
+
+    def test_the_true_states_behind_a_biased_sensor_are_learnt_from_and_the_readings_are_shown(self):
+        true, bias = recorded(3), np.array([0.0, 0.0, 0.05, 0.0], np.float32)
+        windows = Windows.cut([replace(episode, state=episode.state + bias) for episode in true], "state")
+        source = World(CartPole(), [ConstantForce(force=0.0), AngleOffset(offset=0.0)])
+        found = fit_named(source, windows)
+        assert source.effects[0].force.item() == pytest.approx(NEWTONS, abs=0.01)
+        assert source.effects[1].offset.item() == pytest.approx(0.05, abs=1e-3)
+        assert gap(source, found).abs().max() < 1e-3
+        wanted = Windows.cut(true, "state")
+        torch.testing.assert_close(found.state, wanted.state, rtol=0, atol=1e-3)
+        torch.testing.assert_close(found.next_state, wanted.next_state, rtol=0, atol=1e-3)
+        assert torch.equal(found.observations, windows.observations)
+        # Found again from the parameters alone, as a run that goes on after an interruption does.
+        torch.testing.assert_close(with_true_states(source, windows).states, found.states, rtol=0, atol=1e-4)
 
     def test_a_source_without_effects_is_left_as_it_is(self):
         assert not list(self.fitted().parameters())
