@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import copy
 import multiprocessing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -24,27 +24,26 @@ import tyro
 
 from visadapt.effects import ActuatorDelay, Effect, PeriodicForce, Spring, ViscousFriction
 from visadapt.estimation.fit_states import neutral
-from visadapt.evaluation.cartpole_score import Evaluation, evaluate
-from visadapt.evaluation.result_tables import say, speed_row, write_rows
+from visadapt.evaluation import CartPoleScore, kept_score
+from visadapt.evaluation.result_tables import print_speed, speed_row, write_rows
 from visadapt.learning.grounding import fit_named
 from visadapt.learning.ledger import Ledger
-from visadapt.learning.policy import tune
+from visadapt.learning.policy import TuneSettings, tune
 from visadapt.learning.windows import Windows
-from visadapt.policies import StatePolicy
+from visadapt.policies import Policy
 from visadapt.recordings import Episode
-from visadapt.setups.cartpole_states import StateSettings, pretrain
-from visadapt.storage.run_folder import once, open_run
+from visadapt.setups.cartpole_states import SETTINGS, cartpole_states
+from visadapt.storage.run_folder import open_run
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget
-from visadapt.targets.rollout import run, see_states
+from visadapt.targets.rollout import run
 from visadapt.world import World
 
-SCORE_SEED = 2026
 HIDDEN: dict[str, Callable[[], Effect]] = {
     "steady": lambda: ViscousFriction(coefficient=5.0),
     "in time": lambda: PeriodicForce(amplitude=2.0, frequency=0.5, phase=1.0, offset=1.0),
     "with memory": lambda: ActuatorDelay(delay=0.08),
-    "in space": lambda: Spring(stiffness=8.0, rest=0.2),
+    "in space": lambda: Spring(stiffness=2.0, rest=0.2),
 }
 """kind of effect: what is hidden"""
 
@@ -85,66 +84,58 @@ def main(settings: Settings) -> None:
     write_rows(settings.out, rows)
     for row in rows:
         print(f"{row.experiment:50}", end="")
-        say(row)
+        print_speed(row)
 
 
-def _scores(settings: Settings, seed: int) -> dict[tuple[str, str], Evaluation]:
+def _scores(settings: Settings, seed: int) -> dict[tuple[str, str], CartPoleScore]:
     """Scores of one seed, by kind of effect and method."""
     torch.set_num_threads(1)
     folder = settings.work / f"seed-{seed}"
-    training = StateSettings(with_history=True)
-    training = replace(
-        training,
-        source=replace(training.source, iterations=settings.source_iterations),
-        adapted=replace(training.adapted, iterations=settings.iterations),
+    own = replace(
+        SETTINGS,
+        source=replace(SETTINGS.source, iterations=settings.source_iterations),
+        tuning=replace(SETTINGS.tuning, iterations=settings.iterations),
     )
-    about = {"seed": seed, "episodes": settings.episodes, "samples": settings.samples, **asdict(training)}
-    open_run(folder, {**about, "exploration": settings.exploration})
-    source = pretrain(World(CartPole()), training, folder / "policy.safetensors", seed)
+    setup = cartpole_states(with_history=True, settings=own)
+    numbers = {name: getattr(settings, name) for name in ("episodes", "samples", "exploration")}
+    open_run(folder, {"seed": seed, **numbers, **own.numbers()})
+    source = setup.pretrain(folder / "policy.safetensors", seed)
     scores = {}
     for kind, hidden in HIDDEN.items():
         effects = [hidden()]
         target = SyntheticTarget(lambda batch, generator, effects=effects: effects)  # type: ignore[misc]
         for method in (NONE, FOUND, TRUE):
-
-            def score(kind: str = kind, method: str = method, target: SyntheticTarget = target) -> dict[str, object]:
-                policy = source if method == NONE else _tuned(source, target, kind, method, training, settings, seed)
-                return asdict(evaluate(target, policy, see_states, SCORE_SEED, settings.episodes)[0])
-
             path = folder / f"score-{kind}-{method}.json".replace(" ", "-")
-            scores[kind, method] = Evaluation(**once(path, score))
+            policy = source
+            if method != NONE and not path.exists():
+                policy = _tuned(source, target, kind, method, own.tuning, settings, seed)
+            scores[kind, method] = kept_score(path, policy, target, settings.episodes)
     return scores
 
 
 def _tuned(
-    source: StatePolicy,
-    target: SyntheticTarget,
-    kind: str,
-    method: str,
-    training: StateSettings,
-    settings: Settings,
-    seed: int,
-) -> StatePolicy:
+    source: Policy, target: SyntheticTarget, kind: str, method: str, how: TuneSettings, settings: Settings, seed: int
+) -> Policy:
     """The source policy, tuned in a world with the effect as it was found, or as it is."""
-    episodes = _recorded(source, target, settings, seed)
-    windows = Windows.cut(episodes, "state")
+    windows = Windows.cut(_recorded(source, target, settings, seed), "state")
     effect = HIDDEN[kind]()
     if method == FOUND:
-        effect = type(effect)(**dict(zip((p.name for p in effect.table), neutral(type(effect)), strict=True)))
+        names = [parameter.name for parameter in effect.table]
+        effect = type(effect)(**dict(zip(names, neutral(type(effect)), strict=True)))
     world = World(CartPole(), [effect])
     if method == FOUND:
         fit_named(world, windows)
     policy = copy.deepcopy(source)
-    tune(policy, world, None, training.adapted, torch.Generator().manual_seed(seed), windows)
+    tune(policy, world, None, how, torch.Generator().manual_seed(seed), windows)
     return policy
 
 
-def _recorded(policy: StatePolicy, target: SyntheticTarget, settings: Settings, seed: int) -> Sequence[Episode]:
-    """Episodes of as many samples as there are to be, one after the other."""
+def _recorded(policy: Policy, target: SyntheticTarget, settings: Settings, seed: int) -> list[Episode]:
+    """Episodes of `settings.samples` samples in all, one after the other."""
     ledger, generator = Ledger(settings.samples), torch.Generator().manual_seed(1000 + seed)
-    episodes = []
+    episodes: list[Episode] = []
     while ledger.left:
-        episodes.append(run(target, policy, see_states, 1, ledger.left, generator, settings.exploration)[0].episode)
+        episodes.append(run(target, policy, 1, ledger.left, generator, settings.exploration)[0].episode)
         ledger.count("data", episodes[-1].samples)
     return episodes
 
