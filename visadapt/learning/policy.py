@@ -30,7 +30,7 @@ from visadapt.world import World, WorldState
 
 
 class DivergedError(RuntimeError):
-    """Training left the numbers: the message says where."""
+    """The loss is not finite; the message says at which iteration."""
 
 
 @dataclass(frozen=True)
@@ -44,14 +44,14 @@ class TuneSettings:
     longest: int = 150
     """steps after which a stream starts anew"""
     streams: int | None = None
-    """streams, where they are not the batch itself: every stream that they come to is kept, and each batch drawn from
-    all of these, so that much is learnt from few steps"""
+    """number of streams where that is not `batch`: the states that they pass through are then kept, and each batch is
+    drawn from all of them, so that few steps are simulated"""
     every: int = 1
-    """iterations for each step of the streams"""
+    """iterations between two steps of the streams"""
     curriculum: bool = True
-    """whether streams start and stray less far at first; not for a policy that does its task already"""
+    """whether streams start, and are kept, closer to the reference at first; not for a trained policy"""
     recorded: float = 0.0
-    """share of the starts that are recorded windows of the target, histories and all"""
+    """share of the starts that are recorded windows of the target, with their histories"""
     observation_noise: float = 0.01
     """standard deviation of white noise on what the policy sees"""
 
@@ -167,7 +167,7 @@ def train_or_load(
 
 @torch.no_grad()
 def _step(world: World, policy: Policy, stream: StreamState) -> tuple[WorldState, Tensor]:
-    """The world a step on under the policy, and what it did."""
+    """The world a step on under the policy, and the action."""
     action = policy.act(stream.history)
     return world.step(stream.at, action, stream.history), action
 

@@ -19,7 +19,7 @@ PROBE = 0.5
 
 @dataclass(frozen=True)
 class StreamState:
-    """Where streams are: all that imagining on from there needs."""
+    """The state of B streams: all that is needed to simulate on from here."""
 
     at: WorldState
     history: History
@@ -27,7 +27,7 @@ class StreamState:
     """(B, ...) the task's"""
 
     def where(self, keep: Tensor, other: StreamState) -> StreamState:
-        """This stream in the rows where `keep` (B,) holds, `other` in the rest."""
+        """These streams in the rows where `keep` (B,) holds, `other` in the rest."""
         rows = keep.reshape(-1, *[1] * (self.task_state.dim() - 1))
         task_state = torch.where(rows, self.task_state, other.task_state)
         return StreamState(self.at.where(keep, other.at), self.history.where(keep, other.history), task_state)
@@ -36,13 +36,13 @@ class StreamState:
         return StreamState(self.at[rows], self.history[rows], self.task_state[rows])
 
     def joined(self, other: StreamState) -> StreamState:
-        """This stream and, after it, another."""
+        """The rows of these streams and, after them, those of others."""
         return StreamState(
             self.at.joined(other.at), self.history.joined(other.history), torch.cat((self.task_state, other.task_state))
         )
 
     def tree(self) -> dict[str, Any]:
-        """All of it, to be kept in a file."""
+        """All of it as a tree of tensors, for a checkpoint."""
         return {
             "time": self.at.time,
             "state": self.at.state,
@@ -54,7 +54,7 @@ class StreamState:
 
     @classmethod
     def of(cls, tree: dict[str, Any]) -> Self:
-        """From what `tree` gave."""
+        """The inverse of `tree`."""
         at = WorldState(tree["time"], tree["state"], tuple(tree["memory"]))
         return cls(at, History(tree["observations"], tree["actions"]), tree["task_state"])
 
@@ -67,7 +67,7 @@ class StreamSettings:
     longest: int
     """steps after which a stream starts anew"""
     recorded: float
-    """share of the starts that are recorded windows of the target, histories and all"""
+    """share of the starts that are recorded windows of the target, with their histories"""
 
 
 class Streams:
@@ -133,7 +133,7 @@ class Streams:
         if windows is None or self._recorded is None:
             return fresh
         task_states = windows.task_state.to(task_state)
-        # A fall on record is beyond delta_div; starting from it would drown what can be learnt.
+        # Recorded falls are left out: a stream that starts beyond delta_div ends at once, at a cost that outweighs all.
         near = (~self.task.diverged(windows.state, task_states[:, -1], progress)).nonzero()[:, 0]
         if not len(near):
             return fresh
