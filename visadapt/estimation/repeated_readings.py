@@ -76,8 +76,12 @@ def zone(held: Tensor, angle: Tensor, deviation: float) -> tuple[float, float, f
     Maximum likelihood with a normal error of the angles, over the edges between the angles met.
     """
     inside = angle[held]
-    low = torch.linspace(float(inside.min()) - 3 * deviation, float(inside.median()), GRID, dtype=angle.dtype)
-    high = torch.linspace(float(inside.median()), float(inside.max()) + 3 * deviation, GRID, dtype=angle.dtype)
+    # An edge may lie anywhere between the last angle at which the reading was held and the next at which it was not.
+    least, most, middle = inside.min(), inside.max(), float(inside.median())
+    lower, higher = angle[~held & (angle < least)], angle[~held & (angle > most)]
+    first, last = lower.max() if len(lower) else least, higher.min() if len(higher) else most
+    low = torch.linspace(float(first) - 3 * deviation, middle, GRID, dtype=angle.dtype)
+    high = torch.linspace(middle, float(last) + 3 * deviation, GRID, dtype=angle.dtype)
     below = torch.special.ndtr((low[:, None] - angle) / deviation)
     above = torch.special.ndtr((angle - high[:, None]) / deviation)
     chance = (1 - below[:, None] - above[None]).clamp(1e-6, 1 - 1e-6)

@@ -1,28 +1,24 @@
 """Grounding: the residual learns what the source leaves out (equation 10).
 
-Where the source has effects of its own, their parameters are fitted first: an effect with a name leaves less to learn.
-What the residual's network has learnt to see beforehand stays as it is; its head is fitted to all samples so far: a
-linear one by ridge regression, an MLP by descent from where the last round left it.
+Where the source has effects of its own, their parameters are fitted first, so that less is left to the residual. The
+part of the residual's network that was trained beforehand is kept; its head is fitted to all samples so far: a linear
+one by ridge regression, an MLP by gradient descent from its weights of the last round.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from visadapt.effects import Effect, Parameter, Residual
+from visadapt.effects import Effect, Residual, SensingEffect
+from visadapt.estimation.effect_fit import EffectFit, fit_effects
 from visadapt.learning.windows import Windows
 from visadapt.policies.networks import ResidualNetwork
 from visadapt.progress import Progress
 from visadapt.world import World
-
-NAMED_STEPS = 8
-NUDGE = 1e-3
-"""Iterations of the fit of named effects, and its finite difference as a share of a parameter's range."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +28,7 @@ class GroundSettings:
     ridge: float = 10.0
     """weight of the squared coefficients of a linear head, in samples"""
     negligible: float = 0.0
-    """share of a state's change in a period below which a gap is not heard as loudly as others"""
+    """smallest unit of a gap, as a share of the root mean square by which a state changes in a period"""
     steps: int = 2000
     """optimisation steps at most"""
     batch: int = 64
@@ -68,52 +64,55 @@ def left_over(residual: Residual, source: World, windows: Windows) -> Tensor:
         return gap(source, windows) - residual.delta(windows.history(every).acting(windows.action))
 
 
-def fit_named(source: World, windows: Windows) -> None:
-    """Fit the parameters of the source's own effects to all windows so far, in place: least squares of one step.
+def fit_named(source: World, windows: Windows) -> Windows:
+    """Fit the parameters of the source's own effects to all episodes so far, in place, within their ranges.
 
-    Errors count in units of what the source leaves out without them, state by state; parameters stay within the ranges
-    that their effects state.
+    By maximum likelihood over whole episodes (`estimation.effect_fit`). Returns the windows with true states.
     """
     named = [effect for effect in source.effects if isinstance(effect, Effect)]
-    parameters = [(effect, each) for effect in named for each in effect.table]
-    if not parameters:
-        return
-    bare = World(source.system, (), source.period, source.integrator, source.substeps)
-    unit = gap(bare, windows).square().mean(0).sqrt().clamp(min=1e-9)
-    values = [getattr(effect, each.name) for effect, each in parameters]
-    # The problem is small and nearly linear: full steps of Gauss and Newton's method, from wherever it stands.
-    for _ in range(NAMED_STEPS):
-        left, slopes = _one_step_errors(source, windows, parameters, unit)
-        step = torch.linalg.lstsq(slopes, -left[:, None]).solution[:, 0]
-        with torch.no_grad():
-            for value, change, (_, each) in zip(values, step, parameters, strict=True):
-                value.copy_((value + change * (each.high - each.low)).clamp(each.low, each.high))
+    if not named:
+        return windows
+    fit = _fit(source, windows)
+    for effect in named:
+        for parameter, value in zip(effect.table, fit.values[type(effect)].tolist(), strict=True):
+            getattr(effect, parameter.name).data.fill_(min(max(value, parameter.low), parameter.high))
+    return _with_true_states(source, windows, fit)
 
 
-def _one_step_errors(
-    source: World, windows: Windows, parameters: Sequence[tuple[Effect, Parameter]], unit: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Errors (N n_state,), and how they change with each parameter as a share of its range, (N n_state, P)."""
-    left = -(gap(source, windows) / unit).flatten()
-    slopes = []
-    for effect, each in parameters:
-        value, span = getattr(effect, each.name), each.high - each.low
-        with torch.no_grad():
-            kept = value.clone()
-            # Inwards, so that no parameter leaves its range.
-            nudge = -NUDGE if float(kept) + NUDGE * span > each.high else NUDGE
-            value.add_(nudge * span)
-            moved = -(gap(source, windows) / unit).flatten()
-            value.copy_(kept)
-        slopes.append((moved - left) / nudge)
-    return left, torch.stack(slopes, 1)
+def with_true_states(source: World, windows: Windows) -> Windows:
+    """The windows with smoothed true states in place of those recorded, where the source has sensing effects.
+
+    The residual corrects true states, and streams start from them; what policies see stays as recorded.
+    """
+    return _with_true_states(source, windows, _fit(source, windows)) if _senses(source) else windows
+
+
+def _fit(source: World, windows: Windows) -> EffectFit:
+    lengths = (windows.episode.bincount(minlength=len(windows.states)) + 1).tolist()
+    measured = [states[:length] for states, length in zip(windows.states, lengths, strict=True)]
+    commands = [given[:length] for given, length in zip(windows.commands, lengths, strict=True)]
+    named = [effect for effect in source.effects if isinstance(effect, Effect)]
+    return fit_effects(source.system, named, measured, commands, source.period)
+
+
+def _with_true_states(source: World, windows: Windows, fit: EffectFit) -> Windows:
+    if not _senses(source):
+        return windows
+    states = windows.states.clone()
+    for own, found in zip(states, fit.states, strict=True):
+        own[: len(found)], own[len(found) :] = found.to(own), found[-1].to(own)
+    return windows.with_states(states)
+
+
+def _senses(source: World) -> bool:
+    return any(isinstance(effect, SensingEffect) for effect in source.effects)
 
 
 def rescale(residual: Residual, source: World, windows: Windows, negligible: float = 0.0) -> None:
     """Make the root mean square of the gap, state by state, the unit of the residual's corrections.
 
-    A gap that is less than the share `negligible` of what a state changes by in a period, that of integrators and
-    rounding say, has that share for its unit: in units of its own it would be heard as loudly as the others.
+    The unit is at least `negligible` times the root mean square by which the state changes in a period: gaps that come
+    from rounding or from the integrator must not weigh as much as real ones.
     """
     missing = gap(source, windows).square().mean(0).sqrt()
     change = (windows.next_state - windows.state).square().mean(0).sqrt()
@@ -210,7 +209,7 @@ def _embed(network: ResidualNetwork, windows: Windows) -> Tensor:
 
 
 def split(count: int, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Rows to train on and rows held out: stretches of 10 samples, since neighbours know each other."""
+    """Rows to train on and rows held out: stretches of 10 samples, since neighbouring ones are correlated."""
     stretches = torch.arange(count).split(10)
     order = torch.randperm(len(stretches), generator=generator)
     held = max(1, round(share * len(stretches)))

@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 from visadapt.effects import Residual
-from visadapt.learning.grounding import GroundLoss, GroundSettings, fit_named, ground, rescale
+from visadapt.learning.grounding import GroundLoss, GroundSettings, fit_named, ground, rescale, with_true_states
 from visadapt.learning.ledger import Ledger
 from visadapt.learning.policy import TuneSettings, initialise_feedforward, tune
 from visadapt.learning.windows import Observe, Windows
@@ -152,12 +152,13 @@ def adapt(
         windows = Windows.cut(episodes, settings.observations, observe)
 
         def fit(progress: Progress | None, windows: Windows = windows, number: int = number) -> list[GroundLoss]:
-            fit_named(source, windows)
+            windows = fit_named(source, windows)
             if number == 0:
                 rescale(residual, source, windows, settings.ground.negligible)
             return ground(residual, source, windows, settings.ground, _generator(settings, number, 1), progress)
 
         grounding = _grounded(here / "residual.safetensors", fit, grounded, staged(report, f"{name}: ground"))
+        windows = with_true_states(source, windows)
         if number == 0 and settings.feedforward:
             initialise_feedforward(policy, source, residual.scale)
         losses = _tuned(here, policy, grounded, observe, settings, windows, number, staged(report, f"{name}: tune"))

@@ -31,6 +31,10 @@ class Windows:
 
     observations: Tensor
     """(R, ...): uint8 frames, or states"""
+    commands: Tensor
+    """(E, T, n_action) of whole episodes, from their begin; zero after their end"""
+    states: Tensor
+    """(E, T, n_state) of whole episodes; after their end the last state repeats"""
     rows: Tensor
     """(N, LENGTH) rows of `observations`"""
     past_actions: Tensor
@@ -49,10 +53,6 @@ class Windows:
     """(N,) s from the begin of the episode to s_t"""
     row: Tensor
     """(N,) row of s_t in its episode"""
-    commands: Tensor
-    """(E, T, n_action) of whole episodes, from their begin; zero after their end"""
-    states: Tensor
-    """(E, T, n_state) of whole episodes; after their end the last state repeats"""
 
     @classmethod
     def cut(cls, episodes: Sequence[Episode], source: str, observe: Observe | None = None) -> Windows:
@@ -101,7 +101,7 @@ class Windows:
         if not parts or not sum(len(part[0]) for part in parts):
             raise ValueError("the recording holds no sample: every episode has a single row")
         joined = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
-        return cls(torch.cat(observations), *joined, torch.stack(commands), torch.stack(states))
+        return cls(torch.cat(observations), torch.stack(commands), torch.stack(states), *joined)
 
     def __len__(self) -> int:
         return len(self.rows)

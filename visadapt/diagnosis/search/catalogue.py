@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import torch
-
-from visadapt.effects import Effect, SensingEffect
+from visadapt.effects import Effect
 from visadapt.effects.catalogue import twins
+from visadapt.estimation.effect_fit import remembers
 from visadapt.systems import System
 
 
@@ -15,13 +14,6 @@ def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effec
     """Those that are fitted: the first of each group of twins, and no sensor with a memory."""
     out: list[type[Effect]] = []
     for effect in effects:
-        if not (twins(effect, out, system) or effect.repeats_readings or _remembers(effect)):
+        if not (twins(effect, out, system) or effect.repeats_readings or remembers(effect)):
             out.append(effect)
     return out
-
-
-def _remembers(effect: type[Effect]) -> bool:
-    if not issubclass(effect, SensingEffect):
-        return False
-    neutral = effect(**{p.name: p.low if p.neutral is None else p.neutral for p in effect.table})
-    return neutral.memory(torch.zeros(1, 4), 1.0).numel() > 0

@@ -1,0 +1,220 @@
+"""Maximum likelihood of the parameters of given effects, from whole episodes whose states are known with noise.
+
+What a diagnosis computes for one set of effects, without its search. Effects that the likelihood does not hold:
+
+- a sensor with a memory is fitted as the effect that passive data cannot tell from it (measurement_delay as
+  actuator_delay, of the same delay);
+- dropout and frozen_zone are read off readings that repeat, which the fit leaves out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from visadapt.effects import EFFECTS, Dropout, Effect, FrozenZone, MeasurementDelay, Role, SensingEffect
+from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.fit_states import (
+    CAREFUL,
+    QUICK,
+    Effects,
+    extended,
+    first_fits,
+    joined,
+    neutral,
+    only,
+    posterior,
+)
+from visadapt.estimation.likelihood import FitState, fit
+from visadapt.estimation.profiles import profile_of
+from visadapt.estimation.repeated_readings import Holds, find_holds, zone
+from visadapt.estimation.screening import screen
+from visadapt.estimation.segments import Segments, cut
+from visadapt.systems import System
+from visadapt.world import World
+
+SMOOTHED = 1 / 3
+"""Standard deviation of a smoothed angle, in standard deviations of a measured one."""
+
+
+@dataclass(frozen=True)
+class EffectFit:
+    """Effects fitted to episodes."""
+
+    values: dict[type[Effect], Tensor]
+    """(P,) parameters of each effect, in the order of its table"""
+    covariance: dict[type[Effect], Tensor]
+    """(P, P) of each effect's parameters"""
+    states: list[Tensor]
+    """(T, n_state) of each episode: the true states, smoothed"""
+
+
+@torch.no_grad()
+def fit_effects(
+    system: System,
+    effects: Sequence[Effect],
+    measured: Sequence[Tensor],
+    commands: Sequence[Tensor],
+    period: float,
+) -> EffectFit:
+    """Fit the parameters of `effects`, all together, within the ranges that they state.
+
+    Args:
+        system: the source.
+        effects: at most one of each class; their present values are one of two starting points.
+        measured: (T, n_state) of each episode, what sensors read.
+        commands: (T, n_action) of each episode.
+        period: s between rows.
+
+    Raises:
+        ValueError: an effect that can be neither fitted nor read off, or two effects that stand for each other.
+    """
+    kinds = [type(effect) for effect in effects]
+    fitted_as = {kind: stand_in(kind) for kind in kinds if not kind.repeats_readings}
+    fitted = tuple(dict.fromkeys(fitted_as.values()))
+    if len(fitted) < len(fitted_as) or len(set(kinds)) < len(kinds):
+        raise ValueError(
+            f"passive data cannot tell apart some of the effects {', '.join(kind.name for kind in kinds)}: "
+            "leave out those that do the same as another"
+        )
+    columns, first = {}, 0
+    for kind in fitted_as:
+        columns[kind] = slice(first, first + len(kind.table))
+        first += len(kind.table)
+    measured = [values.double() for values in measured]
+    commands = [values.double() for values in commands]
+    profile = profile_of(system)
+    channels = tuple(range(len(system.states)))
+    holds = find_holds(measured, channels, profile.held)
+    rows = cut(measured, holds.used, commands, channels, period, profile.window)
+    present = [float(getattr(effect, p.name)) for effect in effects if type(effect) in fitted_as for p in effect.table]
+    found = _fitted(system, fitted, rows, present)
+    if MeasurementDelay in fitted_as:
+        # Until the first reading of the episode arrives, its first state is read, whatever the motion.
+        arrived = rows.time >= found.theta[0, columns[MeasurementDelay]]
+        rows = replace(rows, used=rows.used * arrived[..., None])
+        found = _best(system, fitted, [found], rows, QUICK)
+    covariance = torch.linalg.inv(posterior(fitted, found)[1]) if fitted else torch.zeros(0, 0)
+    states = _by_episode(rows, found.state[0], measured)
+    values = {kind: _within_a_turn(kind, found.theta[0, own]) for kind, own in columns.items()}
+    spreads = {kind: covariance[own, own] for kind, own in columns.items()}
+    if Dropout in kinds:
+        values[Dropout], spreads[Dropout] = _lost(holds)
+    if FrozenZone in kinds:
+        values[FrozenZone], spreads[FrozenZone] = _frozen(holds, states, found, profile.held[0])
+    if MeasurementDelay in fitted_as:
+        world = CandidateModel(system, fitted, rows).at(found.theta[0])
+        delay = float(values[MeasurementDelay][0])
+        states = [_on_time(world, delay, state, command) for state, command in zip(states, commands, strict=True)]
+    return EffectFit(values, spreads, states)
+
+
+def stand_in(effect: type[Effect]) -> type[Effect]:
+    """The effect that is fitted in the place of one: itself, or its twin where the likelihood does not hold it.
+
+    Raises:
+        ValueError: the likelihood does not hold it, and it has no twin with the same parameters.
+    """
+    if not remembers(effect):
+        return effect
+    for name in effect.indistinguishable_from:
+        if [(p.name, p.unit) for p in EFFECTS[name].table] == [(p.name, p.unit) for p in effect.table]:
+            return EFFECTS[name]
+    raise ValueError(f"{effect.name} cannot be fitted: what it measures depends on earlier rows")
+
+
+def remembers(effect: type[Effect]) -> bool:
+    """Whether it is a sensor whose reading depends on earlier rows."""
+    if not issubclass(effect, SensingEffect):
+        return False
+    return effect(**dict.fromkeys((p.name for p in effect.table), 0.0)).memory(torch.zeros(1, 4), 1.0).numel() > 0
+
+
+def _fitted(system: System, effects: Effects, rows: Segments, present: Sequence[float]) -> FitState:
+    """The likelier fit from two starts: effects added one by one, the most promising first; and `present`."""
+    chosen: Effects = ()
+    base = first_fits(system, rows)
+    for _ in effects:
+        base = _best(system, chosen, [base], rows, QUICK)
+        rest = [effect for effect in effects if effect not in chosen]
+        leads = screen(system, chosen, base, rows, rest)
+        effect, values = (leads[0].effect, leads[0].values) if leads else (rest[0], neutral(rest[0]))
+        chosen, base = (*chosen, effect), extended(base, values)
+    column = {p: k for k, p in enumerate((effect, p.name) for effect in chosen for p in effect.table)}
+    order = [column[effect, p.name] for effect in effects for p in effect.table]
+    starts = [replace(base, theta=base.theta[:, order])]
+    if list(present) != [value for effect in effects for value in neutral(effect)]:
+        starts.append(replace(base, theta=torch.tensor([list(present)], dtype=torch.float64)))
+    return _best(system, effects, starts, rows, CAREFUL)
+
+
+def _best(
+    system: System, effects: Effects, starts: Sequence[FitState], rows: Segments, effort: tuple[int, int]
+) -> FitState:
+    """The likeliest fit of one set of effects from several starts."""
+    iterations, care = effort
+    models = [CandidateModel(system, effects, rows, care) for _ in starts]
+    out = fit(models, joined(starts), torch.ones(len(starts), rows.shape[0], dtype=torch.float64), iterations)
+    return only(out, int(out.likelihood.argmax()), len(models[0].table))
+
+
+def _within_a_turn(effect: type[Effect], values: Tensor) -> Tensor:
+    """The parameters (P,) with phases between -pi and pi: during a fit they may go further."""
+    turns = torch.tensor([float(p.role is Role.PHASE) for p in effect.table]) * (values / (2 * math.pi)).round()
+    return values - 2 * math.pi * turns
+
+
+def _by_episode(rows: Segments, state: Tensor, measured: Sequence[Tensor]) -> list[Tensor]:
+    """States (W, T, n) of windows, which cover the episodes, put together: (T, n) of each episode."""
+    out = [torch.empty_like(values) for values in measured]
+    lengths = rows.inside.sum(1).long().tolist()
+    for window, (episode, first) in enumerate(zip(rows.episode.tolist(), rows.first.tolist(), strict=True)):
+        out[episode][first : first + lengths[window]] = state[window, : lengths[window]]
+    return out
+
+
+def _lost(holds: Holds) -> tuple[Tensor, Tensor]:
+    """The rate at which rows are lost, (1,), and its variance, (1, 1): Bayes' with a uniform prior."""
+    lost, rows = sum(int(x.sum()) for x in holds.lost), sum(len(x) - 1 for x in holds.lost)
+    variance = (lost + 1) * (rows - lost + 1) / ((rows + 2) ** 2 * (rows + 3))
+    return torch.tensor([lost / max(1, rows)]).double(), torch.tensor([[variance]]).double()
+
+
+def _frozen(holds: Holds, states: Sequence[Tensor], found: FitState, angle: int) -> tuple[Tensor, Tensor]:
+    """Start and end (2,) of the angles at which the sensor stands still, and their covariance (2, 2)."""
+    # A first reading has none before it to repeat.
+    held = torch.cat([frozen[1:] for frozen in holds.frozen])
+    if not bool(held.any()):
+        width = torch.tensor([p.high - p.low for p in FrozenZone.table], dtype=torch.float64)
+        return torch.tensor(neutral(FrozenZone), dtype=torch.float64), torch.diag(width.square() / 12)
+    noise = SMOOTHED * float((found.log_noise[0, angle] / 2).exp())
+    start, end, deviation = zone(held, torch.cat([state[1:, angle] for state in states]), noise)
+    return torch.tensor([start, end], dtype=torch.float64), deviation**2 * torch.eye(2, dtype=torch.float64)
+
+
+def _on_time(world: World, delay: float, late: Tensor, commands: Tensor) -> Tensor:
+    """The states (T, n) of an episode whose measurements are `delay` s late.
+
+    Args:
+        world: where commands act `delay` s late instead: there the states are `late` (T, n).
+        commands: (T, n_action).
+    """
+    period = world.period
+    count = math.ceil(delay / period)
+    time = period * torch.tensor([len(late) - 1], dtype=late.dtype)
+    at = world.start(late[-1:], time, commands[None], late[None])
+    rows = [late]
+    for _ in range(count):
+        at = world.step(at, torch.zeros_like(commands[:1]))
+        rows.append(at.state)
+    # As late as needed for the delay to be a whole number of rows in all; these rows are then left out.
+    sensor = MeasurementDelay(delay=max(0.0, count * period - delay))
+    memory, out = sensor.memory(late[:1], period), []
+    for row in torch.cat(rows):
+        seen, memory = sensor.apply_to(row[None], memory, period, None)
+        out.append(seen)
+    return torch.cat(out[count:])
