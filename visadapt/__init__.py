@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from visadapt.recordings.recording import Recording as Recording
     from visadapt.setups.base import Setup as Setup
     from visadapt.setups.policy_file import load_policy as load_policy
+    from visadapt.setups.policy_file import load_source as load_source
     from visadapt.setups.policy_file import save_policy as save_policy
     from visadapt.setups.training import adapt as adapt
     from visadapt.setups.training import setup_for as setup_for
@@ -86,7 +87,7 @@ _MODULES = {
     "recordings.loading": "load_recording",
     "recordings.recording": "Recording",
     "setups.base": "Setup",
-    "setups.policy_file": "load_policy save_policy",
+    "setups.policy_file": "load_policy load_source save_policy",
     "setups.training": "adapt setup_for train",
     "systems.base": "System Variable",
     "systems.cartpole": "CartPole",
