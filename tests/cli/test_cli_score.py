@@ -84,7 +84,7 @@ def test_policies_that_it_refuses(here, trained, capsys):
         return refused(capsys, *score("--policy", policy, "--target", target))
 
     assert "none.safetensors: there is no such checkpoint" in line("none.safetensors", "rig:states")
-    assert "rig.py: not a whole safetensors file" in line("rig.py", "rig:states")
+    assert "rig.py: not a complete safetensors file" in line("rig.py", "rig:states")
     assert "renderer.safetensors: a safetensors file, but not one" in line(va.shipped("renderer"), "rig:states")
     assert "the target has none: give it a camera" in line(trained / "frames.safetensors", "rig:states")
     assert "shows frames of 60 x 50 px" in line(trained / "frames.safetensors", "rig:larger")

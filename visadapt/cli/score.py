@@ -37,7 +37,7 @@ def add(commands: Any) -> None:
 def run(options: argparse.Namespace) -> None:
     """Score, print, write what was asked for."""
     from visadapt.evaluation import score
-    from visadapt.films.film import film
+    from visadapt.films.filming import film
     from visadapt.storage.run_folder import versions, write_json
 
     import_given(options)

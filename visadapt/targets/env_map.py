@@ -48,8 +48,8 @@ class Entry:
 class EnvMap:
     """The map of an environment.
 
-    A TOML file has the same names: `actions`, `period`, `crop`, `contrast`, `width`, `height` at its top, and below them
-    the tables `[states]` (`x = { index = 0 }`), `[limits]`, `[start]` and `[options]`.
+    A TOML file has the same names: `actions`, `period`, `crop`, `contrast`, `width`, `height` at its top, and below
+    them the tables `[states]` (`x = { index = 0 }`), `[limits]`, `[start]` and `[options]`.
 
     >>> import visadapt as va
     >>> states = {"x": va.Entry(0), "theta": va.Entry(1), "x_dot": va.Entry(2), "theta_dot": va.Entry(3)}
