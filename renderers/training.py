@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,6 +12,9 @@ from renderers.learnt import LayeredRenderer, MLPRenderer
 
 Progress = Callable[[int, int, float], None]
 """Called with (steps done, steps in total, loss)."""
+
+KEEP_EVERY = 100
+"""Steps between two states of an interruptible training."""
 
 
 def fit(
@@ -22,6 +26,8 @@ def fit(
     generator: torch.Generator,
     batch: int = 32,
     progress: Progress | None = None,
+    keep: Callable[[dict[str, Any]], None] | None = None,
+    kept: dict[str, Any] | None = None,
 ) -> None:
     """Minimise the mean squared error of the renderer's frames, in place, by Adam under a one-cycle learning rate.
 
@@ -33,6 +39,8 @@ def fit(
         generator: draws the batches.
         batch: frames in a step.
         progress: called after each step.
+        keep: called with the state of the training, plain values and tensors, every `KEEP_EVERY` steps.
+        kept: such a state, from which an interrupted training continues to the same renderer.
 
     Raises:
         ValueError: fewer than 3 steps.
@@ -51,7 +59,13 @@ def fit(
     # Fused, since the optimiser would take most of a step of the MLP, whose last layer has 3 million weights.
     optimiser = torch.optim.Adam(groups, fused=True)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rates, total_steps=steps, pct_start=max(0.2, 2 / steps))
-    for step in range(steps):
+    begun = 0
+    if kept is not None:
+        begun = kept["step"]
+        for part, state in ((renderer, "renderer"), (optimiser, "optimiser"), (schedule, "schedule")):
+            part.load_state_dict(kept[state])
+        generator.set_state(kept["generator"])
+    for step in range(begun, steps):
         rows = torch.randint(len(frames), (batch,), generator=generator)
         loss = (renderer(x[rows], theta[rows]) - frames[rows].to(x) / 255).square().mean()
         optimiser.zero_grad()
@@ -60,3 +74,7 @@ def fit(
         schedule.step()
         if progress is not None:
             progress(step + 1, steps, float(loss.detach()))
+        if keep is not None and (step + 1) % KEEP_EVERY == 0:
+            parts = {"renderer": renderer, "optimiser": optimiser, "schedule": schedule}
+            states = {name: part.state_dict() for name, part in parts.items()}
+            keep({"step": step + 1, "generator": generator.get_state(), **states})

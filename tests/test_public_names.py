@@ -50,7 +50,7 @@ def test_from_a_diagnosis_to_a_better_policy(tmp_path):
     found = va.diagnose(va.load_recording(tmp_path / "run.h5", source.system), source, [va.effects.ConstantForce])
     assert "constant_force" in str(found)
     world = va.World(source.system, found.effects())
-    assert world.effects[0].force.item() == pytest.approx(2.0, abs=0.1)
+    assert next(world.effects[0].parameters()).item() == pytest.approx(2.0, abs=0.1)
     tuned = va.adapt(policy, world, iterations=60)
     before, after = (va.score(each, target, episodes=10, steps=60).mean_speed for each in (policy, tuned))
     assert after < 0.7 * before

@@ -19,7 +19,7 @@ from .recordings.hdf5 import read_recording as read_recording, write_recording a
 from .recordings.loading import load_recording as load_recording
 from .recordings.recording import Recording as Recording
 from .setups.base import Setup as Setup
-from .setups.policy_file import load_policy as load_policy, save_policy as save_policy
+from .setups.policy_file import load_policy as load_policy, load_source as load_source, save_policy as save_policy
 from .setups.training import adapt as adapt, setup_for as setup_for, train as train
 from .systems.base import System as System, Variable as Variable
 from .systems.cartpole import CartPole as CartPole

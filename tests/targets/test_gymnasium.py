@@ -67,7 +67,7 @@ def generator(seed=0):
 def test_maps_states_actions_and_frames():
     toy = target(dataclasses.replace(MAP, contrast=(0.0, 20.0)))
     start = toy.reset(2, generator())
-    assert toy.period == 0.05
+    assert (toy.period, toy.period_origin[:15]) == (0.05, "render_fps = 20")
     assert start.frame.shape == (2, 100, 120)
     assert start.frame.dtype == torch.uint8
     assert (start.frame == 128).all()  # 10 of 20, rounded to even
@@ -110,6 +110,7 @@ def test_an_environment_that_does_not_do_is_one_clear_line(toy, says):
         ({"actions": (Entry(0), Entry(1))}, "has 2 actions, cartpole has 1"),
         ({"states": {"x": Entry(0)}}, "ours are x, x_dot, theta, theta_dot"),
         ({"limits": {"height": 1.0}}, "limits 'height'"),
+        ({"start": {"height": 1.0}}, "starts 'height'"),
     ],
 )
 def test_a_map_that_does_not_fit_the_environment(change, says):
@@ -121,7 +122,13 @@ def test_a_map_that_does_not_fit_the_environment(change, says):
     ("change", "says"),
     [
         ({"crop": (10, 0, 10, 100)}, "holds no pixel"),
-        ({"crop": (0, 0, 100, 100)}, "100 x 100 px, 1.000 wide for 1 high; frames of 120 x 100 px need 1.200"),
+        (
+            {"crop": (0, 0, 100, 100), "width": 120},
+            "100 x 100 px, 1.000 wide for 1 high; frames of 120 x 100 px need 1.200",
+        ),
+        ({"crop": (0, 0, 100)}, "crop must be left, top, right, bottom"),
+        ({"start": {"x": 0.0}}, "start: x must be positive, got 0.0"),
+        ({"period": -0.05}, "period must be a positive number of seconds, got -0.05"),
         ({"contrast": (5.0, 5.0)}, "two rising grey levels"),
         ({"limits": {"x": -1.0}}, "x must be positive"),
         ({"actions": ()}, "actions is empty"),
@@ -152,8 +159,9 @@ def test_a_map_can_be_a_toml_file(tmp_path):
     path.write_text(TOML)
     assert EnvMap.load(path) == MAP
     for old, new, says in (
-        ("crop", "clip", "unknown key 'clip'; there are states, actions, crop"),
-        ("crop = [0, 0, 120, 100]", "", "'crop' is missing"),
+        ("crop", "clip", "unknown key 'clip'; there are states, actions, period, crop"),
+        ("actions = [{ index = 1, scale = -2.0 }]", "", "'actions' is missing"),
+        ("crop =", "period = 0\ncrop =", "period must be a positive number"),
         ("index = 3", "index = -3", "index must be a whole number from 0 on, got -3"),
         ("index = 3", "column = 3", "unexpected keyword argument 'column'"),
         ("crop = [0, 0", 'crop = ["left", 0', "crop must be left, top, right, bottom in whole px"),
@@ -163,6 +171,85 @@ def test_a_map_can_be_a_toml_file(tmp_path):
         with pytest.raises(TargetError, match=r"rig\.toml: ") as error:
             EnvMap.load(path)
         assert says in str(error.value)
+
+
+def test_a_crop_of_any_shape_and_none():
+    for crop, height, shape in (((0, 0, 60, 90), 30, (30, 20)), (None, 50, (50, 60))):
+        toy = target(dataclasses.replace(MAP, crop=crop, height=height))
+        assert toy.reset(1, generator()).frame.shape == (1, *shape)
+
+
+class Clocked(Toy):
+    """A toy that says how long its step is."""
+
+    tau = 0.02
+
+
+def clocked(period=None):
+    return GymnasiumTarget(Clocked, dataclasses.replace(MAP, period=period), name="toy")
+
+
+def test_a_period_comes_from_the_map_or_the_environment_s_own_clock_or_with_a_warning_from_its_films(recwarn):
+    assert (clocked().period, clocked().period_origin) == (0.02, "its tau")
+    assert (clocked(0.04).period, clocked(0.04).period_origin) == (0.04, "as given")
+    assert not recwarn
+    with pytest.raises(TargetError, match=r"its tau says 0.02 s a step, so that the period given, 0.05 s, is no whole"):
+        clocked(0.05)
+    with pytest.raises(TargetError, match=r"the period given, 0\.002 s"):
+        clocked(0.002)
+    with pytest.warns(UserWarning, match=r"toy: the period, 0.05 s, is taken from render_fps = 20"):
+        target()
+
+
+class Kept(Toy):
+    """A toy that keeps what it observes as its state, as gymnasium's classic control does."""
+
+    def reset(self, seed=None, options=None):
+        self.state, nothing = super().reset(seed, options)
+        return self.state.copy(), nothing
+
+    def step(self, action):
+        self.seen = np.array(self.state)
+        self.state, *rest = super().step(action)
+        return self.state.copy(), *rest
+
+    def render(self):
+        return np.full(self.size, round(100 * abs(self.state[0])), np.uint8)
+
+
+def test_an_environment_that_keeps_its_observation_as_its_state_shows_and_starts_in_any():
+    mapping = dataclasses.replace(MAP, start={"x": 0.5, "theta": 0.2}, contrast=(0.0, 255.0))
+    toy = GymnasiumTarget(Kept, mapping, name="kept")
+    frames = toy.show(np.array([[0.3, 0, 0, 0], [0.7, 0, 0.1, 0]]))
+    assert [int(frame.max()) for frame in frames] == [30, 70]
+    start = toy.reset(64, generator()).state
+    assert 0.4 < start[:, 0].abs().max() <= 0.5
+    assert 0.15 < start[:, 2].abs().max() <= 0.2
+    assert (start[:, [1, 3]] == 0).all()
+    after = toy.step(torch.full((64, 1), 0.1)).state
+    torch.testing.assert_close(after[:, 0], start[:, 0] - 0.2)
+
+
+def test_one_that_does_not_keep_it_says_so():
+    with pytest.raises(TargetError, match="toy: cannot be put into a state"):
+        target().show(np.zeros((1, 4)))
+
+
+def test_gymnasium_s_own_cart_pole_starts_where_it_is_put():
+    def make():
+        return gymnasium.wrappers.TransformAction(
+            gymnasium.make("CartPole-v1", max_episode_steps=-1),
+            lambda action: int(action[0] > 0),
+            gymnasium.spaces.Box(-1, 1, (1,)),
+        )
+
+    mapping = EnvMap({name: Entry(i) for i, name in enumerate(("x", "x_dot", "theta", "theta_dot"))}, (Entry(0),))
+    start = dataclasses.replace(mapping, start={"x": 1.0, "x_dot": 0.5, "theta": 0.1, "theta_dot": 0.2})
+    target = GymnasiumTarget(make, start, frames=False)
+    before = target.reset(32, generator()).state
+    assert before[:, 0].abs().max() > 0.9
+    after = target.step(torch.ones(32, 1)).state
+    torch.testing.assert_close(after[:, 0], before[:, 0] + target.period * before[:, 1])
 
 
 def test_discrete_actions():

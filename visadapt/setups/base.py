@@ -94,7 +94,7 @@ class Setup:
         if self.prepare is not None and not path.exists():
             self.prepare(policy, path.parent, seed, report)
         settings, name = self.settings.source, self.source.system.name
-        about = {"arguments": policy.arguments, "seed": seed, **_numbers(settings)}
+        about = {"arguments": policy.arguments, "source": describe(self.source), "seed": seed, **_numbers(settings)}
         # Preparing draws from a generator of the seed itself.
         generator = torch.Generator().manual_seed(seed if self.prepare is None else seed + 1)
         progress = staged(report, f"{name}: source policy")

@@ -52,12 +52,8 @@ def load_policy(path: str | Path) -> Policy:
     (4, 1, 'state')
     """
     path = Path(path)
-    tree = load_tree(path)
-    if not isinstance(tree, dict) or not {"class", "settings", "weights"} <= tree.keys():
-        raise CheckpointError(f"{path}: a checkpoint, but not of a policy")
+    tree = _load(path)
     made = tree["settings"]
-    if tree["class"] not in KINDS or "arguments" not in made:
-        raise CheckpointError(f"{path}: holds a {tree['class']}, a policy ({', '.join(sorted(KINDS))}) is needed")
     policy = KINDS[tree["class"]](**made["arguments"])
     weights = tree["weights"]
     if made.get("grounded_in") is not None:
@@ -69,6 +65,34 @@ def load_policy(path: str | Path) -> Policy:
             policy.residual = residual_for(policy, source, with_history=True)
     load_weights(policy, weights, path)
     return policy.eval()
+
+
+def load_source(path: str | Path) -> World:
+    """The world that the policy in a file was trained in, or last adapted from: its source.
+
+    Raises:
+        CheckpointError: as `load_policy`, or the file does not say.
+
+    >>> import visadapt as va
+    >>> source = va.load_source(va.shipped("quadrotor"))
+    >>> source.system.name, source.period
+    ('quadrotor', 0.1)
+    """
+    path = Path(path)
+    made = _load(path)["settings"]
+    description = made.get("grounded_in") or made.get("source")
+    if description is None:
+        raise CheckpointError(f"{path}: does not say in which world the policy was trained; train it again")
+    return _world(description, path)
+
+
+def _load(path: Path) -> dict[str, Any]:
+    tree = load_tree(path)
+    if not isinstance(tree, dict) or not {"class", "settings", "weights"} <= tree.keys():
+        raise CheckpointError(f"{path}: a checkpoint, but not of a policy")
+    if tree["class"] not in KINDS or "arguments" not in tree["settings"]:
+        raise CheckpointError(f"{path}: holds a {tree['class']}, a policy ({', '.join(sorted(KINDS))}) is needed")
+    return tree
 
 
 def describe(world: World) -> dict[str, Any]:

@@ -48,51 +48,69 @@ class Entry:
 class EnvMap:
     """The map of an environment.
 
-    A TOML file has the same names: `actions`, `crop`, `contrast`, `width`, `height` at its top, and below them the
-    tables `[states]` (`x = { index = 0 }`), `[limits]` and `[options]`.
+    A TOML file has the same names: `actions`, `period`, `crop`, `contrast`, `width`, `height` at its top, and below
+    them the tables `[states]` (`x = { index = 0 }`), `[limits]`, `[start]` and `[options]`.
 
     >>> import visadapt as va
     >>> states = {"x": va.Entry(0), "theta": va.Entry(1), "x_dot": va.Entry(2), "theta_dot": va.Entry(3)}
-    >>> va.EnvMap(states, actions=(va.Entry(0),), crop=(0, 0, 240, 200)).width
-    120
+    >>> va.EnvMap(states, actions=(va.Entry(0),), crop=(0, 0, 240, 200)).height
+    100
     """
 
     states: Mapping[str, Entry]
     """by the name of our state: state = scale observation[index] + offset, in SI units"""
     actions: tuple[Entry, ...]
     """for each of our commands in [-1, 1]: action[index] = scale command + offset; the other entries are 0"""
-    crop: tuple[int, int, int, int]
-    """left, top, right, bottom in px of the environment's frame; right and bottom are the first px left out"""
+    period: float | None = None
+    """s between actions; None: what the environment states, its `tau`, `dt` or `render_fps`"""
+    crop: tuple[int, int, int, int] | None = None
+    """left, top, right, bottom in px of the environment's frame; right and bottom are the first px left out. None: the
+    whole frame"""
     contrast: tuple[float, float] = (0.0, 255.0)
     """grey levels, 0 to 255, that become black and white"""
     limits: Mapping[str, float] = field(default_factory=dict)
     """by the name of our state: its largest absolute value, beyond which an episode ends"""
+    start: Mapping[str, float] | None = None
+    """by the name of our state: half-width, around 0, of the uniform distribution in which episodes start; 0 for states
+    that are not named. None: the environment's own reset"""
     options: Mapping[str, Any] = field(default_factory=dict)
     """arguments of gymnasium.make, such as the size of the frame and the camera's place"""
-    width: int = 120
-    """px, of our frames"""
+    width: int | None = None
+    """px, of our frames; None: in proportion to the crop"""
     height: int = 100
     """px"""
 
     def __post_init__(self) -> None:
-        if len(self.crop) != 4 or not all(isinstance(edge, int) for edge in self.crop):
-            raise TargetError(f"crop must be left, top, right, bottom in whole px, got {self.crop!r}")
-        left, top, right, bottom = self.crop
-        if not (0 <= left < right and 0 <= top < bottom):
-            raise TargetError(f"crop {self.crop} holds no pixel: left < right and top < bottom, all from 0 on")
-        wanted, got = self.width / self.height, (right - left) / (bottom - top)
-        if abs(got / wanted - 1) > ASPECT_TOLERANCE:
-            raise TargetError(
-                f"crop {self.crop} is {right - left} x {bottom - top} px, {got:.3f} wide for 1 high; "
-                f"frames of {self.width} x {self.height} px need {wanted:.3f}"
-            )
+        if self.crop is not None:
+            self._check_crop(*self.crop)
+        if self.period is not None and not _is_positive(self.period):
+            raise TargetError(f"period must be a positive number of seconds, got {self.period!r}")
         if len(self.contrast) != 2 or not self.contrast[0] < self.contrast[1]:
             raise TargetError(f"contrast must be two rising grey levels, got {self.contrast!r}")
         if not self.actions:
             raise TargetError("actions is empty: say which entry of the environment's action our command sets")
-        for name, limit in self.limits.items():
-            if not limit > 0:
-                raise TargetError(f"limits: {name} must be positive, got {limit!r}")
+        for table, entries in (("limits", self.limits), ("start", self.start or {})):
+            for name, number in entries.items():
+                if not _is_positive(number):
+                    raise TargetError(f"{table}: {name} must be positive, got {number!r}")
+
+    def _check_crop(self, *crop: int) -> None:
+        if len(crop) != 4 or not all(isinstance(edge, int) for edge in crop):
+            raise TargetError(f"crop must be left, top, right, bottom in whole px, got {self.crop!r}")
+        left, top, right, bottom = crop
+        if not (0 <= left < right and 0 <= top < bottom):
+            raise TargetError(f"crop {self.crop} holds no pixel: left < right and top < bottom, all from 0 on")
+        columns, rows = right - left, bottom - top
+        wanted, got = self._width(columns, rows) / self.height, columns / rows
+        if self.width is not None and abs(got / wanted - 1) > ASPECT_TOLERANCE:
+            raise TargetError(
+                f"crop {self.crop} is {columns} x {rows} px, {got:.3f} wide for 1 high; "
+                f"frames of {self.width} x {self.height} px need {wanted:.3f}"
+            )
+
+    def _width(self, columns: int, rows: int) -> int:
+        """Px of the frames that are made of so many columns and rows of a picture."""
+        return round(self.height * columns / rows) if self.width is None else self.width
 
     @classmethod
     def load(cls, path: str | Path) -> EnvMap:
@@ -127,9 +145,10 @@ class EnvMap:
         ours = [variable.name for variable in system.states]
         if sorted(self.states) != sorted(ours):
             raise TargetError(f"{name}: the map is of the states {', '.join(self.states)}; ours are {', '.join(ours)}")
-        for state in self.limits:
-            if state not in ours:
-                raise TargetError(f"{name}: the map limits {state!r}; our states are {', '.join(ours)}")
+        for does, entries in (("limits", self.limits), ("starts", self.start or {})):
+            for state in entries:
+                if state not in ours:
+                    raise TargetError(f"{name}: the map {does} {state!r}; our states are {', '.join(ours)}")
         if len(self.actions) != len(system.actions):
             raise TargetError(
                 f"{name}: the map has {len(self.actions)} actions, {system.name} has {len(system.actions)}"
@@ -173,7 +192,7 @@ class EnvMap:
         if not isinstance(picture, np.ndarray) or picture.dtype != np.uint8 or picture.ndim not in (2, 3):
             got = f"{picture.dtype} {picture.shape}" if isinstance(picture, np.ndarray) else type(picture).__name__
             raise TargetError(f"{name}: render() gave {got}; a picture (rows, columns, 3) of uint8 is needed")
-        left, top, right, bottom = self.crop
+        left, top, right, bottom = self.crop or (0, 0, picture.shape[1], picture.shape[0])
         if right > picture.shape[1] or bottom > picture.shape[0]:
             raise TargetError(
                 f"{name}: its frames are {picture.shape[1]} x {picture.shape[0]} px, "
@@ -182,6 +201,12 @@ class EnvMap:
         # In floating point, so that stretching the contrast of a dark picture does not leave gaps between grey levels.
         part = picture[top:bottom, left:right].astype(np.float32)
         grey = cv2.cvtColor(part, cv2.COLOR_RGB2GRAY) if part.ndim == 3 and part.shape[2] == 3 else part
-        small = cv2.resize(grey, (self.width, self.height), interpolation=cv2.INTER_AREA)
+        width = self._width(right - left, bottom - top)
+        small = cv2.resize(grey, (width, self.height), interpolation=cv2.INTER_AREA)
         low, high = self.contrast
         return np.clip(np.rint((small - low) * (255 / (high - low))), 0, 255).astype(np.uint8)
+
+
+def _is_positive(value: Any) -> bool:
+    """Whether it is a finite number above 0."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf

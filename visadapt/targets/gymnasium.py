@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import atexit
+import warnings
 import weakref
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -28,14 +30,15 @@ class GymnasiumTarget(Target):
         env: the environment's id, or a function that makes one (with `render_mode="rgb_array"` and no time limit).
         mapping: the map between its numbers and frames and ours; `mapping.options` are for gymnasium.make alone.
         system: the system whose states and actions the mapping gives.
-        start: draws the first state of an episode instead of the environment's own reset; only for MuJoCo
-            environments whose observation is all positions, then all velocities.
-        period: s between actions; by default the environment's `dt`, or 1 / `render_fps` of its metadata.
+        start: draws the first state of an episode instead of the mapping's `start` and the environment's own reset;
+            only for environments that `show` can put into a state.
+        period: s between actions, instead of the mapping's; by default the environment's `tau` or `dt`, or else
+            1 / `render_fps` of its metadata, with a warning, since that may be the speed of its films alone.
         frames: whether frames are drawn.
 
     Raises:
-        TargetError: gymnasium is not installed; the environment cannot be made, has discrete actions, no rgb_array,
-            or no period; or the mapping does not fit it.
+        TargetError: the environment cannot be made, has discrete actions, no rgb_array, or no period; the given period
+            is no whole number of its steps; or the mapping does not fit it.
 
     >>> import torch, visadapt as va
     >>> from visadapt.targets.inverted_pendulum import MAP
@@ -55,11 +58,6 @@ class GymnasiumTarget(Target):
         name: str | None = None,
     ) -> None:
         mujoco_frames.choose_backend()
-        try:
-            import gymnasium
-        except ImportError as error:
-            raise TargetError(f"gymnasium is not installed: {HOW_TO_INSTALL}") from error
-        self._gymnasium = gymnasium
         self._source = env
         self.mapping = mapping
         self.system = system
@@ -70,7 +68,7 @@ class GymnasiumTarget(Target):
         self.name = name or (first.spec.id if first.spec is not None else type(first.unwrapped).__name__)
         self.n_action = len(mapping.actions)
         self._n_env_action = self._check(first)
-        self.period = period if period is not None else self._period(first)
+        self.period, self.period_origin = self._period(first, mapping.period if period is None else period)
         self._mujoco = frames and mujoco_frames.is_mujoco(first)
         if self._mujoco:
             mujoco_frames.probe(self.name)
@@ -88,7 +86,7 @@ class GymnasiumTarget(Target):
             TargetError: an observation is not finite, or the crop does not fit the frame.
         """
         seeds = torch.randint(2**31 - 1, (batch,), generator=generator).tolist()
-        starts = None if self.initial is None else self.initial.draw(batch, generator).double().numpy()
+        starts = self._starts(batch, generator)
         while len(self._envs) < batch:
             self._envs.append(self._make())
         if self._mujoco:
@@ -98,7 +96,7 @@ class GymnasiumTarget(Target):
         for b in range(batch):
             seen, _ = self._envs[b].reset(seed=seeds[b])
             if starts is not None:
-                seen = self._place(self._envs[b], np.asarray(seen), starts[b])
+                seen = self._place(self._envs[b], np.asarray(seen, dtype=float), starts[b])
             self._observations.append(self._finite(seen, b))
             if self.frames:
                 self._pictures.append(self._draw(self._envs[b]))
@@ -148,19 +146,19 @@ class GymnasiumTarget(Target):
         """Frames (N, H, W) uint8 of chosen states (N, n_state), to train a renderer; takes no step of the target.
 
         Raises:
-            TargetError: this environment cannot be put into a state.
+            TargetError: this environment cannot be put into a state: it is neither one of MuJoCo's whose observation
+                is all positions, then all velocities, nor one that keeps what it observes as `unwrapped.state`.
         """
-        seen, _ = self._envs[0].reset(seed=0)
+        seen = np.asarray(self._envs[0].reset(seed=0)[0], dtype=float)
         pictures = []
         for state in states:
-            self._place(self._envs[0], np.asarray(seen), state)
+            seen = self._place(self._envs[0], seen, state)
             pictures.append(self._draw(self._envs[0]))
         return np.stack(pictures)
 
     def _make(self) -> Any:
         if not isinstance(self._source, str):
             return self._source()
-        gymnasium = self._gymnasium
         render_mode = "rgb_array" if self.frames else None
         try:
             # No time limit: episodes end where the mapping's limits or the environment say.
@@ -181,7 +179,7 @@ class GymnasiumTarget(Target):
 
     def _check(self, env: Any) -> int:
         """The length of the environment's action; raises TargetError where it cannot be a target."""
-        box = self._gymnasium.spaces.Box
+        box = gymnasium.spaces.Box
         if not isinstance(env.action_space, box) or len(env.action_space.shape) != 1:
             raise TargetError(
                 f"{self.name}: its actions are {env.action_space}, but policies command real numbers: "
@@ -201,27 +199,57 @@ class GymnasiumTarget(Target):
         self.mapping.check(self.name, self.system, int(env.observation_space.shape[0]), n_action)
         return n_action
 
-    def _period(self, env: Any) -> float:
-        period = getattr(env.unwrapped, "dt", None)
-        rate = env.metadata.get("render_fps")
-        if period is None and not rate:
+    def _period(self, env: Any, given: float | None) -> tuple[float, str]:
+        """s between actions, and where that number comes from."""
+        body, rate = env.unwrapped, env.metadata.get("render_fps")
+        own = next((name for name in ("tau", "dt") if isinstance(getattr(body, name, None), int | float)), None)
+        step = None if own is None else float(getattr(body, own))
+        if given is not None:
+            # A wrapper may repeat actions, but no environment is stepped for a part of its step.
+            if step is not None and (given < 0.99 * step or abs(given / step - round(given / step)) > 0.01):
+                raise TargetError(
+                    f"{self.name}: its {own} says {step:g} s a step, so that the period given, {given:g} s, is no "
+                    "whole number of steps"
+                )
+            return float(given), "as given"
+        if step is not None:
+            return step, f"its {own}"
+        if not rate:
             raise TargetError(
-                f"{self.name}: the environment states no step length (dt or render_fps); give `period` in s"
+                f"{self.name}: the environment states no step length (tau, dt or render_fps); give `period` in s"
             )
-        return float(period) if period is not None else 1 / float(rate)
+        origin = f"render_fps = {rate:g} of its metadata, which may be the speed of a film alone: give `period` in s"
+        warnings.warn(f"{self.name}: the period, {1 / rate:g} s, is taken from {origin}", stacklevel=3)
+        return 1 / float(rate), origin
+
+    def _starts(self, batch: int, generator: torch.Generator) -> NDArray[np.floating] | None:
+        """States (batch, n_state) that episodes start in; None: where the environment itself does."""
+        if self.initial is not None:
+            return self.initial.draw(batch, generator).double().numpy()
+        if self.mapping.start is None:
+            return None
+        widths = torch.tensor([self.mapping.start.get(variable.name, 0.0) for variable in self.system.states])
+        return (widths * (2 * torch.rand(batch, len(widths), generator=generator) - 1)).double().numpy()
 
     def _place(self, env: Any, seen: NDArray[np.floating], state: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Put a MuJoCo environment into our state; returns its observation there."""
+        """Put an environment that observes `seen` and has not been stepped into our state; its observation there."""
         wanted = self.mapping.observation(state, self.system, seen)
         body = env.unwrapped
         n = getattr(getattr(body, "model", None), "nq", None)
-        if n is None or not hasattr(body, "set_state") or len(seen) != n + body.model.nv:
-            raise TargetError(f"{self.name}: cannot be put into a state: its observation is not positions, velocities")
-        body.set_state(wanted[:n], wanted[n:])
-        got = np.asarray(body._get_obs())
-        if not np.allclose(got, wanted, atol=1e-6):
-            raise TargetError(f"{self.name}: put into the observation {wanted}, it shows {got}")
-        return got
+        if n is not None and hasattr(body, "set_state") and len(seen) == n + body.model.nv:
+            body.set_state(wanted[:n], wanted[n:])
+            got = np.asarray(body._get_obs())
+            if not np.allclose(got, wanted, atol=1e-6):
+                raise TargetError(f"{self.name}: put into the observation {wanted}, it shows {got}")
+            return got
+        kept = np.asarray(getattr(body, "state", None))
+        if kept.shape != seen.shape or not np.allclose(kept.astype(float), seen, atol=1e-6):
+            raise TargetError(
+                f"{self.name}: cannot be put into a state: its observation is neither positions, velocities of a "
+                "MuJoCo model nor what it keeps as `unwrapped.state`"
+            )
+        body.state = wanted.astype(kept.dtype)
+        return wanted
 
     def _finite(self, seen: Any, episode: int) -> NDArray[np.floating]:
         out = np.asarray(seen, dtype=float)

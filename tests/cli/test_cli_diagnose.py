@@ -13,7 +13,7 @@ from visadapt import diagnosis
 from visadapt.cli import main as cli
 from visadapt.effects import EFFECTS
 from visadapt.policies import ImagePolicy, StatePolicy
-from visadapt.storage.checkpoints import save_network
+from visadapt.setups.policy_file import save_policy
 from visadapt.systems import CartPole
 
 RIG = Path(__file__).parents[3] / "shared" / "recordings" / "physical-cartpole"
@@ -30,8 +30,8 @@ class {name}(CartForce):
     source = "a test"
     table = (Parameter("strength", "N", -1.0, 1.0, 0.0),)
 
-    def cart_force(self, time, state):
-        return self.value("strength", state)
+    def push(self, time, state, system):
+        return self.value("strength", state).expand_as(time)
 """
 
 
@@ -116,7 +116,7 @@ class TestCommand:
     @pytest.mark.parametrize("with_history", [False, True])
     def test_a_policy(self, recording, stub, tmp_path, with_history):
         policy, path = StatePolicy(4, with_history=with_history), tmp_path / "policy.safetensors"
-        save_network(path, policy, {"seed": 0})
+        save_policy(path, policy)
         assert run(recording, "--policy", path) == 0
         assert stub["policy"].with_history == with_history
         assert all(torch.equal(a, b) for a, b in zip(stub["policy"].parameters(), policy.parameters(), strict=True))
@@ -182,10 +182,16 @@ class TestBadInput:
         self.refuses(capsys, "policy.safetensors: there is no such checkpoint", recording, "--policy", path)
         path.write_bytes(b"torn")
         self.refuses(capsys, "policy.safetensors: not a complete safetensors file", recording, "--policy", path)
-        save_network(path, ImagePolicy(torch.zeros(100, 120), 1.0), {})
+        save_policy(path, ImagePolicy(torch.zeros(100, 120), 1.0))
         self.refuses(capsys, "holds a ImagePolicy, a StatePolicy is needed", recording, "--policy", path)
-        save_network(path, StatePolicy(7), {})
-        self.refuses(capsys, "made for another architecture: feedforward.weight", recording, "--policy", path)
+        save_policy(path, StatePolicy(7))
+        self.refuses(
+            capsys,
+            "policy.safetensors: a policy of 7 states and 1 commands; a cartpole has 4 and 1",
+            recording,
+            "--policy",
+            path,
+        )
 
     def test_where_nothing_can_be_written(self, recording, stub, tmp_path, capsys):
         blocked = tmp_path / "file"

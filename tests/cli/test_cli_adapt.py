@@ -1,0 +1,107 @@
+import json
+
+import pytest
+import torch
+
+import visadapt as va
+from tests.cli.commands import refused, run, write_frames
+from visadapt import progress
+
+SMALL = ("--samples", 40, "--round", 20, "--iterations", 2, "--out", "run")
+
+
+def test_a_policy_on_states(here, trained, capsys):
+    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL)
+    assert run(*command) == 0
+    assert capsys.readouterr().out == "40 samples of synthetic cart-pole used; the policy is run/policy.safetensors\n"
+    ledger = json.loads((here / "run" / "ledger.json").read_text())
+    assert (ledger["budget"], ledger["used"]) == (40, 40)
+    assert sum(steps for _, steps in ledger["entries"]) == 40
+    written = json.loads((here / "run" / "settings.json").read_text())
+    assert written["settings"]["seed"] == 0
+    assert written["settings"]["target"] == "rig:states"
+    assert written["versions"]["torch"] == torch.__version__
+    before, after = va.load_policy(trained / "states.safetensors"), va.load_policy("run/policy.safetensors")
+    assert after.residual is not None
+    assert not torch.equal(before.state_dict()["first.weight"], after.state_dict()["first.weight"])
+    assert va.load_source("run/policy.safetensors").system == va.CartPole()
+    # A finished run is read, not run again; other settings are another run.
+    kept = (here / "run" / "policy.safetensors").read_bytes()
+    assert run(*command) == 0
+    assert (here / "run" / "policy.safetensors").read_bytes() == kept
+    assert "run holds a run with other settings (samples)" in refused(capsys, *command, "--samples", 60)
+
+
+def test_a_policy_on_frames_of_any_shape(here, trained):
+    frames, renderer = trained / "frames.safetensors", trained / "renderer.safetensors"
+    target = ("--target", "rig:filmed", "--renderer", renderer, "--samples", 20, "--round", 20, "--iterations", 1)
+    assert run("adapt", "--policy", frames, *target, "--out", "run") == 0
+    assert va.load_policy("run/policy.safetensors").residual is not None
+
+
+def test_on_a_gymnasium_environment(here, trained, capsys):
+    (here / "map.toml").write_text("period = 0.02\n" + (here / "map.toml").read_text())
+    train = ("train", "--system", "cartpole", "--period", 0.02, "--iterations", 2, "--out", "fast.safetensors")
+    assert run(*train) == 0
+    gym = ("--policy", "fast.safetensors", "--target", "rig:pushed", "--map", "map.toml")
+    assert run("adapt", *gym, *SMALL) == 0
+    assert "between actions" not in capsys.readouterr().err
+    assert json.loads((here / "run" / "ledger.json").read_text())["used"] == 40
+
+
+def test_effects_of_a_diagnosis_are_fitted_to_the_target(here, trained, diagnosis):
+    policy = ("--policy", trained / "states.safetensors", "--target", "rig:states")
+    assert run("adapt", *policy, "--diagnosis", diagnosis([("constant_force", {"force": 0.0})]), *SMALL) == 0
+    (force,) = va.load_source("run/policy.safetensors").effects
+    assert force.name == "constant_force"
+    assert float(force.get_parameter("force").detach()) == pytest.approx(1.0, abs=0.2)
+
+
+def test_interrupted_it_goes_on(here, trained, monkeypatch, capsys):
+    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL[:-1])
+    assert run(*command, "whole") == 0
+
+    def log(self, stage, done, total, loss):
+        if stage == "round 2/2: ground":
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(progress._Log, "__call__", log)
+        assert run(*command, "run") == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "visadapt: interrupted; run the same command to go on"
+    assert not (here / "run" / "policy.safetensors").exists()
+    assert run(*command, "run") == 0
+    whole, resumed = (va.load_policy(f"{name}/policy.safetensors").state_dict() for name in ("whole", "run"))
+    assert all(torch.equal(value, resumed[name]) for name, value in whole.items())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--round", 50), "--round 50 is more than --samples 40"),
+        (("--renderer", "r.safetensors"), "states.safetensors: is shown states, for which --renderer has no use"),
+        (("--effect", "rotor_drag:x=1"), "rotor_drag acts on a quadrotor, not on a cartpole"),
+        (("--diagnosis", "none.json"), "none.json: cannot be read"),
+    ],
+)
+def test_what_it_refuses(here, trained, capsys, arguments, says):
+    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL)
+    assert says in refused(capsys, *command, *arguments)
+    assert not (here / "run").exists()
+
+
+def test_a_diagnosis_that_named_nothing(here, trained, diagnosis, capsys):
+    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL)
+    line = refused(capsys, *command, "--diagnosis", diagnosis((), "no_gap"))
+    assert "the verdict is no_gap: the diagnosis named no cause" in line
+
+
+def test_a_renderer_that_the_policy_was_not_trained_with(here, trained, capsys):
+    command = ("adapt", "--policy", trained / "frames.safetensors", "--target", "rig:filmed", *SMALL)
+    assert "frames.safetensors: was not trained with the renderer" in refused(capsys, *command)
+    write_frames(here / "a.h5", 40)
+    other = ("--hinge", "22,28", "--scale", 15, "--iterations", 3, "--out", "other.safetensors")
+    assert run("renderer", "a.h5", *other) == 0
+    line = refused(capsys, *command, "--renderer", "other.safetensors")
+    assert "was not trained with the renderer other.safetensors" in line
+    assert not (here / "run").exists()

@@ -1,0 +1,103 @@
+import numpy as np
+import pytest
+import torch
+
+from renderers import Camera, load_renderer
+from renderers.training import KEEP_EVERY
+from tests.cli.commands import CAMERA, GUESS, refused, run, write_frames
+from visadapt import progress
+from visadapt.recordings import Episode, write_recording
+
+OUT = ("--out", "r.safetensors")
+
+
+def test_from_recorded_frames_and_states(here, capsys):
+    write_frames(here / "a.h5")
+    write_frames(here / "b.h5", names=("x", "x_dot", "theta", "theta_dot"))
+    assert run("renderer", "a.h5", "b.h5", *GUESS, "--iterations", 60, *OUT) == 0
+    assert "grey levels of 255 off" in capsys.readouterr().out
+    renderer = load_renderer(here / "r.safetensors")
+    assert renderer.size == (40, 48)
+    # Nearer to the camera than the guess, 1.5 px to the left of it.
+    assert abs(float(renderer.state_dict()["origin"][0]) - CAMERA.column) < 1.0
+    assert not (here / "r.safetensors.unfinished").exists()
+
+
+def test_from_what_an_environment_shows(here, capsys):
+    arguments = ("--target", "rig:pushed", "--map", "map.toml", "--show", 50, "--within", "1.2,0.2")
+    assert run("renderer", *arguments, *GUESS, "--iterations", 5, *OUT) == 0
+    printed = capsys.readouterr()
+    assert "in 5 frames left out" in printed.out
+    assert "0.02 s between actions, from its tau" in printed.err
+    assert load_renderer(here / "r.safetensors").size == (40, 48)
+
+
+def test_interrupted_it_goes_on_to_the_same_renderer(here, monkeypatch, capsys):
+    write_frames(here / "a.h5", 40)
+    command = ("renderer", "a.h5", *GUESS, "--iterations", KEEP_EVERY + 10)
+    assert run(*command, "--out", "whole.safetensors") == 0
+    calls = []
+
+    def log(self, stage, done, total, loss):
+        calls.append(done)
+        if len(calls) == KEEP_EVERY + 5:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(progress._Log, "__call__", log)
+    assert run(*command, *OUT) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "visadapt: interrupted; run the same command to go on"
+    assert not (here / "r.safetensors").exists()
+    assert "r.safetensors.unfinished holds a run with other settings (seed)" in refused(
+        capsys, *command, *OUT, "--seed", 1
+    )
+    assert run(*command, *OUT) == 0
+    assert calls[-10:] == list(range(KEEP_EVERY + 1, KEEP_EVERY + 11))
+    whole, resumed = (load_renderer(here / f"{name}.safetensors").state_dict() for name in ("whole", "r"))
+    assert all(torch.equal(value, resumed[name]) for name, value in whole.items())
+
+
+def write_states(path):
+    write_recording(path, [Episode(0.05 * np.arange(30), np.zeros((30, 1)), np.zeros((30, 4)))])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("none.h5",), "none.h5: there is no such file"),
+        (("rig.py",), "rig.py: not a readable HDF5 file"),
+        ((), "give recordings, or a gymnasium environment by --target and --map"),
+        (("a.h5", "--target", "rig:states"), "give recordings, or a gymnasium environment"),
+        (("--target", "rig:states"), "rig:states: cannot be put into chosen states"),
+        (("few.h5",), "10 frames are too few"),
+        (("states.h5",), "states.h5, episode 0: holds states alone; frames and states are needed"),
+        (
+            ("a.h5", "larger.h5"),
+            "larger.h5, episode 0: frames of (100, 120) rows and columns; those before have (40, 48)",
+        ),
+        (("names.h5",), "names.h5: has no state 'theta'; it has x, v, phi, w"),
+        (("a.h5", "--iterations", 2), "--iterations 2: at least 3"),
+    ],
+)
+def test_what_it_refuses(here, capsys, arguments, says):
+    write_frames(here / "a.h5", 30)
+    write_frames(here / "few.h5", 10)
+    write_frames(here / "larger.h5", 30, Camera())
+    write_frames(here / "names.h5", 30, names=("x", "v", "phi", "w"))
+    write_states(here / "states.h5")
+    assert says in refused(capsys, "renderer", *arguments, *GUESS, *OUT)
+    assert not list(here.glob("r.safetensors*"))
+
+
+def test_a_renderer_that_is_there_is_not_overwritten(here, capsys):
+    write_frames(here / "a.h5", 30)
+    (here / "r.safetensors").write_text("mine")
+    assert "r.safetensors is there already" in refused(capsys, "renderer", "a.h5", *GUESS, *OUT)
+    assert (here / "r.safetensors").read_text() == "mine"
+
+
+@pytest.mark.parametrize("guess", [("--hinge", "22"), ("--hinge", "a,b"), ("--scale", "-1"), ("--scale", "nan")])
+def test_guesses(here, capsys, guess):
+    with pytest.raises(SystemExit) as caught:
+        run("renderer", "a.h5", *GUESS, *guess, *OUT)
+    assert caught.value.code == 2
+    assert f"argument {guess[0]}" in capsys.readouterr().err

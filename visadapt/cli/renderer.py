@@ -1,0 +1,161 @@
+"""visadapt renderer: a renderer from recorded frames and states."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from visadapt.cli.arguments import (
+    InputError,
+    add_seed,
+    fingerprint,
+    pair,
+    positive,
+    positive_number,
+    progress,
+    unfinished,
+)
+from visadapt.cli.policy_and_target import add_target, load_target
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+HELD_OUT = 10
+"""Every tenth frame is left out of the training and compared with what the renderer makes of its state."""
+
+
+def add(commands: Any) -> None:
+    """Add the subcommand's parser."""
+    parser = commands.add_parser(
+        "renderer",
+        help="learn from a camera's frames how a cart-pole looks in each state",
+        description="Trains a renderer, states to frames, from recordings of a cart-pole that hold both, or from what "
+        "a gymnasium environment shows of chosen states. --hinge and --scale are a first guess of where the camera "
+        "stands, good to some pixels; it is refined. Interrupted, the same command goes on where it was.",
+    )
+    parser.add_argument(
+        "recording", nargs="*", metavar="RECORDING.h5", help="HDF5 with frames, as visadapt.write_recording writes it"
+    )
+    add_target(parser, required=False)
+    parser.add_argument(
+        "--show", metavar="N", type=positive, default=4000, help="states that --target is put into (default: 4000)"
+    )
+    parser.add_argument(
+        "--within",
+        metavar="X,THETA",
+        type=pair,
+        default=(1.0, 0.35),
+        help="m and rad to either side of 0 that these states are drawn from (default: 1.0,0.35)",
+    )
+    parser.add_argument("--out", required=True, metavar="R.safetensors", help="write the renderer here")
+    parser.add_argument(
+        "--hinge", required=True, type=pair, metavar="COLUMN,ROW", help="px, where the pole's hinge is seen at x = 0"
+    )
+    parser.add_argument("--scale", required=True, type=positive_number, metavar="PX", help="px that a metre is long")
+    parser.add_argument(
+        "--pole",
+        type=positive_number,
+        default=1.05,
+        metavar="M",
+        help="m from the hinge to the pole's tip, rather too long than too short (default: 1.05)",
+    )
+    parser.add_argument("--iterations", metavar="N", type=positive, default=1000, help="(default: 1000)")
+    add_seed(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Train the renderer, write it, and say how well it draws frames that it was not trained on."""
+    import torch
+
+    from renderers import LayeredRenderer, save_renderer
+    from renderers.training import fit
+    from visadapt.progress import staged
+    from visadapt.storage.atomic_files import replacing
+    from visadapt.storage.checkpoints import load_tree, save_tree
+
+    if bool(options.recording) == bool(options.target):
+        raise InputError("give recordings, or a gymnasium environment by --target and --map")
+    x, theta, frames = _read(options.recording) if options.recording else _show(options)
+    if len(frames) < 2 * HELD_OUT:
+        raise InputError(f"{len(frames)} frames are too few to learn from; some hundred are right")
+    if options.iterations < 3:
+        raise InputError(f"--iterations {options.iterations}: at least 3 are right")
+    (height, width), (column, row) = frames.shape[1:], options.hinge
+    torch.manual_seed(options.seed)
+    renderer = LayeredRenderer(height, width, column, row, options.scale, options.pole)
+    held = torch.arange(len(frames)) % HELD_OUT == 0
+    settings = {name: value for name, value in vars(options).items() if name not in ("run", "out")}
+    settings["SHA-256"] = [fingerprint(path) for path in (*options.recording, options.map)]
+    out = Path(options.out)
+    with unfinished(out, settings) as folder, progress() as report:
+        state = folder / "training.safetensors"
+        fit(
+            renderer,
+            x[~held],
+            theta[~held],
+            frames[~held],
+            options.iterations,
+            torch.Generator().manual_seed(options.seed),
+            progress=staged(report, "renderer"),
+            keep=lambda tree: save_tree(state, tree),
+            kept=load_tree(state) if state.exists() else None,
+        )
+        with replacing(out) as temporary:
+            save_renderer(temporary, renderer, settings)
+    with torch.no_grad():
+        drawn = torch.cat([renderer(*each) for each in zip(x[held].split(64), theta[held].split(64), strict=True)])
+    error = 255 * (drawn - frames[held] / 255).abs().mean()
+    column, row = renderer.origin.tolist()
+    print(
+        f"{out}: {error:.2f} grey levels of 255 off, on average, in {len(drawn)} frames left out of the training; "
+        f"hinge at {column:.1f},{row:.1f} px, {renderer.gain[0]:.1f} px a metre"
+    )
+
+
+def _show(options: argparse.Namespace) -> tuple[Tensor, Tensor, Tensor]:
+    """As `_read`, of states that an environment is put into: a calibration, for which it is not stepped."""
+    import torch
+
+    from visadapt.systems import CartPole
+    from visadapt.targets.gymnasium import GymnasiumTarget
+    from visadapt.world import World
+
+    target = load_target(options, World(CartPole()), True)
+    if not isinstance(target, GymnasiumTarget):
+        raise InputError(f"{options.target}: cannot be put into chosen states; give recordings of frames and states")
+    widths = torch.tensor([options.within[0], 0.0, options.within[1], 0.0])
+    generator = torch.Generator().manual_seed(options.seed)
+    states = widths * (2 * torch.rand(options.show, 4, generator=generator) - 1)
+    return states[:, 0], states[:, 2], torch.from_numpy(target.show(states.double().numpy()))
+
+
+def _read(paths: list[str]) -> tuple[Tensor, Tensor, Tensor]:
+    """Cart positions (N,) in m, pole angles (N,) in rad and frames (N, H, W) uint8 of all recordings."""
+    import numpy as np
+    import torch
+    from numpy.typing import NDArray
+
+    from visadapt.recordings.hdf5 import read_names, read_recording
+    from visadapt.systems import CartPole
+
+    states: list[NDArray[np.floating]] = []
+    frames: list[NDArray[np.uint8]] = []
+    for path in paths:
+        names = read_names(path)[0] or [variable.name for variable in CartPole.states]
+        for name in ("x", "theta"):
+            if name not in names:
+                raise InputError(f"{path}: has no state {name!r}; it has {', '.join(names)}")
+        for number, episode in enumerate(read_recording(path)):
+            where = f"{path}, episode {number}"
+            if episode.state is None or episode.frame is None:
+                alone = "frames" if episode.state is None else "states"
+                raise InputError(f"{where}: holds {alone} alone; frames and states are needed")
+            size, wanted = (each.shape[1:] for each in (episode.frame, frames[0] if frames else episode.frame))
+            if size != wanted:
+                raise InputError(f"{where}: frames of {size} rows and columns; those before have {wanted}")
+            states.append(episode.state[:, [names.index("x"), names.index("theta")]])
+            frames.append(episode.frame)
+    x, theta = torch.from_numpy(np.concatenate(states)).float().unbind(1)
+    return x, theta, torch.from_numpy(np.concatenate(frames))

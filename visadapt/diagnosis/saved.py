@@ -1,0 +1,73 @@
+"""The effects that a diagnosis named, from the JSON file that `visadapt diagnose --json` wrote."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+
+from visadapt.diagnosis.result import (
+    SCHEMA_VERSION,
+    Cause,
+    Diagnosis,
+    Estimate,
+    Gap,
+    RecordingSummary,
+    Where,
+)
+from visadapt.effects import EFFECTS, Effect
+
+
+class DiagnosisFileError(ValueError):
+    """A file of a diagnosis that gives no effects; the message is one line that says which and why."""
+
+
+def load_effects(path: str | os.PathLike[str]) -> tuple[str, list[Effect]]:
+    """The system that was diagnosed, by name, and the effects that were named, as `Diagnosis.effects` gives them.
+
+    Raises:
+        DiagnosisFileError: the file is missing or holds no diagnosis, the diagnosis named no effect, or one that is
+            not known here or whose value the recording left open.
+    """
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DiagnosisFileError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise DiagnosisFileError(f"{path}: not JSON: {error}") from error
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA_VERSION:
+        raise DiagnosisFileError(
+            f"{path}: no diagnosis of version {SCHEMA_VERSION}, such as `visadapt diagnose --json` writes"
+        )
+    try:
+        found = Diagnosis(
+            system=content["system"],
+            recording=RecordingSummary(**content["recording"]),
+            verdict=content["verdict"],
+            where=Where({}, {}),
+            causes=tuple(_cause(each) for each in content["causes"]),
+            ranking=(),
+            gap=Gap("", *[math.nan] * 5),
+            next_experiment=content["next_experiment"],
+        )
+        for cause in found.causes:
+            if cause.effect not in EFFECTS:
+                raise ValueError(f"names {cause.effect}, which is not known here: give the file that defines it")
+        return found.system, found.effects()
+    except (KeyError, TypeError) as error:
+        raise DiagnosisFileError(f"{path}: not a whole diagnosis: {error}") from error
+    except ValueError as error:
+        raise DiagnosisFileError(f"{path}: {error}") from error
+
+
+def _cause(content: dict[str, object]) -> Cause:
+    parameters = content["parameters"]
+    assert isinstance(parameters, dict)
+    values = {
+        name: Estimate(math.nan if one["value"] is None else float(one["value"]), one["unit"], (math.nan, math.nan))
+        for name, one in parameters.items()
+    }
+    alike = content["indistinguishable_from"]
+    assert isinstance(alike, list)
+    return Cause(str(content["effect"]), values, math.nan, math.nan, tuple(alike))
