@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
-@pytest.mark.parametrize("name", va.__all__)
+@pytest.mark.parametrize("name", dir(va))
 def test_the_example_of_every_public_name_runs(name):
     if name == "GymnasiumTarget":
         pytest.importorskip("mujoco")
@@ -34,8 +34,9 @@ def test_the_package_itself_imports_neither_torch_nor_numpy():
 
 
 def test_a_name_that_is_not_there_is_an_attribute_error():
+    name = "adopt"
     with pytest.raises(AttributeError, match="No visadapt attribute adopt"):
-        va.adopt  # noqa: B018
+        getattr(va, name)
 
 
 def test_from_a_diagnosis_to_a_better_policy(tmp_path):

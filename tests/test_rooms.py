@@ -36,7 +36,7 @@ def test_a_room_imports_none_that_is_not_below_it(room):
 
 def test_the_rooms_of_the_library_import_each_other_one_way():
     """Otherwise no order of the rooms exists in which a newcomer could read them."""
-    below = {}
+    below: dict[str, set[str]] = {}
     for path in (ROOT / "visadapt").rglob("*.py"):
         room = path.relative_to(ROOT / "visadapt").with_suffix("").parts[0]
         if room != "__init__":
