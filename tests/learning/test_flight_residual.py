@@ -1,6 +1,7 @@
 """What the vehicles' residual learns from a few hundred samples."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -8,23 +9,21 @@ import torch
 
 from tests.flying import PERIOD, seeded
 from tests.scenes import stir
-from visadapt.effects import LinearDrag, PeriodicForce, Residual
+from visadapt.effects import ActuatorLag, LinearDrag, PeriodicForce, Residual
 from visadapt.history import LENGTH, History
 from visadapt.learning.grounding import GroundSettings, gap, ground, rescale
 from visadapt.learning.policy import imagine
 from visadapt.learning.windows import Windows
 from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.recordings import Episode
+from visadapt.setups.residuals import source_steps
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION, VELOCITY
 from visadapt.world import World
 
 RATE = 0.3
 SOURCE = World(Quadrotor(), period=PERIOD, substeps=2)
-
-
-def predict(state, action):
-    return SOURCE.step(SOURCE.start(state), action).state
+predict = partial(source_steps, SOURCE)
 
 
 def a_network(with_history=False):
@@ -201,5 +200,20 @@ class TestNetwork:
 
     def test_it_fits_a_wing_as_well(self, with_history):
         source = World(FixedWing(), period=0.05)
-        back = (lambda state, action: source.step(source.start(state), action).state) if with_history else None
+        back = partial(source_steps, source) if with_history else None
         assert FlightResidualNetwork(FixedWing(), 0.05, back)(self.history()).shape == (3, 13)
+
+
+def test_what_a_named_lag_explains_is_not_left_over_whatever_the_commands_before():
+    """A source that forgot its commands between two rows would blame the lag's memory on a disturbance."""
+    source = World(Quadrotor(), [ActuatorLag(time_constant=0.08)], PERIOD, substeps=2).requires_grad_(False)
+    network = FlightResidualNetwork(Quadrotor(), PERIOD, partial(source_steps, source)).double()
+    state = torch.zeros(3, 13, dtype=torch.float64)
+    state[:, 6] = 1.0
+    at = source.start(state)
+    states, actions = [at.state], 0.3 * torch.randn(LENGTH - 1, 3, 4, generator=seeded()).double()
+    for action in actions:
+        at = source.step(at, action)
+        states.append(at.state)
+    history = History(torch.stack(states, 1), torch.cat((actions, actions[-1:])).movedim(0, 1))
+    assert float(network.disturbance(history).abs().max()) < 1e-9

@@ -1,5 +1,6 @@
 import dataclasses
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from visadapt.learning.streams import Streams, StreamSettings
 from visadapt.learning.windows import Windows
 from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.policies.networks import FlightResidualNetwork
+from visadapt.setups.residuals import source_steps
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
 from visadapt.targets.flight import FlightTarget
@@ -240,7 +242,7 @@ class TestStreams:
         windows = Windows.cut([each.episode for each in flown], "state")
         made = Streams(self.WORLD, task, identity, windows, StreamSettings(40, 1000, 1.0))
         made.start(0.0, seeded(5))
-        network = FlightResidualNetwork(Quadrotor(), PERIOD, lambda s, a: self.WORLD.step(self.WORLD.start(s), a).state)
+        network = FlightResidualNetwork(Quadrotor(), PERIOD, partial(source_steps, self.WORLD))
 
         def unexplained(history):
             return network.unexplained(network.predict, history.observations[..., :13], history.actions)
@@ -308,9 +310,7 @@ class Imagined:
     def __init__(self, task, system, period, policy):
         self.task = task
         source = World(system, period=period)
-        network = FlightResidualNetwork(
-            system, period, lambda state, action: source.step(source.start(state), action).state
-        )
+        network = FlightResidualNetwork(system, period, partial(source_steps, source))
         self.residual = Residual(stir(network.double(), 1), torch.full((13,), 0.02)).double()
         self.world = World(system, [self.residual, LinearDrag(coefficient=0.3)], period).requires_grad_(False)
         state, self.task_state = task.training_start(3, 1.0, seeded(2))

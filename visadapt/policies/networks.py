@@ -26,7 +26,7 @@ HISTORY_ACCELERATION_UNIT = 0.2
 so that ridge regression predicts the disturbance from its own history rather than from velocities and attitudes that
 happen to be correlated with it."""
 Predict = Callable[[Tensor, Tensor], Tensor]
-"""States and actions to the states one period later."""
+"""States (B, T, n) in a row and the actions (B, T, n_action) in them to the states one period later."""
 
 
 class FrameEncoder(nn.Module):
@@ -222,7 +222,8 @@ class FlightResidualNetwork(ResidualNetwork):
     Args:
         system: the vehicle.
         period: s between actions.
-        predict: the source's step, (B, 13) and (B, n_action) to (B, 13); None uses no history.
+        predict: the source's steps (B, T, 13) from consecutive states (B, T, 13) under actions (B, T, n_action); None
+            uses no history.
     """
 
     def __init__(self, system: RigidBody, period: float, predict: Predict | None = None) -> None:
@@ -268,8 +269,9 @@ class FlightResidualNetwork(ResidualNetwork):
         In units of HISTORY_ACCELERATION_UNIT times a period. Periods before a flight begins, over which its first state
         is repeated, take the values of the flight's first period.
         """
+        predicted = predict(states[:, :-1], actions[:, :-1]).flatten(0, 1)
         before, after = states[:, :-1].flatten(0, 1), states[:, 1:].flatten(0, 1)
-        left = after - predict(before, actions[:, :-1].flatten(0, 1))
+        left = after - predicted
         moving = torch.cat((left[:, VELOCITY], left[:, RATES]), 1) / (HISTORY_ACCELERATION_UNIT * self.period)
         known = (after != before).any(1, keepdim=True)
         periods = (len(states), LENGTH - 1)

@@ -17,7 +17,7 @@ from visadapt.policies.networks import (
     StateResidualNetwork,
 )
 from visadapt.systems import RigidBody
-from visadapt.world import World
+from visadapt.world import World, WorldState
 
 
 def residual_for(
@@ -48,11 +48,18 @@ def residual_for(
             period if policy.with_history else 0.0,
         )
     elif isinstance(policy, FlightPolicy) and isinstance(system, RigidBody):
-        network = FlightResidualNetwork(system, period, partial(_step, source) if with_history else None)
+        network = FlightResidualNetwork(system, period, partial(source_steps, source) if with_history else None)
     else:
         raise TypeError(f"no residual is known for a {type(policy).__name__} of a {system.name}")
     return Residual(network, torch.ones(policy.n_state))
 
 
-def _step(source: World, state: Tensor, action: Tensor) -> Tensor:
-    return source.step(source.start(state), action).state
+def source_steps(source: World, states: Tensor, actions: Tensor) -> Tensor:
+    """The source's step from each of the states (B, T, n) that follow each other, under actions (B, T, n_action).
+
+    Actuators remember the actions before; what was given earlier, and the time in the episode, a history does not hold.
+    """
+    memory = source.memories(states[:, 0], actions, states)
+    before = tuple(each[:, :-1].flatten(0, 1) for each in memory)
+    at = WorldState(states.new_zeros(states[..., 0].numel()), states.flatten(0, 1), before)
+    return source.step(at, actions.flatten(0, 1)).state.unflatten(0, states.shape[:2])
