@@ -106,7 +106,8 @@ def _setup(options: argparse.Namespace) -> Setup:
         if not seen:
             setup = setup_for(world, references=references, with_history=options.with_history)
             return replace(setup, settings=replace(setup.settings, source=_source(setup.settings, options)))
-    own = replace(frames.SETTINGS, source=_source(frames.SETTINGS, options))
+    own = frames.cartpole_frames(world, options.renderer).settings
+    own = replace(own, source=_source(own, options))
     if options.seeing:
         perception = own.perception or PerceptionSettings()
         own = replace(own, perception=replace(perception, iterations=options.seeing))

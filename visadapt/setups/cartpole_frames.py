@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +27,9 @@ from visadapt.world import World
 
 CONTRAST = 0.2
 """Grey levels, of 1, that frames are divided by before the networks see them."""
+
+REACH = 1.45
+"""m to either side that a camera has to see for `SETTINGS`, of the drawn cart-pole, which sees 1.5 m."""
 
 SETTINGS = SetupSettings(
     source=TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500),
@@ -53,7 +56,7 @@ SETTINGS = SetupSettings(
 def cartpole_frames(
     source: World | None = None,
     renderer: LayeredRenderer | Path | str | None = None,
-    settings: SetupSettings = SETTINGS,
+    settings: SetupSettings | None = None,
 ) -> Setup:
     """The cart-pole that is shown a camera's frames, and learns from these alone.
 
@@ -61,6 +64,7 @@ def cartpole_frames(
         source: the physics known beforehand, whose states begin with x, x_dot, theta, theta_dot; without it, the
             paper's CartPole, 0.05 s between commands.
         renderer: states to frames, trained, or the file of one; without it, that of the drawn cart-pole.
+        settings: how the policy learns; without it, `SETTINGS`, narrowed to what the renderer's camera sees.
 
     Raises:
         RendererError: the file holds no layered renderer.
@@ -69,6 +73,7 @@ def cartpole_frames(
     seen = renderer if isinstance(renderer, LayeredRenderer) else _load(Path(renderer or shipped("renderer")))
     seen.requires_grad_(False).eval()
     tracker = Tracker(seen, source)
+    settings = settings or _narrowed(SETTINGS, seen)
     perception = settings.perception or PerceptionSettings()
 
     def observe(state: Tensor) -> Tensor:
@@ -102,6 +107,24 @@ def cartpole_frames(
         label=label,
         prepare=prepare,
     )
+
+
+def _narrowed(settings: SetupSettings, renderer: LayeredRenderer) -> SetupSettings:
+    """The settings with all positions of the cart in proportion, where the camera sees less than `REACH`."""
+    column, scale, width = float(renderer.origin[0]), float(renderer.gain[0]), renderer.size[1]
+    share = min(column + 0.5, width - 0.5 - column) / scale / REACH
+    if share >= 1:
+        return settings
+
+    def narrowed(tune: TuneSettings) -> TuneSettings:
+        task = tune.task
+        assert isinstance(task, Balance)
+        spread, far = (share * task.start_spread[0], *task.start_spread[1:]), task.divergence[1:]
+        return replace(tune, task=replace(task, start_spread=spread, divergence=(share * task.divergence[0], *far)))
+
+    own = settings.perception or PerceptionSettings()
+    perception = replace(own, cart=replace(own.cart, reach=share * own.cart.reach))
+    return replace(settings, source=narrowed(settings.source), tuning=narrowed(settings.tuning), perception=perception)
 
 
 def _load(path: Path) -> LayeredRenderer:
