@@ -32,9 +32,9 @@ import tyro
 from datasets import quadrotor_references
 from datasets.blind import flights as blind_flights
 from visadapt import diagnose
-from visadapt.diagnosis.search.causes import NINETY
+from visadapt.diagnosis.search.causes import Z_90
+from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.search.sensor_checks import Readings
 from visadapt.effects import MotorLag, RateDamping, RotorDrag, TranslationalLift, Wind
 from visadapt.estimation.fit_states import posterior
 from visadapt.policies import Policy
@@ -147,14 +147,14 @@ def sized(path: Path) -> dict[str, Any]:
     """The most probable set of KNOWN: parameters by effect, each with its value and 90 % interval."""
     recording = load_recording([path], SOURCE)
     with torch.inference_mode():
-        search = Search(SOURCE, Readings.of(recording, SOURCE).rows, KNOWN)
+        search = Search(SOURCE, prepare(recording, SOURCE).rows, KNOWN)
         search.run()
         best = search.best
         spread = torch.linalg.inv(posterior(best.effects, best.fits)[1]).diagonal().sqrt().tolist()
     names = [(effect.name, parameter.name) for effect in best.effects for parameter in effect.table]
     out: dict[str, Any] = {name: {} for name in best.names}
     for (effect, name), value, deviation in zip(names, best.fits.theta[0].tolist(), spread, strict=True):
-        out[effect][name] = {"value": value, "ci90": [value - NINETY * deviation, value + NINETY * deviation]}
+        out[effect][name] = {"value": value, "ci90": [value - Z_90 * deviation, value + Z_90 * deviation]}
     return out
 
 

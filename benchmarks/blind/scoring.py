@@ -97,7 +97,9 @@ def region_of(effect: str) -> tuple[str, str, str] | None:
     edges = EFFECTS[effect].region()
     if edges is None:
         return None
-    places = next(profile.places for kind, profile in PROFILES.items() if issubclass(kind, EFFECTS[effect].systems))
+    places = next(
+        profile.region_variables for kind, profile in PROFILES.items() if issubclass(kind, EFFECTS[effect].systems)
+    )
     return places[edges[0].unit], edges[0].name, edges[1].name
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from tests.diagnosed import record
 from visadapt import diagnose
-from visadapt.diagnosis.search.sensor_checks import Readings
+from visadapt.diagnosis.search.preparation import prepare
 from visadapt.effects import (
     ActuatorBacklash,
     ActuatorGain,
@@ -30,8 +30,8 @@ def names(result):
     return {cause.effect for cause in result.causes}
 
 
-def held(recording, marks, columns):
-    """The recording with readings of some columns, where marked, those of the row before."""
+def with_repeats(recording, marks, columns):
+    """The recording with readings of some columns replaced, in marked rows, by those of the row before."""
     episodes = []
     for episode, own in zip(recording.episodes, marks, strict=True):
         state = episode.state.copy()
@@ -41,7 +41,7 @@ def held(recording, marks, columns):
     return dataclasses.replace(recording, episodes=tuple(episodes))
 
 
-def test_nothing_there_is_no_gap():
+def test_a_recording_of_the_source_has_no_gap():
     result = diagnose(record(), SOURCE)
     assert result.verdict == "no_gap"
     assert result.causes == ()
@@ -69,7 +69,7 @@ def pushed():
     return diagnose(record([ConstantForce(force=0.5)]), SOURCE)
 
 
-def test_what_no_data_can_tell_apart_is_named_together(pushed):
+def test_effects_that_no_data_can_separate_are_named_together(pushed):
     result = pushed
     assert result.verdict == "ambiguous"
     assert {"constant_force", "actuator_bias"} <= names(result)
@@ -80,14 +80,14 @@ def test_what_no_data_can_tell_apart_is_named_together(pushed):
     assert "motor" in result.next_experiment
 
 
-def test_two_at_once_are_both_named():
+def test_two_simultaneous_effects_are_both_named():
     result = diagnose(record([ViscousFriction(coefficient=1.5), ActuatorGain(scale=0.8)], episodes=6), SOURCE)
     assert "viscous_friction" in names(result)
     assert names(result) & {"actuator_gain", "cart_mass"}
     assert sum(result.where.stages.values()) == pytest.approx(1)
 
 
-def test_a_patch_is_found_where_it_is():
+def test_the_region_of_a_friction_patch_is_found():
     result = diagnose(record([FrictionPatch(start=-0.1, end=0.15, coefficient=6.0)], episodes=6), SOURCE)
     assert names(result) == {"friction_patch"}
     region = result.where.regions[0]
@@ -96,7 +96,7 @@ def test_a_patch_is_found_where_it_is():
     assert region.end == pytest.approx(0.15, abs=0.03)
 
 
-def test_an_effect_of_no_catalogue_is_unexplained():
+def test_an_effect_outside_the_catalogue_is_unexplained():
     class Cogging(CartForce):
         table = (Parameter("force", "N", 0.0, 5.0, 0.0),)
 
@@ -113,7 +113,7 @@ def test_lost_rows_are_counted():
     generator = np.random.default_rng(0)
     whole = record(episodes=6)
     lost = [(generator.random(len(e.time)) < 0.1) & (np.arange(len(e.time)) > 0) for e in whole.episodes]
-    result = diagnose(held(whole, lost, [0, 1]), SOURCE)
+    result = diagnose(with_repeats(whole, lost, [0, 1]), SOURCE)
     assert names(result) == {"dropout"}
     rate = sum(marks.sum() for marks in lost) / sum(len(marks) - 1 for marks in lost)
     assert result.causes[0].parameters["rate"].value == pytest.approx(rate)
@@ -123,7 +123,7 @@ def test_lost_rows_are_counted():
 def test_a_sensor_that_stands_still_is_found_with_its_zone():
     whole = record(episodes=6)
     still = [(e.state[:, 1] > 0.02) & (e.state[:, 1] < 0.06) & (np.arange(len(e.time)) > 0) for e in whole.episodes]
-    result = diagnose(held(whole, still, [1]), SOURCE)
+    result = diagnose(with_repeats(whole, still, [1]), SOURCE)
     assert names(result) == {"frozen_zone"}
     region = result.where.regions[0]
     assert region.variable == "theta"
@@ -131,21 +131,21 @@ def test_a_sensor_that_stands_still_is_found_with_its_zone():
     assert region.end == pytest.approx(0.06, abs=0.006)
 
 
-def test_velocities_that_are_differences_are_left_out():
+def test_velocities_differentiated_from_positions_are_left_out():
     whole = record([ViscousFriction(coefficient=0.8)], measured=("x", "x_dot", "theta", "theta_dot"))
-    assert Readings.of(whole, CartPole()).warnings == ()
+    assert prepare(whole, CartPole()).warnings == ()
     episodes = []
     for episode in whole.episodes:
         state = episode.state.copy()
         for k in (1, 3):
             state[:, k] = np.diff(state[:, k - 1], prepend=state[0, k - 1]) / 0.05
         episodes.append(Episode(episode.time, episode.action, state))
-    readings = Readings.of(dataclasses.replace(whole, episodes=tuple(episodes)), CartPole())
-    assert [warning.split()[0] for warning in readings.warnings] == ["x_dot", "theta_dot"]
-    assert readings.rows.channels == (0, 2)
+    prepared = prepare(dataclasses.replace(whole, episodes=tuple(episodes)), CartPole())
+    assert [warning.split()[0] for warning in prepared.warnings] == ["x_dot", "theta_dot"]
+    assert prepared.rows.channels == (0, 2)
 
 
-def test_an_angle_of_the_other_sign_is_turned_round():
+def test_an_angle_of_opposite_sign_is_inverted():
     whole = record([ViscousFriction(coefficient=0.8)])
     turned = tuple(Episode(e.time, e.action, e.state * np.array([1.0, -1.0])) for e in whole.episodes)
     result = diagnose(dataclasses.replace(whole, episodes=turned), SOURCE)
@@ -170,22 +170,22 @@ def test_an_effect_of_the_users_own_is_found():
     assert result.causes[0].parameters["torque"].value == pytest.approx(0.05, rel=0.1)
 
 
-def test_the_same_again(pushed):
+def test_a_repeated_diagnosis_is_equal(pushed):
     assert diagnose(record([ConstantForce(force=0.5)]), SOURCE).to_json() == pushed.to_json()
 
 
-def test_probabilities_add_up(pushed):
+def test_probabilities_sum_to_one(pushed):
     assert sum(ranked.probability for ranked in pushed.ranking) == pytest.approx(1)
     assert all(0 <= cause.probability <= 1 for cause in pushed.causes)
 
 
-def test_a_world_with_effects_is_no_source():
+def test_a_source_with_effects_is_refused():
     with pytest.raises(ValueError, match="bare system"):
         diagnose(record(), World(CartPole(), [ViscousFriction(coefficient=1.0)]))
 
 
 def test_error_grows_with_the_horizon(pushed):
-    growth = pushed.evidence.growth
+    growth = pushed.figures.growth
     assert growth is not None
     assert growth.before[-1] > 3 * growth.before[0]
     assert growth.after[-1] == pytest.approx(growth.floor[-1], rel=0.1)

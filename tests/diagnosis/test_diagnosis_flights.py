@@ -13,7 +13,7 @@ import torch
 from visadapt import diagnose
 from visadapt.cli.main import main
 from visadapt.diagnosis.search.catalogue import searched
-from visadapt.diagnosis.search.sensor_checks import Readings
+from visadapt.diagnosis.search.preparation import prepare
 from visadapt.effects import ActuatorDelay, ConstantForce, LiftSlope, LinearDrag, ThrustGain, Wind
 from visadapt.effects.catalogue import catalogue
 from visadapt.estimation.profiles import PROFILES
@@ -66,30 +66,30 @@ def diagnosed(system, effects=(), candidates=None):
     return diagnose(record(system, effects), source, catalogue=candidates)
 
 
-def test_each_subject_s_columns_are_all_there():
+def test_each_profile_covers_the_columns_of_its_system():
     for kind, profile in PROFILES.items():
         n = len(kind.states)
-        assert len(profile.spread) == n
-        assert len(profile.columns) == len(kind.loads)
+        assert len(profile.initial_variance) == n
+        assert len(profile.driven_columns) == len(kind.loads)
         assert sorted(column for sensor in profile.sensors for column in sensor) == list(range(n))
         names = {variable.name for variable in (*kind.states, *kind.actions)} | {"time"}
-        assert {*profile.places.values(), *profile.drawn} <= names
+        assert {*profile.region_variables.values(), *profile.plotted_variables} <= names
 
 
-def test_what_a_system_cannot_tell_another_may():
+def test_effects_may_be_separable_on_one_system_only():
     names = {kind: {e.name for e in searched(catalogue(kind()), kind())} for kind in (CartPole, Quadrotor)}
     assert not {"constant_force", "actuator_bias"} <= names[CartPole]
     assert {"constant_force", "actuator_bias"} <= names[Quadrotor]
     assert not {"thrust_gain", "payload"} <= names[Quadrotor]
 
 
-def test_nothing_there_is_no_gap_on_a_quadrotor():
+def test_a_quadrotor_without_effects_has_no_gap():
     result = diagnosed(Quadrotor(), candidates=[LinearDrag, ThrustGain, ActuatorDelay])
     assert result.verdict == "no_gap"
     assert result.gap.before == pytest.approx(result.gap.floor, rel=0.1)
 
 
-def test_a_wind_is_found_by_steps_where_a_grid_would_be_too_large():
+def test_a_wind_is_found_without_a_grid():
     truth = {"velocity_x": 3.0, "velocity_y": -1.5, "velocity_z": 0.5, "coefficient": 0.4}
     result = diagnosed(Quadrotor(), [Wind(**truth)], [LinearDrag, ConstantForce, Wind, ThrustGain])
     assert [cause.effect for cause in result.causes] == ["wind"]
@@ -132,7 +132,7 @@ def test_the_command_reads_a_quadrotor_s_csv(tmp_path, capsys, monkeypatch):
     assert "force along x" in page.read_text()
 
 
-def test_a_quaternion_s_sign_has_no_meaning():
+def test_a_quaternion_s_sign_does_not_matter():
     recording = record(Quadrotor(), episodes=2)
     flipped = []
     for episode in recording.episodes:
@@ -140,12 +140,11 @@ def test_a_quaternion_s_sign_has_no_meaning():
         state[7:15, 6:10] *= -1
         flipped.append(Episode(episode.time, episode.action, state))
     rows, again = (
-        Readings.of(each, Quadrotor()).rows
-        for each in (recording, dataclasses.replace(recording, episodes=tuple(flipped)))
+        prepare(each, Quadrotor()).rows for each in (recording, dataclasses.replace(recording, episodes=tuple(flipped)))
     )
     torch.testing.assert_close(again.measured, rows.measured)
 
 
-def test_terms_for_a_policy_need_one_action():
+def test_terms_of_theorem_1_need_a_system_with_one_action():
     with pytest.raises(ValueError, match="one action"):
         diagnose(record(Quadrotor(), episodes=1), World(Quadrotor(), period=0.1), policy=lambda state: state[:, :4])

@@ -14,8 +14,8 @@ from tests.diagnosis.test_report import SCHEMA
 from visadapt import diagnose
 from visadapt.cli import main as cli
 from visadapt.diagnosis.policy_bound import check, policy_terms
+from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.search.sensor_checks import Readings
 from visadapt.effects import (
     ActuatorBacklash,
     ActuatorDelay,
@@ -48,7 +48,7 @@ def nothing(states):
 
 def fitted(effect, **how):
     """Rows of a recording with an effect, and the fit of that effect alone."""
-    rows = Readings.of(record([effect], **how), CartPole()).rows
+    rows = prepare(record([effect], **how), CartPole()).rows
     search = Search(CartPole(), rows, [type(effect)])
     best = search.single(type(effect))
     return SimpleNamespace(rows=rows, best=search.fit([(best.effects, best.fits)], CAREFUL)[0], source=search.source)
@@ -76,11 +76,11 @@ class TestDelta:
     def test_before_is_what_the_force_does_in_a_step(self, terms):
         assert terms.delta[0] == pytest.approx(FORCE * PERIOD * PER_NEWTON, rel=0.02)
 
-    def test_after_is_next_to_nothing_but_not_less_than_the_truth(self, pushed, terms):
+    def test_after_is_small_but_not_below_the_true_error(self, pushed, terms):
         wrong = abs(float(pushed.best.fits.theta) - FORCE) * PERIOD * PER_NEWTON
         assert wrong < terms.delta[1] < 0.02 * terms.delta[0]
 
-    def test_what_nothing_explains_stays(self, pushed):
+    def test_an_unexplained_gap_remains_in_delta(self, pushed):
         found = policy_terms(linear, CartPole(), pushed.rows, pushed.source)
         assert found.delta[0] == found.delta[1] == pytest.approx(FORCE * PERIOD * PER_NEWTON, rel=0.25)
 
@@ -104,7 +104,7 @@ class TestOtherTerms:
         found = policy_terms(linear, CartPole(), weak.rows, weak.best)
         assert found.lipschitz[1] == pytest.approx(0.8 * found.lipschitz[0], rel=0.01)
 
-    def test_the_best_command_and_what_it_leaves_by_brute_force(self, pushed, terms):
+    def test_the_best_command_and_zeta_against_brute_force(self, pushed, terms):
         state, tried = states_of(pushed), torch.linspace(-1, 1, 401, dtype=torch.float64)
         for column, effects in enumerate(([], [ConstantForce(force=FORCE).double()])):
             with torch.no_grad():
@@ -126,9 +126,9 @@ class TestOtherTerms:
             assert terms.bound[k] == terms.delta[k] + terms.lipschitz[k] * terms.action_gap[k] + terms.zeta[k]
 
 
-class TestWhatThePolicyIsGiven:
+class TestHistories:
     class Spy(Policy):
-        """Keeps what it is given, and does nothing."""
+        """Records its histories and commands 0."""
 
         def __init__(self):
             super().__init__(4, 1)
@@ -160,8 +160,8 @@ class TestWhatThePolicyIsGiven:
     @pytest.mark.parametrize(
         "effect", [ActuatorDelay(delay=0.07), ActuatorLag(time_constant=0.06), ActuatorBacklash(width=0.1)]
     )
-    def test_another_command_meets_what_the_motor_remembers(self, effect):
-        rows = Readings.of(record(rows=150, episodes=2), CartPole()).rows  # two windows each
+    def test_another_command_acts_with_the_actuator_s_memory(self, effect):
+        rows = prepare(record(rows=150, episodes=2), CartPole()).rows  # two windows each
         theta = torch.tensor([next(effect.parameters()).item()], dtype=torch.float64)
         model = CandidateModel(CartPole(), [type(effect)], rows)
         window, row = 1, 20
@@ -183,8 +183,8 @@ class TestWhatThePolicyIsGiven:
 class TestWholeDiagnosis:
     def test_of_a_function(self):
         result = diagnose(record([ConstantForce(force=FORCE)]), World(CartPole()), [ConstantForce], policy=linear)
-        assert result.evidence.policy.delta[0] == pytest.approx(FORCE * PERIOD * PER_NEWTON, rel=0.02)
-        assert result.evidence.policy.bound[1] < result.evidence.policy.bound[0]
+        assert result.policy.delta[0] == pytest.approx(FORCE * PERIOD * PER_NEWTON, rel=0.02)
+        assert result.policy.bound[1] < result.policy.bound[0]
 
     def test_of_a_file(self, tmp_path, capsys):
         run, saved, out, page = (tmp_path / name for name in ("run.csv", "p.safetensors", "a.json", "a.html"))
@@ -213,6 +213,6 @@ class TestNoPolicy:
         with pytest.raises(ValueError, match=message):
             check(policy, CartPole())
 
-    def test_before_the_search(self):
+    def test_is_refused_before_the_search(self):
         with pytest.raises(ValueError, match="sees frames"):
             diagnose(record(), World(CartPole()), policy=ImagePolicy(torch.zeros(100, 120), 1.0))

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from visadapt import diagnosis as package
-from visadapt.diagnosis.report.html import as_html, as_text, write_report
-from visadapt.diagnosis.report.text import estimate, interval, number, sentence
+from visadapt.diagnosis.report.html import as_html, write_report
+from visadapt.diagnosis.report.text import as_text, estimate, interval, number, sentence
 from visadapt.diagnosis.result import (
     VERDICTS,
     Cause,
     Diagnosis,
     Estimate,
-    Evidence,
+    FigureData,
     Gap,
     Growth,
     PolicyTerms,
@@ -37,7 +37,7 @@ MEASURE = "root mean square error of x, theta 0.5 s ahead, in units of the noise
 SETTINGS = {"recording": "run.csv", "seed": "0", "versions": "visadapt 0.1.0"}
 
 
-def some_evidence(velocities=True):
+def some_figures(velocities=True):
     rng = np.random.default_rng(0)
     time = 1.2 + np.arange(41) * 0.05
     truth = np.column_stack(
@@ -52,7 +52,7 @@ def some_evidence(velocities=True):
     error = np.full(15, 0.15)
     seconds = np.linspace(0.05, 0.5, 10)
     frequency = np.linspace(0.1, 10, 60)
-    return Evidence(
+    return FigureData(
         predictions=tuple(Prediction(episode, time, measured, truth + drift, truth) for episode in (3, 5, 8)),
         profiles=(
             Profile("x", "m", "force on the cart", "N", centres, bump, error, 0.1 * bump, error),
@@ -60,7 +60,6 @@ def some_evidence(velocities=True):
         ),
         growth=Growth(seconds, 1 + 8 * seconds**2, 1 + 0.3 * seconds, np.ones(10), 1 + 0.5 * seconds),
         spectrum=Spectrum("force on the cart", "N2/Hz", frequency, 1 / frequency, 0.05 + 0 * frequency),
-        policy=PolicyTerms((0.12, 0.01), (2.5, 2.0), (0.04, 0.03), (0.3, 0.2)),
     )
 
 
@@ -81,7 +80,7 @@ REGION = Region("x", 0.1, 0.4, 0.8, 0.0004)
 
 
 def a_diagnosis(verdict, **changes):
-    """One that could be, for each verdict."""
+    """A plausible diagnosis for each verdict."""
     common: dict = {
         "system": "cartpole",
         "recording": RecordingSummary(10, 1000, 0.05),
@@ -91,7 +90,8 @@ def a_diagnosis(verdict, **changes):
             (REGION,),
         ),
         "gap": Gap(MEASURE, 6.4, 1.21, 1.02, 1.4, 0.965),
-        "evidence": some_evidence(),
+        "figures": some_figures(),
+        "policy": PolicyTerms((0.12, 0.01), (2.5, 2.0), (0.04, 0.03), (0.3, 0.2)),
         "next_experiment": "",
     }
     own: dict[str, dict] = {
@@ -123,7 +123,7 @@ def a_diagnosis(verdict, **changes):
                 dict.fromkeys(("actuation", "dynamics", "sensing", "camera"), 0.0),
                 {"x": 0.5, "x_dot": math.nan, "theta": 0.5, "theta_dot": math.nan},
             ),
-            "evidence": some_evidence(velocities=False),
+            "figures": some_figures(velocities=False),
         },
     }
     return Diagnosis(**(common | {"verdict": verdict} | own[verdict] | changes))
@@ -138,7 +138,7 @@ class TestResult:
         content = json.loads(json.dumps(a_diagnosis(verdict).to_json(), allow_nan=False))
         jsonschema.Draft202012Validator(SCHEMA).validate(content)
 
-    def test_the_schema_is_one(self):
+    def test_the_schema_is_valid(self):
         jsonschema.Draft202012Validator.check_schema(SCHEMA)
 
     def test_keys_and_their_order_are_the_contract(self):
@@ -183,7 +183,7 @@ class TestResult:
         ("changes", "message"),
         [({"verdict": "maybe"}, "'maybe'; there are identified"), ({"causes": ()}, "does not go with 0 causes")],
     )
-    def test_what_does_not_go_together(self, changes, message):
+    def test_contradictions_are_refused(self, changes, message):
         with pytest.raises(ValueError, match=message):
             replace(a_diagnosis("identified"), **changes)
 
@@ -244,7 +244,7 @@ class TestWords:
         assert estimate(Estimate(213.4, "N", (150.0, 270.0))) == "210 N"
 
     @every_verdict
-    def test_the_terminal_has_it_all(self, verdict):
+    def test_the_terminal_shows_everything(self, verdict):
         diagnosis = a_diagnosis(verdict)
         text = as_text(diagnosis)
         assert text.startswith(f"{verdict}: {sentence(diagnosis)}\n")
@@ -259,7 +259,7 @@ class TestWords:
 
 
 class Page(HTMLParser):
-    """What a page is made of: the tags that are open must close."""
+    """Tags, attributes and text of a page; every tag must be closed."""
 
     VOID = ("meta", "link", "img", "br")
 
@@ -289,7 +289,7 @@ class Page(HTMLParser):
 
 class TestPage:
     @every_verdict
-    def test_is_whole_and_stands_alone(self, verdict):
+    def test_is_complete_and_self_contained(self, verdict):
         diagnosis = a_diagnosis(verdict)
         page = Page(as_html(diagnosis, SETTINGS))
         assert "script" not in page.tags
@@ -307,10 +307,10 @@ class TestPage:
             assert "var(--before)" in svg
             assert not re.search(r"(?:fill|stroke): #", svg)
 
-    def test_without_evidence(self):
-        assert Page(as_html(a_diagnosis("identified", evidence=Evidence()), {})).tags.count("svg") == 0
+    def test_without_figures(self):
+        assert Page(as_html(a_diagnosis("identified", figures=FigureData()), {})).tags.count("svg") == 0
 
-    def test_what_others_wrote_is_escaped(self):
+    def test_foreign_text_is_escaped(self):
         page = as_html(a_diagnosis("identified", warnings=("<b>&.csv: odd",)), {"recording": "<i>.csv"})
         assert "&lt;b&gt;&amp;.csv: odd" in page
         assert "&lt;i&gt;.csv" in page

@@ -86,7 +86,7 @@ def test_the_covariance_of_smoothed_states_is_the_conditional_one(problem):
             torch.testing.assert_close(found[n, t], expected[rows, rows])
 
 
-def test_smoothed_disturbances_carry_the_states_on(problem):
+def test_smoothed_states_follow_the_model_with_the_smoothed_disturbances(problem):
     smoothed, adjoint = backward(problem, forward(problem, torch.diag_embed(PROCESS), MEASUREMENT))
     disturbance = -(PROCESS[:, None, :, None] * adjoint)[:, 1:]
     carried = problem.transition @ smoothed[:, :-1] + problem.drive + disturbance

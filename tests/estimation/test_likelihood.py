@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from tests.diagnosed import record
+from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.search.sensor_checks import Readings
 from visadapt.effects import ActuatorDelay, CartMass, ConstantForce, SensorScale, ViscousFriction
 from visadapt.estimation.candidate import CandidateModel, linearise
 from visadapt.estimation.fit_states import CAREFUL
@@ -13,27 +13,27 @@ from visadapt.systems import CartPole
 
 
 @pytest.fixture(scope="module")
-def rubbing():
-    return Readings.of(record([ViscousFriction(coefficient=0.8)]), CartPole()).rows
+def viscous():
+    return prepare(record([ViscousFriction(coefficient=0.8)]), CartPole()).rows
 
 
-def test_linearisation_predicts_small_steps(rubbing):
-    model = CandidateModel(CartPole(), [ViscousFriction, SensorScale, ActuatorDelay, CartMass], rubbing)
+def test_linearisation_predicts_small_steps(viscous):
+    model = CandidateModel(CartPole(), [ViscousFriction, SensorScale, ActuatorDelay, CartMass], viscous)
     theta = torch.tensor([0.5, 1.1, 0.9, 0.03, 1.2], dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
-    state = 0.2 * torch.randn(*rubbing.shape, 4, generator=generator, dtype=torch.float64)
+    state = 0.2 * torch.randn(*viscous.shape, 4, generator=generator, dtype=torch.float64)
     at = linearise(model, theta, state)
     step = 1e-4 * torch.randn(*state.shape, generator=generator, dtype=torch.float64)
     turn = 1e-4 * torch.randn(len(theta), generator=generator, dtype=torch.float64)
     there = linearise(model, theta + turn, state + step)
     change = (at.transition @ step[:, :-1, :, None])[..., 0] + at.by_parameter @ turn
-    torch.testing.assert_close(there.following - at.following, change, atol=2e-7, rtol=0)
+    torch.testing.assert_close(there.next_state - at.next_state, change, atol=2e-7, rtol=0)
     seen = (at.sensing @ step[..., None])[..., 0] + at.sensing_by_parameter @ turn
     torch.testing.assert_close(there.measured - at.measured, seen, atol=2e-7, rtol=0)
 
 
-def test_a_fit_finds_size_noise_and_nothing_left(rubbing):
-    search = Search(CartPole(), rubbing, [ViscousFriction])
+def test_a_fit_finds_size_and_noise_and_leaves_no_disturbance(viscous):
+    search = Search(CartPole(), viscous, [ViscousFriction])
     fits = search.single(ViscousFriction).fits
     deviation = fits.information[0, 0, 0].rsqrt()
     assert abs(float(fits.theta[0, 0]) - 0.8) < 4 * float(deviation)
@@ -42,28 +42,28 @@ def test_a_fit_finds_size_noise_and_nothing_left(rubbing):
     assert float((fits.log_process[0] / 2).exp().max()) < 0.01
 
 
-def test_information_is_the_curvature_of_the_likelihood(rubbing):
-    search = Search(CartPole(), rubbing, [ViscousFriction])
+def test_information_is_the_curvature_of_the_likelihood(viscous):
+    search = Search(CartPole(), viscous, [ViscousFriction])
     best = search.fit([((ViscousFriction,), search.single(ViscousFriction).fits)], CAREFUL)[0].fits
     step = float(best.information[0, 0, 0].rsqrt())
-    model = CandidateModel(CartPole(), [ViscousFriction], rubbing)
+    model = CandidateModel(CartPole(), [ViscousFriction], viscous)
     losses = []
     for side in (-step, step):
         # A range of no width holds the parameter where it is while the states settle.
         model.low = model.high = best.theta[0] + side
         from visadapt.estimation.likelihood import fit  # the one place that needs the bare fit
 
-        held = best.of(torch.tensor([0]))
+        held = best.select(torch.tensor([0]))
         object.__setattr__(held, "theta", best.theta + side)
-        losses.append(float(best.likelihood[0] - fit([model], held, torch.ones(1, rubbing.shape[0]), 10).likelihood[0]))
+        losses.append(float(best.likelihood[0] - fit([model], held, torch.ones(1, viscous.shape[0]), 10).likelihood[0]))
     assert sum(losses) / 2 == pytest.approx(0.5, rel=0.1)
 
 
-def test_a_batch_of_sets_is_fitted_as_each_alone(rubbing):
-    together = Search(CartPole(), rubbing, [])
-    starts = [((effect,), together._lead(together.source, effect)) for effect in (ViscousFriction, ConstantForce)]
+def test_a_batch_of_sets_is_fitted_as_each_alone(viscous):
+    together = Search(CartPole(), viscous, [])
+    starts = [((effect,), together._start(together.source, effect)) for effect in (ViscousFriction, ConstantForce)]
     both = together.fit(starts, CAREFUL)
     for start, found in zip(starts, both, strict=True):
-        alone = Search(CartPole(), rubbing, []).fit([start], CAREFUL)[0]
+        alone = Search(CartPole(), viscous, []).fit([start], CAREFUL)[0]
         torch.testing.assert_close(found.fits.theta, alone.fits.theta, atol=1e-4, rtol=1e-3)
-        assert found.evidence == pytest.approx(alone.evidence, abs=0.05)
+        assert found.log_odds == pytest.approx(alone.log_odds, abs=0.05)

@@ -64,7 +64,8 @@ def _columns(text: str) -> dict[str, str]:
 def run(options: argparse.Namespace) -> None:
     """Diagnose, print the verdict, write what was asked for."""
     from visadapt import diagnosis
-    from visadapt.diagnosis.report.html import as_text, write_report
+    from visadapt.diagnosis.report.html import write_report
+    from visadapt.diagnosis.report.text import as_text
     from visadapt.recordings import load_recording
     from visadapt.storage.atomic_files import replacing
     from visadapt.world import World

@@ -1,4 +1,4 @@
-"""From a recording to a diagnosis: set aside what is no reading, search, judge, predict what was held out."""
+"""From a recording to a diagnosis: prepare the rows, search, compare models, predict held-out episodes, judge."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 
 from visadapt.diagnosis import policy_bound
 from visadapt.diagnosis.report import next_experiment
-from visadapt.diagnosis.report.figures_data import Errors, disturbances, evidence
+from visadapt.diagnosis.report.figures_data import Errors, disturbances, figure_data
 from visadapt.diagnosis.result import (
     AMBIGUOUS,
     IDENTIFIED,
@@ -22,11 +22,12 @@ from visadapt.diagnosis.result import (
 )
 from visadapt.diagnosis.search import heldout, localisation
 from visadapt.diagnosis.search.catalogue import searched
-from visadapt.diagnosis.search.causes import Named, causes, classes, ranking, stage_shares
+from visadapt.diagnosis.search.causes import Alternative, alternatives, causes, ranking, stage_shares
+from visadapt.diagnosis.search.disturbance import Disturbance
 from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
-from visadapt.diagnosis.search.repeated_causes import held_causes, unaware
+from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.search.sensor_checks import Readings
 from visadapt.effects import EFFECTS, Effect
 from visadapt.effects.catalogue import catalogue as all_effects
 from visadapt.estimation.profiles import profile_of
@@ -35,14 +36,14 @@ from visadapt.recordings import Recording
 from visadapt.systems import System
 from visadapt.world import World
 
-ENOUGH = 0.95
-"""Share of the gap that the causes must close to be the explanation where something is left over."""
+MIN_GAP_CLOSED = 0.95
+"""Share of the gap that the causes must close to count as identified although something remains unexplained."""
 
-CLEAR = 3.0
-"""Times the noise that predictions must still err by for the noise to be no measure of what is left."""
+CLEAR_OF_NOISE = 3.0
+"""Error of the corrected predictions over the noise, above which the share of the gap closed decides the verdict."""
 
-RIVALS = 2
-"""Sets after the best one of which it is computed how far they close the gap."""
+RUNNERS_UP = 2
+"""Sets after the best for which the share of the gap that they close is computed."""
 
 
 def diagnose(
@@ -54,20 +55,20 @@ def diagnose(
     progress: Report | None = None,
     policy: policy_bound.StatesToActions | None = None,
 ) -> Diagnosis:
-    """Say where a recording departs from the source, which effects cause it, and how far they close the gap.
+    """Find where a recording departs from the source, which effects cause it, and how far they close the gap.
 
     Args:
-        recording: states, or some of them, and commands.
-        world: the source; its system and its parameters are taken as known.
-        catalogue: the effects that may be named; without it, all that are registered.
-        seed: of the shifts by which the significance of regions is counted; nothing else is drawn.
-        jobs: cores that tensor operations may use.
+        recording: some or all states, and commands.
+        world: the source, without effects; the parameters of its system are taken as known.
+        catalogue: the effects that may be causes; by default all that are registered for the system.
+        seed: of the random shifts that give the p-values of regions; nothing else is random.
+        jobs: threads that tensor operations may use.
         progress: called with (stage, steps done, steps in all, loss).
-        policy: on states, with the units and signs of the source and the rate of the recording; for it, Theorem 1's
-            terms are told (`Diagnosis.evidence.policy`).
+        policy: a policy on states, in the units and signs of the source and at the rate of the recording; with it, the
+            terms of the paper's Theorem 1 are computed (`Diagnosis.policy`).
 
     Raises:
-        ValueError: the world has effects of its own, or a system that cannot be diagnosed; or no policy on its states.
+        ValueError: the world has effects, its system cannot be diagnosed, or `policy` is not one on its states.
 
     >>> import pathlib, tempfile, torch, visadapt as va
     >>> target = va.SyntheticTarget(va.constant_force(2.0))
@@ -100,97 +101,100 @@ def _diagnose(
     progress: Report | None,
     policy: policy_bound.StatesToActions | None,
 ) -> Diagnosis:
-    readings = Readings.of(recording, system)
-    rows = readings.rows
-    search = Search(system, rows, searched(effects, system), readings.source)
+    prepared = prepare(recording, system)
+    rows = prepared.rows
+    search = Search(system, rows, searched(effects, system), prepared.source)
     search.run(staged(progress, "search"))
     comparison = compare(search)
     best = comparison.best
-    places = classes(comparison, effects, system)
-    held = held_causes(readings, search, comparison)
+    groups = alternatives(comparison, effects, system)
+    repeats = repeated_reading_causes(prepared, search, comparison)
+    repeat_causes = [each.cause for each in repeats]
 
-    # How far: the source, the best set, each cause alone, the runners-up; all on episodes held out.
-    alone = [search.single(effect) for effect in dict.fromkeys(named.canonical for place in places for named in place)]
-    rivals = [weighed.fitted for weighed in comparison.weighed[1 : 1 + RIVALS]]
-    sets = {frozenset(f.names): f for f in [search.source, best, *alone, *rivals]}
-    ahead = heldout.held_out(system, rows, [(f.effects, f.fits) for f in sets.values()])
-    predicted = dict(zip(sets, ahead, strict=True))
-    source = unaware(readings, search) if held else predicted[frozenset()]
+    # Predictions of the source, the best set, each cause alone and the runners-up, on held-out episodes.
+    alone = [search.single(effect) for effect in dict.fromkeys(one.canonical for group in groups for one in group)]
+    runners_up = [compared.model for compared in comparison.models[1 : 1 + RUNNERS_UP]]
+    sets = {frozenset(f.names): f for f in [search.source, best, *alone, *runners_up]}
+    rollouts = heldout.held_out(system, rows, [(f.effects, f.fits) for f in sets.values()])
+    predicted = dict(zip(sets, rollouts, strict=True))
+    source = errors_with_repeats(prepared, search) if repeats else predicted[frozenset()]
     corrected = predicted[frozenset(best.names)]
-    boxed = heldout.held_out(system, rows, [((), search.source.fits)], black_box=True)[0]
-    errors = Errors.of(source, corrected, boxed, (best.fits.log_noise[0] / 2).exp())
-    closing = {names: errors.closed_by(each) for names, each in predicted.items()}
+    black_box = heldout.held_out(system, rows, [((), search.source.fits)], black_box=True)[0]
+    errors = Errors.from_rollouts(source, corrected, black_box, (best.fits.log_noise[0] / 2).exp())
+    gap_closed = {names: errors.closed_by(each) for names, each in predicted.items()}
 
-    verdict = _verdict(comparison, errors, bool(held))
-    told: tuple[Cause, ...] = ()
+    verdict = _verdict(comparison, errors, bool(repeats))
+    found: tuple[Cause, ...] = ()
     if verdict == IDENTIFIED:
-        told = (*(each.cause for each in held), *causes(search, comparison, places, closing))
-        if any(cause.indistinguishable_from for cause in told):
+        found = (*repeat_causes, *causes(search, comparison, groups, gap_closed))
+        if any(cause.indistinguishable_from for cause in found):
             verdict = AMBIGUOUS
-    terms = None if policy is None else policy_bound.policy_terms(policy, system, rows, best)
     before, after = disturbances(search, comparison)
-    regions = _regions(told, before if told else after, profile_of(system).places, seed)
+    regions = _regions(found, before if found else after, effects, profile_of(system).region_variables, seed)
     return Diagnosis(
         system=system.name,
         recording=RecordingSummary(len(recording.episodes), recording.samples, float(f"{recording.period:.9g}")),
         verdict=verdict,
         where=Where(
-            stage_shares(search, comparison, [each.cost for each in held]),
-            errors.by_state(system, rows.channels, bool(told)),
+            stage_shares(search, comparison, [each.cost for each in repeats]),
+            errors.by_state(system, rows.channels, bool(found)),
             regions,
         ),
-        causes=told,
-        ranking=ranking(comparison, effects, system, closing, [each.cause for each in held]),
+        causes=found,
+        ranking=ranking(comparison, effects, system, gap_closed, repeat_causes),
         gap=errors.gap(),
-        next_experiment=_next(comparison, verdict, places, system),
-        warnings=(*recording.warnings, *readings.warnings, *_doubts(comparison, verdict)),
-        evidence=evidence(search, source, corrected, errors, before, after, regions, terms),
+        next_experiment=_next(comparison, verdict, groups, system),
+        warnings=(*recording.warnings, *prepared.warnings, *_warnings(comparison, verdict)),
+        figures=figure_data(search, source, corrected, errors, before, after, regions),
+        policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, best),
     )
 
 
-def _verdict(comparison: ModelComparison, errors: Errors, held: bool) -> str:
+def _verdict(comparison: ModelComparison, errors: Errors, repeats: bool) -> str:
+    """The verdict, before it is known whether causes can be told apart; `repeats`: readings are repeated."""
     if comparison.unexplained:
         gap = errors.gap()
-        # Where the noise is so low that any real machine departs from any model, what counts is how much of the gap
-        # is closed; elsewhere, whether what is left is evident.
-        enough = gap.closed >= ENOUGH if gap.after > CLEAR * gap.floor else comparison.slight
+        # Where the noise is low, any model of a real machine leaves something significant: then the share of the gap
+        # that is closed decides, otherwise whether what is unexplained is negligible.
+        clear = gap.after > CLEAR_OF_NOISE * gap.floor
+        enough = gap.closed >= MIN_GAP_CLOSED if clear else comparison.negligible
         return IDENTIFIED if comparison.best.effects and enough else UNEXPLAINED
-    return IDENTIFIED if comparison.best.effects or held else NO_GAP
+    return IDENTIFIED if comparison.best.effects or repeats else NO_GAP
 
 
 def _regions(
-    told: Sequence[Cause], found: localisation.Disturbance, places: Mapping[str, str], seed: int
+    found: Sequence[Cause],
+    disturbance: Disturbance,
+    effects: Sequence[type[Effect]],
+    variables: Mapping[str, str],
+    seed: int,
 ) -> tuple[Region, ...]:
-    """Those of the causes that act in one, as they were fitted; then those where the residual stands out."""
-    own = []
-    for cause in told:
-        edges = EFFECTS[cause.effect].region()
-        if edges is not None and edges[0].unit in places:
+    """The regions of causes that act in one, as fitted; then those of other variables where the disturbance is
+    concentrated. `variables` are those along which regions lie, by unit."""
+    # Effects of the user's own need not be registered; those that repeat readings need not be in the catalogue.
+    by_name = {**EFFECTS, **{effect.name: effect for effect in effects}}
+    fitted = []
+    for cause in found:
+        edges = by_name[cause.effect].region()
+        if edges is not None and edges[0].unit in variables:
             start, end = (cause.parameters[edge.name] for edge in edges)
-            variable = places[start.unit]
-            own.append(
-                Region(
-                    variable,
-                    start.value,
-                    end.value,
-                    localisation.share(found, variable, start.value, end.value),
-                    1 - cause.probability,
-                )
-            )
-    taken = {region.variable for region in own}
-    return (*own, *(region for region in localisation.regions(found, seed) if region.variable not in taken))
+            variable = variables[start.unit]
+            share = localisation.share(disturbance, variable, start.value, end.value)
+            fitted.append(Region(variable, start.value, end.value, share, 1 - cause.probability))
+    taken = {region.variable for region in fitted}
+    return (*fitted, *(one for one in localisation.regions(disturbance, seed) if one.variable not in taken))
 
 
-def _next(comparison: ModelComparison, verdict: str, places: Sequence[Sequence[Named]], system: System) -> str:
+def _next(comparison: ModelComparison, verdict: str, groups: Sequence[Sequence[Alternative]], system: System) -> str:
     if verdict == NO_GAP:
         return next_experiment.more(profile_of(system))
     if verdict == UNEXPLAINED:
         first = comparison.functions[0]
         return next_experiment.explain(first.port, first.variable)
-    return next_experiment.separate([[named.effect for named in place] for place in places], system)
+    return next_experiment.separate([[one.effect for one in group] for group in groups], system)
 
 
-def _doubts(comparison: ModelComparison, verdict: str) -> list[str]:
+def _warnings(comparison: ModelComparison, verdict: str) -> list[str]:
     if verdict in (IDENTIFIED, AMBIGUOUS) and comparison.unexplained:
         first = comparison.functions[0]
         return [

@@ -1,7 +1,7 @@
-"""What a diagnosis says, as numbers: the JSON of the command, and the evidence that the report draws.
+"""The result of a diagnosis as numbers, and the data that the report plots.
 
-The JSON's schema is `schema.json` beside this file, version 1. Shares and probabilities are numbers from 0 to 1;
-parameters are in the units that their effects state; whatever could not be determined is NaN here, null in the JSON.
+Shares and probabilities are numbers from 0 to 1, parameters in the units that their effects state; what could not be
+determined is NaN, null in the JSON.
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from visadapt.diagnosis.result_json import as_json
 from visadapt.effects import EFFECTS, Effect
-
-SCHEMA_VERSION = 1
 
 IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP = "identified", "ambiguous", "unexplained", "no_gap"
 VERDICTS = (IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP)
@@ -24,7 +23,7 @@ VERDICTS = (IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP)
 
 @dataclass(frozen=True)
 class Region:
-    """A stretch of one variable (a state, an action, `time` in s since the episode began, or `episode`)."""
+    """An interval of one variable: a state, an action, `time` in s since the episode started, or `episode`."""
 
     variable: str
     start: float
@@ -32,21 +31,21 @@ class Region:
     end: float
     """the JSON's "to", in the variable's unit"""
     share: float
-    """of the gap that lies here"""
+    """of the gap that lies in it"""
     p_value: float
-    """of a gap like this by chance somewhere, all places looked at included"""
+    """probability that chance concentrates as much of the gap in any interval that was tried"""
 
 
 @dataclass(frozen=True)
 class Where:
-    """Shares of the gap by stage and by state, and the regions that stand out."""
+    """Shares of the gap by stage and by state, and the regions where it is concentrated."""
 
     stages: Mapping[str, float]
     """of the explained gap: actuation, dynamics, sensing, camera"""
     states: Mapping[str, float]
     """every state of the system; NaN where it was not measured"""
     regions: tuple[Region, ...] = ()
-    """the most certain first"""
+    """fitted regions of causes first, then lowest p-value first"""
 
 
 @dataclass(frozen=True)
@@ -56,12 +55,12 @@ class Estimate:
     value: float
     unit: str
     ci90: tuple[float, float]
-    """90 % interval; NaN on a side on which it is open"""
+    """90 % confidence interval; NaN on a side on which it is open"""
 
 
 @dataclass(frozen=True)
 class Cause:
-    """One effect that acts, as far as the data says."""
+    """One effect that explains the gap, or part of it."""
 
     effect: str
     parameters: Mapping[str, Estimate]
@@ -69,12 +68,12 @@ class Cause:
     gap_closed: float
     """by this cause alone, on held-out episodes"""
     indistinguishable_from: tuple[str, ...] = ()
-    """effects that fit this recording as well"""
+    """effects that fit this recording equally well"""
 
 
 @dataclass(frozen=True)
 class Ranked:
-    """One set of effects that was weighed; the empty set is the source as it stands."""
+    """One set of effects that was compared; the empty set is the source."""
 
     effects: tuple[str, ...]
     probability: float
@@ -87,26 +86,26 @@ class Gap:
     """The error of predictions several steps ahead on held-out episodes."""
 
     measure: str
-    """what the other numbers are, in words and with the unit"""
+    """what the other numbers are, in words, with the unit"""
     before: float
     """of the source"""
     after: float
     """of the source with the causes"""
     floor: float
-    """what the measurement noise alone leaves"""
+    """of the measurement noise alone"""
     black_box: float
-    """of the source with a residual network"""
+    """of the source with a black box of smooth functions"""
     closed: float
     """(before - after) / (before - floor)"""
 
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """How much was recorded."""
+    """Size of the recording."""
 
     episodes: int
     samples: int
-    """executed actions"""
+    """actions that were executed"""
     period: float
     """s between rows"""
 
@@ -117,13 +116,13 @@ class Prediction:
 
     episode: int
     time: NDArray[np.floating]
-    """(K,) s since the episode began"""
+    """(K,) s since the episode started"""
     measured: NDArray[np.floating]
     """(K, n_state); NaN in the columns of states that were not measured"""
     source: NDArray[np.floating]
-    """(K, n_state), as the source predicts it"""
+    """(K, n_state) prediction of the source"""
     corrected: NDArray[np.floating]
-    """(K, n_state), as the source with the causes predicts it (without a cause: as `source`)"""
+    """(K, n_state) prediction of the source with the best set of effects"""
 
 
 @dataclass(frozen=True)
@@ -134,10 +133,10 @@ class Profile:
     """a state, an action, `time` or `episode`"""
     variable_unit: str
     quantity: str
-    """what is left over, say "force on the cart" """
+    """the residual in words, such as "force on the cart" """
     quantity_unit: str
     centres: NDArray[np.floating]
-    """(N,) of the bins"""
+    """(N,) means of the variable in the bins"""
     before: NDArray[np.floating]
     """(N,) mean under the source; NaN in empty bins"""
     before_error: NDArray[np.floating]
@@ -150,7 +149,7 @@ class Profile:
 
 @dataclass(frozen=True)
 class Growth:
-    """How the error grows with the horizon of prediction, all (K,); the same measure as `Gap`, but at one instant."""
+    """The errors of `Gap` at each of K horizons, all (K,)."""
 
     seconds: NDArray[np.floating]
     before: NDArray[np.floating]
@@ -164,9 +163,9 @@ class Spectrum:
     """Power spectral density of the residual, all (F,)."""
 
     quantity: str
-    """what is left over, say "force on the cart" """
+    """the residual in words, such as "force on the cart" """
     unit: str
-    """of the density, say "N2/Hz" """
+    """of the density, such as "N2/Hz" """
     frequency: NDArray[np.floating]
     """Hz"""
     before: NDArray[np.floating]
@@ -175,40 +174,39 @@ class Spectrum:
 
 @dataclass(frozen=True)
 class PolicyTerms:
-    """The terms of the paper's Theorem 1 for a given policy, a pair (before, after) each.
+    """The terms of the paper's Theorem 1 for a given policy, each a pair (before, after).
 
-    Before, the model f_hat is the source; after, it is the source with the causes. Means are over the states of the
-    recording, norms are Euclidean over one step's state in SI units (`theorem.py` says how they are found).
+    Before, the model f_hat is the source; after, it is the source with the best set of effects. Means are over the
+    states of the recording, norms are Euclidean over one step's state in SI units; `policy_bound.py` computes them.
     """
 
     delta: tuple[float, float]
     """error of the model's step under the policy, E|f_hat(s, pi(s)) - f*(s, pi(s))| (equation 6)"""
     lipschitz: tuple[float, float]
-    """L, by which the model's step follows a change of the action at most (equation 7), per unit of command"""
+    """L, largest change of the model's step per unit of command (equation 7)"""
     action_gap: tuple[float, float]
-    """distance of the policy's action from the one that is best in the model, E|pi(s) - pi_hat(s)|, in commands"""
+    """distance of the policy's action from the model's best, E|pi(s) - pi_hat(s)|, in units of command"""
     zeta: tuple[float, float]
-    """distance from the reference that this best action leaves, E[zeta] (equation 5)"""
+    """distance from the reference under this best action, E[zeta] (equation 5)"""
 
     @property
     def bound(self) -> tuple[float, float]:
-        """On the policy's distance from the reference after a step of the machine (equation 8)."""
+        """Upper bound of the distance from the reference after one step of the machine (equation 8)."""
         terms = zip(self.delta, self.lipschitz, self.action_gap, self.zeta, strict=True)
         before, after = (delta + lipschitz * gap + zeta for delta, lipschitz, gap, zeta in terms)
         return before, after
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """What the report draws and the JSON leaves out. Whatever is empty or None is not drawn."""
+class FigureData:
+    """What the report plots; what is empty or None is not plotted."""
 
     predictions: tuple[Prediction, ...] = ()
-    """a few held-out windows, the most telling first"""
+    """held-out windows, that of the source's largest error first"""
     profiles: tuple[Profile, ...] = ()
     """the variables of `Where.regions` first"""
     growth: Growth | None = None
     spectrum: Spectrum | None = None
-    policy: PolicyTerms | None = None
 
 
 @dataclass(frozen=True)
@@ -216,7 +214,7 @@ class Diagnosis:
     """The whole result.
 
     Raises:
-        ValueError: an unknown verdict, or causes where the verdict says that there are none.
+        ValueError: an unknown verdict, or causes that contradict the verdict.
 
     >>> import visadapt as va
     >>> from visadapt.diagnosis.result import Gap, RecordingSummary, Where
@@ -232,15 +230,17 @@ class Diagnosis:
     """one of VERDICTS"""
     where: Where
     causes: tuple[Cause, ...]
-    """the likeliest first; empty for no_gap and unexplained. For ambiguous: those that fit equally well"""
+    """empty for no_gap and unexplained; for ambiguous, all that fit equally well"""
     ranking: tuple[Ranked, ...]
-    """the likeliest first, the runners-up too"""
+    """all sets that were compared, the most probable first"""
     gap: Gap
     next_experiment: str
-    """what to record to settle what is open; empty where nothing is"""
+    """what to record to settle open questions; empty where there are none"""
     warnings: tuple[str, ...] = ()
-    """the recording's, and the diagnosis's own"""
-    evidence: Evidence = Evidence()
+    """of loading the recording, and of the diagnosis"""
+    figures: FigureData = FigureData()
+    policy: PolicyTerms | None = None
+    """terms of Theorem 1, where a policy was given"""
 
     def __post_init__(self) -> None:
         if self.verdict not in VERDICTS:
@@ -286,42 +286,8 @@ class Diagnosis:
         return [_effect(cause) for cause in taken]
 
     def to_json(self) -> dict[str, Any]:
-        """What json.dumps takes, strictly (null for what is not finite); keys and their order are the schema's."""
-        return {
-            "schema": SCHEMA_VERSION,
-            "system": self.system,
-            "recording": {
-                "episodes": int(self.recording.episodes),
-                "samples": int(self.recording.samples),
-                "period": _number(self.recording.period),
-            },
-            "verdict": self.verdict,
-            "where": {
-                "stages": {name: _share(share) for name, share in self.where.stages.items()},
-                "states": {name: _share(share) for name, share in self.where.states.items()},
-                "regions": [_region(region) for region in self.where.regions],
-                "pixels": None,
-            },
-            "causes": [_cause(cause) for cause in self.causes],
-            "ranking": [
-                {
-                    "effects": list(ranked.effects),
-                    "probability": _share(ranked.probability),
-                    "gap_closed": _number(ranked.gap_closed),
-                }
-                for ranked in self.ranking
-            ],
-            "gap": {
-                "measure": self.gap.measure,
-                "before": _number(self.gap.before),
-                "after": _number(self.gap.after),
-                "floor": _number(self.gap.floor),
-                "black_box": _number(self.gap.black_box),
-                "closed": _number(self.gap.closed),
-            },
-            "next_experiment": self.next_experiment,
-            "warnings": list(self.warnings),
-        }
+        """The result as json.dumps takes it; keys and their order are those of `schema.json`, NaN becomes None."""
+        return as_json(self)
 
 
 def _effect(cause: Cause) -> Effect:
@@ -330,38 +296,3 @@ def _effect(cause: Cause) -> Effect:
         if not math.isfinite(value):
             raise ValueError(f"{cause.effect}: the recording does not determine its {name}; record what does")
     return EFFECTS[cause.effect](**values)
-
-
-def _region(region: Region) -> dict[str, Any]:
-    return {
-        "variable": region.variable,
-        "from": _number(region.start),
-        "to": _number(region.end),
-        "share": _share(region.share),
-        "p_value": _share(region.p_value),
-    }
-
-
-def _cause(cause: Cause) -> dict[str, Any]:
-    return {
-        "effect": cause.effect,
-        "parameters": {
-            name: {"value": _number(one.value), "unit": one.unit, "ci90": [_number(edge) for edge in one.ci90]}
-            for name, one in cause.parameters.items()
-        },
-        "probability": _share(cause.probability),
-        "gap_closed": _number(cause.gap_closed),
-        "indistinguishable_from": list(cause.indistinguishable_from),
-    }
-
-
-def _number(value: float) -> float | None:
-    """A plain float, whatever numpy or torch made it; None where JSON has no number for it."""
-    plain = float(value)
-    return plain if math.isfinite(plain) else None
-
-
-def _share(value: float) -> float | None:
-    """As `_number`, without the rounding errors by which sums of shares pass 1."""
-    plain = _number(value)
-    return None if plain is None else round(plain, 12)

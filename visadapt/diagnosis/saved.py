@@ -8,7 +8,6 @@ import os
 from pathlib import Path
 
 from visadapt.diagnosis.result import (
-    SCHEMA_VERSION,
     Cause,
     Diagnosis,
     Estimate,
@@ -16,6 +15,7 @@ from visadapt.diagnosis.result import (
     RecordingSummary,
     Where,
 )
+from visadapt.diagnosis.result_json import SCHEMA_VERSION
 from visadapt.effects import EFFECTS, Effect
 
 

@@ -1,4 +1,4 @@
-"""A candidate model: the source with a set of effects, as a function of their parameters, beside a recording."""
+"""A candidate model: the source with a set of effects, evaluated along a recording for any parameter values."""
 
 from __future__ import annotations
 
@@ -16,41 +16,42 @@ from visadapt.estimation.segments import Segments
 from visadapt.systems import System
 from visadapt.world import World, WorldState
 
-GLANCE, COARSE, FINE = 0, 1, 2
-"""Which of the profile's numbers of substeps: to propose an effect, to try it, and for figures that are reported."""
+COARSEST, COARSE, FINE = 0, 1, 2
+"""Accuracy of integration, an index into `SystemProfile.substeps`: for screening, for cross-validated and quick fits,
+and for reported results."""
 
 
 class CandidateModel:
-    """The worlds that a set of effects makes of a source: one for each value of the P parameters in all.
+    """A source with a set of effects, whose P parameters in all are arguments of its methods.
 
     Args:
         system: the source.
         effects: the set.
-        rows: the recording.
-        effort: GLANCE, COARSE or FINE.
+        rows: the recording, W windows of T rows.
+        accuracy: COARSEST, COARSE or FINE.
     """
 
-    def __init__(self, system: System, effects: Sequence[type[Effect]], rows: Segments, effort: int = FINE) -> None:
+    def __init__(self, system: System, effects: Sequence[type[Effect]], rows: Segments, accuracy: int = FINE) -> None:
         self.system = system
         self.profile = profile_of(system)
         self.effects = tuple(effects)
         self.rows = rows
         abrupt = any(effect.abrupt for effect in effects)
-        smooth = 1 if effort == GLANCE else math.ceil(rows.period / self.profile.smooth_step)
-        substeps = max(smooth, self.profile.substeps[effort] if abrupt else 1)
-        nothing = [effect(**{parameter.name: 0.0 for parameter in effect.table}) for effect in effects]
-        self._world = World(system, nothing, rows.period, substeps=substeps)
+        smooth = 1 if accuracy == COARSEST else math.ceil(rows.period / self.profile.longest_step)
+        substeps = max(smooth, self.profile.substeps[accuracy] if abrupt else 1)
+        placeholders = [effect(**{parameter.name: 0.0 for parameter in effect.table}) for effect in effects]
+        self._world = World(system, placeholders, rows.period, substeps=substeps)
         self.table = self._world.table
         self.low, self.high = search_range(self.table)
         self.slopes: tuple[Tensor, Tensor] | None = None
-        """transition (W, T - 1, n, n) and sensing (W, T, m, n) of an earlier linearisation that are near enough"""
+        """transition (W, T - 1, n, n) and sensing (W, T, m, n) of an earlier linearisation, reused where given"""
 
     def at(self, theta: Tensor) -> World:
-        """The world with parameters (P,), or (N, P) for N rows."""
+        """The world with parameters (P,), or (N, P) for a batch of N states."""
         return self._world.with_values(theta)
 
     def commands(self, theta: Tensor) -> Tensor:
-        """What acts over the substeps, (R, W, T, substeps, n_action), for parameters (R, P)."""
+        """Inputs after the actuation effects, (R, W, T, substeps, n_action), for R parameter vectors (R, P)."""
         rows = self.rows
         episodes = len(rows.command)
         given = rows.command.repeat(len(theta), 1, 1)
@@ -58,7 +59,8 @@ class CandidateModel:
         return acting[:, rows.episode[:, None], rows.index]
 
     def started(self, theta: Tensor, state: Tensor) -> WorldState:
-        """The worlds of all rows, flattened, in states (W, T, n) of the first T: at their time, with their memory."""
+        """World states of all rows, flattened, for states (W, T, n): at the rows' times, with the memory of each effect
+        as the recorded commands leave it; parameters (P,)."""
         rows, length = self.rows, state.shape[1]
         episode, index = rows.episode.repeat_interleave(length), rows.index[:, :length].flatten()
         first = rows.command.new_zeros(len(rows.command), state.shape[-1])
@@ -67,30 +69,30 @@ class CandidateModel:
         return WorldState(time, state.flatten(0, 1), tuple(m[episode, index] for m in memory))
 
     def measure(self, theta: Tensor, state: Tensor) -> Tensor:
-        """What is measured (N, m) of states (N, n), for parameters (P,) or (N, P)."""
+        """Measurements (N, m) of states (N, n), without noise, for parameters (P,) or (N, P)."""
         return self.at(theta).reading(state)[:, list(self.rows.channels)]
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """A candidate model along states (W, T, n), K parameters in all."""
+    """Step and measurement of a candidate model along states (W, T, n), with derivatives; K parameters in all."""
 
-    following: Tensor
-    """(W, T - 1, n) the states a period on"""
+    next_state: Tensor
+    """(W, T - 1, n) the state one period after each row but the last"""
     transition: Tensor
-    """(W, T - 1, n, n)"""
+    """(W, T - 1, n, n) its derivative by the state"""
     by_parameter: Tensor
-    """(W, T - 1, n, K)"""
+    """(W, T - 1, n, K) its derivative by the parameters"""
     measured: Tensor
     """(W, T, m)"""
     sensing: Tensor
-    """(W, T, m, n)"""
+    """(W, T, m, n) its derivative by the state"""
     sensing_by_parameter: Tensor
-    """(W, T, m, K)"""
+    """(W, T, m, K) its derivative by the parameters"""
 
 
 def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised:
-    """The tangents of step and reading with parameters (K,) along states (W, T, n)."""
+    """Linearise step and measurement with parameters (K,) along states (W, T, n)."""
     windows, length, _ = state.shape
     known = model.slopes
     shifted = torch.cat((theta[None], theta + torch.diag(parameter_steps(model.table, theta))))

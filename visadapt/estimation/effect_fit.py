@@ -22,23 +22,20 @@ from visadapt.estimation.fit_states import (
     CAREFUL,
     QUICK,
     Effects,
-    extended,
-    first_fits,
-    joined,
+    initial_fit,
     neutral,
-    only,
     posterior,
+    single_fit,
+    stacked,
+    with_effect,
 )
 from visadapt.estimation.likelihood import FitState, fit
 from visadapt.estimation.profiles import profile_of
-from visadapt.estimation.repeated_readings import Holds, find_holds, zone
+from visadapt.estimation.repeated_readings import SMOOTHING_RATIO, RepeatedReadings, find_repeats, zone
 from visadapt.estimation.screening import screen
 from visadapt.estimation.segments import Segments, cut
 from visadapt.systems import System
 from visadapt.world import World
-
-SMOOTHED = 1 / 3
-"""Standard deviation of a smoothed angle, in standard deviations of a measured one."""
 
 
 @dataclass(frozen=True)
@@ -89,8 +86,8 @@ def fit_effects(
     commands = [values.double() for values in commands]
     profile = profile_of(system)
     channels = tuple(range(len(system.states)))
-    holds = find_holds(measured, channels, profile.held)
-    rows = cut(measured, holds.used, commands, channels, period, profile.window)
+    holds = find_repeats(measured, channels, profile.angle_sensor)
+    rows = cut(measured, holds.used, commands, channels, period, profile.window_rows)
     present = [float(getattr(effect, p.name)) for effect in effects if type(effect) in fitted_as for p in effect.table]
     found = _fitted(system, fitted, rows, present)
     if MeasurementDelay in fitted_as:
@@ -105,7 +102,7 @@ def fit_effects(
     if Dropout in kinds:
         values[Dropout], spreads[Dropout] = _lost(holds)
     if FrozenZone in kinds:
-        values[FrozenZone], spreads[FrozenZone] = _frozen(holds, states, found, profile.held[0])
+        values[FrozenZone], spreads[FrozenZone] = _frozen(holds, states, found, profile.angle_sensor[0])
     if MeasurementDelay in fitted_as:
         world = CandidateModel(system, fitted, rows).at(found.theta[0])
         delay = float(values[MeasurementDelay][0])
@@ -137,13 +134,13 @@ def remembers(effect: type[Effect]) -> bool:
 def _fitted(system: System, effects: Effects, rows: Segments, present: Sequence[float]) -> FitState:
     """The likelier fit from two starts: effects added one by one, the most promising first; and `present`."""
     chosen: Effects = ()
-    base = first_fits(system, rows)
+    base = initial_fit(system, rows)
     for _ in effects:
         base = _best(system, chosen, [base], rows, QUICK)
         rest = [effect for effect in effects if effect not in chosen]
         leads = screen(system, chosen, base, rows, rest)
         effect, values = (leads[0].effect, leads[0].values) if leads else (rest[0], neutral(rest[0]))
-        chosen, base = (*chosen, effect), extended(base, values)
+        chosen, base = (*chosen, effect), with_effect(base, values)
     column = {p: k for k, p in enumerate((effect, p.name) for effect in chosen for p in effect.table)}
     order = [column[effect, p.name] for effect in effects for p in effect.table]
     starts = [replace(base, theta=base.theta[:, order])]
@@ -158,8 +155,8 @@ def _best(
     """The likeliest fit of one set of effects from several starts."""
     iterations, care = effort
     models = [CandidateModel(system, effects, rows, care) for _ in starts]
-    out = fit(models, joined(starts), torch.ones(len(starts), rows.shape[0], dtype=torch.float64), iterations)
-    return only(out, int(out.likelihood.argmax()), len(models[0].table))
+    out = fit(models, stacked(starts), torch.ones(len(starts), rows.shape[0], dtype=torch.float64), iterations)
+    return single_fit(out, int(out.likelihood.argmax()), len(models[0].table))
 
 
 def _within_a_turn(effect: type[Effect], values: Tensor) -> Tensor:
@@ -177,21 +174,21 @@ def _by_episode(rows: Segments, state: Tensor, measured: Sequence[Tensor]) -> li
     return out
 
 
-def _lost(holds: Holds) -> tuple[Tensor, Tensor]:
+def _lost(holds: RepeatedReadings) -> tuple[Tensor, Tensor]:
     """The rate at which rows are lost, (1,), and its variance, (1, 1): Bayes' with a uniform prior."""
     lost, rows = sum(int(x.sum()) for x in holds.lost), sum(len(x) - 1 for x in holds.lost)
     variance = (lost + 1) * (rows - lost + 1) / ((rows + 2) ** 2 * (rows + 3))
     return torch.tensor([lost / max(1, rows)]).double(), torch.tensor([[variance]]).double()
 
 
-def _frozen(holds: Holds, states: Sequence[Tensor], found: FitState, angle: int) -> tuple[Tensor, Tensor]:
+def _frozen(holds: RepeatedReadings, states: Sequence[Tensor], found: FitState, angle: int) -> tuple[Tensor, Tensor]:
     """Start and end (2,) of the angles at which the sensor stands still, and their covariance (2, 2)."""
     # A first reading has none before it to repeat.
     held = torch.cat([frozen[1:] for frozen in holds.frozen])
     if not bool(held.any()):
         width = torch.tensor([p.high - p.low for p in FrozenZone.table], dtype=torch.float64)
         return torch.tensor(neutral(FrozenZone), dtype=torch.float64), torch.diag(width.square() / 12)
-    noise = SMOOTHED * float((found.log_noise[0, angle] / 2).exp())
+    noise = SMOOTHING_RATIO * float((found.log_noise[0, angle] / 2).exp())
     start, end, deviation = zone(held, torch.cat([state[1:, angle] for state in states]), noise)
     return torch.tensor([start, end], dtype=torch.float64), deviation**2 * torch.eye(2, dtype=torch.float64)
 

@@ -1,4 +1,4 @@
-"""Fit states made from others: where a fit starts, one effect more, several sets in one batch, and what it found."""
+"""Fit states made from others: the start of a fit, a set with one more effect, several sets in one batch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from visadapt.effects import Effect
 from visadapt.estimation.candidate import COARSE, FINE
-from visadapt.estimation.likelihood import FitState, rough
+from visadapt.estimation.likelihood import FitState, initial_states
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
@@ -19,12 +19,12 @@ from visadapt.systems import System
 Effects = tuple[type[Effect], ...]
 
 QUICK, CAREFUL = (8, COARSE), (20, FINE)
-"""Iterations and effort of a fit that only has to show promise, and of one whose figures are reported."""
+"""Iterations and integration accuracy of a fit in the search, and of one whose result is reported."""
 
 
-def first_fits(system: System, rows: Segments) -> FitState:
-    """A start for the source as it stands."""
-    state = rough(rows, system)[None]
+def initial_fit(system: System, rows: Segments) -> FitState:
+    """The start of the source's own fit (no effects): states from the measurements, guessed noise."""
+    state = initial_states(rows, system)[None]
     return FitState(
         torch.zeros(1, 0, dtype=torch.float64),
         state,
@@ -35,19 +35,19 @@ def first_fits(system: System, rows: Segments) -> FitState:
     )
 
 
-def extended(base: FitState, values: Sequence[float]) -> FitState:
-    """The fit of one set as a start for that set with one effect more, which has these parameters."""
+def with_effect(base: FitState, values: Sequence[float]) -> FitState:
+    """A start for the set of `base` with one more effect, which has these parameter values."""
     theta = torch.cat((base.theta, torch.tensor([list(values)], dtype=torch.float64)), 1)
     return replace(base, theta=theta)
 
 
 def neutral(effect: type[Effect]) -> tuple[float, ...]:
-    """Parameters with which an effect does nothing; in the middle of its range, where none of a parameter's does."""
+    """Parameter values without any effect; for a parameter that has no such value, the middle of its range."""
     return tuple(p.neutral if p.neutral is not None else 0.5 * (p.low + p.high) for p in effect.table)
 
 
-def joined(fits: Sequence[FitState]) -> FitState:
-    """Fits of one set each as fits of many."""
+def stacked(fits: Sequence[FitState]) -> FitState:
+    """Fits of one set each as one batch, with unknown likelihood and information."""
     widest = max(f.theta.shape[1] for f in fits)
     theta = torch.zeros(len(fits), widest, dtype=torch.float64)
     for k, each in enumerate(fits):
@@ -57,18 +57,18 @@ def joined(fits: Sequence[FitState]) -> FitState:
     return FitState(theta, rest[0], rest[1], rest[2], unknown, torch.zeros(len(fits), widest, widest).double())
 
 
-def only(fits: FitState, number: int, count: int) -> FitState:
-    """Of fits of many sets, that of one, which has `count` parameters."""
-    own = fits.of(torch.tensor([number]))
-    return replace(own, theta=own.theta[:, :count], information=own.information[:, :count, :count])
+def single_fit(fits: FitState, index: int, count: int) -> FitState:
+    """The fit of one set of a batch, without the padding of its `count` parameters."""
+    one = fits.select(torch.tensor([index]))
+    return replace(one, theta=one.theta[:, :count], information=one.information[:, :count, :count])
 
 
 def widths(effects: Effects) -> Tensor:
-    """(K,) of the ranges in which the parameters of a set are searched."""
+    """(K,) widths of the ranges in which the parameters of a set are searched."""
     return torch.tensor([p.high - p.low for e in effects for p in e.table], dtype=torch.float64)
 
 
 def posterior(effects: Effects, fits: FitState) -> tuple[Tensor, Tensor]:
-    """Precision of a set's parameters: (K,) before the data, that of their ranges, and (K, K) with them."""
+    """Prior precision (K,) of a set's parameters, uniform in their ranges, and posterior precision (K, K)."""
     precision = 12 / widths(effects).square()
     return precision, fits.information[0] + torch.diag(precision)

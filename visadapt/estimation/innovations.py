@@ -1,4 +1,4 @@
-"""The whitened innovations of a fitted set: white noise where the set is right, and what would change them."""
+"""The whitened innovations of a fitted set, which are white noise if it is right, and their response to inputs."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from visadapt.estimation.likelihood import FitState, linear_problem, variances
 
 
 class Innovations:
-    """Innovations over their deviations, N readings in all; what the set's own parameters can explain is taken out.
+    """Innovations over their standard deviations, of N readings in all, projected off the derivatives by the set's own
+    parameters: what refitting those would explain is not attributed to anything new.
 
     Args:
         model: the set.
-        fits: its fit, of one set alone.
+        fits: its fit (C = 1).
     """
 
     def __init__(self, model: CandidateModel, fits: FitState) -> None:
@@ -28,8 +29,8 @@ class Innovations:
         self.error: Tensor = self._projected(white[:, :1])[:, 0]
         """(N,)"""
 
-    def answer(self, drive: Tensor, reading: Tensor) -> Tensor:
-        """How they change (N, M) with inputs: drive (W, T - 1, n, M) to the states, and reading (W, T, m, M)."""
+    def response(self, drive: Tensor, reading: Tensor) -> Tensor:
+        """Change (N, M) of the innovations with M inputs: `drive` (W, T - 1, n, M) and `reading` (W, T, m, M)."""
         return self._projected(self._white(respond(self._problem, self._filtered, drive, reading)))
 
     def _white(self, innovation: Tensor) -> Tensor:

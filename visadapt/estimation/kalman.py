@@ -1,18 +1,18 @@
-"""Likelihood and smoothed states of a linear system that is driven by columns of inputs, many systems at once.
+"""Kalman filter and smoother of linear systems in a batch, each with several columns of inputs.
 
     x_{t+1} = A_t x_t + c_t + w_t,   w_t ~ N(0, Q)              x_0 ~ N(0, diag(p))
     r_t     = H_t x_t + v_t,         v_t ~ N(0, diag(s))
 
 Kalman (1960, J. Basic Eng. 82(1)) forwards, with a Cholesky factor of the innovations' covariance, so that a channel's
-innovation and variance are those after the channels before it; backwards the adjoint form of Bryson and
-Frazier (1963), which inverts nothing, so that it also holds where there is no process noise. c and r have M columns:
-the first is the data, the others are sensitivities, which pass through the same gains.
+innovation and variance are those given the channels before it; backwards the adjoint form of Bryson and Frazier (1963),
+which inverts no covariance and so also holds without process noise. c and r have M columns: the first is the data, the
+others are derivatives of it (sensitivities), which pass through the same gains.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -36,13 +36,18 @@ class Linear:
     """(n,) p"""
 
     def data(self) -> Linear:
-        """Without the sensitivities."""
+        """The same systems with the first column, the data, alone."""
         return replace(self, drive=self.drive[..., :1], reading=self.reading[..., :1], start=self.start[..., :1])
+
+    def repeat(self, count: int) -> Linear:
+        """`count` copies of the N systems."""
+        tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "spread"}
+        return replace(self, **{name: x.repeat(count, *(1,) * (x.dim() - 1)) for name, x in tensors.items()})
 
 
 @dataclass(frozen=True)
 class Filtered:
-    """The forward pass: everything the backward pass needs, and the whitened innovations."""
+    """The result of the forward pass."""
 
     predicted: list[Tensor]
     """T of (N, n, M): x_t given rows before t"""
@@ -51,11 +56,11 @@ class Filtered:
     root: list[Tensor]
     """T of (N, m, m): lower factors of the innovations' covariances"""
     cross: list[Tensor]
-    """T of (N, m, n): what a whitened innovation moves the states by"""
+    """T of (N, m, n): change of the states per unit of a whitened innovation"""
     innovation: Tensor
     """(N, T, m, M) of each channel, given the rows before and the channels before it"""
     variance: Tensor
-    """(N, T, m) of these"""
+    """(N, T, m) variances of the innovations"""
 
     @property
     def white(self) -> Tensor:
@@ -81,7 +86,7 @@ def forward(problem: Linear, process: Tensor, noise: Tensor) -> Filtered:
         sensing = problem.sensing[:, t]
         seen = torch.bmm(sensing, covariance)
         root, failed = torch.linalg.cholesky_ex(torch.baddbmm(disturbed, seen, sensing.mT))
-        # A step too far can leave no covariance; its likelihood is then no number, and the step is not taken.
+        # After too large a step of a fit the covariance may be indefinite: the likelihood is NaN, the step rejected.
         root = torch.where(failed[:, None, None] > 0, math.nan, root)
         error = torch.baddbmm(problem.reading[:, t], sensing, mean, alpha=-1)
         cross, white = torch.linalg.solve_triangular(root, torch.cat((seen, error), -1), upper=False).split(
@@ -98,7 +103,8 @@ def forward(problem: Linear, process: Tensor, noise: Tensor) -> Filtered:
 
 
 def respond(problem: Linear, filtered: Filtered, drive: Tensor, reading: Tensor) -> Tensor:
-    """Innovations (W, T, m, M) of inputs that pass through the gains of a filter that has run."""
+    """Change of the innovations (N, T, m, M) with inputs `drive` (N, T - 1, n, M) and `reading` (N, T, m, M), under the
+    gains of the filter run that gave `filtered`."""
     mean = torch.zeros_like(drive[:, 0])
     out = []
     for t in range(reading.shape[1]):

@@ -1,4 +1,4 @@
-"""Maximum likelihood of many sets of effects at once, the states, the noise and the disturbances estimated with them.
+"""Maximum likelihood fits of several sets of effects in one batch, with states, noise and disturbances estimated too.
 
     x_{t+1} = f(x_t, u_t; theta) + w_t,  w_t ~ N(0, Q)        y_t = h(x_t; theta) + v_t,  v_t ~ N(0, R)
 
@@ -6,8 +6,8 @@ One-step residuals mislead where states are noisy, so the states are unknowns to
 parameters together, where the states are integrated out by a Kalman filter along their own estimate (a multiple
 shooting in which every row starts a shot; Bock and Plitt 1984, and Kristensen, Madsen and Jorgensen 2004, Automatica
 40(2), for the likelihood of innovations). Q and R follow by Fisher scoring on the same innovations. Where the effects
-are right Q goes to nothing, and every row of an episode speaks on every parameter; where something is missing Q
-grows to be as large as what is missing.
+are right Q goes to zero, and every row of an episode informs every parameter; where an effect is missing Q grows to
+the variance of what is missing.
 """
 
 from __future__ import annotations
@@ -26,57 +26,58 @@ from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
 
-SMOOTH = 1e-6
-"""Process noise of position and angle, m and rad: they follow from their velocities."""
+POSITION_PROCESS_NOISE = 1e-6
+"""Standard deviation of the process noise of states other than driven velocities, in their units (m, rad): practically
+none, since they follow from their velocities."""
 
-QUIET = math.log(1e-4**2)
-LOUD = math.log(3.0**2)
-"""Bounds of the log variance of w in the velocities, (m/s)^2 and (rad/s)^2."""
+MIN_LOG_PROCESS = math.log(1e-4**2)
+MAX_LOG_PROCESS = math.log(3.0**2)
+"""Bounds of the log process noise variance of the driven velocities, (m/s)^2 and (rad/s)^2."""
 
-ENOUGH = 0.02
-"""Log likelihood that is not worth an iteration."""
+MIN_ITERATION_GAIN = 0.02
+"""Log likelihood; a fit stops after two iterations in a row that gain less."""
 
-TINY = 1e-12
-"""Least variance of a measurement, in its unit squared."""
+MIN_MEASUREMENT_VARIANCE = 1e-12
+"""Lower bound of a measurement's variance, in its unit squared."""
 
-STUCK = 100.0
-"""Damping from which on a step is too short to lead anywhere."""
+MAX_DAMPING = 100.0
+"""Damping at which a fit stops, since its steps have become too short to gain anything."""
 
-LOG_STEP = 1e-3
-GREATEST = 1.5
-"""Finite difference, and greatest change in an iteration, of a log variance."""
+LOG_VARIANCE_STEP = 1e-3
+MAX_LOG_VARIANCE_CHANGE = 1.5
+"""Finite difference of a log variance, and its largest change in one iteration."""
 
 
 @dataclass(frozen=True)
 class FitState:
-    """C sets of effects, fitted."""
+    """Estimates for C sets of effects."""
 
     theta: Tensor
-    """(C, K) parameters, 0 beyond what a set has"""
+    """(C, K) parameters, padded with 0 where a set has fewer than K"""
     state: Tensor
-    """(C, W, T, n)"""
+    """(C, W, T, n) states along which the models are linearised"""
     log_process: Tensor
-    """(C, G) log variances of w in the velocities, by group"""
+    """(C, G) log process noise variances of the driven velocities, by group"""
     log_noise: Tensor
     """(C, m) log variances of the measurements"""
     likelihood: Tensor
-    """(C,) log likelihood of the windows that count"""
+    """(C,) log likelihood of the windows that the fit used"""
     information: Tensor
-    """(C, K, K) Fisher's"""
+    """(C, K, K) Fisher information of the parameters"""
 
-    def of(self, chosen: Tensor) -> FitState:
-        """Only these."""
+    def select(self, chosen: Tensor) -> FitState:
+        """The fits of these sets, by index."""
         return FitState(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
 
 
-def rough(rows: Segments, system: System) -> Tensor:
-    """States (W, T, n) from the measurements alone: a velocity that was not measured is a difference."""
+def initial_states(rows: Segments, system: System) -> Tensor:
+    """Initial guess (W, T, n) of the states: the measurements, and difference quotients for missing velocities."""
     out = torch.zeros(*rows.shape, len(system.states), dtype=torch.float64)
     for k, channel in enumerate(rows.channels):
         out[..., channel] = rows.measured[..., k]
-    for channel, place in profile_of(system).slopes.items():
+    for channel, position_column in profile_of(system).position_of.items():
         if channel not in rows.channels:
-            position = out[..., place]
+            position = out[..., position_column]
             change = torch.zeros_like(position)
             change[:, 1:-1] = (position[:, 2:] - position[:, :-2]) / (2 * rows.period)
             change[:, 0] = (position[:, 1] - position[:, 0]) / rows.period
@@ -85,9 +86,13 @@ def rough(rows: Segments, system: System) -> Tensor:
 
 
 def linear_problem(models: Sequence[CandidateModel], fits: FitState) -> Linear:
-    """The count, one after the other, along the states of `fits`."""
+    """The systems of all C models linearised along the states of `fits`, C W in all, model by model.
+
+    Column 0 of the inputs is the data: defects of the states against the model, and measurement residuals. The others
+    are derivatives by the K parameters. States of the linear system are corrections to those of `fits`.
+    """
     rows = models[0].rows
-    origin = rough(rows, models[0].system)[:, 0]
+    origin = initial_states(rows, models[0].system)[:, 0]
     used = rows.used[..., None]
     inside = rows.inside[:, 1:, None, None]
     windows, length, n = fits.state.shape[1:]
@@ -100,11 +105,11 @@ def linear_problem(models: Sequence[CandidateModel], fits: FitState) -> Linear:
     for c, model in enumerate(models):
         count = len(model.table)
         lin = linearise(model, fits.theta[c, :count], fits.state[c])
-        if model.profile.refresh > 1:
+        if model.profile.relinearise_every > 1:
             model.slopes = lin.transition, lin.sensing
         transition.append(torch.where(inside > 0, lin.transition, identity))
         sensing.append(lin.sensing * used)
-        drive[c, ..., 0] = lin.following - fits.state[c, :, 1:]
+        drive[c, ..., 0] = lin.next_state - fits.state[c, :, 1:]
         drive[c, ..., 1 : 1 + count] = lin.by_parameter
         reading[c, ..., 0] = rows.measured - lin.measured
         reading[c, ..., 1 : 1 + count] = -lin.sensing_by_parameter
@@ -115,171 +120,174 @@ def linear_problem(models: Sequence[CandidateModel], fits: FitState) -> Linear:
         torch.cat(sensing),
         (reading * used).flatten(0, 1),
         start.flatten(0, 1),
-        torch.tensor(models[0].profile.spread, dtype=torch.float64),
+        torch.tensor(models[0].profile.initial_variance, dtype=torch.float64),
     )
 
 
 def variances(model: CandidateModel, log_process: Tensor, log_noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Process covariances (C W, n, n) and measurement variances (C W, m) for the filter."""
+    """Process noise covariances (C W, n, n) and measurement variances (C W, m) for the filter."""
     windows = model.rows.shape[0]
-    process = torch.full((len(log_process), len(model.system.states)), SMOOTH**2, dtype=torch.float64)
+    process = torch.full((len(log_process), len(model.system.states)), POSITION_PROCESS_NOISE**2, dtype=torch.float64)
     for k, group in enumerate(model.profile.driven):
         process[:, list(group)] = log_process[:, k, None].exp()
     return torch.diag_embed(process).repeat_interleave(windows, 0), log_noise.exp().repeat_interleave(windows, 0)
 
 
 def noise_groups(model: CandidateModel) -> Tensor:
-    """(G + S, G + m) which variances, of process noise by group and of channels, are one: 1 where it is this one."""
+    """(G + S, G + m) 1 where a variance, of G process noise groups and m channels, equals the row's free variance.
+
+    Channels of one of the S kinds of sensors share a variance.
+    """
     groups, channels = len(model.profile.driven), model.rows.channels
     sensors = [[float(c in kind) for c in channels] for kind in model.profile.sensors]
-    seen = torch.tensor([row for row in sensors if any(row)], dtype=torch.float64)
-    return torch.block_diag(torch.eye(groups, dtype=torch.float64), seen)
+    measured = torch.tensor([row for row in sensors if any(row)], dtype=torch.float64)
+    return torch.block_diag(torch.eye(groups, dtype=torch.float64), measured)
 
 
-Chosen = TypeVar("Chosen", "FitState", "Slope")
+Batched = TypeVar("Batched", "FitState", "Derivatives")
 
 
 @dataclass(frozen=True)
-class Slope:
-    """What a linearisation says about where to go."""
+class Derivatives:
+    """Likelihood of C fits, with its derivatives."""
 
     likelihood: Tensor
     """(C,)"""
     information: Tensor
     """(C, K, K)"""
-    pull: Tensor
-    """(C, K) gradient of the log likelihood in the free parameters"""
+    gradient: Tensor
+    """(C, K) of the log likelihood by the parameters"""
     noise_information: Tensor
-    """(C, G + S, G + S) of the groups of process noise and the kinds of sensors"""
-    noise_pull: Tensor
-    """(C, G + S)"""
+    """(C, G + S, G + S) Fisher information of the log variances of process noise groups and kinds of sensors"""
+    noise_gradient: Tensor
+    """(C, G + S) of the log likelihood by these"""
     smoothed: Tensor
-    """(C, W, T, n, 1 + K) change of the states, and with each parameter"""
+    """(C, W, T, n, 1 + K) smoothed correction of the states, and its derivative by each parameter"""
 
 
-def slope(models: Sequence[CandidateModel], fits: FitState, counts: Tensor) -> Slope:
-    """Likelihood, gradient and Fisher information at `fits`."""
-    count, windows = counts.shape
+def differentiate(models: Sequence[CandidateModel], fits: FitState, window_used: Tensor) -> Derivatives:
+    """Likelihood, gradient and Fisher information at `fits`, over the windows where `window_used` (C, W) is 1."""
+    count, windows = window_used.shape
     logs = torch.cat((fits.log_process, fits.log_noise), 1)
     problem = linear_problem(models, fits)
-    used = models[0].rows.used.repeat(count, 1, 1) * counts.reshape(-1, 1, 1)
+    used = models[0].rows.used.repeat(count, 1, 1) * window_used.reshape(-1, 1, 1)
     here = forward(problem, *variances(models[0], fits.log_process, fits.log_noise))
     likelihood = log_likelihood(here, used).reshape(count, windows).sum(-1)
     white = (here.white * used[..., None]).reshape(count, -1, here.innovation.shape[-1])
     error, columns = white[..., :1], white[..., 1:]
-    # The noise's turn: the data's column alone, filtered with each variance a little larger.
-    alike = noise_groups(models[0])
-    varied = (logs + LOG_STEP * alike[:, None]).flatten(0, 1).split((fits.log_process.shape[1], used.shape[-1]), 1)
-    swayed = forward(_repeated(problem.data(), len(alike)), *variances(models[0], *varied))
-    gains = log_likelihood(swayed, used.repeat(len(alike), 1, 1)).reshape(-1, count, windows).sum(-1) - likelihood
+    # Derivatives by the noise: the data's column alone, filtered with each log variance a little larger.
+    tied = noise_groups(models[0])
+    larger = (logs + LOG_VARIANCE_STEP * tied[:, None]).flatten(0, 1)
+    larger = larger.split((fits.log_process.shape[1], used.shape[-1]), 1)
+    varied = forward(problem.data().repeat(len(tied)), *variances(models[0], *larger))
+    gains = log_likelihood(varied, used.repeat(len(tied), 1, 1)).reshape(-1, count, windows).sum(-1) - likelihood
 
-    def by_noise(there: Tensor, now: Tensor) -> Tensor:
-        change = (there.reshape(-1, *now.shape) - now) / LOG_STEP * used
-        return change.reshape(len(alike), count, -1).permute(1, 2, 0)
+    def by_noise(value: Tensor, base: Tensor) -> Tensor:
+        change = (value.reshape(-1, *base.shape) - base) / LOG_VARIANCE_STEP * used
+        return change.reshape(len(tied), count, -1).permute(1, 2, 0)
 
-    sways = by_noise(swayed.variance.log(), here.variance.log())
-    shifts = by_noise(swayed.innovation[..., 0], here.innovation[..., 0]) / here.variance.sqrt().reshape(count, -1, 1)
+    by_variance = by_noise(varied.variance.log(), here.variance.log())
+    by_mean = by_noise(varied.innovation[..., 0], here.innovation[..., 0])
+    by_mean = by_mean / here.variance.sqrt().reshape(count, -1, 1)
     smoothed, _ = backward(problem, here)
-    return Slope(
+    return Derivatives(
         likelihood,
         columns.mT @ columns,
         -(columns.mT @ error)[..., 0],
-        0.5 * sways.mT @ sways + shifts.mT @ shifts,
-        (gains / LOG_STEP).T,
+        0.5 * by_variance.mT @ by_variance + by_mean.mT @ by_mean,
+        (gains / LOG_VARIANCE_STEP).T,
         smoothed.reshape(*fits.state.shape, -1),
     )
 
 
-def _repeated(problem: Linear, count: int) -> Linear:
-    """The same systems so many times."""
-
-    def repeat(x: Tensor) -> Tensor:
-        return x.repeat(count, *(1,) * (x.dim() - 1))
-
-    every = {field.name: repeat(getattr(problem, field.name)) for field in fields(problem) if field.name != "spread"}
-    return replace(problem, **every)
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Of parameters (C, K), both 0 for those that a set does not have; and of the noise."""
-
-    low: Tensor
-    high: Tensor
-    noise: Tensor
-    """(m,) least log variances: rounding to steps is noise too, of a step over the root of 12"""
-
-
 def fit(
-    models: Sequence[CandidateModel], start: FitState, counts: Tensor, iterations: int, still: bool = False
+    models: Sequence[CandidateModel],
+    start: FitState,
+    window_used: Tensor,
+    iterations: int,
+    process_noise: bool = True,
 ) -> FitState:
-    """Fit from `start`; `counts` (C, W) is 1 for the windows that count; `still` allows no process noise."""
-    if still:
-        start = replace(start, log_process=torch.full_like(start.log_process, QUIET))
+    """The best fits found from `start` by damped Gauss-Newton steps.
+
+    Args:
+        models: C candidate models of the same rows.
+        start: a start for each of them.
+        window_used: (C, W) 1 for the windows that each fit uses.
+        iterations: the most that are made.
+        process_noise: whether process noise is estimated; without, it stays at its lower bound.
+    """
+    if not process_noise:
+        start = replace(start, log_process=torch.full_like(start.log_process, MIN_LOG_PROCESS))
+    # (C, K); the bounds of padding are 0.
     low, high = torch.zeros_like(start.theta), torch.zeros_like(start.theta)
     for c, model in enumerate(models):
         low[c, : len(model.table)], high[c, : len(model.table)] = model.low, model.high
-    steps = torch.tensor(models[0].rows.step, dtype=torch.float64)
-    bounds = Bounds(low, high, (steps.square() / 12 + TINY).log())
     damping = torch.full((len(models),), 1e-3, dtype=torch.float64)
-    stale = torch.zeros(len(models), dtype=torch.long)
-    live = torch.arange(len(models))
+    stalled = torch.zeros(len(models), dtype=torch.long)
+    active = torch.arange(len(models))
     here = best = start
-    at: Slope | None = None
-    refresh = models[0].profile.refresh
+    at: Derivatives | None = None
+    period = models[0].profile.relinearise_every
     for iteration in range(iterations):
-        if (iteration + 1) % refresh == 0:
+        if (iteration + 1) % period == 0:
             for model in models:
                 model.slopes = None
-        now = slope([models[k] for k in live.tolist()], here.of(live), counts[live])
-        tried = replace(here.of(live), likelihood=now.likelihood, information=now.information)
+        now = differentiate([models[k] for k in active.tolist()], here.select(active), window_used[active])
+        tried = replace(here.select(active), likelihood=now.likelihood, information=now.information)
         if at is None:
             best, at = tried, now
         else:
-            gain = tried.likelihood - best.likelihood[live]
+            gain = tried.likelihood - best.likelihood[active]
             better = gain > 0
-            damping[live] = torch.where(better, damping[live] / 4, (8 * damping[live]).clamp(min=0.1))
-            stale[live] = torch.where(better & (gain < ENOUGH), stale[live] + 1, 0)
-            best = _put(best, live[better], tried, better)
-            at = _put(at, live[better], now, better)
-            # Those that have settled leave the batch.
-            live = live[(stale[live] < 2) & (damping[live] < STUCK)]
-            if not len(live):
+            damping[active] = torch.where(better, damping[active] / 4, (8 * damping[active]).clamp(min=0.1))
+            stalled[active] = torch.where(better & (gain < MIN_ITERATION_GAIN), stalled[active] + 1, 0)
+            best = _replaced(best, active[better], tried, better)
+            at = _replaced(at, active[better], now, better)
+            # Fits that have converged leave the batch.
+            active = active[(stalled[active] < 2) & (damping[active] < MAX_DAMPING)]
+            if not len(active):
                 break
-        here = _step(best, at, damping, bounds, noise_groups(models[0]))
-        if still:
+        here = _step(best, at, damping, (low, high), models[0])
+        if not process_noise:
             here = replace(here, log_process=start.log_process)
     return best
 
 
-def _step(fits: FitState, at: Slope, damping: Tensor, bounds: Bounds, alike: Tensor) -> FitState:
-    width = bounds.high - bounds.low
-    # Weak enough to matter only where the data say nothing; a parameter that a set does not have stays where it is.
-    prior = torch.where(width > 0, (2 / width).square(), 1.0)
+def _step(
+    fits: FitState, at: Derivatives, damping: Tensor, bounds: tuple[Tensor, Tensor], model: CandidateModel
+) -> FitState:
+    """The damped Gauss-Newton step from `fits`, with parameters within the bounds (C, K)."""
+    low, high = bounds
+    # A prior weak enough to matter only where the data hold no information; the 1.0 is for padding, which stays 0.
+    prior = torch.where(high > low, (2 / (high - low)).square(), 1.0)
     diagonal = torch.diagonal(at.information, dim1=1, dim2=2)
     matrix = at.information + torch.diag_embed(prior + damping[:, None] * diagonal)
-    change = torch.linalg.solve(matrix, at.pull[..., None])[..., 0]
-    theta = (fits.theta + change).clamp(bounds.low, bounds.high)
+    change = torch.linalg.solve(matrix, at.gradient[..., None])[..., 0]
+    theta = (fits.theta + change).clamp(low, high)
     change = theta - fits.theta
     moves = torch.cat((torch.ones(len(change), 1, dtype=change.dtype), change), 1)
     share = 1 / (1 + damping)[:, None]
-    matrix = at.noise_information + 0.3 * torch.eye(at.noise_pull.shape[1], dtype=change.dtype)
-    sway = torch.linalg.solve(matrix, at.noise_pull[..., None])[..., 0].clamp(-GREATEST, GREATEST) * share @ alike
+    matrix = at.noise_information + 0.3 * torch.eye(at.noise_gradient.shape[1], dtype=change.dtype)
+    move = torch.linalg.solve(matrix, at.noise_gradient[..., None])[..., 0]
+    log_change = move.clamp(-MAX_LOG_VARIANCE_CHANGE, MAX_LOG_VARIANCE_CHANGE) * share @ noise_groups(model)
     groups = fits.log_process.shape[1]
+    # Rounding to a resolution is noise with a deviation of resolution / sqrt(12).
+    resolution = torch.tensor(model.rows.step, dtype=torch.float64)
+    lowest_noise = (resolution.square() / 12 + MIN_MEASUREMENT_VARIANCE).log()
     return replace(
         fits,
         theta=theta,
         state=fits.state + (at.smoothed * moves[:, None, None, None]).sum(-1),
-        log_process=(fits.log_process + sway[:, :groups]).clamp(QUIET, LOUD),
-        log_noise=torch.maximum(fits.log_noise + sway[:, groups:], bounds.noise),
+        log_process=(fits.log_process + log_change[:, :groups]).clamp(MIN_LOG_PROCESS, MAX_LOG_PROCESS),
+        log_noise=torch.maximum(fits.log_noise + log_change[:, groups:], lowest_noise),
     )
 
 
-def _put(into: Chosen, places: Tensor, values: Chosen, which: Tensor) -> Chosen:
-    """`into` with the count at `places` replaced by those of `values` that `which` marks."""
+def _replaced(into: Batched, indices: Tensor, values: Batched, chosen: Tensor) -> Batched:
+    """`into` with its members at `indices` replaced by the `chosen` members of `values`."""
     out = {}
     for field in fields(into):
         tensor = getattr(into, field.name).clone()
-        tensor[places] = getattr(values, field.name)[which]
+        tensor[indices] = getattr(values, field.name)[chosen]
         out[field.name] = tensor
     return replace(into, **out)

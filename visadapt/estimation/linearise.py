@@ -1,4 +1,4 @@
-"""The tangents of a world's step and of its readings, along states, parameters and commands.
+"""Derivatives of a world's step and of its sensor readings, by states, parameters and commands.
 
 By finite differences, all of them in one batch: World steps rows of a batch independently, and each row may have
 parameters of its own. In float64 the error is about 1e-8 of a state.
@@ -25,7 +25,7 @@ PARAMETER_STEP = 1e-6
 """Finite difference of a parameter, as a share of the range in which it is searched."""
 
 PHASE_MARGIN = 4 * math.pi
-"""rad by which a phase may leave its range during a fit, since the angle that fits may lie a turn further."""
+"""rad by which a phase may leave its range during a fit: the best phase may lie up to two turns outside it."""
 
 
 @dataclass(frozen=True)
@@ -35,16 +35,16 @@ class Tangent:
     value: Tensor
     """(N, m)"""
     by_state: Tensor
-    """(N, m, n); of no columns where it was not asked for"""
+    """(N, m, n); no columns where it was not asked for"""
     by_parameter: Tensor
     """(N, m, P)"""
     by_command: Tensor
-    """(N, m, n_action); of no columns where it was not asked for"""
+    """(N, m, n_action); no columns where it was not asked for"""
 
 
 @cache
 def load_effect(system: type[System]) -> type[DynamicsEffect]:
-    """A load of its own on each degree of freedom, to differentiate by. Without a name, it is in no catalogue."""
+    """An effect with one free load on each degree of freedom, to differentiate by; unnamed, so in no catalogue."""
 
     class Load(DynamicsEffect):
         table = tuple(Parameter(load.name, load.unit, -1.0, 1.0, 0.0) for load in system.loads)
@@ -80,32 +80,33 @@ def linearise_step(
     by_state: bool = True,
     by_command: bool = False,
 ) -> Tangent:
-    """The state a period on, from N states, and its tangent.
+    """The state one period after each of N states, with derivatives.
 
     Args:
-        world: its effects' own values are not used.
+        world: the effects' present parameter values are not used.
         values: (P,) of the effects' parameters, or (N, P) with a row for each state.
         time: (N,) s since the episodes began.
         state: (N, n) in float64.
-        acting: what acts over the substeps, (N, substeps, n_action); or (1 + P, N, substeps, n_action) where the
-            parameters change that: first under `values`, then with each parameter moved by `parameter_steps`.
-        by_state, by_command: whether these derivatives are wanted. A command is what acts, held over the period.
+        acting: inputs after actuation over the substeps, (N, substeps, n_action); or (1 + P, N, substeps, n_action)
+            where they depend on the parameters: under `values`, then with each parameter moved by `parameter_steps`.
+        by_state, by_command: whether to compute these derivatives; that by the command is by a constant added to
+            `acting` over the period.
     """
     width = acting.shape[-1]
     given = acting if acting.dim() == 4 else acting[None].expand(1 + values.shape[-1], *acting.shape)
 
-    def step(rows: Tensor, there: Tensor, moved: Sequence[int], pushed: Tensor) -> Tensor:
+    def step(rows: Tensor, states: Tensor, moved: Sequence[int], pushed: Tensor) -> Tensor:
         commands = given[list(moved)] + STATE_STEP * pushed[:, None, None]
-        return world.with_values(rows).integrate(time.repeat(len(moved)), there, commands.flatten(0, 1))
+        return world.with_values(rows).integrate(time.repeat(len(moved)), states, commands.flatten(0, 1))
 
     return _tangent(step, world, values, state, by_state, width if by_command else 0, width)
 
 
 def linearise_reading(world: World, values: Tensor, state: Tensor, by_state: bool = True) -> Tangent:
-    """What sensors read (N, n) of N states, and its tangent. Arguments as those of `linearise_step`."""
+    """Sensor readings (N, n) of N states, with derivatives; arguments as in `linearise_step`."""
 
-    def read(rows: Tensor, there: Tensor, moved: Sequence[int], pushed: Tensor) -> Tensor:
-        return world.with_values(rows).reading(there)
+    def read(rows: Tensor, states: Tensor, moved: Sequence[int], pushed: Tensor) -> Tensor:
+        return world.with_values(rows).reading(states)
 
     return _tangent(read, world, values, state, by_state, 0, len(world.system.actions))
 
@@ -119,23 +120,23 @@ def _tangent(
     commands: int,
     width: int,
 ) -> Tangent:
-    """Evaluate the base, then it with each state, each parameter and each command moved, as one batch."""
+    """Evaluate the base point, and with each state, parameter and command moved, as one batch."""
     (count, n), parameters = state.shape, values.shape[-1]
     states = n if by_state else 0
     replicas = 1 + states + parameters + commands
-    own = values.expand(count, parameters)
-    steps = parameter_steps(world.table, own)
-    rows, there = own.repeat(replicas, 1, 1), state.repeat(replicas, 1, 1)
+    base = values.expand(count, parameters)
+    steps = parameter_steps(world.table, base)
+    rows, states_moved = base.repeat(replicas, 1, 1), state.repeat(replicas, 1, 1)
     pushed = state.new_zeros(replicas, width)
     moved = [0] * replicas
     for i in range(states):
-        there[1 + i, :, i] += STATE_STEP
+        states_moved[1 + i, :, i] += STATE_STEP
     for k in range(parameters):
         rows[1 + states + k, :, k] += steps[:, k]
         moved[1 + states + k] = 1 + k
     for k in range(commands):
         pushed[1 + states + parameters + k, k] = 1
-    out = function(rows.flatten(0, 1), there.flatten(0, 1), moved, pushed)
+    out = function(rows.flatten(0, 1), states_moved.flatten(0, 1), moved, pushed)
     out = out.reshape(replicas, count, out.shape[-1])
     change = (out[1:] - out[:1]).movedim(0, -1)
     by = change.split((states, parameters, commands), -1)

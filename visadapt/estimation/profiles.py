@@ -1,4 +1,4 @@
-"""What a diagnosis needs to know of a system beside its physics, in one place for each system that can be diagnosed."""
+"""What a diagnosis needs to know of a system in addition to its physics, for each system that can be diagnosed."""
 
 from __future__ import annotations
 
@@ -9,99 +9,104 @@ from visadapt.systems import CartPole, FixedWing, Quadrotor, System
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY
 
 Columns = tuple[int, ...]
-"""Of the state."""
+"""Indices into the state vector."""
 
 
 @dataclass(frozen=True)
 class Convention:
-    """Another sign convention than the source's."""
+    """Signs with which a recording may differ from the source."""
 
-    what: str
-    states: float
-    """factor on the columns that a worn sensor holds: the angle and its rate"""
+    name: str
+    """the quantity of opposite sign, as the warning calls it"""
+    angle: float
+    """factor of the angle and its rate: 1 or -1"""
     command: float
+    """factor of the command: 1 or -1"""
 
 
 @dataclass(frozen=True)
 class SystemProfile:
-    """A system as the diagnosis sees it."""
+    """What estimation and diagnosis must know of a system: its sensors, and how much work the search may spend."""
 
     driven: tuple[Columns, ...]
-    """velocities, in which process noise enters, one for each load in the order of the loads; those of a group have
-    the same variance"""
-    slopes: Mapping[int, int]
-    """of a velocity that may be missing from a recording: the column that it is the rate of"""
+    """velocities that process noise changes, one for each load in the order of the loads; the velocities of a group
+    have the same noise variance"""
+    position_of: Mapping[int, int]
+    """column of a velocity to the column of its position, for velocities that a recording may lack"""
     sensors: tuple[Columns, ...]
-    """columns that one kind of sensor reads, with the same noise"""
-    attitude: Columns
-    """of a quaternion, which is the same attitude with either sign; none where there is none"""
-    spread: tuple[float, ...]
-    """variances of the first state around the measured one"""
-    places: Mapping[str, str]
-    """by unit, the variable along which regions of that unit lie"""
-    drawn: tuple[str, ...]
-    """variables over which the report draws what is left, the most telling first"""
-    residual: str
-    """what the first load is, in words"""
-    factors: Mapping[str, tuple[str | None, ...]]
-    """by which variables a black box's function on each load is multiplied; (None,) where it is not listed"""
-    rows: int = 1600
-    """that a search uses; of more, windows spread evenly over the recording are taken"""
-    flies: bool = False
-    """what is worth recording of it next is told in other words"""
-    window: int = 120
-    """rows of a window; a longer episode is cut, since states far apart say nothing about each other's noise"""
-    smooth_step: float = float("inf")
-    """s, the longest step of Runge-Kutta's that smooth physics bears where an effect is not only to be proposed"""
+    """columns that one kind of sensor measures, with the same noise variance"""
+    quaternion: Columns
+    """columns of the attitude quaternion, which means the same with either sign; empty without one"""
+    initial_variance: tuple[float, ...]
+    """(n,) variance of the first state of a window around its measurement, in the states' units squared"""
+    region_variables: Mapping[str, str]
+    """unit of a region's edges to the variable along which that region lies"""
+    plotted_variables: tuple[str, ...]
+    """variables over which the report plots the residual, the most instructive first"""
+    residual_name: str
+    """the first load in words, as the report's figures label it"""
+    black_box_factors: Mapping[str, tuple[str | None, ...]]
+    """load to the variables that multiply a black-box function on it (None: no factor); (None,) for loads not listed"""
+    max_rows: int = 1600
+    """rows that a search uses; of a longer recording, windows spread evenly over it"""
+    is_aircraft: bool = False
+    """whether experiments are advised as flights instead of motions on a track"""
+    window_rows: int = 120
+    """rows of a window; longer episodes are cut, which loses little since states far apart hardly inform each other"""
+    longest_step: float = float("inf")
+    """s, the longest Runge-Kutta step for smooth physics when an effect is fitted (screening takes one per period)"""
     substeps: tuple[int, int, int] = (1, 4, 10)
-    """in a period where an effect changes within one: to propose it, to try it, and for figures that are reported"""
-    refresh: int = 1
-    """iterations of a fit for which derivatives by the states are kept: those of states that are all measured change
-    little on the way"""
-    doubted: bool = True
-    """whether worn sensors, other conventions, and velocities that are no measurements of their own are looked for"""
-    held: Columns = ()
-    """an angle and its rate, of whose sensor defects are looked for"""
-    conventions: tuple[Convention, ...] = ()
-    """other sign conventions in which a recording may be"""
-    promising: tuple[float, float] = (1.0, 0.0)
-    """log likelihood that a lead must promise to be fitted, and more of it for each parameter; an effect costs more"""
-    rivalling: float = 0.0
-    """share of what the best lead promises that another must promise to be fitted"""
-    retried: bool = False
-    """whether a subset of a set that was fitted before is fitted again from the set's own parameters"""
-    function: float = 4.0
-    """log odds of a function of the black box beside a set from which on it counts as something unexplained"""
-    weighed: int = 8
-    """sets, the most probable ones, of which it is asked what they leave unexplained"""
+    """integration steps per period under abrupt effects, at the accuracies COARSEST, COARSE and FINE"""
+    relinearise_every: int = 1
+    """iterations of a fit between two computations of the derivatives by the states; more than 1 is accurate enough
+    where all states are measured"""
+    check_sensors: bool = True
+    """whether to look for defective angle sensors, other sign conventions, and velocities differentiated from
+    positions"""
+    angle_sensor: Columns = ()
+    """columns of the angle, and of its rate, whose sensor is checked for defects"""
+    sign_conventions: tuple[Convention, ...] = ()
+    """sign conventions, other than the source's, in which a recording may be"""
+    min_gain: float = 1.0
+    """log likelihood that an effect must gain in the screening to be fitted"""
+    min_gain_per_parameter: float = 0.0
+    """log likelihood required in addition for each of the effect's parameters"""
+    min_gain_share: float = 0.0
+    """share of the best candidate's gain that a candidate must reach to be fitted"""
+    refit_subsets: bool = False
+    """whether a subset that was fitted before is fitted again, starting from the larger set's parameters"""
+    black_box_threshold: float = 4.0
+    """log odds above which a black-box function counts as something unexplained"""
+    compared_models: int = 8
+    """models, the most probable ones, that are compared"""
     folds: int = 4
-    """in which episodes are held out"""
-    beam: int = 3
-    """sets that are taken further at each size"""
-    tried_rows: float = float("inf")
-    """rows, over all points at which an effect is tried, beyond which only some of the windows are looked at"""
+    """folds of the cross-validation"""
+    beam_width: int = 3
+    """models of each size to which the search adds another effect"""
+    screening_rows: float = float("inf")
+    """rows times parameter points per effect; above it the screening uses every 2nd, 4th, ... window"""
 
     @property
-    def columns(self) -> list[int]:
-        """All driven columns."""
+    def driven_columns(self) -> list[int]:
+        """The driven columns of all groups."""
         return [column for group in self.driven for column in group]
 
 
 _CART_POLE = SystemProfile(
     driven=((1,), (3,)),
-    slopes={1: 0, 3: 2},
+    position_of={1: 0, 3: 2},
     sensors=((0,), (1,), (2,), (3,)),
-    attitude=(),
-    spread=(0.3**2, 2.0**2, 0.3**2, 3.0**2),
-    places={"s": "time", "m": "x", "rad": "theta"},
-    drawn=("x_dot", "x", "command", "time", "theta", "theta_dot"),
-    residual="force on the cart",
-    factors={"cart_force": (None, "x_dot", "command"), "pivot_torque": (None, "theta_dot")},
-    held=(2, 3),
-    conventions=(
+    quaternion=(),
+    initial_variance=(0.3**2, 2.0**2, 0.3**2, 3.0**2),
+    region_variables={"s": "time", "m": "x", "rad": "theta"},
+    plotted_variables=("x_dot", "x", "command", "time", "theta", "theta_dot"),
+    residual_name="force on the cart",
+    black_box_factors={"cart_force": (None, "x_dot", "command"), "pivot_torque": (None, "theta_dot")},
+    angle_sensor=(2, 3),
+    sign_conventions=(
         Convention("the angle", -1, 1),
         Convention("the command", 1, -1),
-        # The position's sign is that of angle and command together, by the symmetry of the cart-pole.
+        # By the mirror symmetry of the cart-pole, a position of opposite sign is angle and command of opposite sign.
         Convention("the position", -1, -1),
     ),
 )
@@ -113,52 +118,52 @@ def _span(columns: slice) -> Columns:
 
 _VEHICLE = SystemProfile(
     driven=(_span(VELOCITY), _span(RATES)),
-    slopes=dict(zip(_span(VELOCITY), _span(POSITION), strict=True)),
+    position_of=dict(zip(_span(VELOCITY), _span(POSITION), strict=True)),
     sensors=tuple(_span(columns) for columns in (POSITION, VELOCITY, ATTITUDE, RATES)),
-    attitude=_span(ATTITUDE),
-    spread=(0.3**2,) * 3 + (1.0,) * 3 + (0.1**2,) * 4 + (1.0,) * 3,
-    places={"s": "time", "m": "z"},
-    drawn=("x_dot", "thrust", "time", "z"),
-    residual="force along x",
-    factors={},
-    rows=650,
-    flies=True,
-    window=25,
+    quaternion=_span(ATTITUDE),
+    initial_variance=(0.3**2,) * 3 + (1.0,) * 3 + (0.1**2,) * 4 + (1.0,) * 3,
+    region_variables={"s": "time", "m": "z"},
+    plotted_variables=("x_dot", "thrust", "time", "z"),
+    residual_name="force along x",
+    black_box_factors={},
+    max_rows=650,
+    is_aircraft=True,
+    window_rows=25,
     substeps=(2, 3, 4),
-    refresh=4,
-    doubted=False,
-    promising=(1.0, 3.0),
-    rivalling=0.3,
-    retried=True,
-    # Of more functions the most evident is more evident by chance.
-    function=6.0,
-    weighed=4,
+    relinearise_every=4,
+    check_sensors=False,
+    min_gain_per_parameter=3.0,
+    min_gain_share=0.3,
+    refit_subsets=True,
+    # With more functions to choose from, the largest log odds by chance are higher.
+    black_box_threshold=6.0,
+    compared_models=4,
     folds=2,
-    beam=2,
-    tried_rows=1.5e4,
+    beam_width=2,
+    screening_rows=1.5e4,
 )
-"""What quadrotor and fixed wing share: 13 states, all of them measured, so that short windows and few rows will do."""
+"""Common to quadrotor and fixed wing: all 13 states are measured, so that short windows and few rows suffice."""
 
 
 PROFILES: dict[type[System], SystemProfile] = {
     CartPole: _CART_POLE,
-    # The rate loop decays at 16.6 a second, the wing's roll rate at 1.95 a metre.
-    Quadrotor: replace(_VEHICLE, smooth_step=0.035),
-    FixedWing: replace(_VEHICLE, smooth_step=0.025),
+    # Runge-Kutta must be stable: the rate loop decays at 16.6 1/s, the wing's roll rate at 1.95 per metre flown.
+    Quadrotor: replace(_VEHICLE, longest_step=0.035),
+    FixedWing: replace(_VEHICLE, longest_step=0.025),
 }
-"""By the class of the system."""
+"""The profile of each system class."""
 
 DIAGNOSABLE: dict[str, type[System]] = {system.name: system for system in PROFILES}
 """The systems that can be diagnosed, by name."""
 
 
 def profile_of(system: System) -> SystemProfile:
-    """What is known of a system, or of one derived from it.
+    """The profile of a system, or of the class that it derives from.
 
     Raises:
-        ValueError: it cannot be diagnosed.
+        ValueError: the system has no profile, so it cannot be diagnosed.
     """
     for kind, profile in PROFILES.items():
         if isinstance(system, kind):
             return profile
-    raise ValueError(f"diagnose: {', '.join(DIAGNOSABLE)} is what can be diagnosed, got {system.name}")
+    raise ValueError(f"diagnose: {system.name} cannot be diagnosed; {', '.join(DIAGNOSABLE)} can")

@@ -1,7 +1,7 @@
-"""Readings that are no readings: rows that repeat the one before, and a sensor that stands still.
+"""Repeated readings: rows that repeat the row before, and an angle sensor that stands still.
 
-A sensor in motion never gives the same number twice; where it does, the reading was held. Such readings say nothing
-of the state, so they are set aside before anything is fitted, and counted here.
+Because of noise, a sensor in motion never gives the same number twice; where it does, the previous reading was
+repeated. Such readings do not measure the state: they are excluded from fits, and counted here.
 """
 
 from __future__ import annotations
@@ -14,78 +14,91 @@ from torch import Tensor
 
 from visadapt.estimation.segments import smallest_step
 
-MOVING = 8
-"""Smallest steps of a sensor that it must jump by, before or after a repeated reading, for that to be a held one."""
+MIN_JUMP_STEPS = 8
+"""Jump into or out of a run of equal readings, in steps of the sensor's resolution, above which the run counts as
+repeated; below, the quantity may have stood still."""
 
-GRID = 120
-"""Places tried for either edge of a zone in which a sensor stands still."""
+ZONE_EDGE_POINTS = 120
+"""Angles tried for either edge of the zone in which the angle sensor stands still."""
+
+SMOOTHING_RATIO = 1 / 3
+"""Assumed standard deviation of a smoothed angle over that of a measured one."""
 
 
 @dataclass(frozen=True)
-class Holds:
-    """What was held, by episode."""
+class RepeatedReadings:
+    """Which readings are repeated, by episode."""
 
     used: list[Tensor]
-    """(T, m) 1 where a reading counts"""
+    """(T, m) 1 where a reading is a measurement"""
     lost: list[Tensor]
-    """(T,) the whole row was held"""
+    """(T,) whether the whole row is repeated"""
     frozen: list[Tensor]
-    """(T,) the angle was held, the rest of the row was not"""
+    """(T,) whether the angle is repeated and the rest of the row is not"""
 
 
-def find_holds(measured: Sequence[Tensor], channels: tuple[int, ...], worn: Sequence[int]) -> Holds:
-    """Held readings in episodes (T, m) of these columns of the state, of which a `worn` angle sensor may hold some."""
+def find_repeats(
+    measured: Sequence[Tensor], channels: tuple[int, ...], angle_sensor: Sequence[int]
+) -> RepeatedReadings:
+    """Find repeated readings in episodes (T, m).
+
+    Args:
+        measured: the episodes.
+        channels: the state's columns that were measured.
+        angle_sensor: columns of the angle, which may stand still on its own, and of its rate; empty without one.
+    """
     together = torch.cat(list(measured))
     steps = [smallest_step(together[:, k]) for k in range(len(channels))]
-    pole = torch.tensor([c in worn for c in channels], dtype=torch.bool)
-    angle = channels.index(worn[0]) if worn and worn[0] in channels else None
+    pole = torch.tensor([c in angle_sensor for c in channels], dtype=torch.bool)
+    angle = channels.index(angle_sensor[0]) if angle_sensor and angle_sensor[0] in channels else None
     used, lost, frozen = [], [], []
     for values in measured:
-        same = torch.stack([_held(values[:, k], MOVING * steps[k]) for k in range(len(channels))], 1)
+        same = torch.stack([_repeats(values[:, k], MIN_JUMP_STEPS * steps[k]) for k in range(len(channels))], 1)
         whole = same.all(1)
-        # An angular velocity of its own sensor may go on while the angle stands still.
+        # A rate from a separate sensor may go on while the angle stands still.
         own = same & pole & ~whole[:, None]
         still = own[:, angle] if angle is not None else torch.zeros_like(whole)
-        # What a sensor gives first when it wakes may still be half of what it held.
+        # The first reading after a standstill may still be mixed with the repeated value.
         waking = torch.zeros_like(own)
         waking[1:] = own[:-1] & ~own[1:]
         used.append(1.0 - (whole[:, None] | (still[:, None] & own) | waking).double())
         lost.append(whole)
         frozen.append(still)
-    return Holds(used, lost, frozen)
+    return RepeatedReadings(used, lost, frozen)
 
 
-def _held(readings: Tensor, moving: float) -> Tensor:
-    """(T,) rows that repeat the one before, in runs that a jump leads into or out of."""
+def _repeats(readings: Tensor, jump: float) -> Tensor:
+    """(T,) rows that repeat the row before, in runs preceded or followed by a change of more than `jump`."""
     change = readings.diff(prepend=readings[:1])
     same = change == 0
     same[0] = False
-    # Segments of a run share a number; the jump into it is that of its first row, the jump out that of the next run's.
+    # Rows of a run share a number; the jump into a run is the change at its first row, the jump out that of the next.
     run = (~same).cumsum(0) - 1
     jumps = torch.cat((change[~same].abs(), torch.zeros(1, dtype=readings.dtype)))
-    return same & ((jumps[run] > moving) | (jumps[run + 1] > moving))
+    return same & ((jumps[run] > jump) | (jumps[run + 1] > jump))
 
 
-def zone(held: Tensor, angle: Tensor, deviation: float) -> tuple[float, float, float]:
-    """Start and end of the angles at which a sensor stands still, and the deviation of either.
+def zone(repeated: Tensor, angle: Tensor, deviation: float) -> tuple[float, float, float]:
+    """Start and end of the zone of angles in which a sensor stands still, and their standard deviation.
 
     Args:
-        held: (N,) whether the reading was held.
-        angle: (N,) true angles, known to `deviation`.
+        repeated: (N,) whether the reading is repeated.
+        angle: (N,) estimated angles, rad.
+        deviation: rad, standard deviation of their normal error.
 
-    Maximum likelihood with a normal error of the angles, over the edges between the angles met.
+    Posterior mean over a grid of both edges, with a uniform prior.
     """
-    inside = angle[held]
-    # An edge may lie anywhere between the last angle at which the reading was held and the next at which it was not.
+    inside = angle[repeated]
+    # An edge may lie anywhere between the last angle with a repeated reading and the next without.
     least, most, middle = inside.min(), inside.max(), float(inside.median())
-    lower, higher = angle[~held & (angle < least)], angle[~held & (angle > most)]
+    lower, higher = angle[~repeated & (angle < least)], angle[~repeated & (angle > most)]
     first, last = lower.max() if len(lower) else least, higher.min() if len(higher) else most
-    low = torch.linspace(float(first) - 3 * deviation, middle, GRID, dtype=angle.dtype)
-    high = torch.linspace(middle, float(last) + 3 * deviation, GRID, dtype=angle.dtype)
+    low = torch.linspace(float(first) - 3 * deviation, middle, ZONE_EDGE_POINTS, dtype=angle.dtype)
+    high = torch.linspace(middle, float(last) + 3 * deviation, ZONE_EDGE_POINTS, dtype=angle.dtype)
     below = torch.special.ndtr((low[:, None] - angle) / deviation)
     above = torch.special.ndtr((angle - high[:, None]) / deviation)
     chance = (1 - below[:, None] - above[None]).clamp(1e-6, 1 - 1e-6)
-    score = torch.where(held, chance.log(), (1 - chance).log()).sum(-1)
+    score = torch.where(repeated, chance.log(), (1 - chance).log()).sum(-1)
     weight = (score - score.max()).exp()
     weight = weight / weight.sum()
     start, end = (weight.sum(1) * low).sum(), (weight.sum(0) * high).sum()

@@ -1,8 +1,8 @@
-"""Which effects are worth fitting beside a fitted set: a linear answer for a grid of shapes and sizes of each.
+"""Which effects are worth adding to a fitted set, by the linear response of its innovations to each of them.
 
-Where a small effect is added, the innovations of the filter change by what its one-step disturbances become when
-passed through the same gains. So a whole grid is scored by one pass of the filter's means, without refitting; and
-where an effect has too many strengths for a grid, a few of Gauss-Newton's steps through the same pass find them.
+When a small effect is added, the filter's innovations change by the effect's one-step disturbances passed through the
+same gains. So a whole grid of parameter values is scored by one pass of the filter's means, without refitting; where a
+grid would be too large, a few Gauss-Newton steps with the same response find the parameters.
 """
 
 from __future__ import annotations
@@ -15,64 +15,72 @@ import torch
 from torch import Tensor
 
 from visadapt.effects import Effect
-from visadapt.estimation.grids import grid, is_climbed, spans, starts
+from visadapt.estimation.grids import grid, needs_descent, spans, starts
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
-from visadapt.estimation.sensitivity import View
+from visadapt.estimation.sensitivity import Sensitivity
 from visadapt.systems import System
 
-STEPS = 6
-SETTLED = 0.1
-"""Steps at most, and log likelihood that is not worth another."""
+MAX_STEPS = 6
+MIN_STEP_GAIN = 0.1
+"""Number of Gauss-Newton steps at most, and log likelihood gained by a step below which no other is made."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A promising start for an effect beside a fitted set."""
+    """An effect that may be added to a fitted set, and the parameter values to start from."""
 
     effect: type[Effect]
     values: tuple[float, ...]
     gain: float
-    """log likelihood that it promises"""
+    """log likelihood that it adds, by the linear response"""
 
 
 def screen(
     system: System, effects: Sequence[type[Effect]], fits: FitState, rows: Segments, candidates: Sequence[type[Effect]]
 ) -> list[Candidate]:
-    """The best lead of every candidate beside the one fitted set in `fits`, best first."""
-    seen_at = spans(system, rows, fits.state[0])
-    views: dict[int, View] = {}
+    """The best parameter values of every effect of `candidates` that raises the likelihood, the largest gain first.
 
-    def view(every: int) -> View:
-        if every not in views:
-            views[every] = View.of(system, effects, fits, rows, every)
-        return views[every]
+    Args:
+        system: the source.
+        effects: the fitted set.
+        fits: its fit (C = 1).
+        rows: the recording.
+        candidates: the effects to try.
+    """
+    covered = spans(system, rows, fits.state[0])
+    by_stride: dict[int, Sensitivity] = {}
 
-    leads = []
+    def sensitivity(stride: int) -> Sensitivity:
+        if stride not in by_stride:
+            by_stride[stride] = Sensitivity.on_every(stride, system, effects, fits, rows)
+        return by_stride[stride]
+
+    found = []
     for effect in candidates:
-        points, columns = starts(effect, seen_at) if is_climbed(effect) else grid(effect, seen_at)
-        every = _every(profile_of(system).tried_rows, rows, len(points) * (1 + len(columns)))
-        if is_climbed(effect):
-            leads.append(_climbed(view(1), effect, _nearest(view(every), effect, points, columns)))
+        points, columns = starts(effect, covered) if needs_descent(effect) else grid(effect, covered)
+        stride = _window_stride(profile_of(system).screening_rows, rows, len(points) * (1 + len(columns)))
+        if needs_descent(effect):
+            found.append(_descend(sensitivity(1), effect, _best_start(sensitivity(stride), effect, points, columns)))
         else:
-            own = view(every)
-            lead = _best(effect, points, columns, own.seen.error, own.by_unit(effect, points, columns))
-            leads.append(None if lead is None else replace(lead, gain=every * lead.gain))
-    return sorted((lead for lead in leads if lead is not None), key=lambda lead: -lead.gain)
+            some = sensitivity(stride)
+            best = _best(effect, points, columns, some.innovations.error, some.by_unit(effect, points, columns))
+            found.append(None if best is None else replace(best, gain=stride * best.gain))
+    return sorted((one for one in found if one is not None), key=lambda one: -one.gain)
 
 
-def _every(most: float, rows: Segments, points: int) -> int:
-    """Of how many windows one is looked at where an effect is tried at so many points."""
+def _window_stride(most: float, rows: Segments, points: int) -> int:
+    """k, so that every k-th window at this many parameter points is at most `most` rows, if 8 windows remain."""
     wanted = points * float(rows.inside.sum()) / most
-    # Powers of two, so that effects share what is looked at.
+    # A power of two, so that effects share their sensitivities.
     return 2 ** max(0, min(math.ceil(math.log2(max(1.0, wanted))), int(math.log2(max(1, rows.shape[0] // 8)))))
 
 
-def _nearest(view: View, effect: type[Effect], points: Tensor, strengths: list[int]) -> Tensor:
-    """Of points (G, P) the one from which one step of the strengths promises most, after that step; (P,)."""
-    change, slopes = view.beside(effect, points, strengths)
-    left, slopes = view.seen.error[:, None] + change, slopes.movedim(1, 0)
+def _best_start(sensitivity: Sensitivity, effect: type[Effect], points: Tensor, strengths: list[int]) -> Tensor:
+    """(P,) the best result of one Gauss-Newton step of the strengths from each of points (G, P)."""
+    change, slopes = sensitivity.around(effect, points, strengths)
+    left, slopes = sensitivity.innovations.error[:, None] + change, slopes.movedim(1, 0)
     normal = slopes.mT @ slopes
     ridge = 1e-3 * torch.diagonal(normal, dim1=1, dim2=2) + 1e-30
     pull = -(slopes.mT @ left.T[..., None])[..., 0]
@@ -84,18 +92,19 @@ def _nearest(view: View, effect: type[Effect], points: Tensor, strengths: list[i
     return _inside(effect, out)
 
 
-def _climbed(view: View, effect: type[Effect], point: Tensor) -> Candidate | None:
-    """The lead that Gauss-Newton's method with damping (Levenberg 1944) reaches from a point (P,)."""
+def _descend(sensitivity: Sensitivity, effect: type[Effect], point: Tensor) -> Candidate | None:
+    """The candidate that damped Gauss-Newton steps (Levenberg 1944) reach from a point (P,); None without a gain."""
+    error = sensitivity.innovations.error
     every = list(range(len(effect.table)))
-    damping, best, found, left = 1e-2, -math.inf, point, view.seen.error
+    damping, best, found, left = 1e-2, -math.inf, point, error
     slopes = torch.zeros(len(left), len(every), dtype=left.dtype)
-    for _ in range(STEPS):
-        change, there = view.beside(effect, point[None], every)
-        now = view.seen.error + change[:, 0]
-        gain = float(0.5 * (view.seen.error.square().sum() - now.square().sum()))
+    for _ in range(MAX_STEPS):
+        change, derivatives = sensitivity.around(effect, point[None], every)
+        now = error + change[:, 0]
+        gain = float(0.5 * (error.square().sum() - now.square().sum()))
         if gain > best:
-            damping, settled = damping / 5, gain - best < SETTLED
-            best, found, slopes, left = gain, point, there[:, 0], now
+            damping, settled = damping / 5, gain - best < MIN_STEP_GAIN
+            best, found, slopes, left = gain, point, derivatives[:, 0], now
             if settled:
                 break
         else:
@@ -111,17 +120,19 @@ def _inside(effect: type[Effect], point: Tensor) -> Tensor:
     return point.clamp(low, high)
 
 
-def _best(effect: type[Effect], shapes: Tensor, linear: list[int], error: Tensor, answer: Tensor) -> Candidate | None:
-    """The point of a grid that takes most from `error` (N,), given the answers (N, G, columns)."""
+def _best(effect: type[Effect], shapes: Tensor, linear: list[int], error: Tensor, response: Tensor) -> Candidate | None:
+    """The point of a grid (G, P) that reduces the squares of `error` (N,) most, with the best sizes of the parameters
+    `linear`; `response` (N, G, L) is the change per unit of these. None where no point reduces them.
+    """
     if not linear:
-        gains = 0.5 * (error.square().sum() - (error[:, None] + answer[..., 0]).square().sum(0))
+        gains = 0.5 * (error.square().sum() - (error[:, None] + response[..., 0]).square().sum(0))
         best = int(gains.argmax())
         return Candidate(effect, tuple(shapes[best].tolist()), float(gains[best])) if gains[best] > 0 else None
-    answer = answer.movedim(1, 0)
-    normal = answer.mT @ answer
+    response = response.movedim(1, 0)
+    normal = response.mT @ response
     ridge = 1e-9 * torch.diagonal(normal, dim1=1, dim2=2).mean(1) + 1e-30
     normal = normal + ridge[:, None, None] * torch.eye(len(linear), dtype=error.dtype)
-    pull = -(answer.mT @ error)
+    pull = -(response.mT @ error)
     sizes = torch.linalg.solve(normal, pull[..., None])[..., 0]
     for j, column in enumerate(linear):
         parameter = effect.table[column]

@@ -9,34 +9,34 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-ROUNDING = 1e-6
-"""Differences that arithmetic makes of equal readings (turning an angle round, say), not the sensor."""
+ROUNDING_ERROR = 1e-6
+"""In a reading's unit; smaller differences between readings come from arithmetic, such as wrapping an angle."""
 
 
 @dataclass(frozen=True)
 class Segments:
-    """W windows of at most T rows, in float64; what is beyond a window's end is zero and not `used`."""
+    """W windows of at most T rows, in float64, padded with zeros that are neither `inside` nor `used`."""
 
     measured: Tensor
     """(W, T, m)"""
     used: Tensor
-    """(W, T, m) 1 where a measurement counts"""
+    """(W, T, m) 1 where there is a measurement that a fit may use"""
     inside: Tensor
-    """(W, T) 1 within the window"""
+    """(W, T) 1 within the window, 0 in its padding"""
     time: Tensor
-    """(W, T) s since the episode began"""
+    """(W, T) s since the start of the episode"""
     command: Tensor
-    """(E, L, n_action) of whole episodes, from their beginning"""
+    """(E, L, n_action) of whole episodes, from their start"""
     first: Tensor
-    """(W,) row of the episode at which the window begins"""
+    """(W,) row of the episode at which the window starts"""
     episode: Tensor
     """(W,) index of the window's episode"""
     channels: tuple[int, ...]
-    """columns of the state that were measured"""
+    """the m columns of the state that were measured"""
     period: float
-    """s"""
+    """s between rows"""
     step: tuple[float, ...]
-    """of each channel, the least difference between two readings that differ"""
+    """resolution of each channel: the smallest difference between two different readings"""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -45,16 +45,16 @@ class Segments:
 
     @property
     def index(self) -> Tensor:
-        """(W, T) row of the episode; beyond a window's end it goes on."""
+        """(W, T) row of the episode; it continues in the padding."""
         return self.first[:, None] + torch.arange(self.shape[1])
 
-    def of(self, windows: Tensor) -> Segments:
-        """Only these windows."""
+    def select(self, windows: Tensor) -> Segments:
+        """These windows, by index."""
         every = ("measured", "used", "inside", "time", "first", "episode")
         return replace(self, **{name: getattr(self, name)[windows] for name in every})
 
-    def reading(self, kept: Sequence[int]) -> Segments:
-        """Only these of the measured channels."""
+    def with_channels(self, kept: Sequence[int]) -> Segments:
+        """With these of the measured channels, by position in `channels`."""
         return replace(
             self,
             measured=self.measured[..., kept],
@@ -73,10 +73,16 @@ def cut(
     longest: int,
     stretches: Sequence[tuple[int, int, int]] | None = None,
 ) -> Segments:
-    """Cut episodes into windows of equal length within each: measured (T, m), valid (T, m), commands (T, n_action).
+    """Cut each episode into windows of nearly equal length.
 
-    A window has `longest` rows at most. `stretches`, where given, are what is used: an episode's index, and the rows
-    from which and up to which.
+    Args:
+        measured: (T, m) of each episode.
+        valid: (T, m) 1 where a measurement may be used.
+        commands: (T, n_action).
+        channels: the state's columns that were measured.
+        period: s between rows.
+        longest: rows of a window at most.
+        stretches: the parts to use, as (episode index, first row, row past the last); whole episodes by default.
     """
     pieces = []
     for index, begin, end in stretches or [(k, 0, len(values)) for k, values in enumerate(measured)]:
@@ -105,7 +111,7 @@ def cut(
 
 
 def smallest_step(readings: Tensor) -> float:
-    """Of a sensor: the least difference between two readings (N,) that differ."""
+    """A sensor's resolution: the smallest difference between two different readings (N,); 0 if all are equal."""
     steps = readings.unique().diff()
-    steps = steps[steps > ROUNDING]
+    steps = steps[steps > ROUNDING_ERROR]
     return float(steps.min()) if len(steps) else 0.0

@@ -1,4 +1,4 @@
-"""The report's figures, as SVG whose colours are the page's own, light or dark."""
+"""The report's figures as SVG; their colours are CSS variables of the page, light or dark."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from visadapt.systems import System
 
 INK, MUTED, LINE = "#1f2933", "#6e7a88", "#d8dde3"
 BEFORE, AFTER, BLACK_BOX = "#de7416", "#2f67c9", "#0e7a70"
-VARIABLES = {INK: "ink", MUTED: "muted", LINE: "line", BEFORE: "before", AFTER: "after", BLACK_BOX: "black-box"}
-"""The colours drawn with, and the page's CSS variables that take their place."""
+CSS_VARIABLES = {INK: "ink", MUTED: "muted", LINE: "line", BEFORE: "before", AFTER: "after", BLACK_BOX: "black-box"}
+"""Colours in matplotlib, and the page's CSS variables that replace them."""
 
-MOST_STATES = 5
-"""that are shown of a prediction"""
+MAX_STATES = 5
+"""States of a prediction that are plotted."""
 
-WIDTH = 4.0
-"""inches: a phone's width at the size in which the text is set"""
+FIGURE_WIDTH = 4.0
+"""inches; at the font size of STYLE, the text is readable on a phone"""
 STYLE: dict[Any, Any] = {
-    "svg.fonttype": "none",  # text stays text
-    "svg.hashsalt": "visadapt",  # the same diagnosis gives the same page
+    "svg.fonttype": "none",  # letters as text, not as paths
+    "svg.hashsalt": "visadapt",  # fixed ids: equal diagnoses give equal pages
     "font.family": "sans-serif",
     "font.size": 9,
-    "figure.facecolor": "none",  # the page is the background
+    "figure.facecolor": "none",  # transparent
     "axes.facecolor": "none",
     "axes.edgecolor": MUTED,
     "axes.labelcolor": INK,
@@ -53,10 +53,12 @@ STYLE: dict[Any, Any] = {
 
 
 def prediction(one: Prediction, system: type[System], corrected: bool) -> str:
-    """A held-out window: measured states, and as they were predicted from its start."""
-    shown = _telling(one, [index for index in range(len(system.states)) if np.isfinite(one.measured[:, index]).any()])
+    """A held-out window: its states as measured, and as predicted from its start."""
+    shown = _most_wrong(
+        one, [index for index in range(len(system.states)) if np.isfinite(one.measured[:, index]).any()]
+    )
     with matplotlib.rc_context(STYLE):
-        figure = Figure((WIDTH, 0.5 + 1.15 * len(shown)), layout="constrained")
+        figure = Figure((FIGURE_WIDTH, 0.5 + 1.15 * len(shown)), layout="constrained")
         rows: list[Axes] = list(figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0])
         for axes, index in zip(rows, shown, strict=True):
             variable = system.states[index]
@@ -71,20 +73,21 @@ def prediction(one: Prediction, system: type[System], corrected: bool) -> str:
         return _svg(figure, f"measured and predicted states, episode {one.episode}")
 
 
-def _telling(one: Prediction, measured: Sequence[int]) -> list[int]:
-    """Of the measured states those, MOST_STATES at most, from which the source departs most beside their noise."""
+def _most_wrong(one: Prediction, measured: Sequence[int]) -> list[int]:
+    """The MAX_STATES measured states with the largest error of the source relative to its change from row to row, a
+    measure of the noise."""
     error = (one.source - one.measured)[:, measured]
-    departs = np.sqrt((error**2).mean(0) / (np.diff(error, axis=0) ** 2).mean(0).clip(1e-300))
-    return sorted(measured[k] for k in np.argsort(-departs)[:MOST_STATES])
+    relative = np.sqrt((error**2).mean(0) / (np.diff(error, axis=0) ** 2).mean(0).clip(1e-300))
+    return sorted(measured[k] for k in np.argsort(-relative)[:MAX_STATES])
 
 
 def profile(one: Profile, regions: Sequence[Region], corrected: bool) -> str:
-    """The mean residual over a variable, with bands of 90 %, and the regions that stand out shaded."""
+    """The mean residual over a variable with 90 % confidence bands; regions are shaded."""
     with matplotlib.rc_context(STYLE):
         figure, axes = _one_plot()
-        for stretch in regions:
-            if stretch.variable == one.variable:
-                axes.axvspan(stretch.start, stretch.end, color=LINE, alpha=0.7, zorder=0, linewidth=0)
+        for region in regions:
+            if region.variable == one.variable:
+                axes.axvspan(region.start, region.end, color=LINE, alpha=0.7, zorder=0, linewidth=0)
         axes.axhline(0, color=MUTED, linewidth=0.8)
         _band(axes, one.centres, one.before, one.before_error, BEFORE, "simulator")
         if corrected:
@@ -92,7 +95,7 @@ def profile(one: Profile, regions: Sequence[Region], corrected: bool) -> str:
         axes.set_xlabel(_labelled(one.variable, one.variable_unit))
         axes.set_ylabel(_labelled(one.quantity, one.quantity_unit))
         _legend(figure, axes)
-        return _svg(figure, f"{one.quantity} left over, over {one.variable}")
+        return _svg(figure, f"residual {one.quantity} over {one.variable}")
 
 
 def growth(one: Growth, corrected: bool) -> str:
@@ -121,11 +124,11 @@ def spectrum(one: Spectrum, corrected: bool) -> str:
         axes.set_xlabel("frequency [Hz]")
         axes.set_ylabel(_labelled(one.quantity, one.unit))
         _legend(figure, axes)
-        return _svg(figure, f"spectrum of the {one.quantity} left over")
+        return _svg(figure, f"spectrum of the residual {one.quantity}")
 
 
 def _one_plot() -> tuple[Figure, Axes]:
-    figure = Figure((WIDTH, 2.7), layout="constrained")
+    figure = Figure((FIGURE_WIDTH, 2.7), layout="constrained")
     return figure, figure.subplots()
 
 
@@ -144,15 +147,15 @@ def _legend(figure: Figure, axes: Axes) -> None:
 
 
 def _svg(figure: Figure, title: str) -> str:
-    """The figure as an element of an HTML page, described by `title`."""
+    """The figure as an HTML element with a title for screen readers."""
     text = io.StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
     svg = text.getvalue()
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
-    # The page says how wide.
+    # Without width and height, so that the page's CSS sets the size.
     view = re.search(r'viewBox="[^"]*"', svg)
     assert view is not None
     svg = f'<svg role="img" {view[0]}><title>{html.escape(title)}</title>{svg[svg.index(">") + 1 :]}'
-    for colour, name in VARIABLES.items():
+    for colour, name in CSS_VARIABLES.items():
         svg = svg.replace(colour, f"var(--{name})")
     return svg

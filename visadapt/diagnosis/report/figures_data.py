@@ -1,4 +1,4 @@
-"""The figures behind a result: errors by horizon and state, and what the report draws."""
+"""Numbers behind a result: prediction errors by horizon and state, and the data of the report's figures."""
 
 from __future__ import annotations
 
@@ -7,63 +7,71 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from visadapt.diagnosis.result import Evidence, Gap, Growth, PolicyTerms, Prediction, Region
+from visadapt.diagnosis.result import FigureData, Gap, Growth, Prediction, Profile, Region, Spectrum
 from visadapt.diagnosis.search import heldout
+from visadapt.diagnosis.search.disturbance import Disturbance, disturbance
 from visadapt.diagnosis.search.heldout import RolloutErrors
-from visadapt.diagnosis.search.localisation import Disturbance, disturbance, profile, spectrum
+from visadapt.diagnosis.search.localisation import binned
 from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.systems import System
 
-SHOWN = 3
-"""Held-out predictions that the report draws."""
-
-PROFILES = 4
-"""Variables over which it draws what is left."""
+MAX_PREDICTIONS, MAX_PROFILES = 3, 3
+"""Figures of held-out predictions, and of the residual over a variable; more would hide the instructive ones."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Root mean square errors of held-out predictions by horizon and channel (H, m), in deviations of the noise."""
+    """Root mean square errors of held-out predictions by horizon and channel (H, m), in units of `deviation`."""
 
     before: Tensor
+    """of the source"""
     after: Tensor
+    """of the source with the causes"""
     floor: Tensor
+    """of the states that the smoother estimates: noise"""
     black_box: Tensor
+    """of the source with a black box"""
     deviation: Tensor
-    """(m,) of the noise"""
+    """(m,) standard deviations of the measurement noise, in the states' units"""
 
     @classmethod
-    def of(cls, source: RolloutErrors, corrected: RolloutErrors, boxed: RolloutErrors, deviation: Tensor) -> Errors:
+    def from_rollouts(
+        cls, source: RolloutErrors, corrected: RolloutErrors, black_box: RolloutErrors, deviation: Tensor
+    ) -> Errors:
         """From predictions of the source, of the source with the causes, and of the source with a black box."""
-        every = (source.rms(deviation), corrected.rms(deviation), corrected.floor(deviation), boxed.rms(deviation))
-        return cls(*every, deviation)
+        after, floor = corrected.rms(deviation), corrected.floor(deviation)
+        return cls(source.rms(deviation), after, floor, black_box.rms(deviation), deviation)
 
-    def closed_by(self, ahead: RolloutErrors) -> float:
-        """Share of the gap that a set closes."""
-        reached = heldout.overall(ahead.rms(self.deviation))[-1]
+    def closed_by(self, rollouts: RolloutErrors) -> float:
+        """Share of the gap that the set with these predictions closes."""
+        reached = heldout.overall(rollouts.rms(self.deviation))[-1]
         return heldout.closed(_last(self.before), float(reached), _last(self.floor))
 
     def gap(self) -> Gap:
-        """As the result states it."""
+        """The errors at the longest horizon, over all channels."""
         before, after, floor, box = (_last(e) for e in (self.before, self.after, self.floor, self.black_box))
         measure = (
-            f"root mean square error of predictions {heldout.AHEAD:g} s ahead on held-out episodes, "
+            f"root mean square error of predictions {heldout.PREDICTION_TIME:g} s ahead on held-out episodes, "
             "in standard deviations of the measurement noise"
         )
         return Gap(measure, before, after, floor, box, heldout.closed(before, after, floor))
 
     def growth(self, period: float) -> Growth:
-        """Over the horizon."""
+        """The errors over the horizon, over all channels; `period` in s."""
         seconds = period * np.arange(1, len(self.before) + 1)
         every = (heldout.overall(e).numpy() for e in (self.before, self.after, self.floor, self.black_box))
         return Growth(seconds, *every)
 
     def by_state(self, system: System, channels: Sequence[int], explained: bool) -> dict[str, float]:
-        """Share of the gap by state: of what the causes close, or else of what is there; NaN where unmeasured."""
+        """Share by state of the squared error above `after` if the causes explain the gap, else above the noise floor.
+
+        NaN where the state was not measured.
+        """
         least = self.after if explained else self.floor
         excess = (self.before[-1].square() - least[-1].square()).clamp(min=0)
         whole = float(excess.sum())
@@ -78,17 +86,17 @@ def _last(errors: Tensor) -> float:
 
 
 def disturbances(search: Search, comparison: ModelComparison) -> tuple[Disturbance, Disturbance]:
-    """What acts beside the source, and beside the best set, smoothed alike."""
+    """Disturbance estimates of the source, and of the best set."""
     source, best = search.source, comparison.best
-    # The same room for a disturbance in both, or the smoother one would look cleaner for that alone.
-    room = source.fits.log_process.clamp(min=math.log(0.01**2))
+    # The same process noise in both: less of it alone would make the second estimate smoother.
+    log_process = source.fits.log_process.clamp(min=math.log(0.01**2))
     return (
-        disturbance(CandidateModel(search.system, (), search.rows), source.fits, room),
-        disturbance(CandidateModel(search.system, best.effects, search.rows), best.fits, room),
+        disturbance(CandidateModel(search.system, (), search.rows), source.fits, log_process),
+        disturbance(CandidateModel(search.system, best.effects, search.rows), best.fits, log_process),
     )
 
 
-def evidence(
+def figure_data(
     search: Search,
     source: RolloutErrors,
     corrected: RolloutErrors,
@@ -96,31 +104,29 @@ def evidence(
     before: Disturbance,
     after: Disturbance,
     regions: Sequence[Region],
-    policy: PolicyTerms | None,
-) -> Evidence:
-    """What the report draws."""
+) -> FigureData:
+    """What the report plots."""
     units = {v.name: v.unit for v in (*search.system.states, *search.system.actions)} | {"time": "s"}
-    drawn = [region.variable for region in regions] + list(search.profile.drawn)
-    names = [name for name in dict.fromkeys(drawn) if name in units][:PROFILES]
-    return Evidence(
+    plotted = [region.variable for region in regions] + list(search.profile.plotted_variables)
+    names = [name for name in dict.fromkeys(plotted) if name in units][:MAX_PROFILES]
+    return FigureData(
         _predictions(search, source, corrected),
-        tuple(profile(name, units[name], search.profile.residual, before, after) for name in names),
+        tuple(_profile(name, units[name], search.profile.residual_name, before, after) for name in names),
         errors.growth(search.rows.period),
-        spectrum(search.profile.residual, before, after, search.rows.period),
-        policy,
+        _spectrum(search.profile.residual_name, before, after, search.rows.period),
     )
 
 
 def _predictions(search: Search, source: RolloutErrors, corrected: RolloutErrors) -> tuple[Prediction, ...]:
-    """Stretches in which the source errs most, from windows of their own."""
+    """The prediction of largest error in each of the windows in which the source errs most."""
     rows = search.rows
     horizon = source.predicted.shape[2] - 1
-    wrong = source.error[-1].square().sum(-1) * source.there[-1].prod(-1)
+    size = source.error[-1].square().sum(-1) * source.valid[-1].prod(-1)
     out = []
-    for window in wrong.max(1).values.argsort(descending=True)[:SHOWN].tolist():
-        end = int(wrong[window].argmax())
+    for window in size.max(1).values.argsort(descending=True)[:MAX_PREDICTIONS].tolist():
+        end = int(size[window].argmax())
         start = end - horizon
-        if start < 0 or float(wrong[window, end]) == 0:
+        if start < 0 or float(size[window, end]) == 0:
             continue
         measured = np.full((horizon + 1, source.predicted.shape[-1]), np.nan)
         measured[:, list(rows.channels)] = rows.measured[window, start : end + 1].numpy()
@@ -134,3 +140,32 @@ def _predictions(search: Search, source: RolloutErrors, corrected: RolloutErrors
             )
         )
     return tuple(out)
+
+
+def _profile(name: str, unit: str, quantity: str, before: Disturbance, after: Disturbance) -> Profile:
+    """The mean disturbance on the first load over one variable, without and with the causes."""
+    here = before.valid.flatten() > 0
+    values = before.variables[name].flatten()[here]
+    edges, bins = binned(values)
+    count = len(edges) - 1
+    means = []
+    for found in (before, after):
+        load = found.load[..., 0].flatten()[here]
+        binned_load = [load[bins == k] for k in range(count)]
+        means.append(np.array([float(s.mean()) if len(s) else math.nan for s in binned_load]))
+        means.append(np.array([float(s.std() / math.sqrt(len(s))) if len(s) > 1 else math.nan for s in binned_load]))
+    centres = np.array([float(values[bins == k].mean()) if bool((bins == k).any()) else math.nan for k in range(count)])
+    return Profile(name, unit, quantity, "N", centres, *means)
+
+
+def _spectrum(quantity: str, before: Disturbance, after: Disturbance, period: float) -> Spectrum:
+    """Power spectral density of the disturbance on the first load, averaged over windows (Welch 1967, one Hann window
+    each)."""
+    densities = []
+    for found in (before, after):
+        load = found.load[..., 0]
+        window = torch.hann_window(load.shape[1], dtype=load.dtype)
+        power = torch.fft.rfft(load * window, dim=1).abs().square().mean(0)
+        densities.append((2 * period * power / window.square().sum()).numpy())
+    frequency = np.fft.rfftfreq(before.load.shape[1], period)
+    return Spectrum(quantity, "N2/Hz", frequency, *densities)

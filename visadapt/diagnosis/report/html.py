@@ -1,4 +1,4 @@
-"""The report of a diagnosis: one self-contained HTML page, and text for the terminal."""
+"""The report of a diagnosis: one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -10,28 +10,22 @@ from typing import Any
 import jinja2
 
 from visadapt.diagnosis.report import figures, text
-from visadapt.diagnosis.report.text import as_text
 from visadapt.diagnosis.result import Diagnosis
 from visadapt.effects import EFFECTS
 from visadapt.storage.atomic_files import replacing
 from visadapt.systems import SYSTEMS
 
-__all__ = ["as_html", "as_text", "write_report"]
-
-MOST_WINDOWS, MOST_PROFILES = 3, 3
-"""More figures would hide the telling ones."""
-
 
 def write_report(path: str | os.PathLike[str], diagnosis: Diagnosis, settings: Mapping[str, str]) -> None:
-    """Write the page; it appears under its name once it is whole.
+    """Write the page, atomically.
 
     Args:
         path: of the page.
-        diagnosis: what it tells.
-        settings: what the diagnosis depends on (files, seed, versions), for the foot.
+        diagnosis: its content.
+        settings: what the diagnosis depends on (files, seed, versions), for the footer.
 
     Raises:
-        DiskFullError: the disk is full; what stood at `path` before stays.
+        DiskFullError: the disk is full; an earlier file at `path` is kept.
     """
     page = as_html(diagnosis, settings)
     with replacing(path) as temporary:
@@ -39,7 +33,7 @@ def write_report(path: str | os.PathLike[str], diagnosis: Diagnosis, settings: M
 
 
 def as_html(diagnosis: Diagnosis, settings: Mapping[str, str]) -> str:
-    """The page: no script, nothing fetched; light or dark as the reader's machine is."""
+    """The page: no scripts, no external resources; light or dark as the browser prefers."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("visadapt.diagnosis.report", "."),
         autoescape=True,
@@ -71,7 +65,7 @@ def as_html(diagnosis: Diagnosis, settings: Mapping[str, str]) -> str:
 
 
 def _gaps(diagnosis: Diagnosis) -> list[tuple[str, float, str]]:
-    """What the bars show: name, error, CSS class."""
+    """Bars of the errors: name, error, CSS class."""
     gap = diagnosis.gap
     rows = [("simulator", gap.before, "before")]
     if gap.after != gap.before:
@@ -80,13 +74,11 @@ def _gaps(diagnosis: Diagnosis) -> list[tuple[str, float, str]]:
 
 
 def _figures(diagnosis: Diagnosis) -> dict[str, Any]:
-    evidence, system = diagnosis.evidence, SYSTEMS[diagnosis.system]
+    data, system = diagnosis.figures, SYSTEMS[diagnosis.system]
     corrected = bool(diagnosis.causes)
     return {
-        "predictions": [figures.prediction(one, system, corrected) for one in evidence.predictions[:MOST_WINDOWS]],
-        "profiles": [
-            figures.profile(one, diagnosis.where.regions, corrected) for one in evidence.profiles[:MOST_PROFILES]
-        ],
-        "growth": figures.growth(evidence.growth, corrected) if evidence.growth else "",
-        "spectrum": figures.spectrum(evidence.spectrum, corrected) if evidence.spectrum else "",
+        "predictions": [figures.prediction(one, system, corrected) for one in data.predictions],
+        "profiles": [figures.profile(one, diagnosis.where.regions, corrected) for one in data.profiles],
+        "growth": figures.growth(data.growth, corrected) if data.growth else "",
+        "spectrum": figures.spectrum(data.spectrum, corrected) if data.spectrum else "",
     }

@@ -1,4 +1,4 @@
-"""A diagnosis in words: the verdict in a sentence, numbers with the digits they deserve, the text for the terminal."""
+"""A diagnosis in words: the verdict in a sentence, rounded numbers, the text for the terminal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ UNKNOWN = "unknown"
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number with so many significant digits, without an exponent where it reads well without."""
+    """A number with this many significant digits; with an exponent below 1e-4 and from 1e6 on."""
     if not math.isfinite(value):
         return UNKNOWN
     if value == 0:
@@ -23,7 +23,7 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def percent(share: float) -> str:
-    """A share as a percentage; "unknown" where it is."""
+    """A share as a percentage; "unknown" for NaN."""
     return f"{100 * share:.0f} %" if math.isfinite(share) else UNKNOWN
 
 
@@ -33,7 +33,7 @@ def with_unit(text: str, unit: str) -> str:
 
 
 def estimate(one: Estimate) -> str:
-    """A parameter's value, with two digits of what its interval leaves open."""
+    """A parameter's value, rounded to two significant digits of its interval's width."""
     return with_unit(_rounded(one.value, one), one.unit)
 
 
@@ -54,12 +54,12 @@ def _rounded(value: float, one: Estimate) -> str:
 
 
 def plain(name: str) -> str:
-    """A standard name in words."""
+    """A standard name with spaces."""
     return name.replace("_", " ")
 
 
 def unit_of(variable: str, system: str) -> str:
-    """The unit of a variable that a region or a profile is over."""
+    """The unit of the variable of a region or a profile."""
     known = {one.name: one.unit for one in (*SYSTEMS[system].states, *SYSTEMS[system].actions)}
     return {"time": "s", "episode": "1"}.get(variable) or known.get(variable, "1")
 
@@ -91,20 +91,20 @@ def sentence(diagnosis: Diagnosis) -> str:
             f"(error {number(gap.before)}, noise {number(gap.floor)})."
         )
     if diagnosis.verdict == IDENTIFIED:
-        return f"{_first(listed([_named(cause) for cause in diagnosis.causes]))} {_closes(diagnosis)}."
+        return f"{_capitalised(listed([_described(cause) for cause in diagnosis.causes]))} {_closes(diagnosis)}."
     if diagnosis.verdict == AMBIGUOUS:
-        places = [listed([_named(cause) for cause in place], "or") for place in _places(diagnosis.causes)]
-        whole = listed([f"either {place}" if " or " in place else place for place in places])
-        return f"{_first(whole)} {_closes(diagnosis)}; this recording cannot tell which."
+        groups = [listed([_described(cause) for cause in group], "or") for group in _alternatives(diagnosis.causes)]
+        whole = listed([f"either {group}" if " or " in group else group for group in groups])
+        return f"{_capitalised(whole)} {_closes(diagnosis)}; this recording cannot tell which."
     return _unexplained(diagnosis)
 
 
-def _places(causes: Sequence[Cause]) -> list[list[Cause]]:
-    """Causes that stand in for each other together; those that nothing else could stand in for first."""
-    places: dict[frozenset[str], list[Cause]] = {}
+def _alternatives(causes: Sequence[Cause]) -> list[list[Cause]]:
+    """Causes grouped with those that they cannot be told from; the smallest groups first."""
+    groups: dict[frozenset[str], list[Cause]] = {}
     for cause in causes:
-        places.setdefault(frozenset((cause.effect, *cause.indistinguishable_from)), []).append(cause)
-    return sorted(places.values(), key=len)
+        groups.setdefault(frozenset((cause.effect, *cause.indistinguishable_from)), []).append(cause)
+    return sorted(groups.values(), key=len)
 
 
 def _unexplained(diagnosis: Diagnosis) -> str:
@@ -124,35 +124,35 @@ def _unexplained(diagnosis: Diagnosis) -> str:
     return f"{text}."
 
 
-def _named(cause: Cause) -> str:
+def _described(cause: Cause) -> str:
     values = ", ".join(f"{plain(name)} {estimate(one)}" for name, one in cause.parameters.items())
     return f"{plain(cause.effect)} ({values})" if values else plain(cause.effect)
 
 
 def _closes(diagnosis: Diagnosis) -> str:
-    many = len(_places(diagnosis.causes)) > 1
+    many = len(_alternatives(diagnosis.causes)) > 1
     return f"{'close' if many else 'closes'} {percent(diagnosis.gap.closed)} of the gap to the simulator"
 
 
-def _first(text: str) -> str:
+def _capitalised(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
 def corrected(diagnosis: Diagnosis) -> str:
-    """What the simulator is called with what was found."""
+    """What the report calls the simulator with the effects that were found."""
     return "with the causes" if diagnosis.causes else "with the best known effects"
 
 
 def policy_terms(diagnosis: Diagnosis) -> list[tuple[str, tuple[float, float]]]:
-    """Theorem 1's terms, each with what it is; none where no policy was given."""
-    terms = diagnosis.evidence.policy
+    """Theorem 1's terms, each with a description; empty where no policy was given."""
+    terms = diagnosis.policy
     if terms is None:
         return []
     return [
         ("delta, error of the model's step under the policy", terms.delta),
-        ("L, change of that step with the command at most", terms.lipschitz),
+        ("L, largest change of that step per unit of command", terms.lipschitz),
         ("E|pi - pi_hat|, distance of the policy's command from the model's best", terms.action_gap),
-        ("E[zeta], distance from the reference that the best command leaves", terms.zeta),
+        ("E[zeta], distance from the reference under the best command", terms.zeta),
         ("delta + L E|pi - pi_hat| + E[zeta], bound on the policy's distance from the reference", terms.bound),
     ]
 

@@ -11,7 +11,8 @@ from visadapt.systems import System
 
 
 def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:
-    """Those that are fitted: the first of each group of twins, and no sensor with a memory."""
+    """The first effect of each group of twins; without effects that repeat readings, which are found by another method,
+    and without sensors with memory, which candidate models cannot linearise by the present state."""
     out: list[type[Effect]] = []
     for effect in effects:
         if not (twins(effect, out, system) or effect.repeats_readings or remembers(effect)):

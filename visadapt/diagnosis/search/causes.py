@@ -1,4 +1,4 @@
-"""The causes of a gap as the result states them: parameters with intervals, probabilities, and what else would do."""
+"""The causes of a gap as the result states them: parameters with intervals, probabilities, and alternatives."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from visadapt.diagnosis.result import Cause, Estimate, Ranked
-from visadapt.diagnosis.search.model_comparison import ModelComparison, Weighed, exchanged
+from visadapt.diagnosis.search.model_comparison import ComparedModel, ModelComparison, exchanged
 from visadapt.diagnosis.search.search import ScoredModel, Search
 from visadapt.effects import Effect, Parameter, Role
 from visadapt.effects.catalogue import twins
@@ -17,92 +17,94 @@ from visadapt.estimation.fit_states import posterior
 from visadapt.estimation.grids import spans
 from visadapt.systems import System
 
-NINETY = 1.6449
-"""Deviations to either side that hold 90 % of a normal distribution."""
+Z_90 = 1.6449
+"""Half-width of a normal distribution's 90 % interval, in standard deviations."""
 
-Closing = Mapping[frozenset[str], float]
-"""Share of the gap that a set closes on held-out episodes, by its names."""
+GapClosed = Mapping[frozenset[str], float]
+"""Share of the gap that a set closes on held-out episodes, by the names of its effects."""
 
 
 @dataclass(frozen=True)
-class Named:
-    """An effect that may stand in one place of the best set."""
+class Alternative:
+    """An effect that explains one part of the gap, in place of an effect of the best set."""
 
     effect: type[Effect]
-    weighed: Weighed
-    """the set with it"""
+    compared: ComparedModel
+    """the model with it"""
     canonical: type[Effect]
-    """the effect that was fitted in its place: itself, or its twin"""
+    """the effect that was fitted: itself, or its twin, which does the same with other parameters"""
 
 
-def classes(comparison: ModelComparison, effects: Sequence[type[Effect]], system: System) -> list[list[Named]]:
-    """For each place of the best set, the effects that fit as well there, the best first, twins behind each other."""
+def alternatives(
+    comparison: ModelComparison, effects: Sequence[type[Effect]], system: System
+) -> list[list[Alternative]]:
+    """For each effect of the best set, those that fit as well in its place, the best first, each followed by its twins;
+    of `effects` alone."""
     out = []
-    for effect, rivals in comparison.classes.items():
-        here = [(effect, comparison.weighed[0])]
-        here += [(exchanged(comparison.best.effects, rival.fitted.effects), rival) for rival in rivals]
-        members = [Named(twin, weighed, own) for own, weighed in here for twin in [own, *twins(own, effects, system)]]
-        out.append([member for member in members if member.effect in effects])
+    for effect, rivals in comparison.alternatives.items():
+        fitted = [(effect, comparison.models[0])]
+        fitted += [(exchanged(comparison.best.effects, rival.model.effects), rival) for rival in rivals]
+        group = [Alternative(twin, model, own) for own, model in fitted for twin in [own, *twins(own, effects, system)]]
+        out.append([one for one in group if one.effect in effects])
     return out
 
 
 def causes(
-    search: Search, comparison: ModelComparison, places: Sequence[Sequence[Named]], closing: Closing
+    search: Search, comparison: ModelComparison, groups: Sequence[Sequence[Alternative]], gap_closed: GapClosed
 ) -> list[Cause]:
-    """Every member of every class as a cause."""
+    """Every alternative as a cause."""
     out = []
-    for place in places:
-        names = [member.effect.name for member in place]
-        for member in place:
-            own = estimates(search, member.weighed.fitted, member.canonical)
+    for group in groups:
+        names = [one.effect.name for one in group]
+        for one in group:
+            fitted = estimates(search, one.compared.model, one.canonical)
             out.append(
                 Cause(
-                    member.effect.name,
-                    own if member.effect is member.canonical else _twin(search, member, own),
-                    _probability(comparison, member, place),
-                    closing.get(frozenset({member.canonical.name}), math.nan),
-                    tuple(name for name in names if name != member.effect.name),
+                    one.effect.name,
+                    fitted if one.effect is one.canonical else _twin(search, one, fitted),
+                    _probability(comparison, one, group),
+                    gap_closed.get(frozenset({one.canonical.name}), math.nan),
+                    tuple(name for name in names if name != one.effect.name),
                 )
             )
     return out
 
 
-def _probability(comparison: ModelComparison, member: Named, place: Sequence[Named]) -> float:
-    """Of the effect, over all sets weighed; twins share it evenly."""
-    alike = sum(other.canonical is member.canonical for other in place)
-    return sum(w.probability for w in comparison.weighed if member.canonical in w.fitted.effects) / alike
+def _probability(comparison: ModelComparison, one: Alternative, group: Sequence[Alternative]) -> float:
+    """Sum over all compared models with the effect, shared evenly between twins."""
+    count = sum(other.canonical is one.canonical for other in group)
+    return sum(c.probability for c in comparison.models if one.canonical in c.model.effects) / count
 
 
-def _twin(search: Search, member: Named, own: Mapping[str, Estimate]) -> Mapping[str, Estimate]:
-    """The parameters that make a twin do the same."""
-    if [(p.name, p.unit) for p in member.effect.table] == [(p.name, p.unit) for p in member.canonical.table]:
-        return own
-    fitted = search.exchange(member.weighed.fitted, member.canonical, member.effect)
-    return estimates(search, fitted, member.effect)
+def _twin(search: Search, one: Alternative, fitted: Mapping[str, Estimate]) -> Mapping[str, Estimate]:
+    """The parameters with which a twin has the same effect."""
+    if [(p.name, p.unit) for p in one.effect.table] == [(p.name, p.unit) for p in one.canonical.table]:
+        return fitted
+    return estimates(search, search.exchange(one.compared.model, one.canonical, one.effect), one.effect)
 
 
-def estimates(search: Search, fitted: ScoredModel, effect: type[Effect]) -> dict[str, Estimate]:
+def estimates(search: Search, model: ScoredModel, effect: type[Effect]) -> dict[str, Estimate]:
     """Maximum likelihood estimates of one effect's parameters, with 90 % intervals from Fisher's information."""
-    _, whole = posterior(fitted.effects, fitted.fits)
+    _, whole = posterior(model.effects, model.fits)
     deviation = torch.linalg.inv(whole).diagonal().sqrt()
-    first = sum(len(e.table) for e in fitted.effects[: fitted.effects.index(effect)])
-    seen = spans(search.system, search.rows, fitted.fits.state[0])
+    first = sum(len(e.table) for e in model.effects[: model.effects.index(effect)])
+    covered = spans(search.system, search.rows, model.fits.state[0])
     out = {}
     for k, parameter in enumerate(effect.table, first):
-        out[parameter.name] = _estimate(parameter, float(fitted.fits.theta[0, k]), float(deviation[k]), seen)
+        out[parameter.name] = _estimate(parameter, float(model.fits.theta[0, k]), float(deviation[k]), covered)
     return out
 
 
 def _estimate(
-    parameter: Parameter, value: float, deviation: float, seen: Mapping[str, tuple[float, float]]
+    parameter: Parameter, value: float, deviation: float, covered: Mapping[str, tuple[float, float]]
 ) -> Estimate:
-    low, high = value - NINETY * deviation, value + NINETY * deviation
+    low, high = value - Z_90 * deviation, value + Z_90 * deviation
     if parameter.role is Role.PHASE:
         turn = 2 * math.pi * round(value / (2 * math.pi))
         return Estimate(value - turn, parameter.unit, (low - turn, high - turn))
     if parameter.is_edge:
-        # A region that goes beyond where the data are ends somewhere there.
-        first, last = seen.get(parameter.unit, (parameter.low, parameter.high))
+        # Where an edge lies outside the data is unknown.
+        first, last = covered.get(parameter.unit, (parameter.low, parameter.high))
         if value < first:
             return Estimate(first, parameter.unit, (parameter.low, first))
         if value > last:
@@ -114,27 +116,26 @@ def ranking(
     comparison: ModelComparison,
     effects: Sequence[type[Effect]],
     system: System,
-    closing: Closing,
-    held: Sequence[Cause],
+    gap_closed: GapClosed,
+    certain: Sequence[Cause],
 ) -> tuple[Ranked, ...]:
-    """All sets weighed, each twin on its own, the most probable first; what is held for sure is in all of them."""
-    sure = tuple(cause.effect for cause in held)
+    """All models compared, the most probable first, with a set for each twin; `certain` causes are in every set."""
+    names = tuple(cause.effect for cause in certain)
     out = []
-    for weighed in comparison.weighed:
+    for compared in comparison.models:
         versions: list[tuple[str, ...]] = [()]
-        for effect in weighed.fitted.effects:
-            alike = [e.name for e in [effect, *twins(effect, effects, system)] if e in effects]
-            versions = [(*version, name) for version in versions for name in alike]
-        for version in versions:
-            share = weighed.probability / len(versions)
-            out.append(Ranked((*sure, *version), share, closing.get(frozenset(weighed.fitted.names), math.nan)))
+        for effect in compared.model.effects:
+            same = [e.name for e in [effect, *twins(effect, effects, system)] if e in effects]
+            versions = [(*version, name) for version in versions for name in same]
+        closed = gap_closed.get(frozenset(compared.model.names), math.nan)
+        out += [Ranked((*names, *version), compared.probability / len(versions), closed) for version in versions]
     return tuple(sorted(out, key=lambda ranked: -ranked.probability))
 
 
-def stage_shares(search: Search, comparison: ModelComparison, held_costs: Sequence[float]) -> dict[str, float]:
-    """Share of the explained gap by stage: the log likelihood lost when each cause is taken away.
+def stage_shares(search: Search, comparison: ModelComparison, repeat_costs: Sequence[float]) -> dict[str, float]:
+    """Share of the explained gap by stage: the log likelihood lost without each cause.
 
-    `held_costs` are those of held readings.
+    `repeat_costs` are the losses if repeated readings were taken for measurements; they count as sensing.
     """
     shares = {"actuation": 0.0, "dynamics": 0.0, "sensing": 0.0, "camera": 0.0}
     best = comparison.best
@@ -142,6 +143,6 @@ def stage_shares(search: Search, comparison: ModelComparison, held_costs: Sequen
         without = search.fitted.get(frozenset(best.names) - {effect.name}, search.source)
         lost = max(0.0, float(best.fits.likelihood[0] - without.fits.likelihood[0]))
         shares[effect.stage.value] = shares.get(effect.stage.value, 0.0) + lost
-    shares["sensing"] += sum(held_costs)
+    shares["sensing"] += sum(repeat_costs)
     whole = sum(shares.values())
     return {stage: share / whole if whole > 0 else 0.0 for stage, share in shares.items()}

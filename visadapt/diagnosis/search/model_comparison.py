@@ -1,4 +1,4 @@
-"""The verdict: which sets of effects the recording speaks for, whether they explain it all, and what else would do."""
+"""Comparison of the fitted models: their probabilities, what the best leaves unexplained, and what fits as well."""
 
 from __future__ import annotations
 
@@ -8,108 +8,108 @@ from dataclasses import dataclass
 import torch
 
 from visadapt.diagnosis.search.search import ScoredModel, Search
-from visadapt.diagnosis.search.unexplained import Function, functions
+from visadapt.diagnosis.search.unexplained import BlackBoxFunction, black_box_functions
 from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import Effects
 
-WITHIN = 10.0
-"""Log posterior odds that such a set may be behind the best."""
+COMPARE_WITHIN = 10.0
+"""Log posterior odds; models further behind the best are not compared."""
 
-NOISE = 5.0
-"""Log likelihood that process noise must add to a set to count as something unexplained, and what a set pays for it."""
+MIN_LEFTOVER = 5.0
+"""Log likelihood that process noise must add to a model for something to count as unexplained, and the most that a
+model's score is lowered for it."""
 
-SLIGHT = 0.05
-"""Log likelihood left over, beside that which the best set brings, that is not worth the word unexplained."""
+SLIGHT_SHARE = 0.05
+"""Share of the best model's gain in log likelihood below which what it leaves unexplained is negligible."""
 
-MASS = 0.93
-"""Posterior probability that the members of a class hold between them."""
+CLASS_PROBABILITY = 0.93
+"""Share of the probability of all models that differ in one effect which the listed alternatives reach."""
 
 
 @dataclass(frozen=True)
-class Weighed:
-    """A set of effects and its posterior probability."""
+class ComparedModel:
+    """A fitted model and its posterior probability."""
 
-    fitted: ScoredModel
-    score: float
-    """log posterior odds, what it leaves unexplained counted against it"""
+    model: ScoredModel
     probability: float
+    """among the models compared; log odds are lowered by what process noise adds to the model"""
 
 
 @dataclass(frozen=True)
 class ModelComparison:
-    """What the search says."""
+    """The models that were compared, and what the best leaves unexplained."""
 
-    weighed: list[Weighed]
+    models: list[ComparedModel]
     """the most probable first"""
     leftover: float
     """log likelihood that process noise adds to the best"""
-    functions: list[Function]
-    """of a black box beside the best"""
-    classes: dict[type[Effect], list[Weighed]]
-    """for each effect of the best set: the sets with another effect in its place that fit as well"""
+    functions: list[BlackBoxFunction]
+    """of a black box added to the best, the largest log odds first"""
+    alternatives: dict[type[Effect], list[ComparedModel]]
+    """for each effect of the best: the models with another effect in its place that fit as well"""
     gained: float
-    """log likelihood of the best beyond the source's"""
-    function: float
-    """log odds of a function from which on it counts as something unexplained"""
+    """log likelihood of the best minus that of the source"""
+    threshold: float
+    """log odds of a function above which it counts as something unexplained"""
 
     @property
     def best(self) -> ScoredModel:
-        """The most probable set."""
-        return self.weighed[0].fitted
+        """The most probable model."""
+        return self.models[0].model
 
     @property
     def unexplained(self) -> bool:
-        """Whether something is left that no set explains."""
-        return self.leftover > NOISE or self.functions[0].evidence > self.function
+        """Whether the best model leaves something unexplained."""
+        return self.leftover > MIN_LEFTOVER or self.functions[0].log_odds > self.threshold
 
     @property
-    def slight(self) -> bool:
-        """Whether what is left is little beside what the best set explains: a friction's rounded corner, say."""
-        return max(self.leftover, self.functions[0].evidence) < SLIGHT * self.gained
+    def negligible(self) -> bool:
+        """Whether what is unexplained is small against what the best model explains."""
+        return max(self.leftover, self.functions[0].log_odds) < SLIGHT_SHARE * self.gained
 
 
 def compare(search: Search) -> ModelComparison:
-    """Weigh what a search has fitted."""
-    close = [f for f in search.ranked if f.evidence > search.best.evidence - WITHIN][: search.profile.weighed]
+    """Compare the best models that a search has fitted, and the source."""
+    close = [f for f in search.ranked if f.log_odds > search.best.log_odds - COMPARE_WITHIN]
+    close = close[: search.profile.compared_models]
     if all(f is not search.source for f in close):
         close.append(search.source)
-    left = search.leftover(close)
-    scores = [f.evidence - min(rest, NOISE) for f, rest in zip(close, left, strict=True)]
-    mass = torch.tensor(scores, dtype=torch.float64).softmax(0).tolist()
+    leftover = search.leftover(close)
+    scores = [f.log_odds - min(rest, MIN_LEFTOVER) for f, rest in zip(close, leftover, strict=True)]
+    probabilities = torch.tensor(scores, dtype=torch.float64).softmax(0).tolist()
     order = sorted(range(len(close)), key=lambda k: -scores[k])
-    weighed = [Weighed(close[k], scores[k], mass[k]) for k in order]
-    best = weighed[0].fitted
-    model = CandidateModel(search.system, best.effects, search.rows)
-    classes = {effect: _class(weighed, effect) for effect in best.effects}
+    models = [ComparedModel(close[k], probabilities[k]) for k in order]
+    best = models[0].model
+    functions = black_box_functions(CandidateModel(search.system, best.effects, search.rows), best.fits)
+    alternatives = {effect: _alternatives(models, effect) for effect in best.effects}
     gained = float(best.fits.likelihood[0] - search.source.fits.likelihood[0])
-    return ModelComparison(
-        weighed, left[order[0]], functions(model, best.fits), classes, gained, search.profile.function
-    )
+    threshold = search.profile.black_box_threshold
+    return ModelComparison(models, leftover[order[0]], functions, alternatives, gained, threshold)
 
 
-def _class(weighed: Sequence[Weighed], effect: type[Effect]) -> list[Weighed]:
-    """Sets that differ from the first by having another effect in the place of `effect`, and fit as well."""
-    first = weighed[0]
-    rest = {e for e in first.fitted.effects if e is not effect}
+def _alternatives(models: Sequence[ComparedModel], effect: type[Effect]) -> list[ComparedModel]:
+    """Models that differ from the first by another effect in the place of `effect`, and fit as well."""
+    first = models[0]
+    kept = {e for e in first.model.effects if e is not effect}
     rivals = []
-    for other in weighed[1:]:
-        if len(other.fitted.effects) == len(first.fitted.effects) and rest < set(other.fitted.effects):
-            # More parameters that buy nothing only make the same thing with another name.
-            more = other.fitted.fits.theta.shape[1] - first.fitted.fits.theta.shape[1]
-            gained = float(other.fitted.fits.likelihood[0] - first.fitted.fits.likelihood[0])
+    for other in models[1:]:
+        if len(other.model.effects) == len(first.model.effects) and kept < set(other.model.effects):
+            # An effect with more parameters but no gain only imitates the first under another name.
+            more = other.model.fits.theta.shape[1] - first.model.fits.theta.shape[1]
+            gained = float(other.model.fits.likelihood[0] - first.model.fits.likelihood[0])
             if more <= 0 or gained > more:
                 rivals.append(other)
     whole = first.probability + sum(r.probability for r in rivals)
-    held, members = first.probability, []
+    reached, members = first.probability, []
     for rival in rivals:
-        if held >= MASS * whole:
+        if reached >= CLASS_PROBABILITY * whole:
             break
         members.append(rival)
-        held += rival.probability
+        reached += rival.probability
     return members
 
 
 def exchanged(first: Effects, other: Effects) -> type[Effect]:
-    """The one effect of `other` that `first` has not."""
+    """The one effect of `other` that is not in `first`."""
     return next(e for e in other if e not in first)

@@ -1,0 +1,106 @@
+"""A recording made ready for fitting: windows of rows, without readings that are not measurements of the state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from visadapt.diagnosis.search import angle_defects, sign_conventions
+from visadapt.diagnosis.search.derived_velocities import derived_velocities
+from visadapt.diagnosis.search.search import Search
+from visadapt.estimation.likelihood import FitState
+from visadapt.estimation.profiles import profile_of
+from visadapt.estimation.repeated_readings import RepeatedReadings, find_repeats
+from visadapt.estimation.segments import Segments, cut
+from visadapt.recordings import Recording
+from visadapt.systems import System
+
+
+@dataclass(frozen=True)
+class PreparedRecording:
+    """What is fitted, in the signs of the source."""
+
+    rows: Segments
+    """without repeated or defective readings"""
+    raw: Segments
+    """the same windows with repeated readings as they were read"""
+    repeats: RepeatedReadings
+    defect: tuple[float, float] | None
+    """rad, between which the angle sensor is defective"""
+    warnings: tuple[str, ...]
+    source: FitState | None = None
+    """the fit of the source to `rows`, if a check needed it"""
+
+
+def prepare(recording: Recording, system: System) -> PreparedRecording:
+    """Prepare a recording of some or all states, and the commands, of a system."""
+    profile = profile_of(system)
+    channels = tuple(system.index(name) for name in recording.measured)
+    quaternion = [k for k, channel in enumerate(channels) if channel in profile.quaternion]
+    states = [torch.tensor(np.asarray(e.state, dtype=np.float64)) for e in recording.episodes]
+    states = [sign_conventions.continuous_quaternion(values, quaternion) for values in states]
+    commands = [torch.tensor(np.asarray(e.action, dtype=np.float64)) for e in recording.episodes]
+    repeats = find_repeats(states, channels, profile.angle_sensor)
+
+    def windows(
+        measured: Sequence[Tensor], stretches: Sequence[tuple[int, int, int]] | None = None
+    ) -> tuple[Segments, Segments, list[str]]:
+        """`rows` and `raw` of episodes or stretches of these, and a warning if not all windows are used."""
+        all_used = [torch.ones_like(m) for m in measured]
+        rows, raw = (
+            cut(measured, valid, commands, channels, recording.period, profile.window_rows, stretches)
+            for valid in (repeats.used, all_used)
+        )
+        count, length = rows.shape
+        most = max(4, int(profile.max_rows / float(rows.inside.sum(1).mean())))
+        if count <= most:
+            return rows, raw, []
+        chosen = torch.linspace(0, count - 1, most).round().long()
+        warning = f"of {count} windows of up to {length} rows, {most}, spread evenly over the recording, were used"
+        return rows.select(chosen), raw.select(chosen), [warning]
+
+    rows, raw, thinning = windows(states)
+    if not profile.check_sensors:
+        return PreparedRecording(rows, raw, repeats, None, tuple(thinning))
+    unchecked, source = rows, Search(system, rows, ()).source.fits
+    warnings: list[str] = []
+    defect = angle_defects.find(system, rows, source)
+    band = None
+    if defect is not None:
+        band = (defect.low, defect.high)
+        angle = channels.index(profile.angle_sensor[0])
+        bad = [angle_defects.between(values[:, angle], *band) for values in states]
+        if defect.full_turns:
+            # A potentiometer's dead zone has an unknown width, so windows end at it, and the angle runs from one of its
+            # edges to the other, so that an error of the sensor's scale is symmetric about upright.
+            states = [angle_defects.on_one_turn(values, angle, 0.5 * (defect.low + defect.high)) for values in states]
+            rows, raw, thinning = windows(states, angle_defects.stretches_without(bad))
+        else:
+            rows = angle_defects.without(rows, profile.angle_sensor, *band)
+        warnings.append(
+            f"{sum(int(b.sum()) for b in bad)} readings of theta between {band[0]:.2f} and {band[1]:.2f} rad "
+            "contradict those around them and the physics: the sensor is defective there; they were set aside"
+        )
+    warnings += thinning
+    derived = derived_velocities(system, rows)
+    if derived:
+        kept = [k for k, channel in enumerate(channels) if system.states[channel].name not in derived]
+        warnings += [
+            f"{name} is {lag:.3g} s late against the slope of its position: derived on the rig, not measured; left out"
+            for name, lag in derived.items()
+        ]
+        rows, raw = rows.with_channels(kept), raw.with_channels(kept)
+    # After the velocities, since those that lag make the wrong sign likelier.
+    fitted = source if rows is unchecked else None
+    convention = sign_conventions.find(system, rows, source, fitted)
+    if convention is not None:
+        rows, raw = (sign_conventions.to_source(each, convention, profile.angle_sensor) for each in (rows, raw))
+        fitted = None
+        if band is not None and convention.angle < 0:
+            band = (-band[1], -band[0])
+        warnings.append(f"{convention.name} has the other sign than the source's: it was turned round")
+    return PreparedRecording(rows, raw, repeats, band, tuple(warnings), fitted)
