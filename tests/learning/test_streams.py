@@ -87,8 +87,13 @@ class TestTimeOfOtherStarts:
         windows = Windows.cut(episodes_of(world), "state")
         assert not streams_of(world, windows=windows).now.at.time.any()
 
-    def test_without_a_recording_they_begin_at_zero(self):
-        assert not streams_of(world_with(EFFECTS["gust"](**HIDDEN["gust"]))).now.at.time.any()
+    def test_without_a_recording_all_times_of_an_episode_are_met(self):
+        time = streams_of(world_with(EFFECTS["gust"](start=8.0, end=9.0, force=4.0)), count=400).now.at.time
+        assert 0.0 <= time.min() < 0.5
+        assert 12.0 < time.max() < 12.5
+
+    def test_without_a_recording_they_begin_at_zero_where_nothing_depends_on_time(self):
+        assert not streams_of(world_with(ActuatorDelay(delay=0.08))).now.at.time.any()
 
 
 class TestSensors:

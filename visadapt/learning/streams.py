@@ -13,6 +13,9 @@ from visadapt.learning.windows import Observe, Windows
 from visadapt.tasks.base import Task
 from visadapt.world import World, WorldState
 
+EPISODE_STEPS = 250
+"""Steps of an episode: over its times starts are spread where the world depends on time and nothing is recorded."""
+
 PROBE = 0.5
 """Command under which a world is tested for a dependence on time: not zero, since some effects scale commands."""
 
@@ -89,11 +92,14 @@ class Streams:
         self.now: StreamState
         self.age: Tensor
         self._recorded: WorldState | None = None
-        self._times: Tensor | None = None
-        if windows is not None:
-            with torch.no_grad():
+        with torch.no_grad():
+            if windows is None:
+                times = world.period * torch.arange(EPISODE_STEPS)
+                state, _ = task.training_start(1, 0.0, torch.Generator().manual_seed(0))
+            else:
+                times, state = windows.time, windows.state[:1]
                 self._recorded = windows.start(world) if settings.recorded > 0 else None
-                self._times = windows.time if _depends_on_time(world, windows) else None
+            self._times = times if _depends_on_time(world, times.unique(), state) else None
 
     @torch.no_grad()
     def start(self, progress: float, generator: torch.Generator) -> None:
@@ -124,8 +130,8 @@ class Streams:
         at = self.world.start(state)
         if self._times is not None:
             # Streams are shorter than episodes: those that all began at time 0 would never meet a gust that comes
-            # late, or all phases of a slow force. So they begin at the times of samples, in proportion to how often
-            # each was recorded.
+            # late, or all phases of a slow force. So they begin at the times of recorded samples, or, without a
+            # recording, at any time of an episode.
             at = replace(at, time=self._times[torch.randint(len(self._times), (count,), generator=generator)].to(state))
         seen, at = look(self.world, self.observe, at, generator)
         history = History.start(self.task.show(seen, task_state), len(self.world.system.actions))
@@ -157,10 +163,9 @@ def look(
     return world.measure(at, generator) if observe is None else (observe(at.state), at)
 
 
-def _depends_on_time(world: World, windows: Windows) -> bool:
-    """Whether the same state under the same command goes on differently at other times of the recording."""
-    time = windows.time.unique()
-    state = windows.state[:1].expand(len(time), -1)
+def _depends_on_time(world: World, time: Tensor, state: Tensor) -> bool:
+    """Whether the state (1, n_state) under the same command goes on differently at some of the times (T,)."""
+    state = state.expand(len(time), -1)
     command = torch.full((len(time), world.substeps, len(world.system.actions)), PROBE).to(state)
     after = world.integrate(time, state, command)
     return not torch.allclose(after, after[:1], rtol=1e-5, atol=1e-6)
