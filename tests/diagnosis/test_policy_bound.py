@@ -29,7 +29,7 @@ from visadapt.estimation.fit_states import CAREFUL
 from visadapt.history import HORIZON
 from visadapt.policies import ImagePolicy, Policy, StatePolicy
 from visadapt.recordings import write_csv
-from visadapt.storage.checkpoints import save_network
+from visadapt.setups.policy_file import save_policy
 from visadapt.systems import CartPole
 from visadapt.world import World
 
@@ -190,7 +190,7 @@ class TestWholeDiagnosis:
         run, saved, out, page = (tmp_path / name for name in ("run.csv", "p.safetensors", "a.json", "a.html"))
         recording = record([ConstantForce(force=FORCE)])
         write_csv(run, recording.episodes, recording.measured, ["command"])
-        save_network(saved, StatePolicy(4), {})
+        save_policy(saved, StatePolicy(4))
         arguments = ["--policy", saved, "--json", out, "--report", page]
         assert cli.main(["diagnose", str(run), "--system", "cartpole", *map(str, arguments)]) == 0
         delta = next(line for line in capsys.readouterr().out.splitlines() if "delta, error" in line)

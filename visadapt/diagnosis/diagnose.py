@@ -198,7 +198,7 @@ def _warnings(comparison: ModelComparison, verdict: str) -> list[str]:
     if verdict in (IDENTIFIED, AMBIGUOUS) and comparison.unexplained:
         first = comparison.functions[0]
         return [
-            f"the causes close the gap but do not explain all: something is left that enters as {first.port} and goes "
-            f"with {first.variable}"
+            "the causes close the gap but do not explain everything: an unexplained disturbance acts as "
+            f"{first.port} and depends on {first.variable}"
         ]
     return []

@@ -56,12 +56,12 @@ def find_repeats(
         same = torch.stack([_repeats(values[:, k], MIN_JUMP_STEPS * steps[k]) for k in range(len(channels))], 1)
         whole = same.all(1)
         # A rate from a separate sensor may go on while the angle stands still.
-        own = same & pole & ~whole[:, None]
-        still = own[:, angle] if angle is not None else torch.zeros_like(whole)
+        partial = same & pole & ~whole[:, None]
+        still = partial[:, angle] if angle is not None else torch.zeros_like(whole)
         # The first reading after a standstill may still be mixed with the repeated value.
-        waking = torch.zeros_like(own)
-        waking[1:] = own[:-1] & ~own[1:]
-        used.append(1.0 - (whole[:, None] | (still[:, None] & own) | waking).double())
+        waking = torch.zeros_like(partial)
+        waking[1:] = partial[:-1] & ~partial[1:]
+        used.append(1.0 - (whole[:, None] | (still[:, None] & partial) | waking).double())
         lost.append(whole)
         frozen.append(still)
     return RepeatedReadings(used, lost, frozen)

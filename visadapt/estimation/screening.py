@@ -71,7 +71,7 @@ def screen(
 
 
 def _window_stride(most: float, rows: Segments, points: int) -> int:
-    """k, so that every k-th window at this many parameter points is at most `most` rows, if 8 windows remain."""
+    """Smallest k for which every k-th window has at most `most` rows times points; it leaves at least 8 windows."""
     wanted = points * float(rows.inside.sum()) / most
     # A power of two, so that effects share their sensitivities.
     return 2 ** max(0, min(math.ceil(math.log2(max(1.0, wanted))), int(math.log2(max(1, rows.shape[0] // 8)))))

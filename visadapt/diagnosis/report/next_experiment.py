@@ -44,9 +44,9 @@ def separate(classes: Sequence[Collection[type[Effect]]], system: System) -> str
 def explain(port: str, variable: str) -> str:
     """The experiment that shows an unexplained disturbance on `port`, a function of `variable`, more clearly."""
     return (
-        f"What is left enters as {plain(port)} and goes with {plain(variable)}: record runs that cover the whole range "
-        f"of {plain(variable)} slowly and fast, with the rest as still as can be, and add an effect of your own for it "
-        "(--effects)."
+        f"An unexplained disturbance acts as {plain(port)} and depends on {plain(variable)}: record runs that cover "
+        f"the whole range of {plain(variable)} slowly and fast, with all else as constant as possible, and add an "
+        "effect of your own for it (--effects)."
     )
 
 

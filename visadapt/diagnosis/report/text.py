@@ -79,7 +79,7 @@ def listed(words: Sequence[str], last: str = "and") -> str:
 
 def effects(names: Sequence[str]) -> str:
     """A set of effects in words; the empty set is the source."""
-    return " + ".join(plain(name) for name in names) or "nothing: the simulator as it stands"
+    return " + ".join(plain(name) for name in names) or "none: the unchanged simulator"
 
 
 def sentence(diagnosis: Diagnosis) -> str:

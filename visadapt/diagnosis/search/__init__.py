@@ -1,1 +1,1 @@
-"""Which effects a recording speaks for, and where."""
+"""The search: which effects explain a recording, how well, and where."""

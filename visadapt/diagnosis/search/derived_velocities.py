@@ -8,7 +8,7 @@ from visadapt.estimation.segments import Segments
 from visadapt.systems import System
 
 MAX_LAG = 0.2
-"""Lag of a measured velocity behind the slope of its position at most, in periods; backward differences lag by 0.5."""
+"""Largest lag, in periods, of a measured velocity behind the slope of its position; backward differences lag by 0.5."""
 
 
 def derived_velocities(system: System, rows: Segments) -> dict[str, float]:

@@ -102,5 +102,5 @@ def prepare(recording: Recording, system: System) -> PreparedRecording:
         fitted = None
         if band is not None and convention.angle < 0:
             band = (-band[1], -band[0])
-        warnings.append(f"{convention.name} has the other sign than the source's: it was turned round")
+        warnings.append(f"{convention.name} has the opposite sign of the source's; it was inverted")
     return PreparedRecording(rows, raw, repeats, band, tuple(warnings), fitted)
