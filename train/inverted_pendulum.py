@@ -193,7 +193,7 @@ def _panels(films: Sequence[tuple[str, Run]]) -> list[CartPolePanel]:
 def _gap(source: World, episodes: list[Episode]) -> dict[str, float]:
     """Viscous friction and pole damping that explain most of the gap in the velocities, by least squares.
 
-    From the states that the frames told, so from nothing privileged; `explained` is their share of its mean square.
+    From states estimated from frames, so nothing privileged; `explained` is the share of its mean square explained.
     """
     windows = Windows.cut(episodes, "state")
     left = gap(source, windows)[:, 1::2]

@@ -6,7 +6,7 @@ import math
 
 
 def wilson(hits: int, n: int, z: float = 1.959964) -> tuple[float, float]:
-    """Interval of a share, 95 % unless told, `z` deviations to either side (Wilson 1927); NaN where nothing counts."""
+    """Confidence interval of a share, `z` standard deviations to either side (Wilson 1927); NaN of no trials."""
     if n == 0:
         return math.nan, math.nan
     p = hits / n

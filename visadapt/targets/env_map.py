@@ -109,7 +109,7 @@ class EnvMap:
             )
 
     def _width(self, columns: int, rows: int) -> int:
-        """Px of the frames that are made of so many columns and rows of a picture."""
+        """Width in px of the frames that a crop of these columns and rows becomes."""
         return round(self.height * columns / rows) if self.width is None else self.width
 
     @classmethod
