@@ -59,6 +59,7 @@ TABLES = {
     "residual": Table(adaptation.residual, ("residual_samples",)),
     "collection": Table(adaptation.collection, ("data_collection",)),
     "named": Table(adaptation.named, ("named_effects",)),
+    "named control": Table(adaptation.named_control, ("named_control",)),
     "rotorpy": Table(adaptation.rotorpy, ("rotorpy",)),
     "loops": Table(adaptation.loops, ("power_loop",)),
     "swing": Table(adaptation.swing, ("swing_up",)),
@@ -96,9 +97,12 @@ def filled(page: Path) -> str:
 
 
 def results_table(name: str, with_origin: bool) -> str:
-    """A table of results, and where asked for the commands, dates and commits of its CSVs."""
+    """A table of results, or that it is missing, and where asked for the commands, dates and commits of its CSVs."""
     table = TABLES[name]
-    lines = markdown(table.make(*(read_rows(Path("results") / file) for file in table.files)))
+    paths = [Path("results") / file for file in table.files]
+    lines = "Not run in full yet."
+    if all(path.exists() for path in paths):
+        lines = markdown(table.make(*(read_rows(path) for path in paths)))
     return lines + "\n\n" + "\n".join(origins(table)) if with_origin else lines
 
 
@@ -113,7 +117,7 @@ def origins(table: Table) -> list[str]:
 
 def changed(path: Path) -> str:
     """The date and commit at which git last saw a file change."""
-    if _git("status", "--porcelain", "--", str(path)):
+    if not path.exists() or _git("status", "--porcelain", "--", str(path)):
         return "not committed yet"
     return "last changed on " + _git("log", "-1", "--format=%cs in commit %h", "--", str(path))
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 
 from benchmarks.cartpole_pixels import EXPERIMENT as PIXELS, OURS as FRAMES_ALONE
 from benchmarks.cartpole_states import CONSTANT, OURS, SINE
+from benchmarks.named_control import FOUND, NONE, TRUE
 
 Rows = list[dict[str, str]]
 Lines = list[list[str]]
@@ -117,6 +118,17 @@ def collection(rows: Rows) -> Lines:
 def named(rows: Rows) -> Lines:
     """Named effects beside the residual, from very few samples, in m."""
     return _by_samples(rows, "quadrotor, drag: mean tracking error in m", mean_and_spread)
+
+
+def named_control(rows: Rows) -> Lines:
+    """Policies tuned without the hidden effect, with it as found, and with the true one, in m/s."""
+    methods = (NONE, FOUND, TRUE)
+    lines = [["mean cart speed in m/s (episodes up)", *methods]]
+    for experiment in dict.fromkeys(row["experiment"] for row in rows):
+        own = {row["method"]: _speed_cells(row) for row in rows if row["experiment"] == experiment}
+        cells = [f"{own[method][0]} ({own[method][1]})" for method in methods]
+        lines.append([experiment.removeprefix("CartPole, states, ").replace("_", " "), *cells])
+    return lines
 
 
 def rotorpy(rows: Rows) -> Lines:

@@ -10,8 +10,9 @@ from datasets import cartpole_frames
 from renderers import Camera, DrawnCartPole, LayeredRenderer, MLPRenderer, RendererError, load_renderer, save_renderer
 from renderers.measure import measure
 from renderers.training import fit
+from visadapt.weights import shipped
 
-ASSETS = Path(__file__).parents[2] / "assets"
+MLP = Path(__file__).parents[2] / "assets/renderer_mlp.safetensors"
 SMALL = Camera(width=48, height=40, scale=16.0, column=23.5, row=29.5)
 
 
@@ -112,7 +113,7 @@ class TestShipped:
         scene = DrawnCartPole()
         x, theta = states(77, 200)
         with torch.no_grad():
-            frames = load_renderer(ASSETS / "renderer.safetensors", (100, 120))(
+            frames = load_renderer(shipped("renderer"), (100, 120))(
                 torch.from_numpy(x).float(), torch.from_numpy(theta).float()
             ).numpy()
         seen_x, seen_theta = measure(frames, scene)
@@ -120,7 +121,7 @@ class TestShipped:
         assert np.degrees(np.abs(seen_theta - theta).max()) < 0.5
 
     def test_the_papers_mlp_is_there_too(self):
-        assert isinstance(load_renderer(ASSETS / "renderer_mlp.safetensors", (100, 120)), MLPRenderer)
+        assert isinstance(load_renderer(MLP, (100, 120)), MLPRenderer)
 
 
 class TestFiles:
