@@ -209,7 +209,7 @@ class TestRun:
             run(Broken(), Scripted(), 3, 10, seeded())
 
     def test_frames_asked_of_a_target_without_a_camera(self):
-        with pytest.raises(TargetError, match="shows none: give it a camera"):
+        with pytest.raises(TargetError, match="has none: give it a camera"):
             run(SyntheticTarget(), Scripted(), 1, 3, seeded(), see=see_frames)
 
     def test_a_policy_of_frames_is_shown_frames_between_0_and_1_and_nothing_else(self):
