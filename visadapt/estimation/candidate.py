@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from visadapt.effects import Effect
+from visadapt.effects import ActuationEffect, Effect
 from visadapt.estimation.linearise import linearise_reading, linearise_step, parameter_steps, search_range
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
@@ -43,6 +43,14 @@ class CandidateModel:
         self._world = World(system, placeholders, rows.period, substeps=substeps)
         self.table = self._world.table
         self.low, self.high = search_range(self.table)
+        acting = [effect for effect in effects if issubclass(effect, ActuationEffect)]
+        alone = all(effect.acting_on is ActuationEffect.acting_on for effect in acting)
+        self.acting_parameters = [
+            k
+            for k, effect in enumerate(effect for effect in effects for _ in effect.table)
+            if acting and (effect in acting or not alone)
+        ]
+        """columns of the parameters that change what acts of the commands"""
         self.slopes: tuple[Tensor, Tensor] | None = None
         """transition (W, T - 1, n, n) and sensing (W, T, m, n) of an earlier linearisation, reused where given"""
 
@@ -96,7 +104,10 @@ def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised
     windows, length, _ = state.shape
     known = model.slopes
     shifted = torch.cat((theta[None], theta + torch.diag(parameter_steps(model.table, theta))))
-    commands = model.commands(shifted)[:, :, :-1].flatten(1, 2)
+    # What acts changes with the parameters of actuation effects alone: for the others it is computed once.
+    variants = [0, *(1 + k for k in model.acting_parameters)]
+    acting = model.commands(shifted[variants])[:, :, :-1].flatten(1, 2)
+    commands = acting[[variants.index(k) if k in variants else 0 for k in range(len(shifted))]]
     world = model.at(theta)
     time = model.rows.time[:, :-1].flatten()
     step = linearise_step(world, theta, time, state[:, :-1].flatten(0, 1), commands, by_state=known is None)

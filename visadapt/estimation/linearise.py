@@ -96,7 +96,9 @@ def linearise_step(
     given = acting if acting.dim() == 4 else acting[None].expand(1 + values.shape[-1], *acting.shape)
 
     def step(rows: Tensor, states: Tensor, moved: Sequence[int], pushed: Tensor) -> Tensor:
-        commands = given[list(moved)] + STATE_STEP * pushed[:, None, None]
+        commands = given[list(moved)]
+        if by_command:
+            commands = commands + STATE_STEP * pushed[:, None, None]
         return world.with_values(rows).integrate(time.repeat(len(moved)), states, commands.flatten(0, 1))
 
     return _tangent(step, world, values, state, by_state, width if by_command else 0, width)
