@@ -9,16 +9,14 @@ adding an effect means adding one class.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 
 from visadapt.systems import System
-
-SystemKind = TypeVar("SystemKind", bound=System)
 
 
 class Stage(StrEnum):
@@ -254,22 +252,16 @@ class SensingEffect(Effect):
         raise NotImplementedError
 
 
-def expect(system: System, kind: type[SystemKind], effect: Effect) -> SystemKind:
-    """The system as one of the `kind` that an effect acts on.
+def expect(system: System, effect: Effect) -> Any:
+    """The system, which has the parameters of those that the effect acts on.
 
     Raises:
         TypeError: it is another.
     """
-    if not isinstance(system, kind):
-        raise TypeError(f"{effect.name} acts on a {kind.name}, not on a {system.name}")
+    if not isinstance(system, effect.systems):
+        kinds = " or a ".join(getattr(kind, "name", kind.__name__) for kind in effect.systems)
+        raise TypeError(f"{effect.name} acts on a {kinds}, not on a {system.name}")
     return system
-
-
-def with_parameters(system: SystemKind, **values: float | Tensor) -> SystemKind:
-    """The system with other values of the parameters that are named."""
-    itself: Any = system  # a dataclass, which the base of all systems is not
-    changed: SystemKind = replace(itself, **values)
-    return changed
 
 
 def inside(place: Tensor, start: Tensor, end: Tensor, width: float) -> Tensor:

@@ -141,7 +141,7 @@ class TrackTilt(DynamicsEffect):
     systems = (CartPole,)
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        cart_pole = expect(system, CartPole, self)
+        cart_pole = expect(system, self)
         tilt, theta = self.value("angle", state), state[:, 2]
         weight = (cart_pole.cart_mass + cart_pole.pole_mass) * cart_pole.gravity
         moment = cart_pole.pole_mass * cart_pole.pole_half_length * cart_pole.gravity

@@ -56,7 +56,7 @@ class CoulombFriction(CartForce):
     """m/s, the width where the force tends to 0"""
 
     def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        cart_pole = expect(system, CartPole, self)
+        cart_pole = expect(system, self)
         force = self.value("force", state)
         # The effective mass that a force on the cart accelerates while the pole is near upright and free to turn.
         mass = cart_pole.cart_mass + cart_pole.pole_mass / 4
