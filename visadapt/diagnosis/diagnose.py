@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import torch
 
@@ -20,16 +20,23 @@ from visadapt.diagnosis.result import (
     Region,
     Where,
 )
-from visadapt.diagnosis.search import heldout, localisation
-from visadapt.diagnosis.search.catalogue import searched
-from visadapt.diagnosis.search.causes import Alternative, alternatives, causes, ranking, stage_shares
-from visadapt.diagnosis.search.disturbance import Disturbance
+from visadapt.diagnosis.search import heldout
+from visadapt.diagnosis.search.causes import (
+    Alternative,
+    alternatives,
+    causes,
+    errors_with_repeats,
+    ranking,
+    repeated_reading_causes,
+    stage_shares,
+)
+from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
 from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
 from visadapt.diagnosis.search.preparation import prepare
-from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
 from visadapt.effects import EFFECTS, Effect
-from visadapt.effects.catalogue import catalogue as all_effects
+from visadapt.effects.catalogue import catalogue as all_effects, twins
+from visadapt.estimation.effect_fit import remembers
 from visadapt.estimation.profiles import profile_of
 from visadapt.progress import Report, staged
 from visadapt.recordings import Recording
@@ -93,6 +100,16 @@ def diagnose(
         return _diagnose(recording, world.system, effects, seed, progress, policy)
 
 
+def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:
+    """The first effect of each group of twins; without effects that repeat readings, which are found by another method,
+    and without sensors with memory, which candidate models cannot linearise by the present state."""
+    out: list[type[Effect]] = []
+    for effect in effects:
+        if not (twins(effect, out, system) or effect.repeats_readings or remembers(effect)):
+            out.append(effect)
+    return out
+
+
 def _diagnose(
     recording: Recording,
     system: System,
@@ -120,7 +137,8 @@ def _diagnose(
     source = errors_with_repeats(prepared, search) if repeats else predicted[frozenset()]
     corrected = predicted[frozenset(best.names)]
     black_box = heldout.held_out(system, rows, [((), search.source.fits)], black_box=True)[0]
-    errors = Errors.from_rollouts(source, corrected, black_box, (best.fits.log_noise[0] / 2).exp())
+    noise = (best.fits.log_noise[0] / 2).exp()
+    errors = Errors(source.rms(noise), corrected.rms(noise), corrected.floor(noise), black_box.rms(noise), noise)
     gap_closed = {names: errors.closed_by(each) for names, each in predicted.items()}
 
     verdict = _verdict(comparison, errors, bool(repeats))
@@ -179,10 +197,10 @@ def _regions(
         if edges is not None and edges[0].unit in variables:
             start, end = (cause.parameters[edge.name] for edge in edges)
             variable = variables[start.unit]
-            share = localisation.share(disturbance, variable, start.value, end.value)
+            share = share_between(disturbance, variable, start.value, end.value)
             fitted.append(Region(variable, start.value, end.value, share, 1 - cause.probability))
     taken = {region.variable for region in fitted}
-    return (*fitted, *(one for one in localisation.regions(disturbance, seed) if one.variable not in taken))
+    return (*fitted, *(one for one in regions_of(disturbance, seed) if one.variable not in taken))
 
 
 def _next(comparison: ModelComparison, verdict: str, groups: Sequence[Sequence[Alternative]], system: System) -> str:

@@ -8,17 +8,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from visadapt.diagnosis.result_json import as_json
 from visadapt.effects import EFFECTS, Effect
 
 IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP = "identified", "ambiguous", "unexplained", "no_gap"
 VERDICTS = (IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP)
+
+SCHEMA_VERSION = 1
+"""Version of `schema.json`."""
+
+KEYS = {"start": "from", "end": "to"}
+NOT_IN_JSON = ("figures", "policy")
+SHARES = ("probability", "share", "p_value", "stages", "states")
+"""Fields whose JSON keys differ from their names, fields that only the report shows, and fields with numbers from 0 to
+1, which are rounded to 12 digits so that a rounding error does not exceed 1."""
 
 
 @dataclass(frozen=True)
@@ -126,50 +135,30 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Profile:
-    """The mean residual over one variable, in bins."""
+class Curve:
+    """One curve of a chart."""
+
+    label: str
+    values: NDArray[np.floating]
+    """(N,); NaN where there is none"""
+    error: NDArray[np.floating] | None = None
+    """(N,) standard error of the values"""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Curves over one variable: a mean residual, the error over the horizon, or a spectrum."""
 
     variable: str
-    """a state, an action, `time` or `episode`"""
+    """a state, an action, `time`, `episode`, or words"""
     variable_unit: str
     quantity: str
-    """the residual in words, such as "force on the cart" """
+    """in words, such as "force on the cart" """
     quantity_unit: str
-    centres: NDArray[np.floating]
-    """(N,) means of the variable in the bins"""
-    before: NDArray[np.floating]
-    """(N,) mean under the source; NaN in empty bins"""
-    before_error: NDArray[np.floating]
-    """(N,) its standard error"""
-    after: NDArray[np.floating]
-    """(N,) mean with the causes"""
-    after_error: NDArray[np.floating]
-    """(N,) its standard error"""
-
-
-@dataclass(frozen=True)
-class Growth:
-    """The errors of `Gap` at each of K horizons, all (K,)."""
-
-    seconds: NDArray[np.floating]
-    before: NDArray[np.floating]
-    after: NDArray[np.floating]
-    floor: NDArray[np.floating]
-    black_box: NDArray[np.floating]
-
-
-@dataclass(frozen=True)
-class Spectrum:
-    """Power spectral density of the residual, all (F,)."""
-
-    quantity: str
-    """the residual in words, such as "force on the cart" """
-    unit: str
-    """of the density, such as "N2/Hz" """
-    frequency: NDArray[np.floating]
-    """Hz"""
-    before: NDArray[np.floating]
-    after: NDArray[np.floating]
+    x: NDArray[np.floating]
+    """(N,)"""
+    curves: tuple[Curve, ...]
+    """of the source and, second, of the source with the causes"""
 
 
 @dataclass(frozen=True)
@@ -203,10 +192,12 @@ class FigureData:
 
     predictions: tuple[Prediction, ...] = ()
     """held-out windows, that of the source's largest error first"""
-    profiles: tuple[Profile, ...] = ()
-    """the variables of `Where.regions` first"""
-    growth: Growth | None = None
-    spectrum: Spectrum | None = None
+    profiles: tuple[Chart, ...] = ()
+    """the mean residual over a variable, in bins; the variables of `Where.regions` first"""
+    growth: Chart | None = None
+    """the errors of `Gap` by horizon"""
+    spectrum: Chart | None = None
+    """power spectral density of the residual"""
 
 
 @dataclass(frozen=True)
@@ -287,7 +278,9 @@ class Diagnosis:
 
     def to_json(self) -> dict[str, Any]:
         """The result as json.dumps takes it; keys and their order are those of `schema.json`, NaN becomes None."""
-        return as_json(self)
+        content = {"schema": SCHEMA_VERSION, **_plain(self)}
+        content["where"]["pixels"] = None
+        return content
 
 
 def _effect(cause: Cause) -> Effect:
@@ -296,3 +289,22 @@ def _effect(cause: Cause) -> Effect:
         if not math.isfinite(value):
             raise ValueError(f"{cause.effect}: the recording does not determine its {name}; record what does")
     return EFFECTS[cause.effect](**values)
+
+
+def _plain(value: Any, is_share: bool = False) -> Any:
+    """The fields of dataclasses in their order, as plain numbers; what is not finite becomes None."""
+    if is_dataclass(value):
+        names = [field.name for field in fields(value) if field.name not in NOT_IN_JSON]
+        return {KEYS.get(name, name): _plain(getattr(value, name), name in SHARES) for name in names}
+    if isinstance(value, Mapping):
+        return {key: _plain(each, is_share) for key, each in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, str):
+        return value
+    if isinstance(value, Integral):
+        return int(value)
+    number = float(value)
+    if not math.isfinite(number):
+        return None
+    return round(number, 12) if is_share else number

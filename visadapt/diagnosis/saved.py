@@ -7,15 +7,7 @@ import math
 import os
 from pathlib import Path
 
-from visadapt.diagnosis.result import (
-    Cause,
-    Diagnosis,
-    Estimate,
-    Gap,
-    RecordingSummary,
-    Where,
-)
-from visadapt.diagnosis.result_json import SCHEMA_VERSION
+from visadapt.diagnosis.result import SCHEMA_VERSION, Cause, Diagnosis, Estimate, Gap, RecordingSummary, Where
 from visadapt.effects import EFFECTS, Effect
 
 

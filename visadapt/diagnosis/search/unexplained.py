@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from visadapt.estimation.candidate import CandidateModel, linearise
-from visadapt.estimation.innovations import Innovations
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.linearise import load_effect
+from visadapt.estimation.sensitivity import Innovations
 
 BUMPS = 10
 """Gaussian bumps of a function."""
