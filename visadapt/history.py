@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from visadapt.batch import Batch
+
 LENGTH = 5
 """Observations and actions kept (the paper, section 3.2.2)."""
 
@@ -15,7 +17,7 @@ HORIZON = 10
 
 
 @dataclass(frozen=True)
-class History:
+class History(Batch):
     """The last observations (B, L, ...), oldest first, and the last actions (B, L, n_action).
 
     For a policy the last action is the one before the last observation; for a residual (see `acting`) it is the
@@ -39,22 +41,3 @@ class History:
     def observing(self, observation: Tensor) -> History:
         """The same actions, with `observation` (B, ...) as the last observation."""
         return History(torch.cat((self.observations[:, 1:], observation[:, None]), 1), self.actions)
-
-    def where(self, keep: Tensor, other: History) -> History:
-        """This history in the rows where `keep` (B,) holds, `other` in the rest."""
-        rows = keep.reshape(-1, *[1] * (self.observations.dim() - 1))
-        return History(
-            torch.where(rows, self.observations, other.observations),
-            torch.where(keep[:, None, None], self.actions, other.actions),
-        )
-
-    def joined(self, other: History) -> History:
-        """The rows of this history and, after them, those of another."""
-        return History(torch.cat((self.observations, other.observations)), torch.cat((self.actions, other.actions)))
-
-    def detach(self) -> History:
-        """The same history, cut off from the graph."""
-        return History(self.observations.detach(), self.actions.detach())
-
-    def __getitem__(self, rows: Tensor | slice) -> History:
-        return History(self.observations[rows], self.actions[rows])

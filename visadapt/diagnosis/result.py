@@ -7,7 +7,7 @@ determined is NaN, null in the JSON.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from numbers import Integral
 from typing import Any
@@ -265,16 +265,7 @@ class Diagnosis:
         >>> [(effect.name, round(effect.coefficient.item(), 2)) for effect in world.effects]
         [('viscous_friction', 2.1)]
         """
-        if not self.causes:
-            raise ValueError(
-                f"the verdict is {self.verdict}: the diagnosis named no cause to put into a world; "
-                + ("the source explains the recording as it is" if self.verdict == NO_GAP else "adapt with a residual")
-            )
-        taken: list[Cause] = []
-        for cause in self.causes:
-            if not any(cause.effect in (one.effect, *one.indistinguishable_from) for one in taken):
-                taken.append(cause)
-        return [_effect(cause) for cause in taken]
+        return named_effects(self.verdict, self.causes)
 
     def to_json(self) -> dict[str, Any]:
         """The result as json.dumps takes it; keys and their order are those of `schema.json`, NaN becomes None."""
@@ -283,12 +274,22 @@ class Diagnosis:
         return content
 
 
-def _effect(cause: Cause) -> Effect:
-    values = {name: estimate.value for name, estimate in cause.parameters.items()}
-    for name, value in values.items():
-        if not math.isfinite(value):
-            raise ValueError(f"{cause.effect}: the recording does not determine its {name}; record what does")
-    return EFFECTS[cause.effect](**values)
+def named_effects(verdict: str, causes: Sequence[Cause]) -> list[Effect]:
+    """`Diagnosis.effects` of a verdict with its causes."""
+    if not causes:
+        raise ValueError(
+            f"the verdict is {verdict}: the diagnosis named no cause to put into a world; "
+            + ("the source explains the recording as it is" if verdict == NO_GAP else "adapt with a residual")
+        )
+    taken: list[Cause] = []
+    for cause in causes:
+        if not any(cause.effect in (one.effect, *one.indistinguishable_from) for one in taken):
+            taken.append(cause)
+    for cause in taken:
+        for name, estimate in cause.parameters.items():
+            if not math.isfinite(estimate.value):
+                raise ValueError(f"{cause.effect}: the recording does not determine its {name}; record what does")
+    return [EFFECTS[cause.effect](**{name: one.value for name, one in cause.parameters.items()}) for cause in taken]
 
 
 def _plain(value: Any, is_share: bool = False) -> Any:

@@ -14,12 +14,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+from visadapt.batch import Batch
 from visadapt.estimation.candidate import CandidateModel, linearise
 from visadapt.estimation.kalman import Linear, backward, forward, log_likelihood
 from visadapt.estimation.profiles import profile_of
@@ -49,7 +50,7 @@ MAX_LOG_VARIANCE_CHANGE = 1.5
 
 
 @dataclass(frozen=True)
-class FitState:
+class FitState(Batch):
     """Estimates for C sets of effects."""
 
     theta: Tensor
@@ -64,10 +65,6 @@ class FitState:
     """(C,) log likelihood of the windows that the fit used"""
     information: Tensor
     """(C, K, K) Fisher information of the parameters"""
-
-    def select(self, chosen: Tensor) -> FitState:
-        """The fits of these sets, by index."""
-        return FitState(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
 
 
 def initial_states(rows: Segments, system: System) -> Tensor:
@@ -148,7 +145,7 @@ Batched = TypeVar("Batched", "FitState", "Derivatives")
 
 
 @dataclass(frozen=True)
-class Derivatives:
+class Derivatives(Batch):
     """Likelihood of C fits, with its derivatives."""
 
     likelihood: Tensor
@@ -232,8 +229,8 @@ def fit(
         if (iteration + 1) % period == 0:
             for model in models:
                 model.slopes = None
-        now = differentiate([models[k] for k in active.tolist()], here.select(active), window_used[active])
-        tried = replace(here.select(active), likelihood=now.likelihood, information=now.information)
+        now = differentiate([models[k] for k in active.tolist()], here[active], window_used[active])
+        tried = replace(here[active], likelihood=now.likelihood, information=now.information)
         if at is None:
             best, at = tried, now
         else:
@@ -285,9 +282,4 @@ def _step(
 
 def _replaced(into: Batched, indices: Tensor, values: Batched, chosen: Tensor) -> Batched:
     """`into` with its members at `indices` replaced by the `chosen` members of `values`."""
-    out = {}
-    for field in fields(into):
-        tensor = getattr(into, field.name).clone()
-        tensor[indices] = getattr(values, field.name)[chosen]
-        out[field.name] = tensor
-    return replace(into, **out)
+    return into.map(lambda old, new: old.index_put((indices,), new[chosen]), values)
