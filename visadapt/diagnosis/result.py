@@ -35,26 +35,19 @@ class Region:
     """An interval of one variable: a state, an action, `time` in s since the episode started, or `episode`."""
 
     variable: str
-    start: float
-    """the JSON's "from", in the variable's unit"""
-    end: float
-    """the JSON's "to", in the variable's unit"""
-    share: float
-    """of the gap that lies in it"""
-    p_value: float
-    """probability that chance concentrates as much of the gap in any interval that was tried"""
+    start: float  # the JSON's "from", in the variable's unit
+    end: float  # the JSON's "to", in the variable's unit
+    share: float  # of the gap that lies in it
+    p_value: float  # probability that chance concentrates as much of the gap in any interval that was tried
 
 
 @dataclass(frozen=True)
 class Where:
     """Shares of the gap by stage and by state, and the regions where it is concentrated."""
 
-    stages: Mapping[str, float]
-    """of the explained gap: actuation, dynamics, sensing, camera"""
-    states: Mapping[str, float]
-    """every state of the system; NaN where it was not measured"""
-    regions: tuple[Region, ...] = ()
-    """fitted regions of causes first, then lowest p-value first"""
+    stages: Mapping[str, float]  # of the explained gap: actuation, dynamics, sensing, camera
+    states: Mapping[str, float]  # every state of the system; NaN where it was not measured
+    regions: tuple[Region, ...] = ()  # fitted regions of causes first, then lowest p-value first
 
 
 @dataclass(frozen=True)
@@ -63,8 +56,7 @@ class Estimate:
 
     value: float
     unit: str
-    ci90: tuple[float, float]
-    """90 % confidence interval; NaN on a side on which it is open"""
+    ci90: tuple[float, float]  # 90 % confidence interval; NaN on a side on which it is open
 
 
 @dataclass(frozen=True)
@@ -74,10 +66,8 @@ class Cause:
     effect: str
     parameters: Mapping[str, Estimate]
     probability: float
-    gap_closed: float
-    """by this cause alone, on held-out episodes"""
-    indistinguishable_from: tuple[str, ...] = ()
-    """effects that fit this recording equally well"""
+    gap_closed: float  # by this cause alone, on held-out episodes
+    indistinguishable_from: tuple[str, ...] = ()  # effects that fit this recording equally well
 
 
 @dataclass(frozen=True)
@@ -86,26 +76,19 @@ class Ranked:
 
     effects: tuple[str, ...]
     probability: float
-    gap_closed: float
-    """by the set, on held-out episodes"""
+    gap_closed: float  # by the set, on held-out episodes
 
 
 @dataclass(frozen=True)
 class Gap:
     """The error of predictions several steps ahead on held-out episodes."""
 
-    measure: str
-    """what the other numbers are, in words, with the unit"""
-    before: float
-    """of the source"""
-    after: float
-    """of the source with the causes"""
-    floor: float
-    """of the measurement noise alone"""
-    black_box: float
-    """of the source with a black box of smooth functions"""
-    closed: float
-    """(before - after) / (before - floor)"""
+    measure: str  # what the other numbers are, in words, with the unit
+    before: float  # of the source
+    after: float  # of the source with the causes
+    floor: float  # of the measurement noise alone
+    black_box: float  # of the source with a black box of smooth functions
+    closed: float  # (before - after) / (before - floor)
 
 
 @dataclass(frozen=True)
@@ -113,10 +96,8 @@ class RecordingSummary:
     """Size of the recording."""
 
     episodes: int
-    samples: int
-    """actions that were executed"""
-    period: float
-    """s between rows"""
+    samples: int  # actions that were executed
+    period: float  # s between rows
 
 
 @dataclass(frozen=True)
@@ -124,14 +105,10 @@ class Prediction:
     """One held-out window, predicted from its start with the actions that were commanded."""
 
     episode: int
-    time: NDArray[np.floating]
-    """(K,) s since the episode started"""
-    measured: NDArray[np.floating]
-    """(K, n_state); NaN in the columns of states that were not measured"""
-    source: NDArray[np.floating]
-    """(K, n_state) prediction of the source"""
-    corrected: NDArray[np.floating]
-    """(K, n_state) prediction of the source with the best set of effects"""
+    time: NDArray[np.floating]  # (K,) s since the episode started
+    measured: NDArray[np.floating]  # (K, n_state); NaN in the columns of states that were not measured
+    source: NDArray[np.floating]  # (K, n_state) prediction of the source
+    corrected: NDArray[np.floating]  # (K, n_state) prediction of the source with the best set of effects
 
 
 @dataclass(frozen=True)
@@ -139,26 +116,20 @@ class Curve:
     """One curve of a chart."""
 
     label: str
-    values: NDArray[np.floating]
-    """(N,); NaN where there is none"""
-    error: NDArray[np.floating] | None = None
-    """(N,) standard error of the values"""
+    values: NDArray[np.floating]  # (N,); NaN where there is none
+    error: NDArray[np.floating] | None = None  # (N,) standard error of the values
 
 
 @dataclass(frozen=True)
 class Chart:
     """Curves over one variable: a mean residual, the error over the horizon, or a spectrum."""
 
-    variable: str
-    """a state, an action, `time`, `episode`, or words"""
+    variable: str  # a state, an action, `time`, `episode`, or words
     variable_unit: str
-    quantity: str
-    """in words, such as "force on the cart" """
+    quantity: str  # in words, such as "force on the cart"
     quantity_unit: str
-    x: NDArray[np.floating]
-    """(N,)"""
-    curves: tuple[Curve, ...]
-    """of the source and, second, of the source with the causes"""
+    x: NDArray[np.floating]  # (N,)
+    curves: tuple[Curve, ...]  # of the source and, second, of the source with the causes
 
 
 @dataclass(frozen=True)
@@ -171,12 +142,10 @@ class PolicyTerms:
 
     delta: tuple[float, float]
     """error of the model's step under the policy, E|f_hat(s, pi(s)) - f*(s, pi(s))| (equation 6)"""
-    lipschitz: tuple[float, float]
-    """L, largest change of the model's step per unit of command (equation 7)"""
+    lipschitz: tuple[float, float]  # L, largest change of the model's step per unit of command (equation 7)
     action_gap: tuple[float, float]
     """distance of the policy's action from the model's best, E|pi(s) - pi_hat(s)|, in units of command"""
-    zeta: tuple[float, float]
-    """distance from the reference under this best action, E[zeta] (equation 5)"""
+    zeta: tuple[float, float]  # distance from the reference under this best action, E[zeta] (equation 5)
 
     @property
     def bound(self) -> tuple[float, float]:
@@ -190,14 +159,11 @@ class PolicyTerms:
 class FigureData:
     """What the report plots; what is empty or None is not plotted."""
 
-    predictions: tuple[Prediction, ...] = ()
-    """held-out windows, that of the source's largest error first"""
+    predictions: tuple[Prediction, ...] = ()  # held-out windows, that of the source's largest error first
     profiles: tuple[Chart, ...] = ()
     """the mean residual over a variable, in bins; the variables of `Where.regions` first"""
-    growth: Chart | None = None
-    """the errors of `Gap` by horizon"""
-    spectrum: Chart | None = None
-    """power spectral density of the residual"""
+    growth: Chart | None = None  # the errors of `Gap` by horizon
+    spectrum: Chart | None = None  # power spectral density of the residual
 
 
 @dataclass(frozen=True)
@@ -217,21 +183,15 @@ class Diagnosis:
 
     system: str
     recording: RecordingSummary
-    verdict: str
-    """one of VERDICTS"""
+    verdict: str  # one of VERDICTS
     where: Where
-    causes: tuple[Cause, ...]
-    """empty for no_gap and unexplained; for ambiguous, all that fit equally well"""
-    ranking: tuple[Ranked, ...]
-    """all sets that were compared, the most probable first"""
+    causes: tuple[Cause, ...]  # empty for no_gap and unexplained; for ambiguous, all that fit equally well
+    ranking: tuple[Ranked, ...]  # all sets that were compared, the most probable first
     gap: Gap
-    next_experiment: str
-    """what to record to settle open questions; empty where there are none"""
-    warnings: tuple[str, ...] = ()
-    """of loading the recording, and of the diagnosis"""
+    next_experiment: str  # what to record to settle open questions; empty where there are none
+    warnings: tuple[str, ...] = ()  # of loading the recording, and of the diagnosis
     figures: FigureData = FigureData()
-    policy: PolicyTerms | None = None
-    """terms of Theorem 1, where a policy was given"""
+    policy: PolicyTerms | None = None  # terms of Theorem 1, where a policy was given
 
     def __post_init__(self) -> None:
         if self.verdict not in VERDICTS:

@@ -12,8 +12,7 @@ from visadapt.systems import CartPole, System
 class ParameterScale(DynamicsEffect):
     """Scale factors on parameters of the system that a subclass acts on; adds no load."""
 
-    scaled: ClassVar[dict[str, str]]
-    """the system's parameter for each of the effect's"""
+    scaled: ClassVar[dict[str, str]]  # the system's parameter for each of the effect's
 
     def alter(self, system: System) -> System:
         own = expect(system, self)
@@ -24,8 +23,7 @@ class ParameterScale(DynamicsEffect):
 class ParameterShift(DynamicsEffect):
     """Amounts added to parameters of the system that a subclass acts on; adds no load."""
 
-    shifted: ClassVar[dict[str, str]]
-    """the effect's parameter for each of the system's"""
+    shifted: ClassVar[dict[str, str]]  # the effect's parameter for each of the system's
 
     def alter(self, system: System) -> System:
         own = expect(system, self)

@@ -126,8 +126,7 @@ class SensorOffset(SensingEffect):
     """An offset, () or (B,), on the reading of one state."""
 
     systems = (CartPole,)
-    state: ClassVar[str]
-    """its name in the system"""
+    state: ClassVar[str]  # its name in the system
 
     def apply_to(
         self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None

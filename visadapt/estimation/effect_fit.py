@@ -42,12 +42,9 @@ from visadapt.world import World
 class EffectFit:
     """Effects fitted to episodes."""
 
-    values: dict[type[Effect], Tensor]
-    """(P,) parameters of each effect, in the order of its table"""
-    covariance: dict[type[Effect], Tensor]
-    """(P, P) of each effect's parameters"""
-    states: list[Tensor]
-    """(T, n_state) of each episode: the true states, smoothed"""
+    values: dict[type[Effect], Tensor]  # (P,) parameters of each effect, in the order of its table
+    covariance: dict[type[Effect], Tensor]  # (P, P) of each effect's parameters
+    states: list[Tensor]  # (T, n_state) of each episode: the true states, smoothed
 
 
 @torch.no_grad()

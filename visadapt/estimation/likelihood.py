@@ -53,18 +53,12 @@ MAX_LOG_VARIANCE_CHANGE = 1.5
 class FitState(Batch):
     """Estimates for C sets of effects."""
 
-    theta: Tensor
-    """(C, K) parameters, padded with 0 where a set has fewer than K"""
-    state: Tensor
-    """(C, W, T, n) states along which the models are linearised"""
-    log_process: Tensor
-    """(C, G) log process noise variances of the driven velocities, by group"""
-    log_noise: Tensor
-    """(C, m) log variances of the measurements"""
-    likelihood: Tensor
-    """(C,) log likelihood of the windows that the fit used"""
-    information: Tensor
-    """(C, K, K) Fisher information of the parameters"""
+    theta: Tensor  # (C, K) parameters, padded with 0 where a set has fewer than K
+    state: Tensor  # (C, W, T, n) states along which the models are linearised
+    log_process: Tensor  # (C, G) log process noise variances of the driven velocities, by group
+    log_noise: Tensor  # (C, m) log variances of the measurements
+    likelihood: Tensor  # (C,) log likelihood of the windows that the fit used
+    information: Tensor  # (C, K, K) Fisher information of the parameters
 
 
 def initial_states(rows: Segments, system: System) -> Tensor:
@@ -148,18 +142,13 @@ Batched = TypeVar("Batched", "FitState", "Derivatives")
 class Derivatives(Batch):
     """Likelihood of C fits, with its derivatives."""
 
-    likelihood: Tensor
-    """(C,)"""
-    information: Tensor
-    """(C, K, K)"""
-    gradient: Tensor
-    """(C, K) of the log likelihood by the parameters"""
+    likelihood: Tensor  # (C,)
+    information: Tensor  # (C, K, K)
+    gradient: Tensor  # (C, K) of the log likelihood by the parameters
     noise_information: Tensor
     """(C, G + S, G + S) Fisher information of the log variances of process noise groups and kinds of sensors"""
-    noise_gradient: Tensor
-    """(C, G + S) of the log likelihood by these"""
-    smoothed: Tensor
-    """(C, W, T, n, 1 + K) smoothed correction of the states, and its derivative by each parameter"""
+    noise_gradient: Tensor  # (C, G + S) of the log likelihood by these
+    smoothed: Tensor  # (C, W, T, n, 1 + K) smoothed correction of the states, and its derivative by each parameter
 
 
 def differentiate(models: Sequence[CandidateModel], fits: FitState, window_used: Tensor) -> Derivatives:

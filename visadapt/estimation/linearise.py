@@ -32,14 +32,10 @@ PHASE_MARGIN = 4 * math.pi
 class Tangent:
     """A function of N states and of P parameters, with its first derivatives."""
 
-    value: Tensor
-    """(N, m)"""
-    by_state: Tensor
-    """(N, m, n); no columns where it was not asked for"""
-    by_parameter: Tensor
-    """(N, m, P)"""
-    by_command: Tensor
-    """(N, m, n_action); no columns where it was not asked for"""
+    value: Tensor  # (N, m)
+    by_state: Tensor  # (N, m, n); no columns where it was not asked for
+    by_parameter: Tensor  # (N, m, P)
+    by_command: Tensor  # (N, m, n_action); no columns where it was not asked for
 
 
 @cache

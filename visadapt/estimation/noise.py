@@ -32,12 +32,9 @@ FIRST_STEP, REFINED_STEP, LAST_STEP = 0.8, 0.3, 0.15
 class UnknownNoise:
     """One episode of T rows with unknown noise; float64."""
 
-    system: Linear
-    """one system (N = 1); readings in units of their stated standard deviations, uncorrelated"""
-    used: Tensor
-    """(1, T, m) 1 where something was measured"""
-    shapes: Tensor
-    """(D, n, n) covariances Q_d for unit intensity"""
+    system: Linear  # one system (N = 1); readings in units of their stated standard deviations, uncorrelated
+    used: Tensor  # (1, T, m) 1 where something was measured
+    shapes: Tensor  # (D, n, n) covariances Q_d for unit intensity
 
     def filtered(self, noise: Noise) -> Filtered:
         """The forward pass under K candidates of the noise."""
@@ -50,10 +47,8 @@ class UnknownNoise:
 class Noise:
     """K candidates."""
 
-    process: Tensor
-    """(K, D) intensities q"""
-    measurement: Tensor
-    """(K,) factors s on the stated standard deviations of the measurements"""
+    process: Tensor  # (K, D) intensities q
+    measurement: Tensor  # (K,) factors s on the stated standard deviations of the measurements
 
 
 def most_probable_noise(episodes: Sequence[UnknownNoise], guess: Noise | None = None) -> Noise:

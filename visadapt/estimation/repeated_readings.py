@@ -29,12 +29,9 @@ SMOOTHING_RATIO = 1 / 3
 class RepeatedReadings:
     """Which readings are repeated, by episode."""
 
-    used: list[Tensor]
-    """(T, m) 1 where a reading is a measurement"""
-    lost: list[Tensor]
-    """(T,) whether the whole row is repeated"""
-    frozen: list[Tensor]
-    """(T,) whether the angle is repeated and the rest of the row is not"""
+    used: list[Tensor]  # (T, m) 1 where a reading is a measurement
+    lost: list[Tensor]  # (T,) whether the whole row is repeated
+    frozen: list[Tensor]  # (T,) whether the angle is repeated and the rest of the row is not
 
 
 def find_repeats(

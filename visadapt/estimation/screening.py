@@ -118,8 +118,7 @@ class Candidate:
 
     effect: type[Effect]
     values: tuple[float, ...]
-    gain: float
-    """log likelihood that it adds, by the linear response"""
+    gain: float  # log likelihood that it adds, by the linear response
 
 
 def screen(

@@ -17,26 +17,16 @@ ROUNDING_ERROR = 1e-6
 class Segments:
     """W windows of at most T rows, in float64, padded with zeros that are neither `inside` nor `used`."""
 
-    measured: Tensor
-    """(W, T, m)"""
-    used: Tensor
-    """(W, T, m) 1 where there is a measurement that a fit may use"""
-    inside: Tensor
-    """(W, T) 1 within the window, 0 in its padding"""
-    time: Tensor
-    """(W, T) s since the start of the episode"""
-    command: Tensor
-    """(E, L, n_action) of whole episodes, from their start"""
-    first: Tensor
-    """(W,) row of the episode at which the window starts"""
-    episode: Tensor
-    """(W,) index of the window's episode"""
-    channels: tuple[int, ...]
-    """the m columns of the state that were measured"""
-    period: float
-    """s between rows"""
-    step: tuple[float, ...]
-    """resolution of each channel: the smallest difference between two different readings"""
+    measured: Tensor  # (W, T, m)
+    used: Tensor  # (W, T, m) 1 where there is a measurement that a fit may use
+    inside: Tensor  # (W, T) 1 within the window, 0 in its padding
+    time: Tensor  # (W, T) s since the start of the episode
+    command: Tensor  # (E, L, n_action) of whole episodes, from their start
+    first: Tensor  # (W,) row of the episode at which the window starts
+    episode: Tensor  # (W,) index of the window's episode
+    channels: tuple[int, ...]  # the m columns of the state that were measured
+    period: float  # s between rows
+    step: tuple[float, ...]  # resolution of each channel: the smallest difference between two different readings
 
     @property
     def shape(self) -> tuple[int, int]:

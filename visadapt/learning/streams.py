@@ -27,8 +27,7 @@ class StreamState(Batch):
 
     at: WorldState
     history: History
-    task_state: Tensor
-    """(B, ...) the task's"""
+    task_state: Tensor  # (B, ...) the task's
 
     def tree(self) -> dict[str, Any]:
         """All of it as a tree of tensors, for a checkpoint."""
@@ -53,10 +52,8 @@ class StreamSettings:
     """How streams run."""
 
     count: int
-    longest: int
-    """steps after which a stream starts anew"""
-    recorded: float
-    """share of the starts that are recorded windows of the target, with their histories"""
+    longest: int  # steps after which a stream starts anew
+    recorded: float  # share of the starts that are recorded windows of the target, with their histories
 
 
 class Streams:

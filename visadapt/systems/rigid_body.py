@@ -54,10 +54,8 @@ class RigidBody(System):
     )
     """A force in world axes and a torque in body axes."""
 
-    mass: float | Tensor
-    """kg"""
-    gravity: float | Tensor
-    """m/s2"""
+    mass: float | Tensor  # kg
+    gravity: float | Tensor  # m/s2
 
     @abstractmethod
     def wrench(self, velocity: Tensor, rates: Tensor, command: Tensor) -> tuple[Tensor, Tensor]:

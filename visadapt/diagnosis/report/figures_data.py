@@ -30,16 +30,11 @@ SOURCE, CORRECTED = "simulator", "with the causes"
 class Errors:
     """Root mean square errors of held-out predictions by horizon and channel (H, m), in units of `deviation`."""
 
-    before: Tensor
-    """of the source"""
-    after: Tensor
-    """of the source with the causes"""
-    floor: Tensor
-    """of the states that the smoother estimates: noise"""
-    black_box: Tensor
-    """of the source with a black box"""
-    deviation: Tensor
-    """(m,) standard deviations of the measurement noise, in the states' units"""
+    before: Tensor  # of the source
+    after: Tensor  # of the source with the causes
+    floor: Tensor  # of the states that the smoother estimates: noise
+    black_box: Tensor  # of the source with a black box
+    deviation: Tensor  # (m,) standard deviations of the measurement noise, in the states' units
 
     def closed_by(self, rollouts: RolloutErrors) -> float:
         """Share of the gap that the set with these predictions closes."""

@@ -38,8 +38,7 @@ class Alternative:
     """An effect that explains one part of the gap, in place of an effect of the best set."""
 
     effect: type[Effect]
-    compared: ComparedModel
-    """the model with it"""
+    compared: ComparedModel  # the model with it
     canonical: type[Effect]
     """the effect that was fitted: itself, or its twin, which does the same with other parameters"""
 
@@ -166,8 +165,7 @@ class RepeatCause:
     """A cause that repeats readings."""
 
     cause: Cause
-    cost: float
-    """log likelihood that would be lost if the repeated readings were taken for measurements"""
+    cost: float  # log likelihood that would be lost if the repeated readings were taken for measurements
 
 
 def repeated_reading_causes(

@@ -20,12 +20,9 @@ from visadapt.estimation.likelihood import FitState, linear_problem, variances
 class Disturbance:
     """Smoothed disturbance estimate over W windows of T rows."""
 
-    load: Tensor
-    """(W, T - 1, loads) in N or N m, constant over the period after a row"""
-    valid: Tensor
-    """(W, T - 1) 1 within the windows, 0 in their padding"""
-    variables: Mapping[str, Tensor]
-    """(W, T - 1) states, commands, time and episode by name"""
+    load: Tensor  # (W, T - 1, loads) in N or N m, constant over the period after a row
+    valid: Tensor  # (W, T - 1) 1 within the windows, 0 in their padding
+    variables: Mapping[str, Tensor]  # (W, T - 1) states, commands, time and episode by name
 
     @property
     def power(self) -> Tensor:

@@ -41,10 +41,8 @@ class RolloutErrors:
 
     error: Tensor
     """(H + 1, W, T, m) prediction minus measurement, at the row where the prediction ends; 0 where not `valid`"""
-    valid: Tensor
-    """(H + 1, W, T, m) 1 where there are both a prediction and a measurement"""
-    predicted: Tensor
-    """(W, T, H + 1, n) states predicted from each row"""
+    valid: Tensor  # (H + 1, W, T, m) 1 where there are both a prediction and a measurement
+    predicted: Tensor  # (W, T, H + 1, n) states predicted from each row
 
     def rms(self, deviation: Tensor) -> Tensor:
         """(H, m) root mean square errors 1 to H rows ahead, in units of `deviation` (m,)."""

@@ -32,26 +32,20 @@ class ComparedModel:
     """A fitted model and its posterior probability."""
 
     model: ScoredModel
-    probability: float
-    """among the models compared; log odds are lowered by what process noise adds to the model"""
+    probability: float  # among the models compared; log odds are lowered by what process noise adds to the model
 
 
 @dataclass(frozen=True)
 class ModelComparison:
     """The models that were compared, and what the best leaves unexplained."""
 
-    models: list[ComparedModel]
-    """the most probable first"""
-    leftover: float
-    """log likelihood that process noise adds to the best"""
-    functions: list[BlackBoxFunction]
-    """of a black box added to the best, the largest log odds first"""
+    models: list[ComparedModel]  # the most probable first
+    leftover: float  # log likelihood that process noise adds to the best
+    functions: list[BlackBoxFunction]  # of a black box added to the best, the largest log odds first
     alternatives: dict[type[Effect], list[ComparedModel]]
     """for each effect of the best: the models with another effect in its place that fit as well"""
-    gained: float
-    """log likelihood of the best minus that of the source"""
-    threshold: float
-    """log odds of a function above which it counts as something unexplained"""
+    gained: float  # log likelihood of the best minus that of the source
+    threshold: float  # log odds of a function above which it counts as something unexplained
 
     @property
     def best(self) -> ScoredModel:

@@ -23,16 +23,12 @@ from visadapt.systems import System
 class PreparedRecording:
     """What is fitted, in the signs of the source."""
 
-    rows: Segments
-    """without repeated or defective readings"""
-    raw: Segments
-    """the same windows with repeated readings as they were read"""
+    rows: Segments  # without repeated or defective readings
+    raw: Segments  # the same windows with repeated readings as they were read
     repeats: RepeatedReadings
-    defect: tuple[float, float] | None
-    """rad, between which the angle sensor is defective"""
+    defect: tuple[float, float] | None  # rad, between which the angle sensor is defective
     warnings: tuple[str, ...]
-    source: FitState | None = None
-    """the fit of the source to `rows`, if a check needed it"""
+    source: FitState | None = None  # the fit of the source to `rows`, if a check needed it
 
 
 def prepare(recording: Recording, system: System) -> PreparedRecording:

@@ -50,10 +50,8 @@ class ScoredModel:
     """One set of effects, fitted to a recording."""
 
     effects: Effects
-    fits: FitState
-    """of this set alone (C = 1), parameters in the order of the effects"""
-    log_odds: float
-    """log posterior odds, up to a constant"""
+    fits: FitState  # of this set alone (C = 1), parameters in the order of the effects
+    log_odds: float  # log posterior odds, up to a constant
 
     @property
     def names(self) -> tuple[str, ...]:

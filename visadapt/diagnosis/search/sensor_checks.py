@@ -116,12 +116,9 @@ MIN_STRETCH_ROWS = 15
 class Defect:
     """A band of angles in which the sensor is defective."""
 
-    low: float
-    """rad"""
-    high: float
-    """rad"""
-    full_turns: bool
-    """whether the pole turns all the way round"""
+    low: float  # rad
+    high: float  # rad
+    full_turns: bool  # whether the pole turns all the way round
 
 
 def angle_defect(system: System, rows: Segments, fits: FitState) -> Defect | None:

@@ -37,12 +37,9 @@ PRIOR_DEVIATIONS = (0.03, 0.3, 3.0, 30.0)
 class BlackBoxFunction:
     """One function of the black box, fitted alone."""
 
-    port: str
-    """the load, or the state whose reading is in error"""
-    variable: str
-    """a state, a command, a command of the period before, or time"""
-    log_odds: float
-    """that it is there, at even prior odds"""
+    port: str  # the load, or the state whose reading is in error
+    variable: str  # a state, a command, a command of the period before, or time
+    log_odds: float  # that it is there, at even prior odds
 
 
 @dataclass(frozen=True)
@@ -51,10 +48,8 @@ class Block:
 
     port: str
     variable: str
-    drive: Tensor
-    """(W, T - 1, n, BUMPS) to the states"""
-    reading: Tensor
-    """(W, T, m, BUMPS) to the readings"""
+    drive: Tensor  # (W, T - 1, n, BUMPS) to the states
+    reading: Tensor  # (W, T, m, BUMPS) to the readings
 
 
 def black_box_functions(model: CandidateModel, fits: FitState) -> list[BlackBoxFunction]:
