@@ -53,6 +53,7 @@ RUNNERS_UP = 2
 """Sets after the best for which the share of the gap that they close is computed."""
 
 
+@torch.inference_mode()
 def diagnose(
     recording: Recording,
     world: World,
@@ -91,33 +92,12 @@ def diagnose(
     """
     if len(world.effects):
         raise ValueError("diagnose: the world is the source and has no effects; give the bare system")
-    profile_of(world.system)
+    system = world.system
+    profile = profile_of(system)
     torch.set_num_threads(jobs)
-    effects = list(all_effects(world.system) if catalogue is None else catalogue)
-    with torch.inference_mode():
-        if policy is not None:
-            policy_bound.check(policy, world.system)
-        return _diagnose(recording, world.system, effects, seed, progress, policy)
-
-
-def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:
-    """The first effect of each group of twins; without effects that repeat readings, which are found by another method,
-    and without sensors with memory, which candidate models cannot linearise by the present state."""
-    out: list[type[Effect]] = []
-    for effect in effects:
-        if not (twins(effect, out, system) or effect.repeats_readings or remembers(effect)):
-            out.append(effect)
-    return out
-
-
-def _diagnose(
-    recording: Recording,
-    system: System,
-    effects: list[type[Effect]],
-    seed: int,
-    progress: Report | None,
-    policy: policy_bound.StatesToActions | None,
-) -> Diagnosis:
+    effects = list(all_effects(system) if catalogue is None else catalogue)
+    if policy is not None:
+        policy_bound.check(policy, system)
     prepared = prepare(recording, system)
     rows = prepared.rows
     search = Search(system, rows, searched(effects, system), prepared.source)
@@ -126,7 +106,7 @@ def _diagnose(
     best = comparison.best
     groups = alternatives(comparison, effects, system)
     repeats = repeated_reading_causes(prepared, search, comparison)
-    repeat_causes = [each.cause for each in repeats]
+    repeat_causes = [cause for cause, _ in repeats]
 
     # Predictions of the source, the best set, each cause alone and the runners-up, on held-out episodes.
     alone = [search.single(effect) for effect in dict.fromkeys(one.canonical for group in groups for one in group)]
@@ -148,13 +128,13 @@ def _diagnose(
         if any(cause.indistinguishable_from for cause in found):
             verdict = AMBIGUOUS
     before, after = disturbances(search, comparison)
-    regions = _regions(found, before if found else after, effects, profile_of(system).region_variables, seed)
+    regions = _regions(found, before if found else after, effects, profile.region_variables, seed)
     return Diagnosis(
         system=system.name,
         recording=RecordingSummary(len(recording.episodes), recording.samples, float(f"{recording.period:.9g}")),
         verdict=verdict,
         where=Where(
-            stage_shares(search, comparison, [each.cost for each in repeats]),
+            stage_shares(search, comparison, [cost for _, cost in repeats]),
             errors.by_state(system, rows.channels, bool(found)),
             regions,
         ),
@@ -166,6 +146,16 @@ def _diagnose(
         figures=figure_data(search, source, corrected, errors, before, after, regions),
         policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, best),
     )
+
+
+def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:
+    """The first effect of each group of twins; without effects that repeat readings, which are found by another method,
+    and without sensors with memory, which candidate models cannot linearise by the present state."""
+    out: list[type[Effect]] = []
+    for effect in effects:
+        if not (twins(effect, out, system) or effect.repeats_readings or remembers(effect)):
+            out.append(effect)
+    return out
 
 
 def _verdict(comparison: ModelComparison, errors: Errors, repeats: bool) -> str:

@@ -22,13 +22,9 @@ and for reported results."""
 
 
 class CandidateModel:
-    """A source with a set of effects, whose P parameters in all are arguments of its methods.
+    """A source with a set of effects along W windows of T rows; their P parameters in all are arguments of its methods.
 
-    Args:
-        system: the source.
-        effects: the set.
-        rows: the recording, W windows of T rows.
-        accuracy: COARSEST, COARSE or FINE.
+    `accuracy` is COARSEST, COARSE or FINE.
     """
 
     def __init__(self, system: System, effects: Sequence[type[Effect]], rows: Segments, accuracy: int = FINE) -> None:

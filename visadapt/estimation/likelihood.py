@@ -187,20 +187,11 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState, window_used:
 
 
 def fit(
-    models: Sequence[CandidateModel],
-    start: FitState,
-    window_used: Tensor,
-    iterations: int,
-    process_noise: bool = True,
+    models: Sequence[CandidateModel], start: FitState, window_used: Tensor, iterations: int, process_noise: bool = True
 ) -> FitState:
-    """The best fits found from `start` by damped Gauss-Newton steps.
+    """The best fits of C models of the same rows in at most `iterations` damped Gauss-Newton steps from `start`.
 
-    Args:
-        models: C candidate models of the same rows.
-        start: a start for each of them.
-        window_used: (C, W) 1 for the windows that each fit uses.
-        iterations: the most that are made.
-        process_noise: whether process noise is estimated; without, it stays at its lower bound.
+    `window_used` (C, W) is 1 for the windows that each fit uses. Without `process_noise` that stays at its lower bound.
     """
     if not process_noise:
         start = replace(start, log_process=torch.full_like(start.log_process, MIN_LOG_PROCESS))

@@ -54,8 +54,7 @@ class Noise:
 def most_probable_noise(episodes: Sequence[UnknownNoise], guess: Noise | None = None) -> Noise:
     """The noise (K = 1) of largest posterior density over all episodes, by pattern search (Hooke and Jeeves 1961).
 
-    Args:
-        guess: the start of the search (K = 1); by default the mean of the prior.
+    It starts at `guess` (K = 1), by default at the mean of the prior.
     """
     width = len(episodes[0].shapes)
     middle, spread = torch.tensor([PROCESS_PRIOR] * width + [MEASUREMENT_PRIOR], dtype=torch.float64).T

@@ -37,12 +37,9 @@ class RepeatedReadings:
 def find_repeats(
     measured: Sequence[Tensor], channels: tuple[int, ...], angle_sensor: Sequence[int]
 ) -> RepeatedReadings:
-    """Find repeated readings in episodes (T, m).
+    """Find repeated readings in episodes (T, m) of these columns of the state.
 
-    Args:
-        measured: the episodes.
-        channels: the state's columns that were measured.
-        angle_sensor: columns of the angle, which may stand still on its own, and of its rate; empty without one.
+    `angle_sensor` are the columns of the angle, which may stand still on its own, and of its rate; empty without one.
     """
     together = torch.cat(list(measured))
     steps = [smallest_step(together[:, k]) for k in range(len(channels))]
@@ -76,14 +73,10 @@ def _repeats(readings: Tensor, jump: float) -> Tensor:
 
 
 def zone(repeated: Tensor, angle: Tensor, deviation: float) -> tuple[float, float, float]:
-    """Start and end of the zone of angles in which a sensor stands still, and their standard deviation.
+    """Start and end in rad of the zone of angles in which a sensor stands still, and their standard deviation.
 
-    Args:
-        repeated: (N,) whether the reading is repeated.
-        angle: (N,) estimated angles, rad.
-        deviation: rad, standard deviation of their normal error.
-
-    Posterior mean over a grid of both edges, with a uniform prior.
+    Given whether each of N readings is `repeated`, and estimates of their angles with a normal error of this `deviation`
+    in rad. Posterior mean over a grid of both edges, with a uniform prior.
     """
     inside = angle[repeated]
     # An edge may lie anywhere between the last angle with a repeated reading and the next without.

@@ -126,12 +126,7 @@ def screen(
 ) -> list[Candidate]:
     """The best parameter values of every effect of `candidates` that raises the likelihood, the largest gain first.
 
-    Args:
-        system: the source.
-        effects: the fitted set.
-        fits: its fit (C = 1).
-        rows: the recording.
-        candidates: the effects to try.
+    They are added to a set of `effects` with its fit (C = 1).
     """
     covered = spans(system, rows, fits.state[0])
     by_stride: dict[int, Sensitivity] = {}

@@ -63,15 +63,11 @@ def cut(
     longest: int,
     stretches: Sequence[tuple[int, int, int]] | None = None,
 ) -> Segments:
-    """Cut each episode into windows of nearly equal length.
+    """Cut each episode into windows of nearly equal length, at most `longest` rows of `period` s.
 
     Args:
-        measured: (T, m) of each episode.
-        valid: (T, m) 1 where a measurement may be used.
+        measured, valid: (T, m) of each episode; `valid` is 1 where a measurement of these `channels` may be used.
         commands: (T, n_action).
-        channels: the state's columns that were measured.
-        period: s between rows.
-        longest: rows of a window at most.
         stretches: the parts to use, as (episode index, first row, row past the last); whole episodes by default.
     """
     pieces = []

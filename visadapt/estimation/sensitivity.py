@@ -18,12 +18,7 @@ from visadapt.systems import System
 
 class Innovations:
     """Innovations over their standard deviations, of N readings in all, projected off the derivatives by the set's own
-    parameters: what refitting those would explain is not attributed to anything new.
-
-    Args:
-        model: the set.
-        fits: its fit (C = 1).
-    """
+    parameters: what refitting those would explain is not attributed to anything new. The set has one fit (C = 1)."""
 
     def __init__(self, model: CandidateModel, fits: FitState) -> None:
         rows = model.rows

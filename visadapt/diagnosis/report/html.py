@@ -17,12 +17,7 @@ from visadapt.systems import SYSTEMS
 
 
 def write_report(path: str | os.PathLike[str], diagnosis: Diagnosis, settings: Mapping[str, str]) -> None:
-    """Write the page, atomically.
-
-    Args:
-        path: of the page.
-        diagnosis: its content.
-        settings: what the diagnosis depends on (files, seed, versions), for the footer.
+    """Write the page, atomically; `settings` for its foot are what the diagnosis depends on (files, seed, versions).
 
     Raises:
         DiskFullError: the disk is full; an earlier file at `path` is kept.

@@ -160,25 +160,20 @@ MIN_REPEATS = 2
 """Repeated readings required for a cause."""
 
 
-@dataclass(frozen=True)
-class RepeatCause:
-    """A cause that repeats readings."""
-
-    cause: Cause
-    cost: float  # log likelihood that would be lost if the repeated readings were taken for measurements
-
-
 def repeated_reading_causes(
     recording: PreparedRecording, search: Search, comparison: ModelComparison
-) -> list[RepeatCause]:
-    """The causes of repeated readings; their probability is 1, since noise never repeats a reading."""
+) -> list[tuple[Cause, float]]:
+    """The causes of repeated readings; their probability is 1, since noise never repeats a reading.
+
+    Each with the log likelihood that would be lost if the readings that it repeats were taken for measurements.
+    """
     out = []
     repeats = recording.repeats
     lost, rows = sum(int(x.sum()) for x in repeats.lost), sum(len(x) - 1 for x in repeats.lost)
     if lost >= MIN_REPEATS:
         parameters = {"rate": Estimate(lost / rows, Dropout.table[0].unit, wilson(lost, rows, Z_90))}
         cost = _cost(recording, search, comparison, repeats.lost)
-        out.append(RepeatCause(Cause(Dropout.name, parameters, 1.0, math.nan), cost))
+        out.append((Cause(Dropout.name, parameters, 1.0, math.nan), cost))
     frozen = sum(int(x.sum()) for x in repeats.frozen)
     in_windows = int(_in_windows(recording.rows, repeats.frozen).sum())
     if frozen >= MIN_REPEATS and (recording.defect is not None or in_windows >= MIN_REPEATS):
@@ -189,7 +184,7 @@ def repeated_reading_causes(
             for name, edge in (("start", start), ("end", end))
         }
         cost = _cost(recording, search, comparison, repeats.frozen)
-        out.append(RepeatCause(Cause(FrozenZone.name, parameters, 1.0, math.nan), cost))
+        out.append((Cause(FrozenZone.name, parameters, 1.0, math.nan), cost))
     return out
 
 

@@ -75,14 +75,7 @@ def folds(rows: Segments, most: int) -> Tensor:
 def held_out(
     system: System, rows: Segments, sets: Sequence[tuple[Effects, FitState]], black_box: bool = False
 ) -> list[RolloutErrors]:
-    """Cross-validated predictions of each set.
-
-    Args:
-        system: the source.
-        rows: the recording.
-        sets: each set of effects and its fit to all rows.
-        black_box: whether to add a black box to the fitted sets.
-    """
+    """Cross-validated predictions of each set of effects, given its fit to all rows, perhaps with a black box added."""
     out = folds(rows, profile_of(system).folds)
     count = len(out)
     models = [CandidateModel(system, effects, rows, COARSE) for effects, _ in sets for _ in range(count)]

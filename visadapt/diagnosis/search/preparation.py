@@ -66,13 +66,13 @@ def prepare(recording: Recording, system: System) -> PreparedRecording:
     defect = sensor_checks.angle_defect(system, rows, source)
     band = None
     if defect is not None:
-        band = (defect.low, defect.high)
+        band, full_turns = defect
         angle = channels.index(profile.angle_sensor[0])
         bad = [sensor_checks.between(values[:, angle], *band) for values in states]
-        if defect.full_turns:
+        if full_turns:
             # A potentiometer's dead zone has an unknown width, so windows end at it, and the angle runs from one of its
             # edges to the other, so that an error of the sensor's scale is symmetric about upright.
-            states = [sensor_checks.on_one_turn(values, angle, 0.5 * (defect.low + defect.high)) for values in states]
+            states = [sensor_checks.on_one_turn(values, angle, 0.5 * (band[0] + band[1])) for values in states]
             rows, raw, thinning = windows(states, sensor_checks.stretches_without(bad))
         else:
             rows = sensor_checks.without_angles(rows, profile.angle_sensor, *band)

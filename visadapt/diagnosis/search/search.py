@@ -60,21 +60,13 @@ class ScoredModel:
 
 
 class Search:
-    """The sets of effects fitted so far to one recording, and how to fit more.
+    """The sets of effects of a catalogue fitted so far to one recording, and how to fit more.
 
-    Args:
-        system: the source.
-        rows: the recording.
-        catalogue: the effects that are searched.
-        source: the fit of the source to these rows, if it is already known.
+    `source` is the fit of the source to these rows, if it is already known.
     """
 
     def __init__(
-        self,
-        system: System,
-        rows: Segments,
-        catalogue: Sequence[type[Effect]],
-        source: FitState | None = None,
+        self, system: System, rows: Segments, catalogue: Sequence[type[Effect]], source: FitState | None = None
     ) -> None:
         self.system = system
         self.profile = profile_of(system)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import torch
@@ -40,11 +40,7 @@ def continuous_quaternion(measured: Tensor, quaternion: Sequence[int]) -> Tensor
 def opposite_signs(system: System, rows: Segments, source: FitState, fitted: FitState | None) -> Convention | None:
     """The convention in which the recording is far likelier than in the source's, if there is one.
 
-    Args:
-        system: the source.
-        rows: the recording.
-        source: a fit of the source to the recording before bad readings were excluded.
-        fitted: its fit to `rows`, if known.
+    `source` is a fit of the source before bad readings were excluded, `fitted` that to `rows`, if known.
     """
     profile = profile_of(system)
     if not profile.sign_conventions or float(source.log_process.max()) < SUSPICIOUS_LOG_PROCESS:
@@ -112,17 +108,11 @@ MIN_STRETCH_ROWS = 15
 """Rows between two passes of a defective band for them to be used."""
 
 
-@dataclass(frozen=True)
-class Defect:
-    """A band of angles in which the sensor is defective."""
+def angle_defect(system: System, rows: Segments, fits: FitState) -> tuple[tuple[float, float], bool] | None:
+    """The band of angles where following the readings takes far greater torques than elsewhere, by the source's fit.
 
-    low: float  # rad
-    high: float  # rad
-    full_turns: bool  # whether the pole turns all the way round
-
-
-def angle_defect(system: System, rows: Segments, fits: FitState) -> Defect | None:
-    """The band of angles where following the readings takes far greater torques than elsewhere, by the source's fit."""
+    Its edges in rad, and whether the pole turns all the way round; None where there is no such band.
+    """
     angle_sensor = profile_of(system).angle_sensor
     if not angle_sensor or float(fits.log_process[0, 1]) < SUSPICIOUS_LOG_PROCESS:
         return None
@@ -138,7 +128,7 @@ def angle_defect(system: System, rows: Segments, fits: FitState) -> Defect | Non
         return None
     bands = defective.nonzero()[:, 0]
     low, high = (BAND * float(edge) - math.pi for edge in (bands.min(), bands.max() + 1))
-    return Defect(low, high, float((count > 0).double().mean()) > FULL_TURN_SHARE)
+    return (low, high), float((count > 0).double().mean()) > FULL_TURN_SHARE
 
 
 def between(theta: Tensor, low: float, high: float) -> Tensor:

@@ -99,7 +99,7 @@ def _blocks(model: CandidateModel, fits: FitState) -> list[Block]:
     no_reading = torch.zeros(*rows.used.shape, BUMPS, dtype=torch.float64)
     out = []
     for name, values in variables.items():
-        bumps = _bumps(values, _ends(values, rows.inside > 0))
+        bumps = _bumps(values, rows.inside > 0)
         inner = bumps[:, :-1] * rows.inside[:, 1:, None]
         for k, load in enumerate(system.loads):
             for factor in model.profile.black_box_factors.get(load.name, (None,)):
@@ -135,15 +135,10 @@ def loads_of(model: CandidateModel, fits: FitState) -> Tensor:
     return linearise(loaded, theta, fits.state[0]).by_parameter[..., -count:]
 
 
-def _ends(values: Tensor, inside: Tensor) -> tuple[float, float]:
-    """The 1 % and 99 % quantiles of values (W, T)."""
+def _bumps(values: Tensor, inside: Tensor) -> Tensor:
+    """Bumps (W, T, BUMPS) at values (W, T), with centres evenly spaced from their 1 % to their 99 % quantile."""
     low, high = torch.quantile(values[inside], torch.tensor([0.01, 0.99], dtype=values.dtype)).tolist()
-    return low, max(high, low + 1e-9)
-
-
-def _bumps(values: Tensor, ends: tuple[float, float]) -> Tensor:
-    """Bumps (..., BUMPS) at values (...), with centres evenly spaced between the ends."""
-    centres = torch.linspace(*ends, BUMPS, dtype=values.dtype)
+    centres = torch.linspace(low, max(high, low + 1e-9), BUMPS, dtype=values.dtype)
     width = centres[1] - centres[0]
     return torch.exp(-0.5 * ((values[..., None] - centres) / width).square())
 
