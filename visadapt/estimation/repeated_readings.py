@@ -75,8 +75,8 @@ def _repeats(readings: Tensor, jump: float) -> Tensor:
 def zone(repeated: Tensor, angle: Tensor, deviation: float) -> tuple[float, float, float]:
     """Start and end in rad of the zone of angles in which a sensor stands still, and their standard deviation.
 
-    Given whether each of N readings is `repeated`, and estimates of their angles with a normal error of this `deviation`
-    in rad. Posterior mean over a grid of both edges, with a uniform prior.
+    Given whether each of N readings is `repeated`, and their estimated angles with a normal error of `deviation` rad.
+    Posterior mean over a grid of both edges, with a uniform prior.
     """
     inside = angle[repeated]
     # An edge may lie anywhere between the last angle with a repeated reading and the next without.

@@ -7,8 +7,6 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-import jinja2
-
 from visadapt.diagnosis.report import figures, text
 from visadapt.diagnosis.result import Diagnosis
 from visadapt.effects import EFFECTS
@@ -29,32 +27,14 @@ def write_report(path: str | os.PathLike[str], diagnosis: Diagnosis, settings: M
 
 def as_html(diagnosis: Diagnosis, settings: Mapping[str, str]) -> str:
     """The page: no scripts, no external resources; light or dark as the browser prefers."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("visadapt.diagnosis.report", "."),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-    )
-    environment.filters |= {
-        "plain": text.plain,
-        "number": text.number,
-        "percent": text.percent,
-        "estimate": text.estimate,
-        "interval": text.interval,
-        "effects": text.effects,
-        "either": lambda names: text.listed(names, "or"),
-        "region": lambda region: text.region(region, diagnosis.system),
-    }
     gaps = _gaps(diagnosis)
-    return environment.get_template("page.html").render(
-        diagnosis=diagnosis,
-        sentence=text.sentence(diagnosis),
+    return text.rendered(
+        "page.html",
+        diagnosis,
         gaps=gaps,
         largest=max((value for _, value, _ in gaps if math.isfinite(value)), default=0.0),
         equations={name: effect.equation for name, effect in EFFECTS.items()},
         figures=_figures(diagnosis),
-        corrected=text.corrected(diagnosis),
-        policy=text.policy_terms(diagnosis),
         settings=settings,
     )
 
