@@ -9,11 +9,9 @@ from torch import Tensor
 
 from visadapt.batch import Batch
 
-LENGTH = 5
-"""Observations and actions kept (the paper, section 3.2.2)."""
+LENGTH = 5  # Observations and actions kept (the paper, section 3.2.2)
 
-HORIZON = 10
-"""Actions planned at once, k in the paper; only the first is executed before planning again."""
+HORIZON = 10  # Actions planned at once, k in the paper; only the first is executed before planning again
 
 
 @dataclass(frozen=True)

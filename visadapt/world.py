@@ -104,11 +104,7 @@ class World(nn.Module):
         return made
 
     def start(
-        self,
-        state: Tensor,
-        time: Tensor | None = None,
-        commands: Tensor | None = None,
-        states: Tensor | None = None,
+        self, state: Tensor, time: Tensor | None = None, commands: Tensor | None = None, states: Tensor | None = None
     ) -> WorldState:
         """The world in the state (B, n_state), at the start of an episode or within one; its row is not read yet.
 

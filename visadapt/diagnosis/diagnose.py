@@ -49,8 +49,7 @@ MIN_GAP_CLOSED = 0.95
 CLEAR_OF_NOISE = 3.0
 """Error of the corrected predictions over the noise, above which the share of the gap closed decides the verdict."""
 
-RUNNERS_UP = 2
-"""Sets after the best for which the share of the gap that they close is computed."""
+RUNNERS_UP = 2  # Sets after the best for which the share of the gap that they close is computed
 
 
 @torch.inference_mode()

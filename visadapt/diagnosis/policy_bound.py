@@ -40,8 +40,7 @@ from visadapt.systems import System
 StatesToActions = Policy | Callable[[Tensor], Any]
 """A policy on states: a `Policy`, or a function from states (N, n_state) to actions (N, n_action) in [-1, 1]."""
 
-COMMAND_POINTS = 41
-"""Commands from -1 to 1 at which a step is computed; between them it is interpolated linearly."""
+COMMAND_POINTS = 41  # Commands from -1 to 1 at which a step is computed; between them it is interpolated linearly
 
 
 def check(policy: StatesToActions, system: System) -> None:

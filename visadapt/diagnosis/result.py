@@ -20,8 +20,7 @@ from visadapt.effects import EFFECTS, Effect
 IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP = "identified", "ambiguous", "unexplained", "no_gap"
 VERDICTS = (IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP)
 
-SCHEMA_VERSION = 1
-"""Version of `schema.json`."""
+SCHEMA_VERSION = 1  # Version of `schema.json`
 
 KEYS = {"start": "from", "end": "to"}
 NOT_IN_JSON = ("figures", "policy")

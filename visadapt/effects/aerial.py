@@ -18,8 +18,7 @@ from visadapt.systems import FixedWing, Quadrotor, System
 from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, beside, rotation, times
 
 Vehicle: TypeAlias = Quadrotor | FixedWing
-VEHICLES: tuple[type[System], ...] = (Quadrotor, FixedWing)
-"""The systems that have a wind."""
+VEHICLES: tuple[type[System], ...] = (Quadrotor, FixedWing)  # The systems that have a wind
 
 
 def airspeed(state: Tensor, vehicle: Vehicle) -> Tensor:

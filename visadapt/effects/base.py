@@ -31,16 +31,11 @@ class Stage(StrEnum):
 class Role(StrEnum):
     """What a parameter stands for, where a fit must treat it in a special way."""
 
-    PLAIN = "plain"
-    """Nothing special: a strength, or a shape such as a spring's rest position."""
-    START = "start"
-    """Where a region of a state or of time starts; searched within what the recording covers."""
-    END = "end"
-    """Where that region ends."""
-    FREQUENCY = "frequency"
-    """In Hz; searched on a logarithmic grid."""
-    PHASE = "phase"
-    """In rad; equal modulo a turn."""
+    PLAIN = "plain"  # Nothing special: a strength, or a shape such as a spring's rest position
+    START = "start"  # Where a region of a state or of time starts; searched within what the recording covers
+    END = "end"  # Where that region ends
+    FREQUENCY = "frequency"  # In Hz; searched on a logarithmic grid
+    PHASE = "phase"  # In rad; equal modulo a turn
 
 
 @dataclass(frozen=True)
@@ -272,5 +267,4 @@ def inside(place: Tensor, start: Tensor, end: Tensor, width: float) -> Tensor:
     return (((place - start) / width).sigmoid() - ((place - end) / width).sigmoid()).clamp_min(0)
 
 
-EFFECTS: dict[str, type[Effect]] = {}
-"""Every effect by its standard name."""
+EFFECTS: dict[str, type[Effect]] = {}  # Every effect by its standard name

@@ -83,8 +83,7 @@ class FrozenZone(SensingEffect):
         Parameter("end", "rad", -0.5, 0.5, 0.0, role=Role.END),
     )
 
-    EDGE: ClassVar[float] = 0.001
-    """rad"""
+    EDGE: ClassVar[float] = 0.001  # rad
 
     def memory(self, state: Tensor, period: float) -> Tensor:
         return state[:, None, _POLE]

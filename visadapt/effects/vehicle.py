@@ -161,8 +161,7 @@ class GroundEffect(DynamicsEffect):
     table = (Parameter("radius", "m", 0.0, 1.0, 0.0), Parameter("ground", "m", -3.0, 3.0, None))
     systems = (Quadrotor,)
 
-    LEAST: ClassVar[float] = 1e-30
-    """m8, keeps the root positive where both height and radius are 0"""
+    LEAST: ClassVar[float] = 1e-30  # m8, keeps the root positive where both height and radius are 0
 
     def vary(self, system: System, time: Tensor, state: Tensor) -> System:
         vehicle = expect(system, self)

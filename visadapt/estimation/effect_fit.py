@@ -49,11 +49,7 @@ class EffectFit:
 
 @torch.no_grad()
 def fit_effects(
-    system: System,
-    effects: Sequence[Effect],
-    measured: Sequence[Tensor],
-    commands: Sequence[Tensor],
-    period: float,
+    system: System, effects: Sequence[Effect], measured: Sequence[Tensor], commands: Sequence[Tensor], period: float
 ) -> EffectFit:
     """Fit the parameters of `effects`, all together, within the ranges that they state.
 

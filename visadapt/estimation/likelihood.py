@@ -35,14 +35,11 @@ MIN_LOG_PROCESS = math.log(1e-4**2)
 MAX_LOG_PROCESS = math.log(3.0**2)
 """Bounds of the log process noise variance of the driven velocities, (m/s)^2 and (rad/s)^2."""
 
-MIN_ITERATION_GAIN = 0.02
-"""Log likelihood; a fit stops after two iterations in a row that gain less."""
+MIN_ITERATION_GAIN = 0.02  # Log likelihood; a fit stops after two iterations in a row that gain less
 
-MIN_MEASUREMENT_VARIANCE = 1e-12
-"""Lower bound of a measurement's variance, in its unit squared."""
+MIN_MEASUREMENT_VARIANCE = 1e-12  # Lower bound of a measurement's variance, in its unit squared
 
-MAX_DAMPING = 100.0
-"""Damping at which a fit stops, since its steps have become too short to gain anything."""
+MAX_DAMPING = 100.0  # Damping at which a fit stops, since its steps have become too short to gain anything
 
 LOG_VARIANCE_STEP = 1e-3
 MAX_LOG_VARIANCE_CHANGE = 1.5

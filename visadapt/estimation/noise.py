@@ -14,15 +14,13 @@ from torch import Tensor
 
 from visadapt.estimation.kalman import Filtered, Linear, forward, log_likelihood
 
-PROCESS_PRIOR = (-1.0, 1.5)
-"""Mean and standard deviation of the normal prior of log10 q."""
+PROCESS_PRIOR = (-1.0, 1.5)  # Mean and standard deviation of the normal prior of log10 q
 
 MEASUREMENT_PRIOR = (0.5, 0.5)
 """Mean and standard deviation of the normal prior of log10 s; s above 1 is likelier, since errors of neighbouring
 pixels are correlated and a fit that assumes them independent understates its standard deviation."""
 
-MAX_ROUNDS = 12
-"""Rounds of the pattern search; each tries all combinations of steps -1, 0, 1 in every parameter."""
+MAX_ROUNDS = 12  # Rounds of the pattern search; each tries all combinations of steps -1, 0, 1 in every parameter
 
 FIRST_STEP, REFINED_STEP, LAST_STEP = 0.8, 0.3, 0.15
 """Step lengths in prior standard deviations: the first, the first when a guess is given, and the shortest."""

@@ -18,11 +18,9 @@ MIN_JUMP_STEPS = 8
 """Jump into or out of a run of equal readings, in steps of the sensor's resolution, above which the run counts as
 repeated; below, the quantity may have stood still."""
 
-ZONE_EDGE_POINTS = 120
-"""Angles tried for either edge of the zone in which the angle sensor stands still."""
+ZONE_EDGE_POINTS = 120  # Angles tried for either edge of the zone in which the angle sensor stands still
 
-SMOOTHING_RATIO = 1 / 3
-"""Assumed standard deviation of a smoothed angle over that of a measured one."""
+SMOOTHING_RATIO = 1 / 3  # Assumed standard deviation of a smoothed angle over that of a measured one
 
 
 @dataclass(frozen=True)

@@ -45,8 +45,7 @@ class Innovations:
 PROBE_SHARE = 0.02
 """Share of the range, from neutral, at which a parameter is probed that the effect is proportional to."""
 
-DIFFERENCE_SHARE = 1e-4
-"""Share of its range by which a parameter is moved to take a finite difference."""
+DIFFERENCE_SHARE = 1e-4  # Share of its range by which a parameter is moved to take a finite difference
 
 
 @dataclass(frozen=True)

@@ -122,8 +122,7 @@ class Quadrotor(RigidBody):
         return delivered[:, 0], delivered[:, 1:]
 
 
-_EITHER_SIGN = ("centre_x", "centre_y", "wind_x", "wind_y", "wind_z")
-"""Parameters that may be negative."""
+_EITHER_SIGN = ("centre_x", "centre_y", "wind_x", "wind_y", "wind_z")  # Parameters that may be negative
 _MAY_BE_ZERO = (
     *("min_thrust", "payload", "rotor_1", "rotor_2", "rotor_3", "rotor_4"),
     *("damping_x", "damping_y", "damping_z"),

@@ -28,8 +28,7 @@ _PRODUCT = one_hot(_HAMILTON.abs() - 1) * _HAMILTON.sign()[..., None]
 
 # Matrices (I J, K) that map the flattened products of two vectors, (I,) and (J,), to a vector (K,): one matrix product
 # is faster than many small operations.
-_TURNING = _PRODUCT[:, 1:].flatten(0, 1) / 2
-"""q' = q (0, rates) / 2."""
+_TURNING = _PRODUCT[:, 1:].flatten(0, 1) / 2  # q' = q (0, rates) / 2
 _CONJUGATE = torch.tensor([1, -1, -1, -1])
 _TURNED = torch.einsum("iml,ljk,j->kmij", _PRODUCT[:, 1:], _PRODUCT[..., 1:], _CONJUGATE)
 _ROTATION = (_TURNED.triu() + _TURNED.tril(-1).mT).reshape(9, 16).T.contiguous().float()

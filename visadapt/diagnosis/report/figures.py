@@ -23,11 +23,9 @@ BEFORE, AFTER, BLACK_BOX = "#de7416", "#2f67c9", "#0e7a70"
 CSS_VARIABLES = {INK: "ink", MUTED: "muted", LINE: "line", BEFORE: "before", AFTER: "after", BLACK_BOX: "black-box"}
 """Colours in matplotlib, and the page's CSS variables that replace them."""
 
-MAX_STATES = 5
-"""States of a prediction that are plotted."""
+MAX_STATES = 5  # States of a prediction that are plotted
 
-FIGURE_WIDTH = 4.0
-"""inches; at the font size of STYLE, the text is readable on a phone"""
+FIGURE_WIDTH = 4.0  # inches; at the font size of STYLE, the text is readable on a phone
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # letters as text, not as paths
     "svg.hashsalt": "visadapt",  # fixed ids: equal diagnoses give equal pages

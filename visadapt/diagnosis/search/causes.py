@@ -26,8 +26,7 @@ from visadapt.estimation.segments import Segments
 from visadapt.evaluation.intervals import wilson
 from visadapt.systems import System
 
-Z_90 = 1.6449
-"""Half-width of a normal distribution's 90 % interval, in standard deviations."""
+Z_90 = 1.6449  # Half-width of a normal distribution's 90 % interval, in standard deviations
 
 GapClosed = Mapping[frozenset[str], float]
 """Share of the gap that a set closes on held-out episodes, by the names of its effects."""
@@ -156,8 +155,7 @@ def stage_shares(search: Search, comparison: ModelComparison, repeat_costs: Sequ
     return {stage: share / whole if whole > 0 else 0.0 for stage, share in shares.items()}
 
 
-MIN_REPEATS = 2
-"""Repeated readings required for a cause."""
+MIN_REPEATS = 2  # Repeated readings required for a cause
 
 
 def repeated_reading_causes(

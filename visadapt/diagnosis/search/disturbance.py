@@ -51,11 +51,9 @@ def disturbance(model: CandidateModel, fits: FitState, log_process: Tensor) -> D
     return Disturbance(load, valid, variables)
 
 
-BINS = 12
-"""Quantile bins of a variable; regions start and end at their edges."""
+BINS = 12  # Quantile bins of a variable; regions start and end at their edges
 
-SHIFTS = 400
-"""Random shifts in time of the disturbance against the variables, from which a p-value is counted."""
+SHIFTS = 400  # Random shifts in time of the disturbance against the variables, from which a p-value is counted
 
 MAX_P_VALUE = 0.01
 """p-value up to which a region is reported; a variable's p-value cannot be below 1 / (1 + SHIFTS), so the limit rises

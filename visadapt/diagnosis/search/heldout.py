@@ -25,11 +25,9 @@ from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
 
-PREDICTION_TIME = 0.5
-"""s; the horizon at which the gap is measured."""
+PREDICTION_TIME = 0.5  # s; the horizon at which the gap is measured
 
-REFIT_ITERATIONS = 5
-"""Iterations of a fit without a fold, which starts from the fit to all episodes."""
+REFIT_ITERATIONS = 5  # Iterations of a fit without a fold, which starts from the fit to all episodes
 
 STATE_LIMIT = 1e3
 """Bound on predicted states, in their units, so that an unstable prediction gives a large but finite error."""

@@ -13,8 +13,7 @@ from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import Effects
 
-COMPARE_WITHIN = 10.0
-"""Log posterior odds; models further behind the best are not compared."""
+COMPARE_WITHIN = 10.0  # Log posterior odds; models further behind the best are not compared
 
 MIN_LEFTOVER = 5.0
 """Log likelihood that process noise must add to a model for something to count as unexplained, and the most that a

@@ -29,8 +29,7 @@ from visadapt.estimation.segments import Segments
 from visadapt.progress import Progress
 from visadapt.systems import System
 
-MAX_EFFECTS = 6
-"""Effects in a set at most."""
+MAX_EFFECTS = 6  # Effects in a set at most
 
 MAX_CANDIDATES, MAX_EXCHANGES = 8, 5
 """Effects that are fitted in addition to each set when sets grow, and when one effect is exchanged."""

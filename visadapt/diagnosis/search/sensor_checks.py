@@ -92,8 +92,7 @@ def derived_velocities(system: System, rows: Segments) -> dict[str, float]:
     return out
 
 
-BAND = 0.1
-"""rad, width of the bands of angle that are tested."""
+BAND = 0.1  # rad, width of the bands of angle that are tested
 
 POWER_RATIO = 25.0
 MIN_BAND_ROWS = 5
@@ -101,11 +100,9 @@ MAX_ROWS_SHARE = 0.15
 """A band is defective if the mean square of the disturbance torque in it exceeds POWER_RATIO times the median
 over bands, on at least MIN_BAND_ROWS rows; all defective bands together hold at most MAX_ROWS_SHARE of the rows."""
 
-FULL_TURN_SHARE = 0.8
-"""Share of the circle's bands that the pole visits, above which it turns all the way round."""
+FULL_TURN_SHARE = 0.8  # Share of the circle's bands that the pole visits, above which it turns all the way round
 
-MIN_STRETCH_ROWS = 15
-"""Rows between two passes of a defective band for them to be used."""
+MIN_STRETCH_ROWS = 15  # Rows between two passes of a defective band for them to be used
 
 
 def angle_defect(system: System, rows: Segments, fits: FitState) -> tuple[tuple[float, float], bool] | None:

@@ -20,14 +20,11 @@ from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.linearise import load_effect
 from visadapt.estimation.sensitivity import Innovations
 
-BUMPS = 10
-"""Gaussian bumps of a function."""
+BUMPS = 10  # Gaussian bumps of a function
 
-MAX_FUNCTIONS = 8
-"""Functions of a black box at most."""
+MAX_FUNCTIONS = 8  # Functions of a black box at most
 
-PREVIOUS_PREFIX = "previous_"
-"""Prefix of the name of a command in the period before."""
+PREVIOUS_PREFIX = "previous_"  # Prefix of the name of a command in the period before
 
 PRIOR_DEVIATIONS = (0.03, 0.3, 3.0, 30.0)
 """Prior standard deviations that are tried for the change of the whitened innovations by all bumps together."""
