@@ -20,9 +20,8 @@ from visadapt.effects import Dropout, Effect, FrozenZone, Parameter, Role
 from visadapt.effects.catalogue import twins
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import posterior
-from visadapt.estimation.repeated_readings import SMOOTHING_RATIO, zone
 from visadapt.estimation.screening import spans
-from visadapt.estimation.segments import Segments
+from visadapt.estimation.segments import SMOOTHING_RATIO, Segments, zone
 from visadapt.evaluation.intervals import wilson
 from visadapt.systems import System
 
