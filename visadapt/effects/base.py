@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -218,6 +218,9 @@ class DynamicsEffect(Effect):
         return torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)
 
 
+Reading: TypeAlias = tuple[Tensor, Tensor]  # what a sensor reads of a row (B, n_state), and its new memory
+
+
 class SensingEffect(Effect):
     """Changes what is measured of the state, row by row.
 
@@ -237,9 +240,7 @@ class SensingEffect(Effect):
         """
         return state[:, None, :0]
 
-    def apply_to(
-        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
-    ) -> tuple[Tensor, Tensor]:
+    def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
         """The reading of one row (B, n_state) and the new memory; rows are `period` s apart.
 
         Only random effects need the `generator`.

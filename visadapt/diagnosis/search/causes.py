@@ -12,7 +12,7 @@ from torch import Tensor
 from visadapt.diagnosis.result import Cause, Estimate, Ranked
 from visadapt.diagnosis.search import heldout
 from visadapt.diagnosis.search.heldout import RolloutErrors
-from visadapt.diagnosis.search.model_comparison import ComparedModel, ModelComparison, exchanged
+from visadapt.diagnosis.search.model_comparison import ComparedModel, ModelComparison
 from visadapt.diagnosis.search.preparation import PreparedRecording
 from visadapt.diagnosis.search.search import ScoredModel, Search
 from visadapt.diagnosis.search.sensor_checks import BAND
@@ -49,7 +49,7 @@ def alternatives(
     out = []
     for effect, rivals in comparison.alternatives.items():
         fitted = [(effect, comparison.models[0])]
-        fitted += [(exchanged(comparison.best.effects, rival.model.effects), rival) for rival in rivals]
+        fitted += [(e, rival) for rival in rivals for e in rival.model.effects if e not in comparison.best.effects]
         group = [Alternative(twin, model, own) for own, model in fitted for twin in [own, *twins(own, effects, system)]]
         out.append([one for one in group if one.effect in effects])
     return out

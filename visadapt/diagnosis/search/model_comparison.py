@@ -11,7 +11,6 @@ from visadapt.diagnosis.search.search import ScoredModel, Search
 from visadapt.diagnosis.search.unexplained import BlackBoxFunction, black_box_functions
 from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel
-from visadapt.estimation.fit_states import Effects
 
 COMPARE_WITHIN = 10.0  # Log posterior odds; models further behind the best are not compared
 
@@ -101,8 +100,3 @@ def _alternatives(models: Sequence[ComparedModel], effect: type[Effect]) -> list
         members.append(rival)
         reached += rival.probability
     return members
-
-
-def exchanged(first: Effects, other: Effects) -> type[Effect]:
-    """The one effect of `other` that is not in `first`."""
-    return next(e for e in other if e not in first)

@@ -95,7 +95,9 @@ class Search:
         self._settle()
         if self.leftover([self.best])[0] > WIDEN_ABOVE:
             # Something is unexplained: perhaps two effects that only together beat single effects which fit fairly.
-            self._widen()
+            for size in (1, 2):
+                bases = [f for f in self.ranked if len(f.effects) == size and f.log_odds > -math.inf]
+                self.extend(bases[:WIDEN_MODELS])
             self._settle()
         if progress is not None:
             progress(MAX_EFFECTS, MAX_EFFECTS, -self.best.log_odds)
@@ -108,12 +110,6 @@ class Search:
             self.polish()
             if self.best.names == before.names:
                 return
-
-    def _widen(self) -> None:
-        """Extend more of the sets of one effect, then of two."""
-        for size in (1, 2):
-            bases = [f for f in self.ranked if len(f.effects) == size and f.log_odds > -math.inf][:WIDEN_MODELS]
-            self.extend(bases)
 
     @property
     def source(self) -> ScoredModel:
