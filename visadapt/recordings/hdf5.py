@@ -109,7 +109,10 @@ def _opened(path: Path) -> Iterator[h5py.File]:
         raise RecordingError(f"{path}: there is no such file")
     try:
         with h5py.File(path, "r") as file:
-            _check_version(path, file)
+            if file.attrs.get("format") != FORMAT:
+                raise RecordingError(f"{path}: an HDF5 file, but its attribute 'format' is not {FORMAT!r}")
+            if (version := file.attrs.get("version")) != VERSION:
+                raise RecordingError(f"{path}: version {version} of the format; this visadapt reads version {VERSION}")
             yield file
     except OSError as error:
         # HDF5's own message describes its internals and may be several lines long.
@@ -133,42 +136,27 @@ def _write_episode(group: h5py.Group, episode: Episode) -> None:
         group.create_dataset("frame", data=episode.frame, chunks=chunks, compression="gzip", fletcher32=True)
 
 
-def _check_version(path: Path, file: h5py.File) -> None:
-    if file.attrs.get("format") != FORMAT:
-        raise RecordingError(f"{path}: an HDF5 file, but its attribute 'format' is not {FORMAT!r}")
-    version = file.attrs.get("version")
-    if version != VERSION:
-        raise RecordingError(f"{path}: version {version} of the format; this visadapt reads version {VERSION}")
-
-
 def _read_episode(path: Path, file: h5py.File, number: int, frames: bool) -> Episode:
     where = f"{path}: {_group_name(number)}"
     group = file.get(_group_name(number))
     if not isinstance(group, h5py.Group):
         raise RecordingError(f"{where} is missing; {len(file)} groups, numbered from 0, were expected")
-    time, action = _read(where, group, "time"), _read(where, group, "action")
-    if time is None or action is None:
-        raise RecordingError(f"{where} has no dataset {'time' if time is None else 'action'!r}")
-    state = _read(where, group, "state")
-    if state is None and not frames:
+    for name in ("time", "action"):
+        if name not in group:
+            raise RecordingError(f"{where} has no dataset {name!r}")
+    if "state" not in group and not frames:
         raise RecordingError(f"{where} holds frames alone; states are needed")
+    arrays: dict[str, NDArray[Any]] = {}
+    for name in ("time", "action", "state", "task_state", *(["frame"] if frames else [])):
+        try:
+            if name in group:
+                arrays[name] = np.asarray(group[name][()])
+        except (OSError, TypeError) as error:  # a group has no values
+            raise RecordingError(f"{where}: {name!r} is damaged, or no dataset, and cannot be read") from error
     try:
-        frame = _read(where, group, "frame") if frames else None
-        return Episode(time, action, state, frame, _read(where, group, "task_state"))
+        return Episode(**arrays)
     except ValueError as error:
         raise RecordingError(f"{where}: {error}") from error
-
-
-def _read(where: str, group: h5py.Group, name: str) -> NDArray[Any] | None:
-    dataset = group.get(name)
-    if dataset is None:
-        return None
-    if not isinstance(dataset, h5py.Dataset):
-        raise RecordingError(f"{where}: {name!r} is a group; a dataset was expected")
-    try:
-        return np.asarray(dataset[()])
-    except OSError as error:
-        raise RecordingError(f"{where}: {name!r} is damaged and cannot be read") from error
 
 
 def _check_alike(path: Path, episodes: Sequence[Episode]) -> None:
@@ -176,14 +164,10 @@ def _check_alike(path: Path, episodes: Sequence[Episode]) -> None:
     if not episodes:
         raise RecordingError(f"{path}: a recording needs at least one episode")
     for name in ("action", "state", "frame", "task_state"):
-        first = _row_shape(getattr(episodes[0], name))
-        for number, episode in enumerate(episodes):
-            shape = _row_shape(getattr(episode, name))
+        every = [getattr(episode, name) for episode in episodes]
+        first, *others = (None if values is None else values.shape[1:] for values in every)
+        for number, shape in enumerate(others, 1):
             if shape != first:
                 raise RecordingError(
                     f"{path}: {_group_name(number)} has {name} rows of shape {shape}, the first episode of {first}"
                 )
-
-
-def _row_shape(values: NDArray[np.generic] | None) -> tuple[int, ...] | None:
-    return None if values is None else values.shape[1:]

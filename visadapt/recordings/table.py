@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,9 +25,8 @@ class Table:
     path: Path
     header: tuple[str, ...]
     separator: str
-    body: str
-    first_line: int
-    """line number of the body's first line"""
+    rows: tuple[tuple[int, str], ...]
+    """number and text of each row's line"""
 
     @classmethod
     def open(cls, path: Path) -> Table:
@@ -43,22 +41,19 @@ class Table:
             raise RecordingError(f"{path}: not text in UTF-8 (byte {error.start}); a CSV file is right") from error
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-        start, line = 0, 0
-        while start < len(text):
-            end = text.find("\n", start) + 1 or len(text)
-            first, line = text[start:end].strip(), line + 1
-            start = end
-            if first and not first.startswith("#"):
-                break
-        else:
+        lines = [(number, line.strip()) for number, line in enumerate(text.split("\n"), 1)]
+        lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
+        if not lines:
             raise RecordingError(f"{path}: is empty; a line of names and rows of numbers below it are right")
+        (number, first), *rows = lines
         separator = ";" if first.count(";") > first.count(",") else ","
         header = tuple(name.strip().strip('"') for name in first.split(separator))
         if all(_is_number(name) for name in header):
             raise RecordingError(
-                f"{path}: line {line} holds numbers where the columns' names belong (say episode,time,x,theta,command)"
+                f"{path}: line {number} holds numbers where the columns' names belong "
+                "(say episode,time,x,theta,command)"
             )
-        return cls(path, header, separator, text[start:], line + 1)
+        return cls(path, header, separator, tuple(rows))
 
     def numbers(self, columns: Sequence[int]) -> NDArray[np.float64]:
         """Some columns (rows, len(columns)); the other columns may hold anything.
@@ -67,52 +62,28 @@ class Table:
             RecordingError: no rows, a row with more or fewer cells than the header, or a cell that is not a number;
                 the message names row, line and column.
         """
-        if next(self._lines(), None) is None:
+        if not self.rows:
             raise RecordingError(f"{self.path}: has no rows below its line of names")
-        try:
-            values = np.loadtxt(
-                io.StringIO(self.body), delimiter=self.separator, comments="#", usecols=columns, ndmin=2
-            )
-        except ValueError:
-            return self._numbers_one_by_one(columns)
-        if self.body.count(self.separator) != len(values) * (len(self.header) - 1):
-            return self._numbers_one_by_one(columns)
-        return values
-
-    def place(self, row: int) -> str:
-        """The name in messages of a row, counted from 0."""
-        for index, (line, _) in enumerate(self._lines()):
-            if index == row:
-                return f"row {row + 1} (line {line})"
-        return f"row {row + 1}"
-
-    def _lines(self) -> Iterator[tuple[int, str]]:
-        """Number and text of each row's line."""
-        start, number = 0, self.first_line
-        while start < len(self.body):
-            end = self.body.find("\n", start) + 1 or len(self.body)
-            line = self.body[start:end].strip()
-            if line and not line.startswith("#"):
-                yield number, line
-            start, number = end, number + 1
-
-    def _numbers_one_by_one(self, columns: Sequence[int]) -> NDArray[np.float64]:
-        """Like `numbers`; slower, but it accepts quoted cells and finds the cell that is wrong."""
-        rows = []
-        for row, (number, line) in enumerate(self._lines()):
-            cells = next(csv.reader([line], delimiter=self.separator))
-            where = f"{self.path}: row {row + 1} (line {number})"
+        values = []
+        for row, (_, line) in enumerate(self.rows):
+            (cells,) = csv.reader([line], delimiter=self.separator)
+            where = f"{self.path}: {self.place(row)}"
             if len(cells) < len(self.header):
                 raise RecordingError(
                     f"{where} is cut short: {len(cells)} of {len(self.header)} cells; is the file incomplete?"
                 )
             if len(cells) > len(self.header):
                 raise RecordingError(f"{where} has {len(cells)} cells, the line of names {len(self.header)}")
-            for column in columns:
-                if not _is_number(cells[column]):
-                    raise RecordingError(f"{where}, column {self.header[column]!r} {_complaint(cells[column])}")
-            rows.append([float(cells[column]) for column in columns])
-        return np.array(rows)
+            try:
+                values.append([float(cells[column].partition("#")[0]) for column in columns])
+            except ValueError:
+                column = next(column for column in columns if not _is_number(cells[column]))
+                raise RecordingError(f"{where}, column {self.header[column]!r} {_complaint(cells[column])}") from None
+        return np.array(values)
+
+    def place(self, row: int) -> str:
+        """The name in messages of a row, counted from 0."""
+        return f"row {row + 1} (line {self.rows[row][0]})"
 
 
 def _is_number(cell: str) -> bool:
