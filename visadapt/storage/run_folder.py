@@ -25,18 +25,15 @@ def open_run(folder: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         RunError: the folder holds a run with other settings.
     """
-    path = folder / "settings.json"
     wanted = json.loads(json.dumps(_finite(settings), default=str))
-    if path.exists():
-        found = read_json(path)["settings"]
-        if found != wanted:
-            differing = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
-            raise RunError(
-                f"{folder} holds a run with other settings ({', '.join(differing)}): remove it or name another folder"
-            )
-        return read_json(path)
-    write_json(path, {"settings": wanted, "versions": versions()})
-    return read_json(path)
+    run = once(folder / "settings.json", lambda: {"settings": wanted, "versions": versions()})
+    found = run["settings"]
+    if found != wanted:
+        differing = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
+        raise RunError(
+            f"{folder} holds a run with other settings ({', '.join(differing)}): remove it or name another folder"
+        )
+    return run
 
 
 def versions() -> dict[str, str]:

@@ -11,29 +11,25 @@ from typing import Any
 
 from visadapt.targets.base import TargetError
 
-BACKEND_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
-"""Values of MUJOCO_GL and the shared library that each needs, the faster first."""
-
-HOW_TO_INSTALL = (
-    "install EGL (Debian: apt-get install libegl1 libgl1; then MUJOCO_GL=egl) "
-    "or OSMesa (apt-get install libosmesa6; then MUJOCO_GL=osmesa)"
-)
-
 
 def choose_backend() -> None:
     """Set MUJOCO_GL if it is unset and there is no display; must be called before mujoco is first imported."""
     displayed = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if "MUJOCO_GL" in os.environ or displayed or not sys.platform.startswith("linux"):
         return
-    found = [backend for backend, library in BACKEND_LIBRARIES.items() if ctypes.util.find_library(library)]
-    os.environ["MUJOCO_GL"] = found[0] if found else "egl"
+    # EGL is the faster.
+    only_osmesa = ctypes.util.find_library("OSMesa") and not ctypes.util.find_library("EGL")
+    os.environ["MUJOCO_GL"] = "osmesa" if only_osmesa else "egl"
 
 
 def cannot_render(name: str, error: BaseException) -> TargetError:
     """The error that no frame can be drawn, in one line with what to install."""
     backend = os.environ.get("MUJOCO_GL", "unset")
     reason = " ".join(str(error).split())[:120] or type(error).__name__
-    return TargetError(f"{name}: cannot render off-screen (MUJOCO_GL is {backend}: {reason}); {HOW_TO_INSTALL}")
+    return TargetError(
+        f"{name}: cannot render off-screen (MUJOCO_GL is {backend}: {reason}); install EGL (Debian: apt-get install "
+        "libegl1 libgl1; then MUJOCO_GL=egl) or OSMesa (apt-get install libosmesa6; then MUJOCO_GL=osmesa)"
+    )
 
 
 def is_mujoco(env: Any) -> bool:
@@ -43,10 +39,7 @@ def is_mujoco(env: Any) -> bool:
 
 def failed_to_import(error: BaseException) -> bool:
     """Whether the error is from importing mujoco, which fails in many ways if MUJOCO_GL names a missing library."""
-    return any(
-        frame.filename.replace(os.sep, "/").endswith("/mujoco/__init__.py")
-        for frame in traceback.extract_tb(error.__traceback__)
-    )
+    return "/mujoco/__init__.py" in "".join(traceback.format_tb(error.__traceback__)).replace(os.sep, "/")
 
 
 def probe(name: str) -> None:

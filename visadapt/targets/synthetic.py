@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -68,8 +68,42 @@ class Start:
         return width * (2 * torch.rand(batch, 4, generator=generator) - 1)
 
 
-class SyntheticTarget(Target):
-    """A cart-pole with hidden effects, integrated by the midpoint rule with steps of 1 ms, unlike any source.
+class WorldTarget(Target):
+    """A batch of worlds with hidden effects, integrated by the midpoint rule with steps of 1 ms, unlike any source."""
+
+    def __init__(self, system: System, period: float, draw_effects: DrawEffects) -> None:
+        self.system = system
+        self.period = period
+        self.n_action = len(system.actions)
+        self.draw_effects = draw_effects
+        self._world: World | None = None
+        self._at: WorldState
+        self._generator: torch.Generator
+
+    def _start(self, state: Tensor, effects: Sequence[Effect], generator: torch.Generator) -> Observation:
+        """Start episodes in states (batch, n_state)."""
+        self._generator = generator
+        substeps = round(self.period / 0.001)
+        self._world = World(self.system, effects, self.period, "midpoint", substeps).requires_grad_(False)
+        self._at = self._world.start(state)
+        return self._observe()
+
+    def step(self, action: Tensor) -> Observation:
+        if self._world is None:
+            raise TargetError(f"{self.name}: step before reset")
+        with torch.no_grad():
+            self._at = self._world.step(self._at, action)
+        return self._observe()
+
+    def _observe(self) -> Observation:
+        """What the sensors read, `alive` where the state is finite, and the force as all that the world loads."""
+        assert self._world is not None
+        measured, self._at = self._world.measure(self._at, self._generator)
+        return Observation(measured, self._at.state.isfinite().all(1), force=self._world.load(self._at))
+
+
+class SyntheticTarget(WorldTarget):
+    """A cart-pole with hidden effects, integrated more finely (1 ms) and by another method than any source.
 
     Args:
         draw_effects: draws the hidden effects of a batch of episodes.
@@ -84,7 +118,7 @@ class SyntheticTarget(Target):
     torch.Size([2, 4])
     """
 
-    n_action = 1
+    name = "synthetic cart-pole"
 
     def __init__(
         self,
@@ -94,44 +128,24 @@ class SyntheticTarget(Target):
         period: float = 0.05,
         start: Start | None = None,
         angle_limit: float = 0.3,
-        name: str = "synthetic cart-pole",
     ) -> None:
-        self.name = name
-        self.period = period
-        self.draw_effects = draw_effects
+        super().__init__(system or CartPole(), period, draw_effects)
         self.camera = camera
-        self.system = system or CartPole()
         self.initial = start or Start()
         self.angle_limit = angle_limit
-        self._world: World | None = None
-        self._at: WorldState | None = None
-        self._generator: torch.Generator | None = None
 
     def reset(self, batch: int, generator: torch.Generator) -> Observation:
         effects = self.draw_effects(batch, generator)
-        substeps = round(self.period / 0.001)
-        self._generator = generator
-        self._world = World(self.system, effects, self.period, "midpoint", substeps).requires_grad_(False)
-        self._at = self._world.start(self.initial.draw(batch, generator))
-        return self._observe()
-
-    def step(self, action: Tensor) -> Observation:
-        if self._world is None or self._at is None:
-            raise TargetError(f"{self.name}: step before reset")
-        with torch.no_grad():
-            self._at = self._world.step(self._at, action)
-        return self._observe()
+        return self._start(self.initial.draw(batch, generator), effects, generator)
 
     def _observe(self) -> Observation:
-        assert self._world is not None
-        assert self._at is not None
-        measured, self._at = self._world.measure(self._at, self._generator)
-        state = self._at.state
-        alive = state.isfinite().all(1) & (state[:, 2].abs() <= self.angle_limit)
+        seen, state = super()._observe(), self._at.state
+        alive = seen.alive & (state[:, 2].abs() <= self.angle_limit)
         frame = None
         if self.camera is not None:
             alive &= state[:, 0].abs() <= self.camera.camera.reach
             # The state of a fallen cart-pole may be huge or nan: it is drawn at finite values within +-10.
             shown = state.nan_to_num().clamp(-10, 10).double().numpy()
             frame = torch.from_numpy(self.camera(shown[:, 0], shown[:, 2]))
-        return Observation(measured, alive, frame, force=self._world.load(self._at)[:, 0])
+        assert seen.force is not None
+        return replace(seen, alive=alive, frame=frame, force=seen.force[:, 0])

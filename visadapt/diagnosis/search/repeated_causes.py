@@ -21,7 +21,7 @@ from visadapt.effects import Dropout, FrozenZone
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.repeated_readings import SMOOTHING_RATIO, zone
 from visadapt.estimation.segments import Segments
-from visadapt.evaluation.intervals import wilson
+from visadapt.evaluation.scoring import wilson
 
 MIN_REPEATS = 2
 """Repeated readings required for a cause."""

@@ -5,36 +5,18 @@ from __future__ import annotations
 import argparse
 import sys
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from visadapt.cli.arguments import InputError
-from visadapt.cli.user_files import describe, find_factory
+import torch
 
-if TYPE_CHECKING:
-    from visadapt.policies import Policy
-    from visadapt.targets import Target
-    from visadapt.targets.env_map import EnvMap
-    from visadapt.world import World
-
-
-def add_policy_and_target(parser: argparse.ArgumentParser) -> None:
-    """Add --policy, --target and --map."""
-    parser.add_argument(
-        "--policy", required=True, metavar="P.safetensors", help="as `visadapt train` or `visadapt adapt` wrote it"
-    )
-    add_target(parser, required=True)
-
-
-def add_target(parser: argparse.ArgumentParser, required: bool) -> None:
-    """Add --target and --map."""
-    parser.add_argument(
-        "--target",
-        required=required,
-        metavar="TARGET",
-        help="the machine: a gymnasium id with --map, or package.module:factory, a function without arguments that "
-        "returns a visadapt.Target, or, with --map, a gymnasium environment; modules here are found too",
-    )
-    parser.add_argument("--map", metavar="MAP.toml", help="what the numbers and frames of a gymnasium environment mean")
+from visadapt.cli.inputs import InputError, describe, find_factory
+from visadapt.policies import ImagePolicy, Policy
+from visadapt.setups.policy_file import load_policy, load_source
+from visadapt.targets import Target
+from visadapt.targets.env_map import EnvMap
+from visadapt.targets.gymnasium import GymnasiumTarget
+from visadapt.targets.rollout import see_frames
+from visadapt.world import World
 
 
 def load_both(options: argparse.Namespace) -> tuple[Policy, World, Target]:
@@ -44,8 +26,6 @@ def load_both(options: argparse.Namespace) -> tuple[Policy, World, Target]:
         InputError, TargetError: either cannot be had, or the two do not go together.
         CheckpointError: the policy's file is missing, torn, or holds something else.
     """
-    from visadapt.setups.policy_file import load_policy, load_source
-
     policy, source = load_policy(options.policy), load_source(options.policy)
     target = load_target(options, source, policy.shown == "frame")
     _check(options.policy, policy, source, target)
@@ -54,9 +34,6 @@ def load_both(options: argparse.Namespace) -> tuple[Policy, World, Target]:
 
 def load_target(options: argparse.Namespace, source: World, frames: bool) -> Target:
     """The target that --target and --map name; `frames`: whether a gymnasium environment has to draw."""
-    from visadapt.targets import Target
-    from visadapt.targets.env_map import EnvMap
-
     mapping = EnvMap.load(options.map) if options.map else None
     name: str = options.target
     # gymnasium too has ids of the form module:Name-v0, whose last part is no name of Python's.
@@ -86,8 +63,6 @@ def load_target(options: argparse.Namespace, source: World, frames: bool) -> Tar
 
 
 def _environment(env: Any, mapping: EnvMap, source: World, frames: bool, name: str) -> Target:
-    from visadapt.targets.gymnasium import GymnasiumTarget
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of an inherited period: said below
         target = GymnasiumTarget(env, mapping, type(source.system), frames=frames, name=name)
@@ -98,10 +73,6 @@ def _environment(env: Any, mapping: EnvMap, source: World, frames: bool, name: s
 
 def _check(path: str, policy: Policy, source: World, target: Target) -> None:
     """Raises InputError where the policy cannot be run on the target."""
-    import torch
-
-    from visadapt.policies import ImagePolicy
-    from visadapt.targets.rollout import see_frames
 
     system = source.system
     if policy.n_state != len(system.states) or policy.n_action != len(system.actions):
