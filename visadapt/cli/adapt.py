@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -28,32 +29,19 @@ def run(options: argparse.Namespace) -> None:
     _check_renderer(options, policy)
     references = read_reference(options.references, source.period) if options.references else None
     with checked():
-        setup_for(
-            source, policy, options.renderer, references or getattr(getattr(target, "task", None), "references", None)
-        )
-    in_round = options.round or min(options.samples, max(20, options.samples // 5))
-    if in_round > options.samples:
-        raise InputError(f"--round {in_round} is more than --samples {options.samples}: lower it, or raise those")
+        followed = references or getattr(getattr(target, "task", None), "references", None)
+        setup_for(source, policy, options.renderer, followed)
+    if options.round and options.round > options.samples:
+        raise InputError(f"--round {options.round} is more than --samples {options.samples}: lower it, or raise those")
     folder = Path(options.out)
     settings = {name: value for name, value in vars(options).items() if name != "out"}
     for name in ("policy", "renderer", "references", "diagnosis", "map"):
         settings[f"{name} SHA-256"] = fingerprint(settings[name])
     open_run(folder, settings)
     with progress() as report:
-        adapted = adapt(
-            policy,
-            source,
-            target,
-            samples=options.samples,
-            folder=folder,
-            seed=options.seed,
-            round_samples=in_round,
-            iterations=options.iterations,
-            renderer=options.renderer,
-            references=references,
-            with_history=options.with_history,
-            report=report,
-        )
+        asked = {name: getattr(options, name) for name in ("seed", "iterations", "renderer", "with_history")}
+        own: dict[str, Any] = {"references": references, "report": report, **asked}
+        adapted = adapt(policy, source, target, options.samples, folder, round_samples=options.round, **own)
     rounds = [{"samples": each.samples, "policy_loss": each.policy[-1]} for each in adapted.rounds]
     write_json(folder / "ledger.json", {**asdict(adapted.ledger), "used": adapted.ledger.used, "rounds": rounds})
     print(f"{adapted.ledger.used} samples of {target.name} used; the policy is {folder / 'policy.safetensors'}")

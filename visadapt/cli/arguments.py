@@ -56,16 +56,13 @@ def renderer(parser: argparse.ArgumentParser) -> None:
         "to some pixels; it is refined. Interrupted, the same command goes on where it was."
     )
     add = parser.add_argument
-    recording_help = "HDF5 with frames, as visadapt.write_recording writes it"
-    add("recording", nargs="*", metavar="RECORDING.h5", help=recording_help)
+    add("recording", nargs="*", metavar="RECORDING.h5", help="HDF5 with frames, as visadapt.write_recording writes it")
     _add_target(parser, required=False)
-    show_help = "states that --target is put into (default: 4000)"
-    add("--show", metavar="N", type=_positive, default=4000, help=show_help)
+    add("--show", metavar="N", type=_positive, default=4000, help="states that --target is put into (default: 4000)")
     within_help = "m and rad to either side of 0 that these states are drawn from (default: 1.0,0.35)"
     add("--within", metavar="X,THETA", type=_pair, default=(1.0, 0.35), help=within_help)
     add("--out", required=True, metavar="R.safetensors", help="write the renderer here")
-    hinge_help = "px, where the pole's hinge is seen at x = 0"
-    add("--hinge", required=True, type=_pair, metavar="COLUMN,ROW", help=hinge_help)
+    add("--hinge", required=True, type=_pair, metavar="COLUMN,ROW", help="px, where the pole's hinge is seen at x = 0")
     add("--scale", required=True, type=_positive_number, metavar="PX", help="px that a metre is long")
     pole_help = "m from the hinge to the pole's tip, rather too long than too short (default: 1.05)"
     add("--pole", type=_positive_number, default=1.05, metavar="M", help=pole_help)
@@ -83,8 +80,7 @@ def train(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     _add_system(parser)
     add("--out", required=True, metavar="P.safetensors", help="write the policy here")
-    period_help = "s between commands (default: 0.05; quadrotor: 0.1)"
-    add("--period", metavar="S", type=_positive_number, help=period_help)
+    add("--period", metavar="S", type=_positive_number, help="s between commands (default: 0.05; quadrotor: 0.1)")
     add("--frames", action="store_true", help="the policy is shown a camera's frames, not states")
     add(
         "--renderer",
@@ -92,8 +88,7 @@ def train(parser: argparse.ArgumentParser) -> None:
         help="the camera, as `visadapt renderer` writes it; implies --frames (default: of a cart-pole that is drawn)",
     )
     add("--references", metavar="F.csv", help="what a quadrotor is to follow: columns time, x, y, z in s and m")
-    history_help = "read the last 5 periods too, as against a force that changes"
-    add("--with-history", action="store_true", help=history_help)
+    add("--with-history", action="store_true", help="read the last 5 periods too, as against a force that changes")
     _add_effects(parser)
     add("--iterations", metavar="N", type=_positive, help="of the policy (default: the system's own)")
     add("--seeing", metavar="N", type=_positive, help="iterations in which an encoder of frames learns to see")
@@ -112,8 +107,7 @@ def adapt(parser: argparse.ArgumentParser) -> None:
     _add_policy_and_target(parser)
     add("--out", required=True, metavar="FOLDER", help="folder of the run; policy.safetensors in it")
     add("--samples", metavar="N", type=_positive, default=1000, help="steps of the target in all (default: 1000)")
-    round_help = "steps of the target in a round (default: a fifth of --samples)"
-    add("--round", metavar="B", type=_positive, help=round_help)
+    add("--round", metavar="B", type=_positive, help="steps of the target in a round (default: a fifth of --samples)")
     renderer_help = "the one that the policy was trained with (default: of a cart-pole that is drawn)"
     add("--renderer", metavar="R.safetensors", help=renderer_help)
     add("--references", metavar="F.csv", help="what a quadrotor is to follow, if the target has none")

@@ -19,6 +19,7 @@ from visadapt.recordings.hdf5 import read_names, read_recording
 from visadapt.storage.atomic_files import replacing
 from visadapt.storage.checkpoints import load_tree, save_tree
 from visadapt.systems import CartPole
+from visadapt.targets import Start
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.world import World
 
@@ -72,9 +73,8 @@ def _show(options: argparse.Namespace) -> tuple[Tensor, Tensor, Tensor]:
     target = load_target(options, World(CartPole()), True)
     if not isinstance(target, GymnasiumTarget):
         raise InputError(f"{options.target}: cannot be put into chosen states; give recordings of frames and states")
-    widths = torch.tensor([options.within[0], 0.0, options.within[1], 0.0])
-    generator = torch.Generator().manual_seed(options.seed)
-    states = widths * (2 * torch.rand(options.show, 4, generator=generator) - 1)
+    start = Start(options.within[0], 0.0, options.within[1], 0.0)
+    states = start.draw(options.show, torch.Generator().manual_seed(options.seed))
     return states[:, 0], states[:, 2], torch.from_numpy(target.show(states.double().numpy()))
 
 

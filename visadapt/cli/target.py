@@ -75,8 +75,6 @@ def _check(path: str, policy: Policy, source: World, target: Target) -> None:
     """Raises InputError where the policy cannot be run on the target."""
 
     system = source.system
-    if policy.n_state != len(system.states) or policy.n_action != len(system.actions):
-        raise InputError(f"{path}: its policy and its source, a {system.name}, do not go together; train it again")
     if target.n_action != policy.n_action:
         raise InputError(
             f"{path}: a policy of a {system.name}, with {policy.n_action} commands; {target.name} takes "
@@ -88,10 +86,10 @@ def _check(path: str, policy: Policy, source: World, target: Target) -> None:
     if isinstance(policy, ImagePolicy):
         # Only a picture says how large it is. A reset is no step: it is not counted.
         shown = see_frames(target.reset(1, torch.Generator().manual_seed(0)))[0].shape
-        if shown != policy.perception.background.shape:
+        height, width = policy.perception.background.shape
+        if shown != (height, width):
             raise InputError(
-                f"{target.name} shows frames of {shown[1]} x {shown[0]} px; {path} was trained on "
-                f"{policy.perception.background.shape[1]} x {policy.perception.background.shape[0]}"
+                f"{target.name} shows frames of {shown[1]} x {shown[0]} px; {path} was trained on {width} x {height}"
             )
     if abs(target.period - source.period) > 1e-6:
         raise InputError(

@@ -28,23 +28,6 @@ READ_SUFFIXES = (".csv", ".h5", ".hdf5")
 """Of the files of a folder that are read."""
 
 
-class _Notes:
-    """Warnings, one line for each kind."""
-
-    def __init__(self) -> None:
-        self.places: dict[str, list[str]] = {}
-
-    def __call__(self, text: str, where: str) -> None:
-        self.places.setdefault(text, []).append(where)
-
-    def lines(self) -> tuple[str, ...]:
-        """Each kind once, with its first place in the recording and the number of others."""
-        return tuple(
-            f"{where[0]}{f' and {len(where) - 1} more' if len(where) > 1 else ''}: {text}"
-            for text, where in self.places.items()
-        )
-
-
 def load_recording(
     paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     system: System,
@@ -76,7 +59,11 @@ def load_recording(
     >>> run.samples, round(run.period, 6)
     (60, 0.05)
     """
-    note = _Notes()
+    places: dict[str, list[str]] = {}
+
+    def note(text: str, where: str) -> None:
+        places.setdefault(text, []).append(where)
+
     whole: list[RawEpisode] = []
     for path in _files([paths] if isinstance(paths, str | os.PathLike) else paths):
         for raw in _read(path, system, columns or {}):
@@ -99,7 +86,10 @@ def load_recording(
         measured=whole[0].measured,
         period=period,
         sources=tuple(part.source for part in parts),
-        warnings=note.lines(),
+        warnings=tuple(
+            f"{where[0]}{f' and {len(where) - 1} more' if len(where) > 1 else ''}: {text}"
+            for text, where in places.items()
+        ),
     )
 
 

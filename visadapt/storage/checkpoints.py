@@ -58,18 +58,16 @@ def load_weights(module: nn.Module, weights: Mapping[str, Tensor], origin: Path)
     Raises:
         CheckpointError: a key is missing or extra, or differs in shape or dtype; the message names it and `origin`.
     """
-    own = module.state_dict()
-    for key, value in own.items():
-        if key not in weights:
-            raise CheckpointError(f"{origin}: made for another architecture: {key} is missing")
-        if weights[key].shape != value.shape or weights[key].dtype != value.dtype:
+    found, needed = (
+        {key: f"{tuple(value.shape)} {value.dtype}" for key, value in each.items()}
+        for each in (weights, module.state_dict())
+    )
+    for key in (*needed, *sorted(found)):
+        there, right = found.get(key, "missing"), needed.get(key, "none of that name")
+        if there != right:
             raise CheckpointError(
-                f"{origin}: made for another architecture: {key} is {tuple(weights[key].shape)} "
-                f"{weights[key].dtype}, this network needs {tuple(value.shape)} {value.dtype}"
+                f"{origin}: made for another architecture: {key} is {there}, this network needs {right}"
             )
-    extra = sorted(weights.keys() - own.keys())
-    if extra:
-        raise CheckpointError(f"{origin}: made for another architecture: {extra[0]} is not in this network")
     module.load_state_dict(dict(weights))
 
 
