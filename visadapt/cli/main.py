@@ -10,9 +10,6 @@ from collections.abc import Sequence
 
 from visadapt.cli import arguments as asked
 
-DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
-"""Exit statuses; 2 is argparse's own, 130 a shell's."""
-
 COMMANDS = {
     asked.diagnose: "where a rig departs from the simulator, which effect causes it, and how far that explains it",
     asked.effects: "the effects that a diagnosis can name: equations, parameters, units, ranges",
@@ -39,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
     except KeyboardInterrupt:
         print("visadapt: interrupted; run the same command to go on", file=sys.stderr)
-        return INTERRUPTED
+        return 130  # as of a shell
     except BrokenPipeError:
         # Whoever read the output has read enough, as `head` does; Python would complain once more at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -48,5 +45,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not isinstance(error, OSError) and type(error).__module__.partition(".")[0] not in ("visadapt", "renderers"):
             raise
         print(f"visadapt: {error}", file=sys.stderr)
-        return BAD_INPUT
-    return DONE
+        return 2  # argparse's own
+    return 0

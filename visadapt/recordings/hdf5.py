@@ -43,10 +43,8 @@ def write_recording(
         DiskFullError: the disk is full; a file that was at `path` before is unchanged.
 
     >>> import pathlib, tempfile, torch, visadapt as va
-    >>> target = va.SyntheticTarget(va.constant_force(2.0))
-    >>> policy = va.load_policy(va.shipped("cartpole_states"))
-    >>> runs = va.run(target, policy, 2, 30, torch.Generator().manual_seed(0), exploration=0.3)
-    >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.h5"
+    >>> policy, path = va.load_policy(va.shipped("cartpole_states")), pathlib.Path(tempfile.mkdtemp()) / "run.h5"
+    >>> runs = va.run(va.SyntheticTarget(), policy, 2, 30, torch.Generator().manual_seed(0), exploration=0.3)
     >>> va.write_recording(path, [run.episode for run in runs], ["x", "x_dot", "theta", "theta_dot"], ["command"])
     >>> len(va.read_recording(path))
     2

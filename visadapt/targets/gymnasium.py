@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import atexit
+import os
+import traceback
 import warnings
 import weakref
 from collections.abc import Callable
@@ -81,13 +83,12 @@ class GymnasiumTarget(Target):
         self._shown: list[_Shown] = []
 
     def reset(self, batch: int, generator: torch.Generator) -> Observation:
-        """Start `batch` new episodes, each environment seeded from the generator.
-
-        Raises:
-            TargetError: an observation is not finite, or the crop does not fit the frame.
-        """
+        """Start `batch` new episodes, each environment seeded from the generator; raises TargetError as `step` does."""
         seeds = torch.randint(2**31 - 1, (batch,), generator=generator).tolist()
-        starts = self._starts(batch, generator)
+        starts: NDArray[np.floating] | None = None
+        if self.mapping.start is not None:
+            widths = torch.tensor([self.mapping.start.get(variable.name, 0.0) for variable in self.system.states])
+            starts = (widths * (2 * torch.rand(batch, len(widths), generator=generator) - 1)).double().numpy()
         while len(self._envs) < batch:
             self._envs.append(self._make())
         if self._mujoco:
@@ -105,7 +106,7 @@ class GymnasiumTarget(Target):
 
         Raises:
             TargetError: step before reset, an action of another shape or not finite, an observation that is not
-                finite, or an episode that the environment truncates.
+                finite, a frame that the crop does not fit, or an episode that the environment truncates.
         """
         batch = len(self._shown)
         if action.shape != (batch, self.n_action) or not batch:
@@ -166,7 +167,8 @@ class GymnasiumTarget(Target):
         except Exception as error:  # whatever the environment's constructor raises becomes one line
             if isinstance(error, gymnasium.error.DependencyNotInstalled) and "mujoco" in str(error).lower():
                 raise TargetError(f"{self.name}: mujoco is not installed: pip install 'visadapt[mujoco]'") from error
-            if mujoco_frames.failed_to_import(error):
+            # Importing mujoco fails in many ways if MUJOCO_GL names a missing library.
+            if "/mujoco/__init__.py" in "".join(traceback.format_tb(error.__traceback__)).replace(os.sep, "/"):
                 raise mujoco_frames.cannot_render(self.name, error) from error
             raise TargetError(f"{self.name}: cannot be made: {_line(error)}") from error
 
@@ -214,13 +216,6 @@ class GymnasiumTarget(Target):
         origin = f"render_fps = {rate:g} of its metadata, which may be the speed of a film alone: give `period` in s"
         warnings.warn(f"{self.name}: the period, {1 / rate:g} s, is taken from {origin}", stacklevel=3)
         return 1 / float(rate), origin
-
-    def _starts(self, batch: int, generator: torch.Generator) -> NDArray[np.floating] | None:
-        """States (batch, n_state) that episodes start in; None: where the environment itself does."""
-        if self.mapping.start is None:
-            return None
-        widths = torch.tensor([self.mapping.start.get(variable.name, 0.0) for variable in self.system.states])
-        return (widths * (2 * torch.rand(batch, len(widths), generator=generator) - 1)).double().numpy()
 
     def _place(self, env: Any, seen: NDArray[np.floating], state: NDArray[np.floating]) -> NDArray[np.floating]:
         """Put an environment that observes `seen` and has not been stepped into our state; its observation there."""
@@ -282,8 +277,7 @@ class GymnasiumTarget(Target):
 
 
 def _close(target: weakref.ref[GymnasiumTarget]) -> None:
-    alive = target()
-    if alive is not None:
+    if (alive := target()) is not None:
         alive.close()
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes.util
 import os
 import sys
-import traceback
 from collections.abc import Sequence
 from typing import Any
 
@@ -35,11 +34,6 @@ def cannot_render(name: str, error: BaseException) -> TargetError:
 def is_mujoco(env: Any) -> bool:
     """Whether the environment is drawn by gymnasium's own MuJoCo renderer."""
     return hasattr(getattr(env.unwrapped, "mujoco_renderer", None), "_get_viewer")
-
-
-def failed_to_import(error: BaseException) -> bool:
-    """Whether the error is from importing mujoco, which fails in many ways if MUJOCO_GL names a missing library."""
-    return "/mujoco/__init__.py" in "".join(traceback.format_tb(error.__traceback__)).replace(os.sep, "/")
 
 
 def probe(name: str) -> None:
