@@ -36,8 +36,7 @@ class MLPRenderer(nn.Module):
 
     def forward(self, x: Tensor, theta: Tensor) -> Tensor:
         """Frames (B, H, W) of cart positions (B,) in m and pole angles (B,) in rad."""
-        out: Tensor = self.last(self.layers(torch.stack((x, theta.sin(), theta.cos()), -1)))
-        return out.unflatten(-1, self.size)
+        return self.last(self.layers(torch.stack((x, theta.sin(), theta.cos()), -1))).unflatten(-1, self.size)
 
 
 class Layer(nn.Module):

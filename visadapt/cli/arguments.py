@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import math
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -184,28 +186,24 @@ def _positive(text: str) -> int:
 
 def _positive_number(text: str) -> float:
     """A finite number above 0."""
-    number = _finite(text)
-    if not number > 0:
+    if not (number := _finite(text)) > 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
     return number
 
 
 def _pair(text: str) -> tuple[float, float]:
     """Two finite numbers with a comma between them."""
-    first, *rest = text.split(",")
-    if len(rest) != 1:
+    if text.count(",") != 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not two numbers with a comma between them")
-    return _finite(first), _finite(rest[0])
+    first, second = map(_finite, text.split(","))
+    return first, second
 
 
 def _finite(text: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
-    if not abs(number) < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
-    return number
+    with suppress(ValueError):
+        if math.isfinite(number := float(text)):
+            return number
+    raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
 
 
 def _system(text: str) -> type[System]:

@@ -68,8 +68,7 @@ def fingerprint(path: str | Path | None) -> str | None:
 
 def the_system(options: argparse.Namespace) -> System:
     """The system of --system with the parameters of --params."""
-    system: System = load_parameters(options.params, options.system) if options.params else options.system()
-    return system
+    return load_parameters(options.params, options.system) if options.params else options.system()
 
 
 def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
@@ -151,8 +150,7 @@ def find_factory(name: str) -> Callable[[], Any]:
     if not callable(factory):
         what = "nothing" if factory is None else f"a {type(factory).__name__}, not a function,"
         raise InputError(f"{name}: {module.__file__} has {what} called {attribute!r}")
-    found: Callable[[], Any] = factory
-    return found
+    return factory
 
 
 def describe(error: Exception, path: str | None = None) -> str:

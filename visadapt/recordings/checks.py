@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from visadapt.recordings.clock import Note, RawEpisode
 from visadapt.recordings.episode import RecordingError
-from visadapt.recordings.physics import DEGREE, DIFFERENCE_S, are_degrees, exchanged
+from visadapt.recordings.physics import DEGREE, DIFFERENCE_S, are_degrees, correlation, exchanged
 from visadapt.systems import System, Variable
 
 TURN = 2 * math.pi
@@ -135,7 +135,7 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable) -> None:
         row = int(np.abs(measured).argmax())
         raise RecordingError(f"{raw.cell(row, rate.name)} is {measured[row]:g} {rate.unit}; {right}")
     between = 0.5 * (measured[1:] + measured[:-1])
-    if angle and _correlation(change, between) > IS_RATE_CORRELATION:
+    if angle and correlation(change, between) > IS_RATE_CORRELATION:
         ratio = float(change.std() / between.std()) * DEGREE
         for wrong, factor in ((variable, ratio), (rate, DEGREE**2 / ratio)):
             if 0.5 < factor < 2:
@@ -153,17 +153,15 @@ def _check_exchanged(raw: RawEpisode, variables: Mapping[str, Variable]) -> None
     changes = {name: _rates(raw.time, columns[name], variables[name].unit == "rad") for name in bases}
     measured = {name: columns[f"{name}_dot"] for name in bases if f"{name}_dot" in columns}
     for name, rate in measured.items():
-        crossed = _correlation(_rates(raw.time, rate, False), columns[name][1:])
-        if crossed > IS_RATE_CORRELATION and _correlation(changes[name], rate[1:]) < NOT_RATE_CORRELATION:
+        crossed = correlation(_rates(raw.time, rate, False), columns[name][1:])
+        if crossed > IS_RATE_CORRELATION and correlation(changes[name], rate[1:]) < NOT_RATE_CORRELATION:
             raise RecordingError(
                 f"{raw.source}: {raw.column(name)} and {raw.column(f'{name}_dot')} are evidently exchanged: "
                 "the first is the second's rate of change"
             )
     for name, other in combinations(measured, 2):
-        crossed = min(
-            _correlation(changes[name], measured[other][1:]), _correlation(changes[other], measured[name][1:])
-        )
-        own = max(_correlation(changes[one], measured[one][1:]) for one in (name, other))
+        crossed = min(correlation(changes[name], measured[other][1:]), correlation(changes[other], measured[name][1:]))
+        own = max(correlation(changes[one], measured[one][1:]) for one in (name, other))
         if crossed > IS_RATE_CORRELATION and own < NOT_RATE_CORRELATION:
             raise RecordingError(
                 f"{raw.source}: {raw.column(name)} and {raw.column(other)} are evidently exchanged: "
@@ -178,9 +176,3 @@ def _check_exchanged(raw: RawEpisode, variables: Mapping[str, Variable]) -> None
                 f"{raw.cell(row + 1, name)} jumps by {steps[row]:.3g} m, like an angle that wraps; metres are right "
                 "(are two columns exchanged?)"
             )
-
-
-def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    if a.std() == 0 or b.std() == 0:
-        return 0.0
-    return float(np.corrcoef(a, b)[0, 1])

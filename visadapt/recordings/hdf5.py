@@ -51,22 +51,27 @@ def write_recording(
     """
     path = Path(path)
     _check_alike(path, episodes)
-    state = episodes[0].state
-    widths = {"state": 0 if state is None else state.shape[1], "action": episodes[0].action.shape[1]}
-    names = {"state": state_names, "action": action_names}
-    for kind, given in names.items():
-        if given is not None and len(given) != widths[kind]:
-            raise RecordingError(f"{path}: {len(given)} names for {widths[kind]} columns of {kind}")
     # In memory first, since HDF5 aborts the process when the disk fills up. The episodes are in memory already, and
     # uncompressed.
     with h5py.File("recording", "w", driver="core", backing_store=False) as file:
         file.attrs["format"] = FORMAT
         file.attrs["version"] = VERSION
-        for kind, given in names.items():
-            if given is not None:
-                file.attrs[f"{kind}_names"] = list(given)
+        for kind, names in (("state", state_names), ("action", action_names)):
+            if names is not None:
+                columns = getattr(episodes[0], kind)
+                width = 0 if columns is None else columns.shape[1]
+                if len(names) != width:
+                    raise RecordingError(f"{path}: {len(names)} names for {width} columns of {kind}")
+                file.attrs[f"{kind}_names"] = list(names)
         for number, episode in enumerate(episodes):
-            _write_episode(file.create_group(_group_name(number)), episode)
+            group = file.create_group(_group_name(number))
+            for name in ("time", "action", "state", "task_state"):
+                if (values := getattr(episode, name)) is not None:
+                    group.create_dataset(name, data=values, fletcher32=True)
+            if episode.frame is not None:
+                rows, height, width = episode.frame.shape
+                chunks = (min(rows, FRAMES_IN_CHUNK), height, width)
+                group.create_dataset("frame", data=episode.frame, chunks=chunks, compression="gzip", fletcher32=True)
         file.flush()
         content = file.id.get_file_image()
     with replacing(path) as temporary:
@@ -121,17 +126,6 @@ def _opened(path: Path) -> Iterator[h5py.File]:
 
 def _group_name(number: int) -> str:
     return f"episode_{number:05d}"
-
-
-def _write_episode(group: h5py.Group, episode: Episode) -> None:
-    for name in ("time", "action", "state", "task_state"):
-        values = getattr(episode, name)
-        if values is not None:
-            group.create_dataset(name, data=values, fletcher32=True)
-    if episode.frame is not None:
-        rows, height, width = episode.frame.shape
-        chunks = (min(rows, FRAMES_IN_CHUNK), height, width)
-        group.create_dataset("frame", data=episode.frame, chunks=chunks, compression="gzip", fletcher32=True)
 
 
 def _read_episode(path: Path, file: h5py.File, number: int, frames: bool) -> Episode:

@@ -22,10 +22,6 @@ FEWEST_ROWS = 3
 """Rows that an episode of the shortest length must have."""
 UPRIGHT_RAD = 1.0
 """rad from 0 up to which an angle counts as upright when it is unwrapped."""
-HDF5_MAGIC = b"\x89HDF"
-"""First bytes of every HDF5 file."""
-READ_SUFFIXES = (".csv", ".h5", ".hdf5")
-"""Of the files of a folder that are read."""
 
 
 def load_recording(
@@ -95,7 +91,8 @@ def _files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
     files = []
     for path in map(Path, paths):
         if path.is_dir():
-            found = sorted(file for file in path.iterdir() if file.suffix.lower() in READ_SUFFIXES and file.is_file())
+            suffixes = (".csv", ".h5", ".hdf5")
+            found = sorted(file for file in path.iterdir() if file.suffix.lower() in suffixes and file.is_file())
             if not found:
                 raise RecordingError(f"{path}: a folder without recordings; files that end in .csv or .h5 are right")
             files += found
@@ -111,7 +108,7 @@ def _files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
 def _read(path: Path, system: System, given: Mapping[str, str]) -> list[RawEpisode]:
     try:
         with path.open("rb") as file:
-            is_hdf5 = file.read(len(HDF5_MAGIC)) == HDF5_MAGIC
+            is_hdf5 = file.read(4) == b"\x89HDF"
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
     return _read_hdf5(path, system) if is_hdf5 else read_rows(path, system, given)

@@ -118,7 +118,10 @@ def _fits(raw: RawEpisode, columns: Columns, system: System, delay: int = 0) -> 
 
 def _fit(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> tuple[float, float]:
     """Correlation and slope of measured over predicted values."""
-    if measured.std() == 0 or predicted.std() == 0:
-        return 0.0, 0.0
-    correlation = float(np.corrcoef(measured, predicted)[0, 1])
-    return correlation, correlation * float(measured.std() / predicted.std())
+    found = correlation(measured, predicted)
+    return found, found * float(measured.std() / predicted.std()) if found else 0.0
+
+
+def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """0 where one of the two never changes."""
+    return 0.0 if a.std() == 0 or b.std() == 0 else float(np.corrcoef(a, b)[0, 1])

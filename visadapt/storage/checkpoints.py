@@ -88,8 +88,7 @@ def load_network(path: Path, network: nn.Module) -> dict[str, Any]:
     if tree["class"] != type(network).__name__:
         raise CheckpointError(f"{path}: holds a {tree['class']}, a {type(network).__name__} is needed")
     load_weights(network, tree["weights"], path)
-    settings: dict[str, Any] = tree["settings"]
-    return settings
+    return tree["settings"]
 
 
 @dataclass

@@ -56,10 +56,9 @@ def once(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 def read_json(path: Path) -> dict[str, Any]:
     """The JSON object in a file; raises RunError if the file is incomplete."""
     try:
-        content: dict[str, Any] = json.loads(path.read_text())
+        return json.loads(path.read_text())
     except json.JSONDecodeError as error:
         raise RunError(f"{path}: not complete JSON ({error}): remove it and run again") from error
-    return content
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
