@@ -83,7 +83,7 @@ def _read(paths: list[str]) -> tuple[Tensor, Tensor, Tensor]:
     states: list[NDArray[np.floating]] = []
     frames: list[NDArray[np.uint8]] = []
     for path in paths:
-        names = read_names(path)[0] or [variable.name for variable in CartPole.states]
+        names, _ = read_names(path, CartPole)
         for name in ("x", "theta"):
             if name not in names:
                 raise InputError(f"{path}: has no state {name!r}; it has {', '.join(names)}")

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from visadapt.recordings.episode import Episode, RecordingError
 from visadapt.storage.atomic_files import replacing
+from visadapt.systems import System
 
 FORMAT, VERSION = "visadapt recording", 1
 FRAMES_IN_CHUNK = 16
@@ -78,11 +79,12 @@ def write_recording(
         temporary.write_bytes(content)
 
 
-def read_names(path: str | os.PathLike[str]) -> tuple[list[str] | None, list[str] | None]:
-    """Names of the columns of state and of action, None where the file has none; raises like `read_recording`."""
+def read_names(path: str | os.PathLike[str], system: System | type[System]) -> tuple[list[str], list[str]]:
+    """Names of the columns of state and of action, the system's if the file has none; raises like `read_recording`."""
     with _opened(Path(path)) as file:
-        state, action = (file.attrs.get(f"{kind}_names") for kind in ("state", "action"))
-        return None if state is None else list(state), None if action is None else list(action)
+        state = file.attrs.get("state_names", [variable.name for variable in system.states])
+        action = file.attrs.get("action_names", [variable.name for variable in system.actions])
+    return list(state), list(action)
 
 
 def read_recording(path: str | os.PathLike[str], frames: bool = True) -> list[Episode]:

@@ -116,8 +116,7 @@ def _read(path: Path, system: System, given: Mapping[str, str]) -> list[RawEpiso
 
 def _read_hdf5(path: Path, system: System) -> list[RawEpisode]:
     ours, actions = ([variable.name for variable in variables] for variables in (system.states, system.actions))
-    state_names, action_names = read_names(path)
-    state_names, action_names = state_names or ours, action_names or actions
+    state_names, action_names = read_names(path, system)
     measured = tuple(name for name in ours if name in state_names)
     rows = []
     for number, episode in enumerate(read_recording(path, frames=False)):
