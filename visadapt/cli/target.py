@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import warnings
-from typing import Any
+from itertools import chain
 
 import torch
 
@@ -35,34 +35,26 @@ def load_both(options: argparse.Namespace) -> tuple[Policy, World, Target]:
 def load_target(options: argparse.Namespace, source: World, frames: bool) -> Target:
     """The target that --target and --map name; `frames`: whether a gymnasium environment has to draw."""
     mapping = EnvMap.load(options.map) if options.map else None
-    name: str = options.target
+    name = env = options.target
     # gymnasium too has ids of the form module:Name-v0, whose last part is no name of Python's.
-    if not name.rpartition(":")[2].isidentifier() or ":" not in name:
+    if ":" in name and name.rpartition(":")[2].isidentifier():
+        factory = find_factory(name)
+        try:
+            made = factory()
+        except Exception as error:
+            raise InputError(f"{name}: {describe(error)}") from error
+        if isinstance(made, Target):
+            if mapping is not None:
+                raise InputError(f"{name}: returns a visadapt.Target, for which --map has no use: leave it out")
+            return made
+        if not hasattr(made, "action_space") or not hasattr(made, "reset"):
+            kind = type(made).__name__
+            raise InputError(f"{name}: returned a {kind}; a visadapt.Target or a gymnasium environment is needed")
         if mapping is None:
-            raise InputError(
-                f"{name}: a gymnasium id needs --map MAP.toml; a target of your own is package.module:factory"
-            )
-        return _environment(name, mapping, source, frames, name)
-    factory = find_factory(name)
-    try:
-        made = factory()
-    except Exception as error:
-        raise InputError(f"{name}: {describe(error)}") from error
-    if isinstance(made, Target):
-        if mapping is not None:
-            raise InputError(f"{name}: returns a visadapt.Target, for which --map has no use: leave it out")
-        return made
-    if not hasattr(made, "action_space") or not hasattr(made, "reset"):
-        raise InputError(
-            f"{name}: returned a {type(made).__name__}; a visadapt.Target or a gymnasium environment is needed"
-        )
+            raise InputError(f"{name}: returned a gymnasium environment, which needs --map MAP.toml")
+        env = chain([made], iter(factory, None)).__next__  # the one that is made already, then new ones
     if mapping is None:
-        raise InputError(f"{name}: returned a gymnasium environment, which needs --map MAP.toml")
-    first = [made]
-    return _environment(lambda: first.pop() if first else factory(), mapping, source, frames, name)
-
-
-def _environment(env: Any, mapping: EnvMap, source: World, frames: bool, name: str) -> Target:
+        raise InputError(f"{name}: a gymnasium id needs --map MAP.toml; a target of your own is package.module:factory")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of an inherited period: said below
         target = GymnasiumTarget(env, mapping, type(source.system), frames=frames, name=name)
@@ -73,7 +65,6 @@ def _environment(env: Any, mapping: EnvMap, source: World, frames: bool, name: s
 
 def _check(path: str, policy: Policy, source: World, target: Target) -> None:
     """Raises InputError where the policy cannot be run on the target."""
-
     system = source.system
     if target.n_action != policy.n_action:
         raise InputError(
