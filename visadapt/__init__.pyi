@@ -27,10 +27,10 @@ from .systems.parameter_file import load_parameters as load_parameters
 from .systems.quadrotor import Quadrotor as Quadrotor
 from .targets.base import Observation as Observation, Target as Target
 from .targets.env_map import Entry as Entry, EnvMap as EnvMap
-from .targets.flight import FlightTarget as FlightTarget
 from .targets.gymnasium import GymnasiumTarget as GymnasiumTarget
 from .targets.rollout import run as run
 from .targets.synthetic import (
+    FlightTarget as FlightTarget,
     SyntheticTarget as SyntheticTarget,
     constant_force as constant_force,
     sine_force as sine_force,

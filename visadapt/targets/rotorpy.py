@@ -19,7 +19,7 @@ from torch import Tensor
 from visadapt.systems import Quadrotor
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY
 from visadapt.targets.base import Observation, TargetError
-from visadapt.targets.flight import FlightTarget
+from visadapt.targets.synthetic import FlightTarget
 from visadapt.tasks.follow import Follow
 
 RATE_LOOP_PERIOD_S = 0.01
