@@ -1,7 +1,6 @@
 """States to frames: drawn (OpenCV) and learnt (networks). Independent of visadapt."""
 
-from renderers.camera import Camera
-from renderers.drawn import DrawnCartPole
+from renderers.drawn import Camera, DrawnCartPole
 from renderers.learnt import LayeredRenderer, MLPRenderer
 from renderers.weights import RendererError, load_renderer, save_renderer
 

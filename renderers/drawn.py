@@ -8,13 +8,35 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from renderers.camera import Camera
-
 SUPERSAMPLING = 6
 """Factor by which the scene is drawn larger and then averaged down, so that motion of a fraction of a pixel shows."""
 
 SKY_GREY, TRACK_GREY, CART_GREY, POLE_GREY, AXLE_GREY = 245, 120, 60, 150, 20
 """Grey levels, 0 to 255."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A fixed camera, its image plane parallel to the plane of motion: metres to pixels.
+
+    Pixel centres are at whole numbers, rows count downwards.
+    """
+
+    width: int = 120
+    """px"""
+    height: int = 100
+    """px"""
+    scale: float = 40.0
+    """px per m"""
+    column: float = 59.5
+    """px, column of x = 0"""
+    row: float = 74.5
+    """px, row of the pole's hinge"""
+
+    @property
+    def reach(self) -> float:
+        """Largest |x| in m at which the hinge is in the frame."""
+        return min(self.column + 0.5, self.width - 0.5 - self.column) / self.scale
 
 
 @dataclass(frozen=True)

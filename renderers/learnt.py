@@ -24,14 +24,7 @@ class MLPRenderer(nn.Module):
         self.arguments = {"height": height, "width": width}
         self.size = (height, width)
         first, self.last = nn.Linear(3, 32), nn.Linear(256, height * width)
-        self.layers = nn.Sequential(
-            first,
-            nn.Tanh(),
-            nn.Linear(32, 128),
-            nn.Tanh(),
-            nn.Linear(128, 256),
-            nn.Tanh(),
-        )
+        self.layers = nn.Sequential(first, nn.Tanh(), nn.Linear(32, 128), nn.Tanh(), nn.Linear(128, 256), nn.Tanh())
         with torch.no_grad():
             first.weight.mul_(torch.tensor(self.input_gain))
             first.bias.mul_(max(self.input_gain))
@@ -43,8 +36,7 @@ class MLPRenderer(nn.Module):
 
     def forward(self, x: Tensor, theta: Tensor) -> Tensor:
         """Frames (B, H, W) of cart positions (B,) in m and pole angles (B,) in rad."""
-        out: Tensor = self.last(self.layers(torch.stack((x, theta.sin(), theta.cos()), -1)))
-        return out.unflatten(-1, self.size)
+        return self.last(self.layers(torch.stack((x, theta.sin(), theta.cos()), -1))).unflatten(-1, self.size)
 
 
 class Layer(nn.Module):
@@ -111,25 +103,14 @@ class LayeredRenderer(nn.Module):
     def __init__(
         self, height: int, width: int, column: float, row: float, scale: float, reach: float, detail: float = 2.0
     ) -> None:
-        """Frames of (height, width) px from a first guess of the camera.
+        """Frames of (height, width) px, from a first guess of the camera.
 
-        Args:
-            height, width: px.
-            column, row: px, of the hinge at x = 0.
-            scale: px per m.
-            reach: m, the pole's length, or a little more.
-            detail: texels per px of the pictures.
+        The hinge is at (column, row) px at x = 0, and `scale` in px per m. `reach` is the pole's length in m, or a
+        little more, `detail` the pictures' texels per px.
         """
         super().__init__()
-        self.arguments = {
-            "height": height,
-            "width": width,
-            "column": float(column),
-            "row": float(row),
-            "scale": float(scale),
-            "reach": float(reach),
-            "detail": float(detail),
-        }
+        real = {"column": column, "row": row, "scale": scale, "reach": reach, "detail": detail}
+        self.arguments = {"height": height, "width": width, **{name: float(value) for name, value in real.items()}}
         length = reach * scale * 1.1
         self.size = (height, width)
         self.register_buffer("guess", torch.tensor([float(column), float(row)]), persistent=False)

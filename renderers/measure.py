@@ -37,14 +37,9 @@ def measure(frames: NDArray[np.uint8] | NDArray[np.floating], scene: DrawnCartPo
     if frames.ndim != 3 or frames.shape[1:] != (camera.height, camera.width):
         raise ValueError(f"frames are {frames.shape}, the camera's are (B, {camera.height}, {camera.width})")
     shades = frames.astype(float) * (1.0 if frames.dtype == np.uint8 else 255.0)
-    seen = [_measure(frame, scene) for frame in shades]
-    return np.array([x for x, _ in seen]), np.array([theta for _, theta in seen])
-
-
-def _measure(frame: Floats, scene: DrawnCartPole) -> tuple[float, float]:
-    camera = scene.camera
-    column = _cart(frame, scene)
-    return (column - camera.column) / camera.scale, _pole(frame, scene, column)
+    columns = np.array([_cart(frame, scene) for frame in shades])
+    angles = [_pole(frame, scene, float(column)) for frame, column in zip(shades, columns, strict=True)]
+    return (columns - camera.column) / camera.scale, np.array(angles)
 
 
 def _cart(frame: Floats, scene: DrawnCartPole) -> float:
@@ -100,7 +95,8 @@ def _pole(frame: Floats, scene: DrawnCartPole, column: float) -> float:
         if reach < tip / 2:
             return math.nan
         # Only pixels along the present line, and only as far out as the pole's full width is in the frame.
-        away, along = _about_line(camera.row, column, angle, rows, columns)
+        sine, cosine = math.sin(angle), math.cos(angle)
+        away, along = right * cosine - up * sine, right * sine + up * cosine
         band = cover * (np.abs(away) < POLE_BAND_PX) * (along > 0) * (along < reach)
         total = band.sum()
         if total < 5:
@@ -113,13 +109,6 @@ def _pole(frame: Floats, scene: DrawnCartPole, column: float) -> float:
             spread += math.pi
         angle = math.remainder(spread, 2 * math.pi)
     return angle
-
-
-def _about_line(row: float, column: float, angle: float, rows: Floats, columns: Floats) -> tuple[Floats, Floats]:
-    """Distances in px of pixels from a line through the hinge, and their positions along it."""
-    right, up = columns - column, row - rows
-    sine, cosine = math.sin(angle), math.cos(angle)
-    return right * cosine - up * sine, right * sine + up * cosine
 
 
 def _visible(scene: DrawnCartPole, column: float, angle: float) -> float:

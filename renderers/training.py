@@ -59,11 +59,12 @@ def fit(
     # Fused, since the optimiser would take most of a step of the MLP, whose last layer has 3 million weights.
     optimiser = torch.optim.Adam(groups, fused=True)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rates, total_steps=steps, pct_start=max(0.2, 2 / steps))
+    parts: dict[str, Any] = {"renderer": renderer, "optimiser": optimiser, "schedule": schedule}
     begun = 0
     if kept is not None:
         begun = kept["step"]
-        for part, state in ((renderer, "renderer"), (optimiser, "optimiser"), (schedule, "schedule")):
-            part.load_state_dict(kept[state])
+        for name, part in parts.items():
+            part.load_state_dict(kept[name])
         generator.set_state(kept["generator"])
     for step in range(begun, steps):
         rows = torch.randint(len(frames), (batch,), generator=generator)
@@ -75,6 +76,5 @@ def fit(
         if progress is not None:
             progress(step + 1, steps, float(loss.detach()))
         if keep is not None and (step + 1) % KEEP_EVERY == 0:
-            parts = {"renderer": renderer, "optimiser": optimiser, "schedule": schedule}
             states = {name: part.state_dict() for name, part in parts.items()}
             keep({"step": step + 1, "generator": generator.get_state(), **states})

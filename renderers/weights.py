@@ -54,19 +54,12 @@ def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRen
         renderer = KINDS[header["kind"]](**header["arguments"])
     except (KeyError, TypeError, json.JSONDecodeError) as error:
         raise RendererError(f"{path}: its header does not describe a known renderer ({error})") from error
-    for key, value in renderer.state_dict().items():
-        if key not in weights:
-            raise RendererError(f"{path}: made for another architecture: {key} is missing")
-        if weights[key].shape != value.shape:
-            raise RendererError(
-                f"{path}: made for another architecture: {key} is {tuple(weights[key].shape)}, "
-                f"this renderer needs {tuple(value.shape)}"
-            )
-    if extra := sorted(weights.keys() - renderer.state_dict().keys()):
-        raise RendererError(f"{path}: made for another architecture: {extra[0]} is not in this renderer")
+    try:
+        renderer.load_state_dict(weights)
+    except RuntimeError as error:
+        raise RendererError(f"{path}: made for another architecture: {' '.join(str(error).split())}") from error
     if size is not None and renderer.size != size:
         raise RendererError(
             f"{path}: its frames are {renderer.size[1]} x {renderer.size[0]} px, {size[1]} x {size[0]} are needed"
         )
-    renderer.load_state_dict(weights)
     return renderer

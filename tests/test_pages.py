@@ -170,7 +170,7 @@ def test_the_commands_that_pages_show_are_ones_that_the_command_line_takes(line)
     parser = argparse.ArgumentParser(exit_on_error=False)
     commands = parser.add_subparsers(required=True)
     for command in main.COMMANDS:
-        command.add(commands)
+        command(commands.add_parser(command.__name__))
     parser.parse_args(shlex.split(line))
 
 

@@ -40,8 +40,8 @@ from visadapt.setups.flight import flight_target, quadrotor
 from visadapt.storage.run_folder import once, open_run, write_json
 from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, rotation, times
 from visadapt.targets import TargetError
-from visadapt.targets.flight import FlightTarget
 from visadapt.targets.rotorpy import BREEZE, SOURCE, RotorpyTarget
+from visadapt.targets.synthetic import FlightTarget
 from visadapt.tasks.follow import Follow
 from visadapt.weights import shipped
 from visadapt.world import World

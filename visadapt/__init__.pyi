@@ -14,10 +14,9 @@ from .evaluation.scoring import score as score
 from .films.filming import film as film
 from .learning.joint import Adapted as Adapted
 from .policies.base import Policy as Policy
-from .recordings.episode import Episode as Episode
+from .recordings.episode import Episode as Episode, Recording as Recording
 from .recordings.hdf5 import read_recording as read_recording, write_recording as write_recording
 from .recordings.loading import load_recording as load_recording
-from .recordings.recording import Recording as Recording
 from .setups.base import Setup as Setup
 from .setups.policy_file import load_policy as load_policy, load_source as load_source, save_policy as save_policy
 from .setups.training import adapt as adapt, setup_for as setup_for, train as train
@@ -28,10 +27,10 @@ from .systems.parameter_file import load_parameters as load_parameters
 from .systems.quadrotor import Quadrotor as Quadrotor
 from .targets.base import Observation as Observation, Target as Target
 from .targets.env_map import Entry as Entry, EnvMap as EnvMap
-from .targets.flight import FlightTarget as FlightTarget
 from .targets.gymnasium import GymnasiumTarget as GymnasiumTarget
 from .targets.rollout import run as run
 from .targets.synthetic import (
+    FlightTarget as FlightTarget,
     SyntheticTarget as SyntheticTarget,
     constant_force as constant_force,
     sine_force as sine_force,

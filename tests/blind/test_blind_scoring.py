@@ -12,7 +12,7 @@ from benchmarks.blind.diagnosis import Settings, diagnose_one, read_log, run_one
 from benchmarks.blind.scoring import Truth, classes, matches, region_of, score, sizes
 from benchmarks.blind.tables import Row, confusion, label, read_table, tabulate
 from visadapt.effects.catalogue import catalogue
-from visadapt.evaluation.intervals import wilson
+from visadapt.evaluation.scoring import wilson
 
 
 def cause(effect, alike=(), **parameters):

@@ -18,7 +18,7 @@ ROOT = Path(visadapt.__file__).parents[1]
 
 
 def names():
-    return [command.__name__.rpartition(".")[2] for command in COMMANDS]
+    return [command.__name__ for command in COMMANDS]
 
 
 @pytest.mark.parametrize("name", names())
@@ -64,7 +64,7 @@ def test_a_bug_is_not_taken_for_bad_input(monkeypatch):
     def broken(system):
         raise ZeroDivisionError
 
-    monkeypatch.setattr("visadapt.effects.catalogue.catalogue_text", broken)
+    monkeypatch.setattr("visadapt.cli.effects.catalogue_text", broken)
     with pytest.raises(ZeroDivisionError):
         run("effects")
 

@@ -7,7 +7,7 @@ import pytest
 
 import visadapt as va
 from tests.cli.commands import refused, run
-from visadapt.cli.score import SEED
+from visadapt.cli.arguments import SCORE_SEED as SEED
 from visadapt.evaluation import SCORE_SEED
 
 

@@ -28,7 +28,7 @@ from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import CAREFUL
 from visadapt.history import HORIZON
 from visadapt.policies import ImagePolicy, Policy, StatePolicy
-from visadapt.recordings import write_csv
+from visadapt.recordings import write_recording
 from visadapt.setups.policy_file import save_policy
 from visadapt.systems import CartPole
 from visadapt.world import World
@@ -187,9 +187,9 @@ class TestWholeDiagnosis:
         assert result.policy.bound[1] < result.policy.bound[0]
 
     def test_of_a_file(self, tmp_path, capsys):
-        run, saved, out, page = (tmp_path / name for name in ("run.csv", "p.safetensors", "a.json", "a.html"))
+        run, saved, out, page = (tmp_path / name for name in ("run.h5", "p.safetensors", "a.json", "a.html"))
         recording = record([ConstantForce(force=FORCE)])
-        write_csv(run, recording.episodes, recording.measured, ["command"])
+        write_recording(run, recording.episodes, recording.measured, ["command"])
         save_policy(saved, StatePolicy(4))
         arguments = ["--policy", saved, "--json", out, "--report", page]
         assert cli.main(["diagnose", str(run), "--system", "cartpole", *map(str, arguments)]) == 0

@@ -10,7 +10,7 @@ from tests.scenes import (
     stir,
 )
 from visadapt.effects import ActuatorDelay, ConstantForce, Residual
-from visadapt.evaluation.cartpole_score import score_cartpole
+from visadapt.evaluation import score
 from visadapt.history import History
 from visadapt.learning.policy import DivergedError, TuneSettings, imagine, initialise_feedforward, tune
 from visadapt.learning.windows import Windows
@@ -141,12 +141,12 @@ class TestOnStates:
         torch.manual_seed(0)
         policy = StatePolicy(4)
         target = SyntheticTarget()
-        before = score_cartpole(policy, target, 20, 0, 100)
+        before = score(policy, target, 20, 0, 100)
         task = Balance(PAPER_CARTPOLE, divergence=ANYWHERE)
         settings = TuneSettings(task, 200, 16, learning_rate=1e-2, observation_noise=0.0, longest=100)
         world = World(CartPole(), integrator="euler")
         losses = tune(policy, world, identity, settings, torch.Generator().manual_seed(0))
-        after = score_cartpole(policy, target, 20, 0, 100)
+        after = score(policy, target, 20, 0, 100)
         assert len(losses) == 200
         assert sum(losses[-20:]) < 0.3 * sum(losses[:20])
         assert before.survived < 5
@@ -254,7 +254,7 @@ class TestReplay:
         settings = TuneSettings(task, 300, 32, 1e-2, 100, streams=4, every=3, observation_noise=0.0)
         tune(policy, World(CartPole(), integrator="euler"), identity, settings, torch.Generator().manual_seed(0))
         assert Stepped.steps == 4 * 100
-        assert score_cartpole(policy, SyntheticTarget(), 20, 0, 100).survived == 20
+        assert score(policy, SyntheticTarget(), 20, 0, 100).survived == 20
 
 
 class TestResuming:

@@ -151,9 +151,9 @@ class TestFiles:
     @pytest.mark.parametrize(
         ("spoil", "says"),
         [
-            (lambda weights: weights.pop("tilt"), "tilt is missing"),
-            (lambda weights: weights.update(extra=torch.zeros(1)), "extra is not in this renderer"),
-            (lambda weights: weights.update(gain=torch.zeros(3)), r"gain is \(3,\), this renderer needs \(2,\)"),
+            (lambda weights: weights.pop("tilt"), r'Missing key\(s\) .* "tilt"'),
+            (lambda weights: weights.update(extra=torch.zeros(1)), r'Unexpected key\(s\) .* "extra"'),
+            (lambda weights: weights.update(gain=torch.zeros(3)), r"size mismatch for gain: .*\[3\].*\[2\]"),
         ],
     )
     def test_weights_of_another_architecture_are_refused(self, spoil, says, tmp_path):
@@ -162,8 +162,9 @@ class TestFiles:
         spoil(weights)
         header = {"format": 1, "kind": "layered", "arguments": renderer.arguments, "training": {}}
         save_file(weights, tmp_path / "r.safetensors", {"renderers": json.dumps(header)})
-        with pytest.raises(RendererError, match=f"another architecture: {says}"):
+        with pytest.raises(RendererError, match=f"another architecture: .*{says}") as caught:
             load_renderer(tmp_path / "r.safetensors")
+        assert "\n" not in str(caught.value)
 
     def test_frames_of_another_size_are_refused(self, tmp_path):
         save_renderer(tmp_path / "r.safetensors", made("mlp"), {})

@@ -7,7 +7,7 @@ from torch import nn
 from tests.flying import PERIOD, drag, push, seeded, small_quadrotor, straight, waves
 from visadapt.effects import ConstantForce
 from visadapt.evaluation import score
-from visadapt.evaluation.flight_score import FAR
+from visadapt.evaluation.scoring import FAR
 from visadapt.history import HORIZON
 from visadapt.policies import AutoregressivePolicy, FollowPolicy, Policy
 from visadapt.setups.flight import fixed_wing

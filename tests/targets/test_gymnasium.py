@@ -347,11 +347,11 @@ def test_pendulum_is_near_its_source_model(pendulum):
 
 
 def test_pendulums_of_two_targets_do_not_draw_into_each_other(pendulum):
-    from visadapt.targets.inverted_pendulum import MAP, START
+    from visadapt.targets.inverted_pendulum import MAP
 
     options = {**MAP.options, "width": 480, "height": 400}
     large = dataclasses.replace(MAP, options=options, crop=(0, 0, 480, 400))
-    other = GymnasiumTarget("InvertedPendulum-v5", large, start=START)
+    other = GymnasiumTarget("InvertedPendulum-v5", large)
 
     def frames(target):
         return target.reset(2, generator()).frame.float()
@@ -366,9 +366,9 @@ def test_pendulums_of_two_targets_do_not_draw_into_each_other(pendulum):
 
 def test_pendulum_keeps_its_own_reset_and_leaves_nothing_at_exit(pendulum):
     script = (
-        "import torch\n"
-        "from visadapt.targets.inverted_pendulum import inverted_pendulum\n"
-        "target = inverted_pendulum(start=None)\n"
+        "import dataclasses, torch, visadapt\n"
+        "from visadapt.targets.inverted_pendulum import MAP\n"
+        "target = visadapt.GymnasiumTarget('InvertedPendulum-v5', dataclasses.replace(MAP, start=None))\n"
         "print(target.reset(2, torch.Generator()).state.abs().max() <= 0.01)\n"
     )
     root = Path(__file__).parents[2]

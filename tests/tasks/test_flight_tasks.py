@@ -17,8 +17,8 @@ from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.setups.residuals import source_steps
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
-from visadapt.targets.flight import FlightTarget
 from visadapt.targets.rollout import run
+from visadapt.targets.synthetic import FlightTarget
 from visadapt.tasks.follow import Follow, FollowCost
 from visadapt.tasks.reach import Reach
 from visadapt.world import World

@@ -1,52 +1,212 @@
-"""What subcommands share: types of arguments, progress, and the folder that an interrupted command goes on from."""
+"""The arguments of each subcommand. Nothing here loads slowly, so that `visadapt --help` answers at once."""
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import hashlib
-import shutil
-import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+import math
+from contextlib import suppress
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from visadapt.progress import Report
     from visadapt.systems import System
 
 SYSTEMS_HELP = "cartpole, quadrotor or fixed_wing"
+SCORE_SEED = 2026
+"""`evaluation.SCORE_SEED`, which a test holds it to."""
 
 
-class InputError(ValueError):
-    """An argument that cannot be used; the message is one line: what, where, and what would be right."""
+def diagnose(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `visadapt diagnose`."""
+    parser.description = (
+        "Says where a recording departs from the simulator, which named effects cause it, and how much of the gap they "
+        "close. The verdict goes to the terminal; exit status 0: a diagnosis was made, 2: bad input."
+    )
+    add = parser.add_argument
+    add("recording", nargs="+", metavar="RECORDING", help="a CSV or HDF5 file, several, or a folder of them")
+    _add_system(parser)
+    columns_help = "our name=the file's, as in x=position,theta=phi"
+    add("--columns", metavar="A=B,...", type=_columns, default={}, help=columns_help)
+    add("--effects", metavar="FILE.py", help="a file that defines effects of your own")
+    add(
+        "--policy",
+        metavar="P.safetensors",
+        help="a policy on states, as `visadapt train` writes it, for which the terms of the paper's Theorem 1 are "
+        "given, on the terminal and in the report",
+    )
+    add("--json", metavar="F", help="write the result here, as visadapt/diagnosis/schema.json says")
+    add("--report", metavar="F.html", help="write a page with figures here")
+    _add_seed(parser)
+    add("--jobs", metavar="N", type=_positive, default=1, help="cores to use (default: 1)")
 
 
-def positive(text: str) -> int:
+def effects(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `visadapt effects`."""
+    parser.description = (
+        "Lists the effects that separate a real machine from the simulator: the stage of a step at which each acts, "
+        "its equation and source, and its parameters with unit and searched range."
+    )
+    add = parser.add_argument
+    add("--system", type=_system, metavar="NAME", help=f"only those that act on it: {SYSTEMS_HELP}")
+    add("--effects", metavar="FILE.py", help="a file that defines effects of your own, listed too")
+
+
+def renderer(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `visadapt renderer`."""
+    parser.description = (
+        "Trains a renderer, states to frames, from recordings of a cart-pole that hold both, or from what a gymnasium "
+        "environment shows of chosen states. --hinge and --scale are a first guess of where the camera stands, good "
+        "to some pixels; it is refined. Interrupted, the same command goes on where it was."
+    )
+    add = parser.add_argument
+    add("recording", nargs="*", metavar="RECORDING.h5", help="HDF5 with frames, as visadapt.write_recording writes it")
+    _add_target(parser, required=False)
+    add("--show", metavar="N", type=_positive, default=4000, help="states that --target is put into (default: 4000)")
+    within_help = "m and rad to either side of 0 that these states are drawn from (default: 1.0,0.35)"
+    add("--within", metavar="X,THETA", type=_pair, default=(1.0, 0.35), help=within_help)
+    add("--out", required=True, metavar="R.safetensors", help="write the renderer here")
+    add("--hinge", required=True, type=_pair, metavar="COLUMN,ROW", help="px, where the pole's hinge is seen at x = 0")
+    add("--scale", required=True, type=_positive_number, metavar="PX", help="px that a metre is long")
+    pole_help = "m from the hinge to the pole's tip, rather too long than too short (default: 1.05)"
+    add("--pole", type=_positive_number, default=1.05, metavar="M", help=pole_help)
+    add("--iterations", metavar="N", type=_positive, default=1000, help="(default: 1000)")
+    _add_seed(parser)
+
+
+def train(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `visadapt train`."""
+    parser.description = (
+        "Trains a policy by backpropagation through the simulator: on states, or, of a cart-pole, on a camera's "
+        "frames. With --diagnosis or --effect the simulator has these effects. Interrupted, the same command goes on "
+        "where it was."
+    )
+    add = parser.add_argument
+    _add_system(parser)
+    add("--out", required=True, metavar="P.safetensors", help="write the policy here")
+    add("--period", metavar="S", type=_positive_number, help="s between commands (default: 0.05; quadrotor: 0.1)")
+    add("--frames", action="store_true", help="the policy is shown a camera's frames, not states")
+    add(
+        "--renderer",
+        metavar="R.safetensors",
+        help="the camera, as `visadapt renderer` writes it; implies --frames (default: of a cart-pole that is drawn)",
+    )
+    add("--references", metavar="F.csv", help="what a quadrotor is to follow: columns time, x, y, z in s and m")
+    add("--with-history", action="store_true", help="read the last 5 periods too, as against a force that changes")
+    _add_effects(parser)
+    add("--iterations", metavar="N", type=_positive, help="of the policy (default: the system's own)")
+    add("--seeing", metavar="N", type=_positive, help="iterations in which an encoder of frames learns to see")
+    _add_seed(parser)
+
+
+def adapt(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `visadapt adapt`."""
+    parser.description = (
+        "Adapts a policy to a target by the paper's Algorithm 1. In each round the policy is run on the target, a "
+        "residual learns what the simulator leaves out, and the policy is tuned in the result. Every step of the "
+        "target is counted. The folder --out keeps settings, seed, versions, recordings, ledger and policy; "
+        "interrupted, the same command goes on where it was."
+    )
+    add = parser.add_argument
+    _add_policy_and_target(parser)
+    add("--out", required=True, metavar="FOLDER", help="folder of the run; policy.safetensors in it")
+    add("--samples", metavar="N", type=_positive, default=1000, help="steps of the target in all (default: 1000)")
+    add("--round", metavar="B", type=_positive, help="steps of the target in a round (default: a fifth of --samples)")
+    renderer_help = "the one that the policy was trained with (default: of a cart-pole that is drawn)"
+    add("--renderer", metavar="R.safetensors", help=renderer_help)
+    add("--references", metavar="F.csv", help="what a quadrotor is to follow, if the target has none")
+    add("--with-history", action="store_true", help="let a vehicle's residual read the last periods too")
+    _add_effects(parser)
+    add("--iterations", metavar="N", type=_positive, help="of tuning in a round (default: the system's)")
+    _add_seed(parser)
+
+
+def score(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `visadapt score`."""
+    parser.description = (
+        "Runs episodes of a policy on a target. Cart-poles are scored by the cart's mean speed in m/s over the "
+        "episodes that stay up, flights by their distance in m from their line; failed episodes are counted apart."
+    )
+    add = parser.add_argument
+    _add_policy_and_target(parser)
+    add("--episodes", metavar="N", type=_positive, default=100, help="(default: 100)")
+    seed_help = f"of the starts and hidden effects (default: {SCORE_SEED})"
+    add("--seed", metavar="N", type=int, default=SCORE_SEED, help=seed_help)
+    add("--film", metavar="F.mp4", help="film one more episode")
+    add("--json", metavar="F", help="write the score here")
+    add("--effects", metavar="FILE.py", help="a file that defines effects the policy was trained with")
+
+
+def _add_system(parser: argparse.ArgumentParser) -> None:
+    system_help = f"the source physics: {SYSTEMS_HELP}"
+    parser.add_argument("--system", required=True, type=_system, metavar="NAME", help=system_help)
+    parser.add_argument("--params", metavar="RIG.toml", help="the rig's own parameters, in a table [parameters]")
+
+
+def _add_seed(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
+
+
+def _add_effects(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--diagnosis", metavar="D.json", help="put the effects into the simulator that `visadapt diagnose --json` named"
+    )
+    parser.add_argument(
+        "--effect",
+        metavar="NAME:PARAMETER=VALUE,...",
+        action="append",
+        default=[],
+        help="put an effect into the simulator, as in viscous_friction:coefficient=2.1 (`visadapt effects` lists them "
+        "with their units); may be repeated",
+    )
+    parser.add_argument("--effects", metavar="FILE.py", help="a file that defines effects of your own")
+
+
+def _add_policy_and_target(parser: argparse.ArgumentParser) -> None:
+    policy_help = "as `visadapt train` or `visadapt adapt` wrote it"
+    parser.add_argument("--policy", required=True, metavar="P.safetensors", help=policy_help)
+    _add_target(parser, required=True)
+
+
+def _add_target(parser: argparse.ArgumentParser, required: bool) -> None:
+    parser.add_argument(
+        "--target",
+        required=required,
+        metavar="TARGET",
+        help="the machine: a gymnasium id with --map, or package.module:factory, a function without arguments that "
+        "returns a visadapt.Target, or, with --map, a gymnasium environment; modules here are found too",
+    )
+    parser.add_argument("--map", metavar="MAP.toml", help="what the numbers and frames of a gymnasium environment mean")
+
+
+def _positive(text: str) -> int:
     """A whole number from 1 on."""
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 on")
     return int(text)
 
 
-def positive_number(text: str) -> float:
+def _positive_number(text: str) -> float:
     """A finite number above 0."""
-    number = _finite(text)
-    if not number > 0:
+    if not (number := _finite(text)) > 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
     return number
 
 
-def pair(text: str) -> tuple[float, float]:
+def _pair(text: str) -> tuple[float, float]:
     """Two finite numbers with a comma between them."""
-    first, *rest = text.split(",")
-    if len(rest) != 1:
+    if text.count(",") != 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not two numbers with a comma between them")
-    return _finite(first), _finite(rest[0])
+    first, second = map(_finite, text.split(","))
+    return first, second
 
 
-def system_class(text: str) -> type[System]:
+def _finite(text: str) -> float:
+    with suppress(ValueError):
+        if math.isfinite(number := float(text)):
+            return number
+    raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
+
+
+def _system(text: str) -> type[System]:
     """The system of a name."""
     from visadapt.systems import SYSTEMS
 
@@ -55,73 +215,14 @@ def system_class(text: str) -> type[System]:
     return SYSTEMS[text]
 
 
-def _finite(text: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
-    if not abs(number) < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
-    return number
-
-
-def add_system(parser: argparse.ArgumentParser, required: bool = True) -> None:
-    """Add --system and --params."""
-    parser.add_argument(
-        "--system", required=required, type=system_class, metavar="NAME", help=f"the source physics: {SYSTEMS_HELP}"
-    )
-    parser.add_argument("--params", metavar="RIG.toml", help="the rig's own parameters, in a table [parameters]")
-
-
-def the_system(options: argparse.Namespace) -> System:
-    """The system of --system with the parameters of --params."""
-    from visadapt.systems.parameter_file import load_parameters
-
-    system: System = load_parameters(options.params, options.system) if options.params else options.system()
-    return system
-
-
-def add_seed(parser: argparse.ArgumentParser) -> None:
-    """Add --seed."""
-    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
-
-
-@contextmanager
-def checked() -> Iterator[None]:
-    """Turn the ValueError or TypeError by which the library refuses an argument into an InputError."""
-    try:
-        yield
-    except (ValueError, TypeError) as error:
-        raise InputError(str(error)) from error
-
-
-@contextmanager
-def progress() -> Iterator[Report]:
-    """A report of progress on stderr, where everything goes that is printed meanwhile: stdout is for results."""
-    from visadapt.progress import reporting
-
-    with contextlib.redirect_stdout(sys.stderr), reporting() as report:
-        yield report
-
-
-@contextmanager
-def unfinished(out: Path, settings: Mapping[str, Any]) -> Iterator[Path]:
-    """The folder `<out>.unfinished` that a training works in, and goes on from; removed once the block is through.
-
-    Raises:
-        InputError: `out` is there already, or is a folder.
-        RunError: the folder holds a training with other settings.
-    """
-    from visadapt.storage.run_folder import open_run
-
-    if out.exists():
-        raise InputError(f"{out} is there already: remove it, or name another file by --out")
-    folder = out.with_name(out.name + ".unfinished")
-    open_run(folder, settings)
-    yield folder
-    shutil.rmtree(folder)
-
-
-def fingerprint(path: str | Path | None) -> str | None:
-    """The SHA-256 of a file that a run depends on, so that it does not go on with another; None without one."""
-    return None if path is None else hashlib.sha256(Path(path).read_bytes()).hexdigest()
+def _columns(text: str) -> dict[str, str]:
+    """The file's names of columns by ours."""
+    columns: dict[str, str] = {}
+    for pair in text.split(","):
+        ours, _, theirs = (part.strip() for part in pair.partition("="))
+        if not ours or not theirs:
+            raise argparse.ArgumentTypeError(f"{pair!r} is not of the form x=position")
+        if ours in columns:
+            raise argparse.ArgumentTypeError(f"{ours} is given twice")
+        columns[ours] = theirs
+    return columns

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import sys
 from collections.abc import Sequence
 
-from visadapt.cli import adapt, diagnose, effects, renderer, score, train
+from visadapt.cli import arguments as asked
 
-DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
-"""Exit statuses; 2 is argparse's own, 130 a shell's."""
-
-COMMANDS = (diagnose, effects, renderer, train, adapt, score)
-"""Each has `add`, which adds its parser and sets `run`, which carries it out. All that loads slowly, loads in `run`."""
+COMMANDS = {
+    asked.diagnose: "where a rig departs from the simulator, which effect causes it, and how far that explains it",
+    asked.effects: "the effects that a diagnosis can name: equations, parameters, units, ranges",
+    asked.renderer: "learn from a camera's frames how a cart-pole looks in each state",
+    asked.train: "train a policy in the simulator, with the effects of a diagnosis if there are any",
+    asked.adapt: "adapt a policy to a target from few counted samples of it",
+    asked.score: "run a policy on a target: its score, failed episodes counted apart, and a film",
+}
+"""Each subcommand's arguments, and what it does; it is carried out by `run` of the module of its name."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -21,27 +26,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="visadapt", description=(sys.modules["visadapt"].__doc__ or "").partition("\n")[0]
     )
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for command in COMMANDS:
-        command.add(commands)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
+    for add_arguments, does in COMMANDS.items():
+        add_arguments(commands.add_parser(add_arguments.__name__, help=does))
     options = parser.parse_args(arguments)
+    command = vars(options).pop("command")  # what is left are the settings of a run
     try:
-        options.run(options)
+        importlib.import_module(f"visadapt.cli.{command}").run(options)
         sys.stdout.flush()
     except KeyboardInterrupt:
         print("visadapt: interrupted; run the same command to go on", file=sys.stderr)
-        return INTERRUPTED
+        return 130  # as of a shell
     except BrokenPipeError:
         # Whoever read the output has read enough, as `head` does; Python would complain once more at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except Exception as error:
-        if not _is_answer(error):
+        # The messages of our own exceptions and of the system's are for whoever runs the command.
+        if not isinstance(error, OSError) and type(error).__module__.partition(".")[0] not in ("visadapt", "renderers"):
             raise
         print(f"visadapt: {error}", file=sys.stderr)
-        return BAD_INPUT
-    return DONE
-
-
-def _is_answer(error: Exception) -> bool:
-    """Whether its message is for whoever runs the command: those of our own exceptions and of the system's are."""
-    return isinstance(error, OSError) or type(error).__module__.partition(".")[0] in ("visadapt", "renderers")
+        return 2  # argparse's own
+    return 0

@@ -4,77 +4,31 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from visadapt.cli.arguments import (
-    InputError,
-    add_seed,
-    fingerprint,
-    pair,
-    positive,
-    positive_number,
-    progress,
-    unfinished,
-)
-from visadapt.cli.policy_and_target import add_target, load_target
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
-if TYPE_CHECKING:
-    from torch import Tensor
+from renderers import LayeredRenderer, save_renderer
+from renderers.training import fit
+from visadapt.cli.inputs import InputError, fingerprint, progress, unfinished
+from visadapt.cli.target import load_target
+from visadapt.progress import staged
+from visadapt.recordings.hdf5 import read_names, read_recording
+from visadapt.storage.atomic_files import replacing
+from visadapt.storage.checkpoints import load_tree, save_tree
+from visadapt.systems import CartPole
+from visadapt.targets import Start
+from visadapt.targets.gymnasium import GymnasiumTarget
+from visadapt.world import World
 
 HELD_OUT = 10
 """Every tenth frame is left out of the training and compared with what the renderer makes of its state."""
 
 
-def add(commands: Any) -> None:
-    """Add the subcommand's parser."""
-    parser = commands.add_parser(
-        "renderer",
-        help="learn from a camera's frames how a cart-pole looks in each state",
-        description="Trains a renderer, states to frames, from recordings of a cart-pole that hold both, or from what "
-        "a gymnasium environment shows of chosen states. --hinge and --scale are a first guess of where the camera "
-        "stands, good to some pixels; it is refined. Interrupted, the same command goes on where it was.",
-    )
-    parser.add_argument(
-        "recording", nargs="*", metavar="RECORDING.h5", help="HDF5 with frames, as visadapt.write_recording writes it"
-    )
-    add_target(parser, required=False)
-    parser.add_argument(
-        "--show", metavar="N", type=positive, default=4000, help="states that --target is put into (default: 4000)"
-    )
-    parser.add_argument(
-        "--within",
-        metavar="X,THETA",
-        type=pair,
-        default=(1.0, 0.35),
-        help="m and rad to either side of 0 that these states are drawn from (default: 1.0,0.35)",
-    )
-    parser.add_argument("--out", required=True, metavar="R.safetensors", help="write the renderer here")
-    parser.add_argument(
-        "--hinge", required=True, type=pair, metavar="COLUMN,ROW", help="px, where the pole's hinge is seen at x = 0"
-    )
-    parser.add_argument("--scale", required=True, type=positive_number, metavar="PX", help="px that a metre is long")
-    parser.add_argument(
-        "--pole",
-        type=positive_number,
-        default=1.05,
-        metavar="M",
-        help="m from the hinge to the pole's tip, rather too long than too short (default: 1.05)",
-    )
-    parser.add_argument("--iterations", metavar="N", type=positive, default=1000, help="(default: 1000)")
-    add_seed(parser)
-    parser.set_defaults(run=run)
-
-
 def run(options: argparse.Namespace) -> None:
     """Train the renderer, write it, and say how well it draws frames that it was not trained on."""
-    import torch
-
-    from renderers import LayeredRenderer, save_renderer
-    from renderers.training import fit
-    from visadapt.progress import staged
-    from visadapt.storage.atomic_files import replacing
-    from visadapt.storage.checkpoints import load_tree, save_tree
-
     if bool(options.recording) == bool(options.target):
         raise InputError("give recordings, or a gymnasium environment by --target and --map")
     x, theta, frames = _read(options.recording) if options.recording else _show(options)
@@ -86,7 +40,7 @@ def run(options: argparse.Namespace) -> None:
     torch.manual_seed(options.seed)
     renderer = LayeredRenderer(height, width, column, row, options.scale, options.pole)
     held = torch.arange(len(frames)) % HELD_OUT == 0
-    settings = {name: value for name, value in vars(options).items() if name not in ("run", "out")}
+    settings = {name: value for name, value in vars(options).items() if name != "out"}
     settings["SHA-256"] = [fingerprint(path) for path in (*options.recording, options.map)]
     out = Path(options.out)
     with unfinished(out, settings) as folder, progress() as report:
@@ -116,34 +70,20 @@ def run(options: argparse.Namespace) -> None:
 
 def _show(options: argparse.Namespace) -> tuple[Tensor, Tensor, Tensor]:
     """As `_read`, of states that an environment is put into: a calibration, for which it is not stepped."""
-    import torch
-
-    from visadapt.systems import CartPole
-    from visadapt.targets.gymnasium import GymnasiumTarget
-    from visadapt.world import World
-
     target = load_target(options, World(CartPole()), True)
     if not isinstance(target, GymnasiumTarget):
         raise InputError(f"{options.target}: cannot be put into chosen states; give recordings of frames and states")
-    widths = torch.tensor([options.within[0], 0.0, options.within[1], 0.0])
-    generator = torch.Generator().manual_seed(options.seed)
-    states = widths * (2 * torch.rand(options.show, 4, generator=generator) - 1)
+    start = Start(options.within[0], 0.0, options.within[1], 0.0)
+    states = start.draw(options.show, torch.Generator().manual_seed(options.seed))
     return states[:, 0], states[:, 2], torch.from_numpy(target.show(states.double().numpy()))
 
 
 def _read(paths: list[str]) -> tuple[Tensor, Tensor, Tensor]:
     """Cart positions (N,) in m, pole angles (N,) in rad and frames (N, H, W) uint8 of all recordings."""
-    import numpy as np
-    import torch
-    from numpy.typing import NDArray
-
-    from visadapt.recordings.hdf5 import read_names, read_recording
-    from visadapt.systems import CartPole
-
     states: list[NDArray[np.floating]] = []
     frames: list[NDArray[np.uint8]] = []
     for path in paths:
-        names = read_names(path)[0] or [variable.name for variable in CartPole.states]
+        names, _ = read_names(path, CartPole)
         for name in ("x", "theta"):
             if name not in names:
                 raise InputError(f"{path}: has no state {name!r}; it has {', '.join(names)}")

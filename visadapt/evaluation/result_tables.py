@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from visadapt.evaluation.cartpole_score import CartPoleScore
-from visadapt.evaluation.flight_score import FlightScore
+from visadapt.evaluation.scoring import CartPoleScore, FlightScore
 from visadapt.storage.atomic_files import replacing
 
 
@@ -47,20 +46,8 @@ def speed_row(
     mean = float((weights * means).sum() / total) if total else float("nan")
     variance = float((weights * (spreads**2 + (means - mean) ** 2)).sum() / total) if total else float("nan")
     episodes = sum(score.episodes for score in scores)
-    return Row(
-        experiment=experiment,
-        system=system,
-        method=method,
-        domain=domain,
-        samples=samples,
-        measure="mean cart speed",
-        unit="m/s",
-        mean=round(mean, 4),
-        std=round(variance**0.5, 4),
-        episodes=episodes,
-        failed=episodes - int(total),
-        seeds=len(scores),
-    )
+    about = (experiment, system, method, domain, samples, "mean cart speed", "m/s")
+    return Row(*about, round(mean, 4), round(variance**0.5, 4), episodes, episodes - int(total), len(scores))
 
 
 def miss_row(
@@ -70,20 +57,9 @@ def miss_row(
     means = np.array([score.mean for score in scores])
     whole = bool(np.isfinite(means).all())
     variance = np.mean([score.std**2 for score in scores]) + means.var() if whole else np.inf
-    return Row(
-        experiment=experiment,
-        system=system,
-        method=method,
-        domain=domain,
-        samples=samples,
-        measure=measure,
-        unit="m",
-        mean=round(float(means.mean()), 5),
-        std=round(float(np.sqrt(variance)), 5),
-        episodes=sum(score.flights for score in scores),
-        failed=sum(score.failed for score in scores),
-        seeds=len(scores),
-    )
+    about = (experiment, system, method, domain, samples, measure, "m")
+    episodes, failed = sum(score.flights for score in scores), sum(score.failed for score in scores)
+    return Row(*about, round(float(means.mean()), 5), round(float(np.sqrt(variance)), 5), episodes, failed, len(scores))
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:

@@ -1,20 +1,63 @@
-"""The score of a policy on a target: one call for all of them."""
+"""Scores: a cart's speed and how far flights miss, failed episodes counted apart; intervals of what was counted."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, overload
 
-from visadapt.evaluation.cartpole_score import EPISODE_STEPS, CartPoleScore, score_cartpole
-from visadapt.evaluation.flight_score import FlightScore, score_flights
+import numpy as np
+import torch
+
 from visadapt.policies import Policy
 from visadapt.storage.run_folder import once
 from visadapt.targets import FlightTarget, Target
+from visadapt.targets.rollout import Run, run
 
 SCORE_SEED = 2026
 """Of the starts and hidden effects that policies are scored on: never that of a training, which counts from 0."""
+EPISODE_STEPS = 250
+"""Steps of a cart-pole's episode that is scored."""
+FAR = 1.0
+"""m off its task's line at which a flight has failed."""
+
+
+@dataclass(frozen=True)
+class CartPoleScore:
+    """Scores of a set of episodes. Speeds are over surviving episodes only; the fallen are counted apart."""
+
+    episodes: int
+    survived: int
+    mean_speed: float | None
+    """m/s, mean over surviving episodes of the mean |x_dot| over the episode; None where none survived"""
+    std_speed: float | None
+    """m/s, spread over surviving episodes"""
+    mean_length: float
+    """steps until the end, over all episodes"""
+
+    def __str__(self) -> str:
+        speed = f"{self.mean_speed:.3f} m/s" if self.mean_speed is not None else "no speed"
+        return f"{speed}, {self.survived} of {self.episodes} episodes up"
+
+
+@dataclass(frozen=True)
+class FlightScore:
+    """How far flights miss. The mean includes failed flights; it is infinite where a flight's state was not finite."""
+
+    flights: int
+    failed: int
+    """flights that were more than FAR off somewhere, or not finite"""
+    mean: float
+    """m, over flights, of the mean over each"""
+    std: float
+    """m, over flights"""
+    worst: float
+    """m, the greatest distance of all"""
+
+    def __str__(self) -> str:
+        return f"{self.mean:.4f} +- {self.std:.4f} m, {self.flights - self.failed} of {self.flights} stayed near"
 
 
 @overload
@@ -42,9 +85,12 @@ def score(
     >>> found.survived, found.mean_speed < 1.0  # print(found) says both
     (2, True)
     """
+    policy.eval()
+    generator = torch.Generator().manual_seed(seed)
     if isinstance(target, FlightTarget):
-        return score_flights(policy, target, episodes, seed, steps)
-    return score_cartpole(policy, target, episodes, seed, steps or EPISODE_STEPS)
+        runs = run(target, policy, episodes, steps or target.task.steps, generator, strict=False)
+        return _score_flights(runs, target)
+    return score_runs(run(target, policy, episodes, steps or EPISODE_STEPS, generator))
 
 
 @overload
@@ -61,3 +107,43 @@ def kept_score(path: Path, policy: Policy, target: Target, episodes: int = 100) 
     # JSON has no infinity: that of a flight that was not finite is null there.
     missing: dict[str, Any] = {key: math.inf for key, value in found.items() if value is None}
     return FlightScore(**(found | missing))
+
+
+def score_runs(runs: Sequence[Run]) -> CartPoleScore:
+    """Scores of episodes whose second state is the cart's velocity."""
+    speeds = np.array(
+        [np.abs(r.episode.state[:, 1]).mean() for r in runs if r.survived and r.episode.state is not None]
+    )
+    return CartPoleScore(
+        episodes=len(runs),
+        survived=len(speeds),
+        mean_speed=float(speeds.mean()) if len(speeds) else None,
+        std_speed=float(speeds.std()) if len(speeds) else None,
+        mean_length=float(np.mean([r.episode.samples for r in runs])),
+    )
+
+
+def _score_flights(runs: Sequence[Run], target: FlightTarget) -> FlightScore:
+    misses = []
+    for k, flown in enumerate(runs):
+        if flown.survived:
+            assert flown.episode.state is not None
+            states = torch.as_tensor(flown.episode.state)[None]
+            misses.append(target.task.misses(states, target.first[k : k + 1])[0].numpy())
+        else:
+            misses.append(np.array([np.inf]))
+    means = np.array([miss.mean() for miss in misses])
+    worst = np.array([miss.max() for miss in misses])
+    mean = float(means.mean())
+    std = float(means.std()) if math.isfinite(mean) else math.inf
+    return FlightScore(len(runs), int((worst > FAR).sum()), mean, std, float(worst.max()))
+
+
+def wilson(hits: int, n: int, z: float = 1.959964) -> tuple[float, float]:
+    """Confidence interval of a share, `z` standard deviations to either side (Wilson 1927); NaN of no trials."""
+    if n == 0:
+        return math.nan, math.nan
+    p = hits / n
+    centre, scale = p + z * z / (2 * n), 1 + z * z / n
+    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from visadapt.evaluation.flight_score import FAR
+from visadapt.evaluation.scoring import FAR
 from visadapt.films.canvas import Floats
 from visadapt.systems import RigidBody
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, VELOCITY, rotation

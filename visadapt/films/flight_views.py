@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from visadapt.evaluation.flight_score import FAR
+from visadapt.evaluation.scoring import FAR
 from visadapt.films.canvas import Canvas, Floats, text_width
 from visadapt.films.colours import (
     AMBER,

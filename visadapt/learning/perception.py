@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from visadapt.history import LENGTH, History
 from visadapt.policies.networks import FrameEncoder
 from visadapt.progress import Progress
-from visadapt.storage.training_state import CHECKPOINT_ITERATIONS, TrainingState
+from visadapt.storage.checkpoints import CHECKPOINT_ITERATIONS, TrainingState
 
 
 @dataclass(frozen=True)

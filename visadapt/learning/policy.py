@@ -23,8 +23,7 @@ from visadapt.learning.streams import Streams, StreamSettings, StreamState, look
 from visadapt.learning.windows import Observe, Windows
 from visadapt.policies import Policy
 from visadapt.progress import Progress
-from visadapt.storage.checkpoints import load_network, save_network
-from visadapt.storage.training_state import CHECKPOINT_ITERATIONS, TrainingState
+from visadapt.storage.checkpoints import CHECKPOINT_ITERATIONS, TrainingState, load_network, save_network
 from visadapt.tasks.base import Task
 from visadapt.world import World, WorldState
 

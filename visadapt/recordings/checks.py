@@ -6,7 +6,7 @@ These are heuristics that raise only where the numbers cannot be right; a record
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations, product
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from visadapt.recordings.clock import Note, RawEpisode
 from visadapt.recordings.episode import RecordingError
-from visadapt.recordings.physics import DEGREE, DIFFERENCE_S, are_degrees, exchanged
+from visadapt.recordings.physics import DEGREE, DIFFERENCE_S, are_degrees, correlation, exchanged
 from visadapt.systems import System, Variable
 
 TURN = 2 * math.pi
@@ -25,16 +25,16 @@ IS_RATE_CORRELATION, NOT_RATE_CORRELATION = 0.8, 0.3
 """Correlation of a column with the change of another above which it is its rate, and below which it is not."""
 
 
-def check_finite(raw: RawEpisode, states: Sequence[str], actions: Sequence[str]) -> None:
+def check_finite(raw: RawEpisode, actions: Sequence[Variable]) -> None:
     """Raises RecordingError that names the first cell that is not finite."""
     table = np.column_stack([raw.time, raw.state, raw.action])
     bad = ~np.isfinite(table)
     if bad.any():
         row, column = np.argwhere(bad)[0]
-        name = ("time", *states, *actions)[column]
+        name = ("time", *raw.measured, *(variable.name for variable in actions))[column]
         raise RecordingError(
-            f"{raw.source}: {raw.place(int(row))}, {raw.column(name)} is {table[row, column]}; a finite number is "
-            "right (leave out rows without a measurement)"
+            f"{raw.cell(int(row), name)} is {table[row, column]}; a finite number is right (leave out rows without a "
+            "measurement)"
         )
 
 
@@ -62,35 +62,39 @@ def check_commands(episodes: Sequence[RawEpisode], actions: Sequence[Variable], 
         right = f"within [{variable.low:g}, {variable.high:g}] is right"
         if share > 0.5 or abs(largest) > 2 * scale:
             raise RecordingError(
-                f"{raw.source}: {raw.place(row)}, {raw.column(variable.name)} is {largest:g}, and {share:.0%} of the "
-                f"column lie outside; {right} (name a column in N 'force')"
+                f"{raw.cell(row, variable.name)} is {largest:g}, and {share:.0%} of the column lie outside; {right} "
+                "(name a column in N 'force')"
             )
         note(f"{share:.1%} of {variable.name} lie outside, up to {largest:g}; {right}", "the recording")
 
 
-def check_units(raw: RawEpisode, measured: Sequence[str], system: System) -> None:
+def check_units(raw: RawEpisode, system: System) -> None:
     """Raises RecordingError where angles are evidently in degrees, lengths in cm or mm, or columns exchanged."""
     variables = {variable.name: variable for variable in system.states}
     if len(raw.time) < 8:
         return
-    columns = dict(zip(measured, raw.state.T, strict=True))
-    for name, values in columns.items():
-        if variables[name].unit == "rad":
-            _check_jumps(raw, name, values)
-    _check_exchanged(raw, columns, variables)
-    for name, values in columns.items():
-        rate_name = f"{name}_dot"
-        if rate_name in variables:
-            _check_rate(raw, variables[name], values, variables[rate_name], columns.get(rate_name))
+    columns = raw.states
     angles = [name for name in columns if variables[name].unit == "rad"]
-    if are_degrees(raw, measured, system):
+    for name in angles:
+        steps = np.abs(np.diff(columns[name]))
+        row = int(steps.argmax()) + 1
+        if steps.max() > 1.25 * TURN:
+            raise RecordingError(
+                f"{raw.cell(row, name)} jumps from {columns[name][row - 1]:g} to {columns[name][row]:g}; radians are "
+                "right (these look like degrees)"
+            )
+    _check_exchanged(raw, variables)
+    for name in columns:
+        if f"{name}_dot" in variables:
+            _check_rate(raw, variables[name], variables[f"{name}_dot"])
+    if are_degrees(raw, system):
         name, values = angles[0], columns[angles[0]]
         raise RecordingError(
             f"{raw.source}: {raw.column(name)} goes from {values.min():.3g} to {values.max():.3g} and answers the "
             f"command as if in degrees; radians are right"
         )
     for name, other in product((name for name in columns if variables[name].unit == "m"), angles):
-        if exchanged(raw, measured, system, name, other):
+        if exchanged(raw, system, name, other):
             raise RecordingError(
                 f"{raw.source}: {raw.column(name)} answers the command as {other} should, and "
                 f"{raw.column(other)} as {name}: they are exchanged "
@@ -98,7 +102,7 @@ def check_units(raw: RawEpisode, measured: Sequence[str], system: System) -> Non
             )
 
 
-def rates(time: NDArray[np.float64], values: NDArray[np.float64], angle: bool) -> NDArray[np.float64]:
+def _rates(time: NDArray[np.float64], values: NDArray[np.float64], angle: bool) -> NDArray[np.float64]:
     """Rates of change (T - 1,) between rows; jumps of an angle by a turn are removed."""
     steps = np.diff(values)
     if angle:
@@ -106,28 +110,14 @@ def rates(time: NDArray[np.float64], values: NDArray[np.float64], angle: bool) -
     return steps / np.diff(time)
 
 
-def _check_jumps(raw: RawEpisode, name: str, values: NDArray[np.float64]) -> None:
-    steps = np.abs(np.diff(values))
-    if steps.max() > 1.25 * TURN:
-        row = int(steps.argmax()) + 1
-        raise RecordingError(
-            f"{raw.source}: {raw.place(row)}, {raw.column(name)} jumps from {values[row - 1]:g} to {values[row]:g}; "
-            "radians are right (these look like degrees)"
-        )
-
-
-def _check_rate(
-    raw: RawEpisode,
-    variable: Variable,
-    values: NDArray[np.float64],
-    rate: Variable,
-    measured: NDArray[np.float64] | None,
-) -> None:
+def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable) -> None:
     """Compares a variable's change with its measured rate, and both with the range that the system states."""
+    values, measured = raw.states[variable.name], raw.states.get(rate.name)
     angle = variable.unit == "rad"
-    looks = "degrees" if angle else "centimetres or millimetres"
-    right = "radians are right" if angle else "metres are right"
-    change = rates(raw.time, values, angle)
+    right = "metres are right (these look like centimetres or millimetres)"
+    if angle:
+        right = "radians are right (these look like degrees)"
+    change = _rates(raw.time, values, angle)
     stride = max(1, round(DIFFERENCE_S / float(np.median(np.diff(raw.time)))))
     coarse = np.convolve(change, np.ones(stride) / stride, "valid")
     fast = float(np.quantile(np.abs(coarse), 0.9))
@@ -136,46 +126,42 @@ def _check_rate(
     if fast > (rate.high if beyond else limit):
         row = int(np.abs(values).argmax())
         raise RecordingError(
-            f"{raw.source}: {raw.place(row)}, {raw.column(variable.name)} is {values[row]:g} {variable.unit}, and "
-            f"it changes by up to {np.abs(coarse).max():.3g} {rate.unit}; {right} (these look like {looks})"
+            f"{raw.cell(row, variable.name)} is {values[row]:g} {variable.unit}, and it changes by up to "
+            f"{np.abs(coarse).max():.3g} {rate.unit}; {right}"
         )
     if measured is None:
         return
     if float(np.quantile(np.abs(measured), 0.9)) > limit:
         row = int(np.abs(measured).argmax())
-        raise RecordingError(
-            f"{raw.source}: {raw.place(row)}, {raw.column(rate.name)} is {measured[row]:g} {rate.unit}; "
-            f"{right} (these look like {looks})"
-        )
+        raise RecordingError(f"{raw.cell(row, rate.name)} is {measured[row]:g} {rate.unit}; {right}")
     between = 0.5 * (measured[1:] + measured[:-1])
-    if angle and _correlation(change, between) > IS_RATE_CORRELATION:
+    if angle and correlation(change, between) > IS_RATE_CORRELATION:
         ratio = float(change.std() / between.std()) * DEGREE
         for wrong, factor in ((variable, ratio), (rate, DEGREE**2 / ratio)):
             if 0.5 < factor < 2:
                 raise RecordingError(
                     f"{raw.source}: {raw.column(wrong.name)} is {1 / DEGREE:.0f} times what the other says "
                     f"({variable.name} changes by {change.std():.3g} {rate.unit}, {rate.name} is {between.std():.3g} "
-                    f"{rate.unit}, root mean square); {right} (these look like {looks})"
+                    f"{rate.unit}, root mean square); {right}"
                 )
 
 
-def _check_exchanged(raw: RawEpisode, columns: dict[str, NDArray[np.float64]], variables: dict[str, Variable]) -> None:
+def _check_exchanged(raw: RawEpisode, variables: Mapping[str, Variable]) -> None:
     """Raises RecordingError where two columns are evidently exchanged."""
+    columns = raw.states
     bases = [name for name in columns if f"{name}_dot" in variables]
-    changes = {name: rates(raw.time, columns[name], variables[name].unit == "rad") for name in bases}
+    changes = {name: _rates(raw.time, columns[name], variables[name].unit == "rad") for name in bases}
     measured = {name: columns[f"{name}_dot"] for name in bases if f"{name}_dot" in columns}
     for name, rate in measured.items():
-        crossed = _correlation(rates(raw.time, rate, False), columns[name][1:])
-        if crossed > IS_RATE_CORRELATION and _correlation(changes[name], rate[1:]) < NOT_RATE_CORRELATION:
+        crossed = correlation(_rates(raw.time, rate, False), columns[name][1:])
+        if crossed > IS_RATE_CORRELATION and correlation(changes[name], rate[1:]) < NOT_RATE_CORRELATION:
             raise RecordingError(
                 f"{raw.source}: {raw.column(name)} and {raw.column(f'{name}_dot')} are evidently exchanged: "
                 "the first is the second's rate of change"
             )
     for name, other in combinations(measured, 2):
-        crossed = min(
-            _correlation(changes[name], measured[other][1:]), _correlation(changes[other], measured[name][1:])
-        )
-        own = max(_correlation(changes[one], measured[one][1:]) for one in (name, other))
+        crossed = min(correlation(changes[name], measured[other][1:]), correlation(changes[other], measured[name][1:]))
+        own = max(correlation(changes[one], measured[one][1:]) for one in (name, other))
         if crossed > IS_RATE_CORRELATION and own < NOT_RATE_CORRELATION:
             raise RecordingError(
                 f"{raw.source}: {raw.column(name)} and {raw.column(other)} are evidently exchanged: "
@@ -187,12 +173,6 @@ def _check_exchanged(raw: RawEpisode, columns: dict[str, NDArray[np.float64]], v
         wraps = abs(steps[row] - TURN) < 0.5 and np.abs(columns[name]).max() < 0.55 * TURN
         if variables[name].unit == "m" and wraps:
             raise RecordingError(
-                f"{raw.source}: {raw.place(row + 1)}, {raw.column(name)} jumps by {steps[row]:.3g} m, like an angle "
-                "that wraps; metres are right (are two columns exchanged?)"
+                f"{raw.cell(row + 1, name)} jumps by {steps[row]:.3g} m, like an angle that wraps; metres are right "
+                "(are two columns exchanged?)"
             )
-
-
-def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    if a.std() == 0 or b.std() == 0:
-        return 0.0
-    return float(np.corrcoef(a, b)[0, 1])

@@ -1,10 +1,11 @@
-"""The clock of a recording: jitter is removed, irregular rows are resampled, missing rows split an episode."""
+"""An episode as it was read, and its clock: without jitter, irregular rows resampled, split where rows are missing."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,49 +31,58 @@ INTERPOLATED_PERIODS = 3.0
 class RawEpisode:
     """The rows of an episode as they were read: clock, order of columns and units are not checked yet."""
 
-    source: str
-    """the file, and the episode if the file has several, for messages"""
+    path: Path
     time: NDArray[np.float64]
     """(T,) s, as in the file; `steadied` makes it start at 0"""
     action: NDArray[np.float64]
     """(T, n_action)"""
     state: NDArray[np.float64]
     """(T, n_measured)"""
+    measured: tuple[str, ...]
+    """names of the columns of state, in the system's order"""
     place: Callable[[int], str]
     """the name in messages of a row, counted from 0"""
     names: Mapping[str, str] = field(default_factory=dict)
-    """the file's names of the variables that it names differently"""
+    """the file's names of the variables"""
+    number: float | None = None
+    """of the episode, if the file has several"""
+
+    @property
+    def source(self) -> str:
+        """The file, and the episode if the file has several, for messages."""
+        return str(self.path) if self.number is None else f"{self.path}, episode {self.number:g}"
+
+    @property
+    def states(self) -> dict[str, NDArray[np.float64]]:
+        """The columns (T,) of state, by name."""
+        return dict(zip(self.measured, self.state.T, strict=True))
 
     def column(self, name: str) -> str:
         """The name in messages of a variable's column."""
-        return f"column {self.names[name]!r} ({name})" if name in self.names else f"column {name!r}"
+        there = self.names.get(name, name)
+        return f"column {name!r}" if there.lower() == name else f"column {there!r} ({name})"
+
+    def cell(self, row: int, name: str) -> str:
+        """Where in the file a value stands, for messages."""
+        return f"{self.source}: {self.place(row)}, {self.column(name)}"
 
     def part(self, start: int, end: int) -> RawEpisode:
         """The rows from `start` up to, but not including, `end`."""
         rows = slice(start, end)
-        return replace(
-            self,
-            time=self.time[rows],
-            action=self.action[rows],
-            state=self.state[rows],
-            place=lambda row: self.place(start + row),
-        )
-
-    def named(self, source: str) -> RawEpisode:
-        """The same rows, from `source`."""
-        return replace(self, source=source)
+        time, action, state = self.time[rows], self.action[rows], self.state[rows]
+        return replace(self, time=time, action=action, state=state, place=lambda row: self.place(start + row))
 
 
 def check_forward(raw: RawEpisode) -> None:
     """Raises RecordingError where two rows have the same time or a later row an earlier one."""
-    steps = np.diff(raw.time)
-    if (steps <= 0).any():
-        row = int((steps <= 0).argmax())
+    backwards = np.flatnonzero(np.diff(raw.time) <= 0)
+    if len(backwards):
+        row = int(backwards[0])
         before, after = raw.time[row], raw.time[row + 1]
         problem = "repeats itself" if before == after else "runs backward"
         raise RecordingError(
-            f"{raw.source}: {raw.place(row + 1)}, {raw.column('time')}: the clock {problem} (from {before:.9g} s to "
-            f"{after:.9g} s); each row must be later than the one before; mark several episodes by a column 'episode'"
+            f"{raw.cell(row + 1, 'time')}: the clock {problem} (from {before:.9g} s to {after:.9g} s); each row must "
+            "be later than the one before; mark several episodes by a column 'episode'"
         )
 
 

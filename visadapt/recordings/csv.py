@@ -1,87 +1,184 @@
 """Recordings of states as CSV: columns `episode,time,<states>,<actions>`, SI units, one row per instant.
 
-Without a column `episode` the file is one episode. Rates of change may be missing. Other common names, separators and
-clocks are understood too; see `columns.py`, `table.py` and `clock.py`.
+Without a column `episode` the file is one episode. Rates of change may be missing. Other common names, separators
+(commas or semicolons, as spreadsheets write them) and clocks (`clock.py`) are understood too.
 """
 
 from __future__ import annotations
 
 import csv
-import os
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from visadapt.recordings.clock import RawEpisode
-from visadapt.recordings.columns import FORCE_NAME, match
-from visadapt.recordings.episode import Episode, RecordingError
-from visadapt.recordings.table import Table
-from visadapt.storage.atomic_files import replacing
+from visadapt.recordings.episode import RecordingError
 from visadapt.systems import System
 
+OTHER_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
+    "cartpole": {
+        "x": ("position", "cart_position", "pos", "s"),
+        "x_dot": ("positionD", "velocity", "cart_velocity"),
+        "theta": ("angle", "pole_angle"),
+        "theta_dot": ("angleD", "angular_velocity"),
+        "command": ("action", "u", "Q", "control", "input", "force"),
+    }
+}
+"""Other common names of a system's variables, in any case."""
 
-def read_rows(path: Path, system: System, given: Mapping[str, str]) -> tuple[list[RawEpisode], tuple[str, ...], bool]:
-    """The episodes of a file, the names of its states, and whether its command may be in N.
 
-    `given` maps our names of columns to the file's, where these are not evident.
+@dataclass(frozen=True)
+class Table:
+    """A file's text, split into the header and the rows, which are not parsed yet.
+
+    Row numbers start from 1 and leave out the header, comments (lines that begin with #) and blank lines; line numbers
+    are those of an editor.
+    """
+
+    path: Path
+    header: tuple[str, ...]
+    separator: str
+    rows: tuple[tuple[int, str], ...]
+    """number and text of each row's line"""
+
+    @classmethod
+    def open(cls, path: Path) -> Table:
+        """Read a file and parse its header.
+
+        Raises:
+            RecordingError: the file is missing, unreadable, not text, empty, or has no header.
+        """
+        try:
+            text = path.read_text(encoding="utf-8-sig")  # line ends of any kind become \n
+        except UnicodeDecodeError as error:
+            raise RecordingError(f"{path}: not text in UTF-8 (byte {error.start}); a CSV file is right") from error
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+        lines = [(number, line.strip()) for number, line in enumerate(text.split("\n"), 1)]
+        lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
+        if not lines:
+            raise RecordingError(f"{path}: is empty; a line of names and rows of numbers below it are right")
+        (number, first), *rows = lines
+        separator = ";" if first.count(";") > first.count(",") else ","
+        header = tuple(name.strip().strip('"') for name in first.split(separator))
+        if all(_is_number(name) for name in header):
+            raise RecordingError(
+                f"{path}: line {number} holds numbers where the columns' names belong "
+                "(say episode,time,x,theta,command)"
+            )
+        return cls(path, header, separator, tuple(rows))
+
+    def numbers(self, columns: Sequence[int]) -> NDArray[np.float64]:
+        """Some columns (rows, len(columns)); the other columns may hold anything.
+
+        Raises:
+            RecordingError: no rows, a row with more or fewer cells than the header, or a cell that is not a number;
+                the message names row, line and column.
+        """
+        if not self.rows:
+            raise RecordingError(f"{self.path}: has no rows below its line of names")
+        values = []
+        for row, (_, line) in enumerate(self.rows):
+            (cells,) = csv.reader([line], delimiter=self.separator)
+            where = f"{self.path}: {self.place(row)}"
+            if len(cells) < len(self.header):
+                raise RecordingError(
+                    f"{where} is cut short: {len(cells)} of {len(self.header)} cells; is the file incomplete?"
+                )
+            if len(cells) > len(self.header):
+                raise RecordingError(f"{where} has {len(cells)} cells, the line of names {len(self.header)}")
+            try:
+                values.append([float(cells[column].partition("#")[0]) for column in columns])
+            except ValueError:
+                column = next(column for column in columns if not _is_number(cells[column]))
+                raise RecordingError(f"{where}, column {self.header[column]!r} {_complaint(cells[column])}") from None
+        return np.array(values)
+
+    def place(self, row: int) -> str:
+        """The name in messages of a row, counted from 0."""
+        return f"row {row + 1} (line {self.rows[row][0]})"
+
+
+def read_rows(path: Path, system: System, given: Mapping[str, str]) -> list[RawEpisode]:
+    """The episodes of a file; `given` maps our names of columns to the file's, where these are not evident.
 
     Raises:
         RecordingError: the file or a column is missing, or a cell is not a number.
     """
     table = Table.open(path)
-    found = match(path, table.header, system, given)
-    order = list(found)
-    numbers = table.numbers([found[name] for name in order])
-    values = dict(zip(order, numbers.T, strict=True))
+    found = _match(path, table.header, system, given)
+    values = dict(zip(found, table.numbers(list(found.values())).T, strict=True))
     measured = tuple(variable.name for variable in system.states if variable.name in found)
-    actions = [variable.name for variable in system.actions]
     state = np.column_stack([values[name] for name in measured])
-    action = np.column_stack([values[name] for name in actions])
-    names = {name: table.header[found[name]] for name in found if table.header[found[name]].lower() != name}
-    whole = RawEpisode(str(path), values["time"], action, state, table.place, names)
-    force = any(table.header[found[name]].lower() == FORCE_NAME for name in actions)
+    action = np.column_stack([values[variable.name] for variable in system.actions])
+    names = {name: table.header[index] for name, index in found.items()}
+    whole = RawEpisode(path, values["time"], action, state, measured, table.place, names)
     if "episode" not in found:
-        return [whole], measured, force
+        return [whole]
     label = values["episode"]
     if np.isnan(label).any():
         raise RecordingError(f"{path}: {table.place(int(np.isnan(label).argmax()))}, column 'episode' is not a number")
-    edges = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1), len(label)]
-    parts = []
-    for start, end in pairwise(edges):
-        part = whole.part(int(start), int(end))
-        parts.append(part.named(f"{path}, episode {label[start]:g}"))
-    return parts, measured, force
+    edges = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), len(label)]
+    return [replace(whole.part(start, end), number=float(label[start])) for start, end in pairwise(edges)]
 
 
-def write_csv(
-    path: str | os.PathLike[str], episodes: Sequence[Episode], states: Sequence[str], actions: Sequence[str]
-) -> None:
-    """Write episodes that hold states, atomically and with all digits, so that numbers are read back exactly.
+def needed(system: System) -> tuple[str, ...]:
+    """Columns that a recording must have: time, states and actions; rates of change (`_dot`) may be missing."""
+    names = [variable.name for variable in system.states]
+    states = [name for name in names if not name.endswith("_dot") or name.removesuffix("_dot") not in names]
+    return ("time", *states, *(variable.name for variable in system.actions))
 
-    Args:
-        path: of the file.
-        episodes: of any lengths.
-        states: the names of the columns of state.
-        actions: the names of the columns of action.
+
+def _match(path: Path, header: tuple[str, ...], system: System, given: Mapping[str, str]) -> dict[str, int]:
+    """The index of each of our variables in a file's header; `given` maps our names to the file's.
 
     Raises:
-        RecordingError: no episodes, one without states, or names that do not fit the columns.
-        DiskFullError: the disk is full; a file that was at `path` before is unchanged.
+        RecordingError: a needed column is missing, several columns could be one variable, or `given` names a variable
+            or a column that does not exist.
     """
-    if not episodes:
-        raise RecordingError(f"{path}: a recording needs at least one episode")
-    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["episode", "time", *states, *actions])
-        for number, episode in enumerate(episodes):
-            if episode.state is None:
-                raise RecordingError(f"{path}: episode {number} has no states; write frames as HDF5")
-            if (episode.state.shape[1], episode.action.shape[1]) != (len(states), len(actions)):
-                raise RecordingError(
-                    f"{path}: episode {number} has {episode.state.shape[1]} columns of state and "
-                    f"{episode.action.shape[1]} of action; there are names for {len(states)} and {len(actions)}"
-                )
-            for row in np.column_stack([episode.time, episode.state, episode.action]).tolist():
-                writer.writerow([number, *row])
+    others = {"time": ("t", "timestamp"), **OTHER_NAMES.get(system.name, {})}
+    ours = ["episode", "time", *(variable.name for variable in (*system.states, *system.actions))]
+    for name in given:
+        if name not in ours:
+            raise RecordingError(f"--columns {name}=...: {system.name} has no {name!r}; it has {', '.join(ours)}")
+    found: dict[str, int] = {}
+    for name in ours:
+        candidates: list[int] = []
+        for names in ([given[name]],) if name in given else ([name], others.get(name, ())):
+            lower = [wanted.lower() for wanted in names]
+            candidates = candidates or [index for index, there in enumerate(header) if there.lower() in lower]
+        if len(candidates) > 1:
+            which = ", ".join(repr(header[index]) for index in candidates)
+            raise RecordingError(f"{path}: the columns {which} could each be {name}; say which: --columns {name}=...")
+        if candidates:
+            found[name] = candidates[0]
+        elif name in given:
+            raise RecordingError(f"{path}: has no column {given[name]!r} for {name}; it has {', '.join(header)}")
+        elif name in needed(system):
+            raise RecordingError(
+                f"{path}: column {name!r} is missing; it has {', '.join(header)}; "
+                f"if one of them is {name}: --columns {name}=..."
+            )
+    return found
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _complaint(cell: str) -> str:
+    cell = cell.strip()
+    if not cell:
+        return "is empty; a number is right (leave out rows without a measurement)"
+    if _is_number(cell.replace(",", ".", 1)) and math.isfinite(float(cell.replace(",", ".", 1))):
+        return f"is {cell!r}; a decimal point is right"
+    return f"is {cell[:40]!r}; a number is right"

@@ -1,4 +1,4 @@
-"""The episode: measurements and commands, row by row."""
+"""Episodes, measurements and commands row by row, and the checked recording that is a list of them."""
 
 from __future__ import annotations
 
@@ -43,35 +43,56 @@ class Episode:
     def __post_init__(self) -> None:
         if self.state is None and self.frame is None:
             raise RecordingError("an episode needs states or frames")
+        rows = self.time.size
         for name, axes in (("time", 1), ("action", 2), ("state", 2), ("frame", 3), ("task_state", 2)):
             values = getattr(self, name)
-            if values is not None:
-                self._check(name, values, axes)
+            if values is None:
+                continue
+            if values.ndim != axes:
+                shape = f"the shape {values.shape}"
+                raise RecordingError(f"{name} has {shape}; {axes} axes, of which time is the first, are right")
+            if rows < 1:
+                raise RecordingError("an episode needs at least one row")
+            if len(values) != rows:
+                raise RecordingError(f"an episode of {rows} rows has {len(values)} rows of {name}")
+            kind, right = (np.uint8, "uint8") if name == "frame" else (np.floating, "floating point")
+            if not np.issubdtype(values.dtype, kind):
+                raise RecordingError(f"{name} is of type {values.dtype}; {right} is right")
+            bad = ~np.isfinite(values.reshape(rows, -1)).all(1)
+            if bad.any():
+                raise RecordingError(f"{name} is not finite in row {int(bad.argmax())} of {rows}")
         backwards = np.diff(self.time) <= 0
         if backwards.any():
             raise RecordingError(f"the clock does not run forward after row {int(backwards.argmax())}")
-
-    def _check(self, name: str, values: NDArray[np.generic], axes: int) -> None:
-        if values.ndim != axes:
-            raise RecordingError(
-                f"{name} has the shape {values.shape}; {axes} axes, of which time is the first, are right"
-            )
-        rows = len(self.time)
-        if rows < 1:
-            raise RecordingError("an episode needs at least one row")
-        if len(values) != rows:
-            raise RecordingError(f"an episode of {rows} rows has {len(values)} rows of {name}")
-        if name == "frame":
-            if values.dtype != np.uint8:
-                raise RecordingError(f"frame is of type {values.dtype}; uint8 is right")
-            return
-        if not np.issubdtype(values.dtype, np.floating):
-            raise RecordingError(f"{name} is of type {values.dtype}; floating point is right")
-        bad = ~np.isfinite(values.reshape(rows, -1)).all(1)
-        if bad.any():
-            raise RecordingError(f"{name} is not finite in row {int(bad.argmax())} of {rows}")
 
     @property
     def samples(self) -> int:
         """Executed actions: what the ledger counts."""
         return len(self.time) - 1
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Episodes of states and actions. Every episode's clock is steady: its rows are one period apart.
+
+    >>> import numpy as np, visadapt as va
+    >>> episode = va.Episode(time=0.05 * np.arange(3), action=np.zeros((3, 1)), state=np.zeros((3, 2)))
+    >>> va.Recording((episode,), measured=("x", "theta"), period=0.05, sources=("run.csv",)).samples
+    2
+    """
+
+    episodes: tuple[Episode, ...]
+    """`state` has the columns `measured`, `action` all actions of the system, in its order"""
+    measured: tuple[str, ...]
+    """names of the measured states, in the system's order"""
+    period: float
+    """s between rows: the median of the episodes'"""
+    sources: tuple[str, ...]
+    """where each episode comes from, for messages: "run3.csv, episode 2" """
+    warnings: tuple[str, ...] = ()
+    """what was changed or left out, a line each"""
+
+    @property
+    def samples(self) -> int:
+        """Executed actions."""
+        return sum(episode.samples for episode in self.episodes)

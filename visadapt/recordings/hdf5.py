@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from visadapt.recordings.episode import Episode, RecordingError
 from visadapt.storage.atomic_files import replacing
+from visadapt.systems import System
 
 FORMAT, VERSION = "visadapt recording", 1
 FRAMES_IN_CHUNK = 16
@@ -43,43 +44,47 @@ def write_recording(
         DiskFullError: the disk is full; a file that was at `path` before is unchanged.
 
     >>> import pathlib, tempfile, torch, visadapt as va
-    >>> target = va.SyntheticTarget(va.constant_force(2.0))
-    >>> policy = va.load_policy(va.shipped("cartpole_states"))
-    >>> runs = va.run(target, policy, 2, 30, torch.Generator().manual_seed(0), exploration=0.3)
-    >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.h5"
+    >>> policy, path = va.load_policy(va.shipped("cartpole_states")), pathlib.Path(tempfile.mkdtemp()) / "run.h5"
+    >>> runs = va.run(va.SyntheticTarget(), policy, 2, 30, torch.Generator().manual_seed(0), exploration=0.3)
     >>> va.write_recording(path, [run.episode for run in runs], ["x", "x_dot", "theta", "theta_dot"], ["command"])
     >>> len(va.read_recording(path))
     2
     """
     path = Path(path)
     _check_alike(path, episodes)
-    state = episodes[0].state
-    widths = {"state": 0 if state is None else state.shape[1], "action": episodes[0].action.shape[1]}
-    names = {"state": state_names, "action": action_names}
-    for kind, given in names.items():
-        if given is not None and len(given) != widths[kind]:
-            raise RecordingError(f"{path}: {len(given)} names for {widths[kind]} columns of {kind}")
     # In memory first, since HDF5 aborts the process when the disk fills up. The episodes are in memory already, and
     # uncompressed.
     with h5py.File("recording", "w", driver="core", backing_store=False) as file:
         file.attrs["format"] = FORMAT
         file.attrs["version"] = VERSION
-        for kind, given in names.items():
-            if given is not None:
-                file.attrs[f"{kind}_names"] = list(given)
+        for kind, names in (("state", state_names), ("action", action_names)):
+            if names is not None:
+                columns = getattr(episodes[0], kind)
+                width = 0 if columns is None else columns.shape[1]
+                if len(names) != width:
+                    raise RecordingError(f"{path}: {len(names)} names for {width} columns of {kind}")
+                file.attrs[f"{kind}_names"] = list(names)
         for number, episode in enumerate(episodes):
-            _write_episode(file.create_group(_group_name(number)), episode)
+            group = file.create_group(_group_name(number))
+            for name in ("time", "action", "state", "task_state"):
+                if (values := getattr(episode, name)) is not None:
+                    group.create_dataset(name, data=values, fletcher32=True)
+            if episode.frame is not None:
+                rows, height, width = episode.frame.shape
+                chunks = (min(rows, FRAMES_IN_CHUNK), height, width)
+                group.create_dataset("frame", data=episode.frame, chunks=chunks, compression="gzip", fletcher32=True)
         file.flush()
         content = file.id.get_file_image()
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
 
-def read_names(path: str | os.PathLike[str]) -> tuple[list[str] | None, list[str] | None]:
-    """Names of the columns of state and of action, None where the file has none; raises like `read_recording`."""
+def read_names(path: str | os.PathLike[str], system: System | type[System]) -> tuple[list[str], list[str]]:
+    """Names of the columns of state and of action, the system's if the file has none; raises like `read_recording`."""
     with _opened(Path(path)) as file:
-        state, action = (file.attrs.get(f"{kind}_names") for kind in ("state", "action"))
-        return None if state is None else list(state), None if action is None else list(action)
+        state = file.attrs.get("state_names", [variable.name for variable in system.states])
+        action = file.attrs.get("action_names", [variable.name for variable in system.actions])
+    return list(state), list(action)
 
 
 def read_recording(path: str | os.PathLike[str], frames: bool = True) -> list[Episode]:
@@ -109,7 +114,10 @@ def _opened(path: Path) -> Iterator[h5py.File]:
         raise RecordingError(f"{path}: there is no such file")
     try:
         with h5py.File(path, "r") as file:
-            _check_version(path, file)
+            if file.attrs.get("format") != FORMAT:
+                raise RecordingError(f"{path}: an HDF5 file, but its attribute 'format' is not {FORMAT!r}")
+            if (version := file.attrs.get("version")) != VERSION:
+                raise RecordingError(f"{path}: version {version} of the format; this visadapt reads version {VERSION}")
             yield file
     except OSError as error:
         # HDF5's own message describes its internals and may be several lines long.
@@ -122,53 +130,27 @@ def _group_name(number: int) -> str:
     return f"episode_{number:05d}"
 
 
-def _write_episode(group: h5py.Group, episode: Episode) -> None:
-    for name in ("time", "action", "state", "task_state"):
-        values = getattr(episode, name)
-        if values is not None:
-            group.create_dataset(name, data=values, fletcher32=True)
-    if episode.frame is not None:
-        rows, height, width = episode.frame.shape
-        chunks = (min(rows, FRAMES_IN_CHUNK), height, width)
-        group.create_dataset("frame", data=episode.frame, chunks=chunks, compression="gzip", fletcher32=True)
-
-
-def _check_version(path: Path, file: h5py.File) -> None:
-    if file.attrs.get("format") != FORMAT:
-        raise RecordingError(f"{path}: an HDF5 file, but its attribute 'format' is not {FORMAT!r}")
-    version = file.attrs.get("version")
-    if version != VERSION:
-        raise RecordingError(f"{path}: version {version} of the format; this visadapt reads version {VERSION}")
-
-
 def _read_episode(path: Path, file: h5py.File, number: int, frames: bool) -> Episode:
     where = f"{path}: {_group_name(number)}"
     group = file.get(_group_name(number))
     if not isinstance(group, h5py.Group):
         raise RecordingError(f"{where} is missing; {len(file)} groups, numbered from 0, were expected")
-    time, action = _read(where, group, "time"), _read(where, group, "action")
-    if time is None or action is None:
-        raise RecordingError(f"{where} has no dataset {'time' if time is None else 'action'!r}")
-    state = _read(where, group, "state")
-    if state is None and not frames:
+    for name in ("time", "action"):
+        if name not in group:
+            raise RecordingError(f"{where} has no dataset {name!r}")
+    if "state" not in group and not frames:
         raise RecordingError(f"{where} holds frames alone; states are needed")
+    arrays: dict[str, NDArray[Any]] = {}
+    for name in ("time", "action", "state", "task_state", *(["frame"] if frames else [])):
+        try:
+            if name in group:
+                arrays[name] = np.asarray(group[name][()])
+        except (OSError, TypeError) as error:  # a group has no values
+            raise RecordingError(f"{where}: {name!r} is damaged, or no dataset, and cannot be read") from error
     try:
-        frame = _read(where, group, "frame") if frames else None
-        return Episode(time, action, state, frame, _read(where, group, "task_state"))
+        return Episode(**arrays)
     except ValueError as error:
         raise RecordingError(f"{where}: {error}") from error
-
-
-def _read(where: str, group: h5py.Group, name: str) -> NDArray[Any] | None:
-    dataset = group.get(name)
-    if dataset is None:
-        return None
-    if not isinstance(dataset, h5py.Dataset):
-        raise RecordingError(f"{where}: {name!r} is a group; a dataset was expected")
-    try:
-        return np.asarray(dataset[()])
-    except OSError as error:
-        raise RecordingError(f"{where}: {name!r} is damaged and cannot be read") from error
 
 
 def _check_alike(path: Path, episodes: Sequence[Episode]) -> None:
@@ -176,14 +158,10 @@ def _check_alike(path: Path, episodes: Sequence[Episode]) -> None:
     if not episodes:
         raise RecordingError(f"{path}: a recording needs at least one episode")
     for name in ("action", "state", "frame", "task_state"):
-        first = _row_shape(getattr(episodes[0], name))
-        for number, episode in enumerate(episodes):
-            shape = _row_shape(getattr(episode, name))
+        every = [getattr(episode, name) for episode in episodes]
+        first, *others = (None if values is None else values.shape[1:] for values in every)
+        for number, shape in enumerate(others, 1):
             if shape != first:
                 raise RecordingError(
                     f"{path}: {_group_name(number)} has {name} rows of shape {shape}, the first episode of {first}"
                 )
-
-
-def _row_shape(values: NDArray[np.generic] | None) -> tuple[int, ...] | None:
-    return None if values is None else values.shape[1:]

@@ -9,13 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from visadapt.recordings import checks
-from visadapt.recordings.clock import RawEpisode, alike, check_forward, steadied
-from visadapt.recordings.columns import needed
-from visadapt.recordings.csv import read_rows
-from visadapt.recordings.episode import Episode, RecordingError
+from visadapt.recordings.checks import check_commands, check_finite, check_units
+from visadapt.recordings.clock import Note, RawEpisode, alike, check_forward, steadied
+from visadapt.recordings.csv import needed, read_rows
+from visadapt.recordings.episode import Episode, Recording, RecordingError
 from visadapt.recordings.hdf5 import read_names, read_recording
-from visadapt.recordings.recording import Recording
 from visadapt.systems import System
 
 SHORTEST_EPISODE_S = 0.5
@@ -24,27 +22,6 @@ FEWEST_ROWS = 3
 """Rows that an episode of the shortest length must have."""
 UPRIGHT_RAD = 1.0
 """rad from 0 up to which an angle counts as upright when it is unwrapped."""
-HDF5_MAGIC = b"\x89HDF"
-"""First bytes of every HDF5 file."""
-READ_SUFFIXES = (".csv", ".h5", ".hdf5")
-"""Of the files of a folder that are read."""
-
-
-class _Notes:
-    """Warnings, one line for each kind."""
-
-    def __init__(self) -> None:
-        self.places: dict[str, list[str]] = {}
-
-    def __call__(self, text: str, where: str) -> None:
-        self.places.setdefault(text, []).append(where)
-
-    def lines(self) -> tuple[str, ...]:
-        """Each kind once, with its first place in the recording and the number of others."""
-        return tuple(
-            f"{where[0]}{f' and {len(where) - 1} more' if len(where) > 1 else ''}: {text}"
-            for text, where in self.places.items()
-        )
 
 
 def load_recording(
@@ -54,7 +31,7 @@ def load_recording(
 ) -> Recording:
     """Read states and actions from CSV and HDF5 files.
 
-    Names are matched by `columns.match`, clocks made steady by `clock.py`. Angles are unwrapped within an episode so
+    Names are matched by `csv.py`, clocks made steady by `clock.py`. Angles are unwrapped within an episode so
     that upright is 0 (if the pole turns over, in the turn in which it is upright most often). A command in N (a column
     `force` that exceeds 1) is divided by the system's `max_force`. The recording's warnings say what was changed or
     left out.
@@ -69,37 +46,29 @@ def load_recording(
             right.
 
     >>> import pathlib, tempfile, torch, visadapt as va
-    >>> target = va.SyntheticTarget(va.constant_force(2.0))
-    >>> policy = va.load_policy(va.shipped("cartpole_states"))
-    >>> runs = va.run(target, policy, 2, 30, torch.Generator().manual_seed(0), exploration=0.3)
-    >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.h5"
+    >>> policy, path = va.load_policy(va.shipped("cartpole_states")), pathlib.Path(tempfile.mkdtemp()) / "run.h5"
+    >>> runs = va.run(va.SyntheticTarget(), policy, 2, 30, torch.Generator().manual_seed(0), exploration=0.3)
     >>> va.write_recording(path, [run.episode for run in runs], ["x", "x_dot", "theta", "theta_dot"], ["command"])
     >>> run = va.load_recording(path, va.CartPole())
     >>> run.samples, round(run.period, 6)
     (60, 0.05)
     """
-    note = _Notes()
-    contents: list[tuple[list[RawEpisode], tuple[str, ...], bool]] = []
-    files = _files([paths] if isinstance(paths, str | os.PathLike) else paths)
-    for path in files:
-        episodes, measured, force = _read(path, system, columns or {})
-        for raw in episodes:
-            checks.check_finite(raw, measured, [variable.name for variable in system.actions])
+    places: dict[str, list[str]] = {}
+
+    def note(text: str, where: str) -> None:
+        places.setdefault(text, []).append(where)
+
+    whole: list[RawEpisode] = []
+    for path in _files([paths] if isinstance(paths, str | os.PathLike) else paths):
+        for raw in _read(path, system, columns or {}):
+            check_finite(raw, system.actions)
             check_forward(raw)
-        contents.append((episodes, measured, force))
-    measured = _shared(files, [names for _, names, _ in contents], system, note)
-    # Keep the columns that all files have.
-    whole = [
-        replace(raw, state=raw.state[:, [names.index(name) for name in measured]])
-        for episodes, names, _ in contents
-        for raw in episodes
-    ]
-    forces = [force for episodes, _, force in contents for _ in episodes]
-    whole = _commands(whole, forces, system, note)
-    checks.check_commands(whole, system.actions, note)
+            whole.append(raw)
+    whole = _commands(_shared(whole, system, note), system, note)
+    check_commands(whole, system.actions, note)
     for raw in whole:
-        checks.check_units(raw, measured, system)
-    parts = [part for raw in whole for part in steadied(_unwrapped(raw, measured, system), note)]
+        check_units(raw, system)
+    parts = [part for raw in whole for part in steadied(_unwrapped(raw, system), note)]
     parts, period = alike(_long_enough(parts, note), note)
     if period * FEWEST_ROWS > SHORTEST_EPISODE_S:
         raise RecordingError(
@@ -108,10 +77,13 @@ def load_recording(
         )
     return Recording(
         episodes=tuple(Episode(part.time, part.action, part.state) for part in parts),
-        measured=measured,
+        measured=whole[0].measured,
         period=period,
         sources=tuple(part.source for part in parts),
-        warnings=note.lines(),
+        warnings=tuple(
+            f"{where[0]}{f' and {len(where) - 1} more' if len(where) > 1 else ''}: {text}"
+            for text, where in places.items()
+        ),
     )
 
 
@@ -119,7 +91,8 @@ def _files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
     files = []
     for path in map(Path, paths):
         if path.is_dir():
-            found = sorted(file for file in path.iterdir() if file.suffix.lower() in READ_SUFFIXES and file.is_file())
+            suffixes = (".csv", ".h5", ".hdf5")
+            found = sorted(file for file in path.iterdir() if file.suffix.lower() in suffixes and file.is_file())
             if not found:
                 raise RecordingError(f"{path}: a folder without recordings; files that end in .csv or .h5 are right")
             files += found
@@ -132,61 +105,62 @@ def _files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
     return files
 
 
-def _read(path: Path, system: System, given: Mapping[str, str]) -> tuple[list[RawEpisode], tuple[str, ...], bool]:
+def _read(path: Path, system: System, given: Mapping[str, str]) -> list[RawEpisode]:
     try:
         with path.open("rb") as file:
-            is_hdf5 = file.read(len(HDF5_MAGIC)) == HDF5_MAGIC
+            is_hdf5 = file.read(4) == b"\x89HDF"
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
     return _read_hdf5(path, system) if is_hdf5 else read_rows(path, system, given)
 
 
-def _read_hdf5(path: Path, system: System) -> tuple[list[RawEpisode], tuple[str, ...], bool]:
-    ours = tuple(variable.name for variable in system.states)
-    actions = [variable.name for variable in system.actions]
-    names, action_names = read_names(path)
-    names, action_names = names or list(ours), action_names or actions
+def _read_hdf5(path: Path, system: System) -> list[RawEpisode]:
+    ours, actions = ([variable.name for variable in variables] for variables in (system.states, system.actions))
+    state_names, action_names = read_names(path, system)
+    measured = tuple(name for name in ours if name in state_names)
     rows = []
     for number, episode in enumerate(read_recording(path, frames=False)):
         source = f"{path}, episode {number}"
         assert episode.state is not None  # without states, read_recording raises
-        if episode.state.shape[1] != len(names) or episode.action.shape[1] != len(action_names):
+        if episode.state.shape[1] != len(state_names) or episode.action.shape[1] != len(action_names):
             raise RecordingError(
                 f"{source}: {episode.state.shape[1]} columns of state and {episode.action.shape[1]} of action; "
-                f"{', '.join(names)} and {', '.join(action_names)} are right"
+                f"{', '.join(state_names)} and {', '.join(action_names)} are right"
             )
+        there = [*state_names, *action_names]
         for name in needed(system)[1:]:
-            if name not in (*names, *action_names):
-                raise RecordingError(f"{source}: {name!r} is missing; it has {', '.join((*names, *action_names))}")
-        state = episode.state[:, [names.index(name) for name in ours if name in names]]
-        action = episode.action[:, [action_names.index(name) for name in actions]]
-        rows.append(RawEpisode(source, episode.time.astype(float), action.astype(float), state.astype(float), _row))
-    return rows, tuple(name for name in ours if name in names), False
+            if name not in there:
+                raise RecordingError(f"{source}: {name!r} is missing; it has {', '.join(there)}")
+        state = episode.state[:, [state_names.index(name) for name in measured]].astype(float)
+        action = episode.action[:, [action_names.index(name) for name in actions]].astype(float)
+        time = episode.time.astype(float)
+        rows.append(RawEpisode(path, time, action, state, measured, lambda row: f"row {row + 1}", number=number))
+    return rows
 
 
-def _row(row: int) -> str:
-    return f"row {row + 1}"
-
-
-def _shared(
-    files: Sequence[Path], measured: Sequence[tuple[str, ...]], system: System, note: _Notes
-) -> tuple[str, ...]:
-    """The states that all files have."""
+def _shared(episodes: Sequence[RawEpisode], system: System, note: Note) -> list[RawEpisode]:
+    """The episodes with the states alone that all of them have."""
     shared = []
     for variable in system.states:
-        without = [path for path, names in zip(files, measured, strict=True) if variable.name not in names]
+        without = [raw.path for raw in episodes if variable.name not in raw.measured]
         if not without:
             shared.append(variable.name)
-        elif len(without) < len(files):
+        elif len(without) < len(episodes):
             note(f"has no column {variable.name!r}, so that of the other files is not used", str(without[0]))
-    return tuple(shared)
+    return [
+        replace(raw, measured=tuple(shared), state=raw.state[:, [raw.measured.index(name) for name in shared]])
+        for raw in episodes
+    ]
 
 
-def _commands(episodes: list[RawEpisode], forces: Sequence[bool], system: System, note: _Notes) -> list[RawEpisode]:
-    """The episodes with commands in [-1, 1]; `forces` says whose commands may be in N."""
-    newtons = [raw.action for raw, force in zip(episodes, forces, strict=True) if force]
+def _commands(episodes: list[RawEpisode], system: System, note: Note) -> list[RawEpisode]:
+    """The episodes with commands in [-1, 1]: a command column 'force' may be in N."""
+    forces = [
+        any(raw.names.get(variable.name, "").lower() == "force" for variable in system.actions) for raw in episodes
+    ]
+    largest = max((np.abs(raw.action).max() for raw, force in zip(episodes, forces, strict=True) if force), default=0)
     limit = getattr(system, "max_force", None)
-    if limit is None or not newtons or max(np.abs(values).max() for values in newtons) <= 1:
+    if limit is None or largest <= 1:
         return episodes
     note(f"the column 'force' is taken to be in N and was divided by max_force, {limit:g} N", "the recording")
     return [
@@ -194,10 +168,10 @@ def _commands(episodes: list[RawEpisode], forces: Sequence[bool], system: System
     ]
 
 
-def _unwrapped(raw: RawEpisode, measured: Sequence[str], system: System) -> RawEpisode:
+def _unwrapped(raw: RawEpisode, system: System) -> RawEpisode:
     """The episode with its angles unwrapped, in the turn in which they are upright most often."""
     state = raw.state.copy()
-    for column, name in enumerate(measured):
+    for column, name in enumerate(raw.measured):
         if system.states[system.index(name)].unit == "rad":
             angle = np.unwrap(state[:, column])
             turns = np.round(angle / (2 * np.pi))
@@ -206,12 +180,12 @@ def _unwrapped(raw: RawEpisode, measured: Sequence[str], system: System) -> RawE
     return replace(raw, state=state)
 
 
-def _long_enough(parts: Sequence[RawEpisode], note: _Notes) -> list[RawEpisode]:
+def _long_enough(parts: Sequence[RawEpisode], note: Note) -> list[RawEpisode]:
     """The parts of at least SHORTEST_EPISODE_S; notes the others."""
-    durations = [part.time[-1] - part.time[0] for part in parts]
     least = SHORTEST_EPISODE_S * (1 - 1e-6)
+    durations = [part.time[-1] - part.time[0] for part in parts]
+    longest = parts[int(np.argmax(durations))]
     if max(durations) < least:
-        longest = parts[int(np.argmax(durations))]
         raise RecordingError(
             f"{longest.source}: too short: {len(longest.time)} rows, {max(durations):.3g} s; "
             f"an uninterrupted run of at least {SHORTEST_EPISODE_S:g} s is right"

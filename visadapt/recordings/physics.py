@@ -30,23 +30,23 @@ EXPLAINED_CORRELATION = 0.5
 Columns = Mapping[str, NDArray[np.float64]]
 
 
-def are_degrees(raw: RawEpisode, measured: Sequence[str], system: System) -> bool:
+def are_degrees(raw: RawEpisode, system: System) -> bool:
     """Whether the source explains the angle's acceleration if the angle is in degrees, and does not if in radians.
 
     False where that cannot be decided: the command never changes, the recording is too short or too noisy, or the
     system does not have exactly one angle.
     """
     angles = [variable.name for variable in system.states if variable.unit == "rad"]
-    columns = _columns(raw, measured)
     if len(angles) != 1 or not _can_decide(raw, system, angles):
         return False
+    columns = _columns(raw)
     radians, radian_slope = _fits(raw, columns, system)[angles[0]]
     scaled = {name: values * (DEGREE if name.startswith(angles[0]) else 1) for name, values in columns.items()}
     degrees, slope = _fits(raw, scaled, system)[angles[0]]
     return degrees > EXPLAINED_CORRELATION and 1 / 3 < slope < 3 and (degrees > radians + 0.2 or radian_slope > 10)
 
 
-def exchanged(raw: RawEpisode, measured: Sequence[str], system: System, one: str, other: str) -> bool:
+def exchanged(raw: RawEpisode, system: System, one: str, other: str) -> bool:
     """Whether the source explains both accelerations with two columns (and their rates) exchanged, and not as they are.
 
     A delayed command could look like that, so every delay up to `LONGEST_DELAY_S` is tried for the columns as
@@ -54,7 +54,7 @@ def exchanged(raw: RawEpisode, measured: Sequence[str], system: System, one: str
     """
     if not _can_decide(raw, system, (one, other)):
         return False
-    columns = _columns(raw, measured)
+    columns = _columns(raw)
     to = {one: other, other: one, f"{one}_dot": f"{other}_dot", f"{other}_dot": f"{one}_dot"}
     swapped = {to.get(name, name): values for name, values in columns.items()}
     fits = _fits(raw, swapped, system)
@@ -64,15 +64,12 @@ def exchanged(raw: RawEpisode, measured: Sequence[str], system: System, one: str
     unchanged = [_fits(raw, columns, system, delay) for delay in range(round(LONGEST_DELAY_S / period) + 1)]
     best = max(min(fits[one][0], fits[other][0]) for fits in unchanged)
     explained = min(fits[one][0], fits[other][0])
-    return (
-        explained > EXPLAINED_CORRELATION
-        and best < 0.7 * explained
-        and max(unchanged[0][one][0], unchanged[0][other][0]) < 0
-    )
+    opposite = max(unchanged[0][one][0], unchanged[0][other][0]) < 0
+    return explained > EXPLAINED_CORRELATION and best < 0.7 * explained and opposite
 
 
-def _columns(raw: RawEpisode, measured: Sequence[str]) -> Columns:
-    return {name: values[:MOST_ROWS] for name, values in zip(measured, raw.state.T, strict=True)}
+def _columns(raw: RawEpisode) -> Columns:
+    return {name: values[:MOST_ROWS] for name, values in raw.states.items()}
 
 
 def _can_decide(raw: RawEpisode, system: System, names: Sequence[str]) -> bool:
@@ -87,11 +84,8 @@ def _can_decide(raw: RawEpisode, system: System, names: Sequence[str]) -> bool:
 def _fits(raw: RawEpisode, columns: Columns, system: System, delay: int = 0) -> dict[str, tuple[float, float]]:
     """For each variable that has a rate: correlation of its acceleration with the source's, and slope over it.
 
-    Args:
-        raw: the clock and the commands.
-        columns: the measured states, in the units and under the names to be tried.
-        system: the source.
-        delay: rows by which the commands act late.
+    `columns` are the measured states, in the units and under the names to be tried; `delay` is the number of rows by
+    which the commands act late.
     """
     names = [variable.name for variable in system.states]
     angles = [variable.name for variable in system.states if variable.unit == "rad"]
@@ -124,7 +118,10 @@ def _fits(raw: RawEpisode, columns: Columns, system: System, delay: int = 0) -> 
 
 def _fit(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> tuple[float, float]:
     """Correlation and slope of measured over predicted values."""
-    if measured.std() == 0 or predicted.std() == 0:
-        return 0.0, 0.0
-    correlation = float(np.corrcoef(measured, predicted)[0, 1])
-    return correlation, correlation * float(measured.std() / predicted.std())
+    found = correlation(measured, predicted)
+    return found, found * float(measured.std() / predicted.std()) if found else 0.0
+
+
+def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """0 where one of the two never changes."""
+    return 0.0 if a.std() == 0 or b.std() == 0 else float(np.corrcoef(a, b)[0, 1])

@@ -37,7 +37,9 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
-        _flush(temporary)
+        # Onto the disk first, so that a full disk or a power cut cannot cost the old file.
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
         temporary.replace(final)
     except BaseException as error:
         # Before the temporary file, which may be what fills the disk, is removed.
@@ -49,20 +51,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
 
 
-def _flush(path: Path) -> None:
-    """Force the file onto the disk, so that a full disk or a power cut cannot cost the old file."""
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
-
-
 def _is_full(error: BaseException, folder: Path) -> bool:
     """Whether the disk was full. Some libraries chain the system's error, some quote it, some report neither."""
     codes = {errno.ENOSPC, errno.EDQUOT}
     link: BaseException | None = error
     while link is not None:
-        if isinstance(link, OSError) and link.errno in codes:
-            return True
-        if any(os.strerror(code) in str(link) for code in codes):
+        if getattr(link, "errno", None) in codes or any(os.strerror(code) in str(link) for code in codes):
             return True
         link = link.__cause__ or link.__context__
     # torch.save reports "unexpected pos", ffmpeg a broken pipe.

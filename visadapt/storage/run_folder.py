@@ -6,6 +6,7 @@ import json
 import math
 import platform
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -25,28 +26,23 @@ def open_run(folder: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         RunError: the folder holds a run with other settings.
     """
-    path = folder / "settings.json"
     wanted = json.loads(json.dumps(_finite(settings), default=str))
-    if path.exists():
-        found = read_json(path)["settings"]
-        if found != wanted:
-            differing = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
-            raise RunError(
-                f"{folder} holds a run with other settings ({', '.join(differing)}): remove it or name another folder"
-            )
-        return read_json(path)
-    write_json(path, {"settings": wanted, "versions": versions()})
-    return read_json(path)
+    run = once(folder / "settings.json", lambda: {"settings": wanted, "versions": versions()})
+    found = run["settings"]
+    if found != wanted:
+        differing = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
+        raise RunError(
+            f"{folder} holds a run with other settings ({', '.join(differing)}): remove it or name another folder"
+        )
+    return run
 
 
 def versions() -> dict[str, str]:
     """Versions of Python and of those packages that results depend on and that are installed."""
     found = {"python": platform.python_version()}
     for package in RECORDED_PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):
             found[package] = version(package)
-        except PackageNotFoundError:
-            continue
     return found
 
 
@@ -60,10 +56,9 @@ def once(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 def read_json(path: Path) -> dict[str, Any]:
     """The JSON object in a file; raises RunError if the file is incomplete."""
     try:
-        content: dict[str, Any] = json.loads(path.read_text())
+        return json.loads(path.read_text())
     except json.JSONDecodeError as error:
         raise RunError(f"{path}: not complete JSON ({error}): remove it and run again") from error
-    return content
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -1,8 +1,7 @@
 """Targets: machines and simulators on which a policy can be run."""
 
 from visadapt.targets.base import Observation, Target, TargetError
-from visadapt.targets.flight import FlightTarget
-from visadapt.targets.synthetic import Start, SyntheticTarget, constant_force, no_effects, sine_force
+from visadapt.targets.synthetic import FlightTarget, Start, SyntheticTarget, constant_force, no_effects, sine_force
 
 __all__ = [
     "FlightTarget",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -96,15 +96,15 @@ class EnvMap:
 
     def _check_crop(self, *crop: int) -> None:
         if len(crop) != 4 or not all(isinstance(edge, int) for edge in crop):
-            raise TargetError(f"crop must be left, top, right, bottom in whole px, got {self.crop!r}")
+            raise TargetError(f"crop must be left, top, right, bottom in whole px, got {crop!r}")
         left, top, right, bottom = crop
         if not (0 <= left < right and 0 <= top < bottom):
-            raise TargetError(f"crop {self.crop} holds no pixel: left < right and top < bottom, all from 0 on")
+            raise TargetError(f"crop {crop} holds no pixel: left < right and top < bottom, all from 0 on")
         columns, rows = right - left, bottom - top
         wanted, got = self._width(columns, rows) / self.height, columns / rows
         if self.width is not None and abs(got / wanted - 1) > ASPECT_TOLERANCE:
             raise TargetError(
-                f"crop {self.crop} is {columns} x {rows} px, {got:.3f} wide for 1 high; "
+                f"crop {crop} is {columns} x {rows} px, {got:.3f} wide for 1 high; "
                 f"frames of {self.width} x {self.height} px need {wanted:.3f}"
             )
 
@@ -124,11 +124,10 @@ class EnvMap:
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
             raise TargetError(f"{path}: cannot be read as TOML: {error}") from error
         known = [item.name for item in fields(cls)]
-        needed = [item.name for item in fields(cls) if item.default is MISSING and item.default_factory is MISSING]
         for key in table:
             if key not in known:
                 raise TargetError(f"{path}: unknown key {key!r}; there are {', '.join(known)}")
-        for key in needed:
+        for key in ("states", "actions"):
             if key not in table:
                 raise TargetError(f"{path}: {key!r} is missing")
         try:
@@ -150,20 +149,12 @@ class EnvMap:
                 if state not in ours:
                     raise TargetError(f"{name}: the map {does} {state!r}; our states are {', '.join(ours)}")
         if len(self.actions) != len(system.actions):
-            raise TargetError(
-                f"{name}: the map has {len(self.actions)} actions, {system.name} has {len(system.actions)}"
-            )
-        for state, entry in self.states.items():
-            if entry.index >= n_observation:
-                raise TargetError(
-                    f"{name}: the map takes {state} from observation entry {entry.index}; "
-                    f"there are {n_observation}, counted from 0"
-                )
-        for entry in self.actions:
-            if entry.index >= n_action:
-                raise TargetError(
-                    f"{name}: the map sets action entry {entry.index}; there are {n_action}, counted from 0"
-                )
+            count = len(system.actions)
+            raise TargetError(f"{name}: the map has {len(self.actions)} actions, {system.name} has {count}")
+        taken = [(f"takes {state} from observation", entry, n_observation) for state, entry in self.states.items()]
+        for does, entry, count in (*taken, *(("sets action", entry, n_action) for entry in self.actions)):
+            if entry.index >= count:
+                raise TargetError(f"{name}: the map {does} entry {entry.index}; there are {count}, counted from 0")
 
     def state(self, observation: NDArray[np.floating], system: type[System]) -> NDArray[np.floating]:
         """Our state (n_state,), in our system's order, for an observation."""

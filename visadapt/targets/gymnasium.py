@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import atexit
+import os
+import traceback
 import warnings
 import weakref
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -18,9 +20,16 @@ from visadapt.systems import CartPole, System
 from visadapt.targets import mujoco_frames
 from visadapt.targets.base import Observation, Target, TargetError
 from visadapt.targets.env_map import EnvMap
-from visadapt.targets.synthetic import Start
 
-HOW_TO_INSTALL = "pip install 'visadapt[mujoco]'"
+
+class _Shown(NamedTuple):
+    """What one environment shows."""
+
+    state: NDArray[np.floating]
+    """(n_state,)"""
+    alive: bool
+    picture: NDArray[np.uint8] | None
+    """(H, W)"""
 
 
 class GymnasiumTarget(Target):
@@ -28,12 +37,11 @@ class GymnasiumTarget(Target):
 
     Args:
         env: the environment's id, or a function that makes one (with `render_mode="rgb_array"` and no time limit).
-        mapping: the map between its numbers and frames and ours; `mapping.options` are for gymnasium.make alone.
+        mapping: the map between its numbers and frames and ours; `mapping.options` are for gymnasium.make alone. Where
+            it gives no period, that is the environment's `tau` or `dt`, or else 1 / `render_fps` of its metadata, with
+            a warning, since that may be the speed of its films alone. Only environments that `show` can put into a
+            state can begin where it says by `start`.
         system: the system whose states and actions the mapping gives.
-        start: draws the first state of an episode instead of the mapping's `start` and the environment's own reset;
-            only for environments that `show` can put into a state.
-        period: s between actions, instead of the mapping's; by default the environment's `tau` or `dt`, or else
-            1 / `render_fps` of its metadata, with a warning, since that may be the speed of its films alone.
         frames: whether frames are drawn.
 
     Raises:
@@ -52,8 +60,6 @@ class GymnasiumTarget(Target):
         env: str | Callable[[], Any],
         mapping: EnvMap,
         system: type[System] = CartPole,
-        start: Start | None = None,
-        period: float | None = None,
         frames: bool = True,
         name: str | None = None,
     ) -> None:
@@ -61,46 +67,38 @@ class GymnasiumTarget(Target):
         self._source = env
         self.mapping = mapping
         self.system = system
-        self.initial = start
         self.frames = frames
-        self.name = name or (env if isinstance(env, str) else "gymnasium environment")
+        self.name = name or str(env)
         first = self._make()
         self.name = name or (first.spec.id if first.spec is not None else type(first.unwrapped).__name__)
         self.n_action = len(mapping.actions)
         self._n_env_action = self._check(first)
-        self.period, self.period_origin = self._period(first, mapping.period if period is None else period)
+        self.period, self.period_origin = self._period(first)
         self._mujoco = frames and mujoco_frames.is_mujoco(first)
         if self._mujoco:
             mujoco_frames.probe(self.name)
         self._envs = [first]
         self._closed_at_exit = False
         self._steps = 0
-        self._observations: list[NDArray[np.floating]] = []
-        self._pictures: list[NDArray[np.uint8]] = []
-        self._alive: list[bool] = []
+        self._shown: list[_Shown] = []
 
     def reset(self, batch: int, generator: torch.Generator) -> Observation:
-        """Start `batch` new episodes, each environment seeded from the generator.
-
-        Raises:
-            TargetError: an observation is not finite, or the crop does not fit the frame.
-        """
+        """Start `batch` new episodes, each environment seeded from the generator; raises TargetError as `step` does."""
         seeds = torch.randint(2**31 - 1, (batch,), generator=generator).tolist()
-        starts = self._starts(batch, generator)
+        starts: NDArray[np.floating] | None = None
+        if self.mapping.start is not None:
+            widths = torch.tensor([self.mapping.start.get(variable.name, 0.0) for variable in self.system.states])
+            starts = (widths * (2 * torch.rand(batch, len(widths), generator=generator) - 1)).double().numpy()
         while len(self._envs) < batch:
             self._envs.append(self._make())
         if self._mujoco:
             mujoco_frames.share_viewer(self._envs)
-        self._steps = 0
-        self._observations, self._pictures = [], []
-        for b in range(batch):
-            seen, _ = self._envs[b].reset(seed=seeds[b])
+        self._steps, self._shown = 0, []
+        for b, env in enumerate(self._envs[:batch]):
+            seen, _ = env.reset(seed=seeds[b])
             if starts is not None:
-                seen = self._place(self._envs[b], np.asarray(seen, dtype=float), starts[b])
-            self._observations.append(self._finite(seen, b))
-            if self.frames:
-                self._pictures.append(self._draw(self._envs[b]))
-        self._alive = [self._inside(seen) for seen in self._observations]
+                seen = self._place(env, np.asarray(seen, dtype=float), starts[b])
+            self._shown.append(self._see(seen, b))
         return self._observe()
 
     def step(self, action: Tensor) -> Observation:
@@ -108,17 +106,18 @@ class GymnasiumTarget(Target):
 
         Raises:
             TargetError: step before reset, an action of another shape or not finite, an observation that is not
-                finite, or an episode that the environment truncates.
+                finite, a frame that the crop does not fit, or an episode that the environment truncates.
         """
-        if action.shape != (len(self._alive), self.n_action) or not self._alive:
-            wanted = f"({len(self._alive)}, {self.n_action})" if self._alive else "a reset first"
+        batch = len(self._shown)
+        if action.shape != (batch, self.n_action) or not batch:
+            wanted = f"({batch}, {self.n_action})" if batch else "a reset first"
             raise TargetError(f"{self.name}: step with an action of shape {tuple(action.shape)}; it needs {wanted}")
         if not bool(action.isfinite().all()):
             raise TargetError(f"{self.name}: the action of step {self._steps} is not finite")
         self._steps += 1
         commands = action.detach().clamp(-1, 1).double().cpu().numpy()
-        for b, env in enumerate(self._envs[: len(self._alive)]):
-            if not self._alive[b]:
+        for b, env in enumerate(self._envs[:batch]):
+            if not self._shown[b].alive:
                 continue
             ours = self.mapping.action(commands[b], self._n_env_action)
             seen, _, terminated, truncated, _ = env.step(ours.astype(env.action_space.dtype))
@@ -127,15 +126,12 @@ class GymnasiumTarget(Target):
                     f"{self.name}: cut the episode short after {self._steps} steps; make it without a time limit "
                     "(gymnasium.make(..., max_episode_steps=-1))"
                 )
-            self._observations[b] = self._finite(seen, b)
-            if self.frames:
-                self._pictures[b] = self._draw(env)
-            self._alive[b] = not terminated and self._inside(self._observations[b])
+            self._shown[b] = self._see(seen, b, terminated)
         return self._observe()
 
     def close(self) -> None:
         """Free the environments and their renderers; the target cannot be used afterwards."""
-        envs, self._envs, self._alive = self._envs, [], []
+        envs, self._envs, self._shown = self._envs, [], []
         if envs and self._mujoco:
             mujoco_frames.close_all(envs)
         else:
@@ -159,21 +155,20 @@ class GymnasiumTarget(Target):
     def _make(self) -> Any:
         if not isinstance(self._source, str):
             return self._source()
-        render_mode = "rgb_array" if self.frames else None
         try:
             # No time limit: episodes end where the mapping's limits or the environment say.
             return gymnasium.make(
                 self._source,
-                render_mode=render_mode,
+                render_mode="rgb_array" if self.frames else None,
                 max_episode_steps=-1,
                 disable_env_checker=True,
                 **self.mapping.options,
             )
-        except gymnasium.error.DependencyNotInstalled as error:
-            advice = f"mujoco is not installed: {HOW_TO_INSTALL}" if "mujoco" in str(error).lower() else _line(error)
-            raise TargetError(f"{self.name}: {advice}") from error
         except Exception as error:  # whatever the environment's constructor raises becomes one line
-            if mujoco_frames.failed_to_import(error):
+            if isinstance(error, gymnasium.error.DependencyNotInstalled) and "mujoco" in str(error).lower():
+                raise TargetError(f"{self.name}: mujoco is not installed: pip install 'visadapt[mujoco]'") from error
+            # Importing mujoco fails in many ways if MUJOCO_GL names a missing library.
+            if "/mujoco/__init__.py" in "".join(traceback.format_tb(error.__traceback__)).replace(os.sep, "/"):
                 raise mujoco_frames.cannot_render(self.name, error) from error
             raise TargetError(f"{self.name}: cannot be made: {_line(error)}") from error
 
@@ -199,9 +194,9 @@ class GymnasiumTarget(Target):
         self.mapping.check(self.name, self.system, int(env.observation_space.shape[0]), n_action)
         return n_action
 
-    def _period(self, env: Any, given: float | None) -> tuple[float, str]:
+    def _period(self, env: Any) -> tuple[float, str]:
         """s between actions, and where that number comes from."""
-        body, rate = env.unwrapped, env.metadata.get("render_fps")
+        given, body, rate = self.mapping.period, env.unwrapped, env.metadata.get("render_fps")
         own = next((name for name in ("tau", "dt") if isinstance(getattr(body, name, None), int | float)), None)
         step = None if own is None else float(getattr(body, own))
         if given is not None:
@@ -221,15 +216,6 @@ class GymnasiumTarget(Target):
         origin = f"render_fps = {rate:g} of its metadata, which may be the speed of a film alone: give `period` in s"
         warnings.warn(f"{self.name}: the period, {1 / rate:g} s, is taken from {origin}", stacklevel=3)
         return 1 / float(rate), origin
-
-    def _starts(self, batch: int, generator: torch.Generator) -> NDArray[np.floating] | None:
-        """States (batch, n_state) that episodes start in; None: where the environment itself does."""
-        if self.initial is not None:
-            return self.initial.draw(batch, generator).double().numpy()
-        if self.mapping.start is None:
-            return None
-        widths = torch.tensor([self.mapping.start.get(variable.name, 0.0) for variable in self.system.states])
-        return (widths * (2 * torch.rand(batch, len(widths), generator=generator) - 1)).double().numpy()
 
     def _place(self, env: Any, seen: NDArray[np.floating], state: NDArray[np.floating]) -> NDArray[np.floating]:
         """Put an environment that observes `seen` and has not been stepped into our state; its observation there."""
@@ -251,19 +237,19 @@ class GymnasiumTarget(Target):
         body.state = wanted.astype(kept.dtype)
         return wanted
 
-    def _finite(self, seen: Any, episode: int) -> NDArray[np.floating]:
-        out = np.asarray(seen, dtype=float)
-        broken = np.flatnonzero(~np.isfinite(out))
+    def _see(self, seen: Any, episode: int, ended: bool = False) -> _Shown:
+        """What an environment that observes `seen` shows."""
+        numbers = np.asarray(seen, dtype=float)
+        broken = np.flatnonzero(~np.isfinite(numbers))
         if len(broken):
             raise TargetError(
-                f"{self.name}: observation entry {broken[0]} is {out[broken[0]]} after step {self._steps} "
+                f"{self.name}: observation entry {broken[0]} is {numbers[broken[0]]} after step {self._steps} "
                 f"(episode {episode}); the environment must stay finite until it ends the episode"
             )
-        return out
-
-    def _inside(self, seen: NDArray[np.floating]) -> bool:
-        state = self.mapping.state(seen, self.system)
-        return all(abs(state[self.system.index(name)]) <= limit for name, limit in self.mapping.limits.items())
+        state = self.mapping.state(numbers, self.system)
+        limits = self.mapping.limits.items()
+        inside = all(abs(state[self.system.index(name)]) <= limit for name, limit in limits)
+        return _Shown(state, not ended and inside, self._draw(self._envs[episode]) if self.frames else None)
 
     def _draw(self, env: Any) -> NDArray[np.uint8]:
         try:
@@ -282,17 +268,16 @@ class GymnasiumTarget(Target):
         return self.mapping.frame(self.name, picture)
 
     def _observe(self) -> Observation:
-        state = np.stack([self.mapping.state(seen, self.system) for seen in self._observations])
+        states, alive, pictures = zip(*self._shown, strict=True)
         return Observation(
-            state=torch.tensor(state, dtype=torch.get_default_dtype()),
-            alive=torch.tensor(self._alive),
-            frame=torch.from_numpy(np.stack(self._pictures)) if self.frames else None,
+            state=torch.tensor(np.stack(states), dtype=torch.get_default_dtype()),
+            alive=torch.tensor(alive),
+            frame=torch.from_numpy(np.stack(pictures)) if self.frames else None,
         )
 
 
 def _close(target: weakref.ref[GymnasiumTarget]) -> None:
-    alive = target()
-    if alive is not None:
+    if (alive := target()) is not None:
         alive.close()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 from visadapt.systems import CartPole
 from visadapt.targets.env_map import Entry, EnvMap
 from visadapt.targets.gymnasium import GymnasiumTarget
@@ -9,6 +11,9 @@ from visadapt.targets.synthetic import Start
 
 REACH_M = 0.9
 """Largest |x| of the cart: rail and frame end at 1 m."""
+
+START = Start()
+"""The same as the synthetic target's, and wider than the environment's own +-0.01."""
 
 MAP = EnvMap(
     states={"x": Entry(0), "theta": Entry(1), "x_dot": Entry(2), "theta_dot": Entry(3)},
@@ -19,6 +24,7 @@ MAP = EnvMap(
     # The only light is the one at the camera: the brightest pixels have a grey level of about 130.
     contrast=(0.0, 150.0),
     limits={"theta": 0.3, "x": REACH_M},
+    start=asdict(START),
     options={
         "width": 240,
         "height": 200,
@@ -43,14 +49,11 @@ SOURCE = CartPole(
 )
 """The published values of its model: masses, the pole's length, gear, gravity; a uniform rod without friction."""
 
-START = Start(x=0.2, x_dot=0.1, theta=0.1, theta_dot=0.1)
-"""The same as the synthetic target's, and wider than the environment's own +-0.01."""
 
-
-def inverted_pendulum(start: Start | None = START, frames: bool = True) -> GymnasiumTarget:
-    """InvertedPendulum-v5, 0.04 s between actions; `start=None` keeps its own reset, uniform within +-0.01.
+def inverted_pendulum() -> GymnasiumTarget:
+    """InvertedPendulum-v5, 0.04 s between actions.
 
     Raises:
         TargetError: gymnasium or mujoco is not installed, or no off-screen renderer works.
     """
-    return GymnasiumTarget("InvertedPendulum-v5", MAP, CartPole, start, frames=frames)
+    return GymnasiumTarget("InvertedPendulum-v5", MAP)

@@ -5,19 +5,10 @@ from __future__ import annotations
 import ctypes.util
 import os
 import sys
-import traceback
 from collections.abc import Sequence
 from typing import Any
 
 from visadapt.targets.base import TargetError
-
-BACKEND_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
-"""Values of MUJOCO_GL and the shared library that each needs, the faster first."""
-
-HOW_TO_INSTALL = (
-    "install EGL (Debian: apt-get install libegl1 libgl1; then MUJOCO_GL=egl) "
-    "or OSMesa (apt-get install libosmesa6; then MUJOCO_GL=osmesa)"
-)
 
 
 def choose_backend() -> None:
@@ -25,28 +16,24 @@ def choose_backend() -> None:
     displayed = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if "MUJOCO_GL" in os.environ or displayed or not sys.platform.startswith("linux"):
         return
-    found = [backend for backend, library in BACKEND_LIBRARIES.items() if ctypes.util.find_library(library)]
-    os.environ["MUJOCO_GL"] = found[0] if found else "egl"
+    # EGL is the faster.
+    only_osmesa = ctypes.util.find_library("OSMesa") and not ctypes.util.find_library("EGL")
+    os.environ["MUJOCO_GL"] = "osmesa" if only_osmesa else "egl"
 
 
 def cannot_render(name: str, error: BaseException) -> TargetError:
     """The error that no frame can be drawn, in one line with what to install."""
     backend = os.environ.get("MUJOCO_GL", "unset")
     reason = " ".join(str(error).split())[:120] or type(error).__name__
-    return TargetError(f"{name}: cannot render off-screen (MUJOCO_GL is {backend}: {reason}); {HOW_TO_INSTALL}")
+    return TargetError(
+        f"{name}: cannot render off-screen (MUJOCO_GL is {backend}: {reason}); install EGL (Debian: apt-get install "
+        "libegl1 libgl1; then MUJOCO_GL=egl) or OSMesa (apt-get install libosmesa6; then MUJOCO_GL=osmesa)"
+    )
 
 
 def is_mujoco(env: Any) -> bool:
     """Whether the environment is drawn by gymnasium's own MuJoCo renderer."""
     return hasattr(getattr(env.unwrapped, "mujoco_renderer", None), "_get_viewer")
-
-
-def failed_to_import(error: BaseException) -> bool:
-    """Whether the error is from importing mujoco, which fails in many ways if MUJOCO_GL names a missing library."""
-    return any(
-        frame.filename.replace(os.sep, "/").endswith("/mujoco/__init__.py")
-        for frame in traceback.extract_tb(error.__traceback__)
-    )
 
 
 def probe(name: str) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from visadapt.history import History
@@ -119,20 +121,16 @@ def _check_finite(target: Target, observation: Observation, rows: Tensor, which:
 
 def _cut(rows: list[tuple[Observation, Tensor]], b: int, length: int, survived: bool, period: float) -> Run:
     kept = rows[: length + 1]
+
+    def column(name: str) -> NDArray[Any] | None:
+        each = [getattr(seen, name) for seen, _ in kept]
+        return None if each[0] is None else np.stack([values[b].numpy() for values in each])
+
     action = np.stack([action[b].numpy() for _, action in kept])
     action[-1] = 0.0
-    frames = None
-    if kept[0][0].frame is not None:
-        frames = np.stack([seen.frame[b].numpy() for seen, _ in kept if seen.frame is not None])
-    task_state = None
-    if kept[0][0].task_state is not None:
-        task_state = np.stack([seen.task_state[b].double().numpy() for seen, _ in kept if seen.task_state is not None])
-    episode = Episode(
-        time=np.arange(len(kept)) * period,
-        action=action,
-        state=np.stack([seen.state[b].numpy() for seen, _ in kept]),
-        frame=frames,
-        task_state=task_state,
-    )
+    time, task_state = np.arange(len(kept)) * period, column("task_state")
+    if task_state is not None:
+        task_state = task_state.astype(float)
+    episode = Episode(time, action, column("state"), column("frame"), task_state)
     force = np.array([0.0 if seen.force is None else seen.force[b].numpy() for seen, _ in kept])
     return Run(episode, survived, force)

@@ -19,10 +19,9 @@ from torch import Tensor
 from visadapt.systems import Quadrotor
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY
 from visadapt.targets.base import Observation, TargetError
-from visadapt.targets.flight import FlightTarget
+from visadapt.targets.synthetic import FlightTarget
 from visadapt.tasks.follow import Follow
 
-HOW_TO_INSTALL = "pip install 'visadapt[rotorpy]'"
 RATE_LOOP_PERIOD_S = 0.01
 """s between runs of rotorpy's rate loop, its default; thrusts are held in between"""
 
@@ -79,15 +78,12 @@ class RotorpyTarget(FlightTarget):
         TargetError: rotorpy, or a package that its batched multirotor needs, is not installed.
     """
 
+    name = "rotorpy's Crazyflie Brushless"
+
     def __init__(
-        self,
-        task: Follow,
-        air: Air = BREEZE,
-        aero: bool = True,
-        changes: Mapping[str, Any] | None = None,
-        name: str = "rotorpy's Crazyflie Brushless",
+        self, task: Follow, air: Air = BREEZE, aero: bool = True, changes: Mapping[str, Any] | None = None
     ) -> None:
-        super().__init__(task, SOURCE, name=name)
+        super().__init__(task, SOURCE)
         self._physics = _import("rotorpy.vehicles.multirotor", "torchdiffeq", "roma")
         self._winds = _import("rotorpy.wind.default_winds")
         self.vehicle = {**_import("rotorpy.vehicles.crazyfliebrushless_params").quad_params, **(changes or {})}
@@ -110,15 +106,14 @@ class RotorpyTarget(FlightTarget):
             "w": state[:, RATES],
             "rotor_speeds": state.new_full((batch, 4), hover),
         }
-        self._steps = 0
-        self._profiles = self._wind(batch, generator)
+        self._steps, self._profiles = 0, self._wind(batch, generator)
         self._set_wind()
         device = torch.device("cpu")
         parameters = self._physics.BatchedMultirotorParams([self.vehicle] * batch, batch, device)
         self._multirotors = self._physics.BatchedMultirotor(
             parameters, batch, self._state, device, "cmd_ctbr", self.aero, integrator="rk4"
         )
-        return self._observation()
+        return self._observe()
 
     def step(self, action: Tensor) -> Observation:
         if self._multirotors is None:
@@ -134,7 +129,7 @@ class RotorpyTarget(FlightTarget):
                 self._steps += 1
                 self._set_wind()
         self._task_state = self.task.advance(self._task_state)
-        return self._observation()
+        return self._observe()
 
     def published(self) -> dict[str, float]:
         """What rotorpy's parameters say at the rotor speed of a hover; damping, in 1/s, is that of turns."""
@@ -167,7 +162,7 @@ class RotorpyTarget(FlightTarget):
         now, where = self._steps * RATE_LOOP_PERIOD_S, self._state["x"]
         self._state["wind"] = sum((each.update(now, where) for each in self._profiles), torch.zeros_like(where))
 
-    def _observation(self) -> Observation:
+    def _observe(self) -> Observation:
         own = self._state
         state = torch.cat((own["x"], own["v"], own["q"].roll(1, 1), own["w"]), 1).to(torch.get_default_dtype())
         alive = state.isfinite().all(1)
@@ -177,10 +172,8 @@ class RotorpyTarget(FlightTarget):
 def _import(module: str, *needs: str) -> Any:
     """A module of rotorpy; also imports the packages it `needs`, whose absence rotorpy itself does not report."""
     try:
-        found = importlib.import_module(module)
-        for each in needs:
-            importlib.import_module(each)
-        return found
+        found, *_ = [importlib.import_module(each) for each in (module, *needs)]
     except ImportError as error:
         missing = (error.name or module).partition(".")[0]
-        raise TargetError(f"{missing} is not installed: {HOW_TO_INSTALL}") from error
+        raise TargetError(f"{missing} is not installed: pip install 'visadapt[rotorpy]'") from error
+    return found

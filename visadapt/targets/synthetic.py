@@ -1,18 +1,19 @@
-"""Synthetic cart-poles: worlds whose effects the learner does not see, filmed by a fixed camera."""
+"""Synthetic targets, cart-poles and vehicles: worlds whose effects the learner does not see."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from renderers import DrawnCartPole
 from visadapt.effects import ConstantForce, Effect, PeriodicForce
-from visadapt.systems import CartPole, System
+from visadapt.systems import CartPole, RigidBody, System
 from visadapt.targets.base import Observation, Target, TargetError
+from visadapt.tasks.flight import FlightTask
 from visadapt.world import World, WorldState
 
 DrawEffects = Callable[[int, torch.Generator], Sequence[Effect]]
@@ -68,8 +69,42 @@ class Start:
         return width * (2 * torch.rand(batch, 4, generator=generator) - 1)
 
 
-class SyntheticTarget(Target):
-    """A cart-pole with hidden effects, integrated by the midpoint rule with steps of 1 ms, unlike any source.
+class WorldTarget(Target):
+    """A batch of worlds with hidden effects, integrated by the midpoint rule with steps of 1 ms, unlike any source."""
+
+    def __init__(self, system: System, period: float, draw_effects: DrawEffects) -> None:
+        self.system = system
+        self.period = period
+        self.n_action = len(system.actions)
+        self.draw_effects = draw_effects
+        self._world: World | None = None
+        self._at: WorldState
+        self._generator: torch.Generator
+
+    def _start(self, state: Tensor, effects: Sequence[Effect], generator: torch.Generator) -> Observation:
+        """Start episodes in states (batch, n_state)."""
+        self._generator = generator
+        substeps = round(self.period / 0.001)
+        self._world = World(self.system, effects, self.period, "midpoint", substeps).requires_grad_(False)
+        self._at = self._world.start(state)
+        return self._observe()
+
+    def step(self, action: Tensor) -> Observation:
+        if self._world is None:
+            raise TargetError(f"{self.name}: step before reset")
+        with torch.no_grad():
+            self._at = self._world.step(self._at, action)
+        return self._observe()
+
+    def _observe(self) -> Observation:
+        """What the sensors read, `alive` where the state is finite, and the force as all that the world loads."""
+        assert self._world is not None
+        measured, self._at = self._world.measure(self._at, self._generator)
+        return Observation(measured, self._at.state.isfinite().all(1), force=self._world.load(self._at))
+
+
+class SyntheticTarget(WorldTarget):
+    """A cart-pole with hidden effects, integrated more finely (1 ms) and by another method than any source.
 
     Args:
         draw_effects: draws the hidden effects of a batch of episodes.
@@ -84,7 +119,7 @@ class SyntheticTarget(Target):
     torch.Size([2, 4])
     """
 
-    n_action = 1
+    name = "synthetic cart-pole"
 
     def __init__(
         self,
@@ -94,44 +129,75 @@ class SyntheticTarget(Target):
         period: float = 0.05,
         start: Start | None = None,
         angle_limit: float = 0.3,
-        name: str = "synthetic cart-pole",
     ) -> None:
-        self.name = name
-        self.period = period
-        self.draw_effects = draw_effects
+        super().__init__(system or CartPole(), period, draw_effects)
         self.camera = camera
-        self.system = system or CartPole()
         self.initial = start or Start()
         self.angle_limit = angle_limit
-        self._world: World | None = None
-        self._at: WorldState | None = None
-        self._generator: torch.Generator | None = None
 
     def reset(self, batch: int, generator: torch.Generator) -> Observation:
         effects = self.draw_effects(batch, generator)
-        substeps = round(self.period / 0.001)
-        self._generator = generator
-        self._world = World(self.system, effects, self.period, "midpoint", substeps).requires_grad_(False)
-        self._at = self._world.start(self.initial.draw(batch, generator))
-        return self._observe()
-
-    def step(self, action: Tensor) -> Observation:
-        if self._world is None or self._at is None:
-            raise TargetError(f"{self.name}: step before reset")
-        with torch.no_grad():
-            self._at = self._world.step(self._at, action)
-        return self._observe()
+        return self._start(self.initial.draw(batch, generator), effects, generator)
 
     def _observe(self) -> Observation:
-        assert self._world is not None
-        assert self._at is not None
-        measured, self._at = self._world.measure(self._at, self._generator)
-        state = self._at.state
-        alive = state.isfinite().all(1) & (state[:, 2].abs() <= self.angle_limit)
+        seen, state = super()._observe(), self._at.state
+        alive = seen.alive & (state[:, 2].abs() <= self.angle_limit)
         frame = None
         if self.camera is not None:
             alive &= state[:, 0].abs() <= self.camera.camera.reach
             # The state of a fallen cart-pole may be huge or nan: it is drawn at finite values within +-10.
             shown = state.nan_to_num().clamp(-10, 10).double().numpy()
             frame = torch.from_numpy(self.camera(shown[:, 0], shown[:, 2]))
-        return Observation(measured, alive, frame, force=self._world.load(self._at)[:, 0])
+        assert seen.force is not None
+        return replace(seen, alive=alive, frame=frame, force=seen.force[:, 0])
+
+
+class FlightTarget(WorldTarget):
+    """A vehicle with hidden effects, integrated by another method and more finely (1 ms) than any source.
+
+    A flight ends after the task's steps, or where its state is no longer finite; how far off it is does not end it,
+    unless `reach` says so.
+
+    Args:
+        task: where flights start and what a policy is shown.
+        system: its physics.
+        draw_effects: draws the hidden effects of a batch of flights.
+        reach: m off its task's line beyond which a flight ends.
+
+    >>> import torch, visadapt as va
+    >>> from visadapt.tasks.reach import Reach
+    >>> target = va.FlightTarget(Reach(), va.FixedWing())
+    >>> seen = target.reset(2, torch.Generator().manual_seed(0))
+    >>> seen.state.shape, seen.goal.shape, target.period
+    (torch.Size([2, 13]), torch.Size([2, 3]), 0.05)
+    """
+
+    name = "synthetic vehicle"
+
+    def __init__(
+        self, task: FlightTask, system: RigidBody, draw_effects: DrawEffects = no_effects, reach: float = math.inf
+    ) -> None:
+        super().__init__(system, task.period, draw_effects)
+        self.task = task
+        self.system: RigidBody = system
+        self.reach = reach
+        self.first: Tensor
+        """task states in which the flights started"""
+        self._task_state: Tensor
+
+    def reset(self, batch: int, generator: torch.Generator) -> Observation:
+        state, self.first = self.task.evaluation_start(batch, generator)
+        self._task_state = self.first
+        return self._start(state, self.draw_effects(batch, generator), generator)
+
+    def step(self, action: Tensor) -> Observation:
+        if self._world is not None:
+            self._task_state = self.task.advance(self._task_state)
+        return super().step(action)
+
+    def _observe(self) -> Observation:
+        seen = super()._observe()
+        assert seen.force is not None
+        near = self.task.distance_off(self._at.state, self._task_state) <= self.reach
+        goal = self.task.goal(self._task_state)
+        return Observation(seen.state, seen.alive & near, None, seen.force[:, :3], goal, self._task_state)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from visadapt.recordings import RecordingError
-from visadapt.recordings.table import Table
+from visadapt.recordings.csv import Table
 from visadapt.systems import Quadrotor
 from visadapt.tasks.differential_flatness import commands, demanded
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
 
 
@@ -19,12 +18,7 @@ def shipped(name: str) -> Path:
     >>> va.shipped("quadrotor").name
     'quadrotor.safetensors'
     """
-    folder = Path(str(resources.files("visadapt.weights")))
-    path = folder / f"{name}.safetensors"
-    if not path.is_file():
-        raise ValueError(f"no weights {name!r} are shipped; there are {', '.join(sorted(_names(folder)))}")
-    return path
-
-
-def _names(folder: Path) -> list[str]:
-    return [path.stem for path in folder.glob("*.safetensors")]
+    there = {path.stem: path for path in sorted(Path(__file__).parent.glob("*.safetensors"))}
+    if name not in there:
+        raise ValueError(f"no weights {name!r} are shipped; there are {', '.join(there)}")
+    return there[name]

@@ -22,7 +22,7 @@ from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import posterior
 from visadapt.estimation.screening import spans
 from visadapt.estimation.segments import SMOOTHING_RATIO, Segments, zone
-from visadapt.evaluation.intervals import wilson
+from visadapt.evaluation.scoring import wilson
 from visadapt.systems import System
 
 Z_90 = 1.6449  # Half-width of a normal distribution's 90 % interval, in standard deviations

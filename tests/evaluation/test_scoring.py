@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from visadapt.evaluation.cartpole_score import score_cartpole, score_runs
+from visadapt.evaluation.scoring import score, score_runs
 from visadapt.policies import Policy
 from visadapt.recordings import Episode
 from visadapt.targets import SyntheticTarget, sine_force
@@ -54,7 +54,7 @@ class Steady(Policy):
 class TestEvaluate:
     def test_the_same_seed_gives_the_same_result_and_another_seed_another(self):
         def made(seed):
-            found = score_cartpole(Steady(), SyntheticTarget(sine_force), 5, seed, 40)
+            found = score(Steady(), SyntheticTarget(sine_force), 5, seed, 40)
             runs = run(SyntheticTarget(sine_force), Steady(), 5, 40, torch.Generator().manual_seed(seed))
             return dataclasses.astuple(found), [r.episode.state for r in runs]
 
@@ -68,7 +68,7 @@ class TestEvaluate:
 
     def test_what_holds_the_pole_survives_and_what_pushes_the_wrong_way_falls(self):
         runs = run(SyntheticTarget(), Steady(), 5, 100, torch.Generator().manual_seed(0))
-        held = score_cartpole(Steady(), SyntheticTarget(), 5, 0, 100)
+        held = score(Steady(), SyntheticTarget(), 5, 0, 100)
         assert held.survived == 5
         assert held.mean_length == 100
         speeds = [np.abs(r.episode.state[:, 1]).mean() for r in runs]

@@ -1,0 +1,164 @@
+"""What the arguments of subcommands name: systems, effects, the user's own Python, and the folder of a training."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import difflib
+import hashlib
+import importlib
+import importlib.util
+import shutil
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from visadapt.diagnosis.saved import load_effects
+from visadapt.effects import EFFECTS, Effect
+from visadapt.effects.catalogue import catalogue
+from visadapt.progress import Report, reporting
+from visadapt.storage.run_folder import open_run
+from visadapt.systems import System
+from visadapt.systems.parameter_file import load_parameters
+
+
+class InputError(ValueError):
+    """An argument that cannot be used; the message is one line: what, where, and what would be right."""
+
+
+@contextmanager
+def checked() -> Iterator[None]:
+    """Turn the ValueError or TypeError by which the library refuses an argument into an InputError."""
+    try:
+        yield
+    except (ValueError, TypeError) as error:
+        raise InputError(str(error)) from error
+
+
+@contextmanager
+def progress() -> Iterator[Report]:
+    """A report of progress on stderr, where everything goes that is printed meanwhile: stdout is for results."""
+    with contextlib.redirect_stdout(sys.stderr), reporting() as report:
+        yield report
+
+
+@contextmanager
+def unfinished(out: Path, settings: Mapping[str, Any]) -> Iterator[Path]:
+    """The folder `<out>.unfinished` that a training works in, and goes on from; removed once the block is through.
+
+    Raises:
+        InputError: `out` is there already, or is a folder.
+        RunError: the folder holds a training with other settings.
+    """
+    if out.exists():
+        raise InputError(f"{out} is there already: remove it, or name another file by --out")
+    folder = out.with_name(out.name + ".unfinished")
+    open_run(folder, settings)
+    yield folder
+    shutil.rmtree(folder)
+
+
+def fingerprint(path: str | Path | None) -> str | None:
+    """The SHA-256 of a file that a run depends on, so that it does not go on with another; None without one."""
+    return None if path is None else hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+def the_system(options: argparse.Namespace) -> System:
+    """The system of --system with the parameters of --params."""
+    return load_parameters(options.params, options.system) if options.params else options.system()
+
+
+def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
+    """The effects of --diagnosis, then those of --effect.
+
+    Raises:
+        InputError: an unknown effect, one without its parameters, or one that does not act on the system.
+        DiagnosisFileError: a diagnosis that named nothing.
+    """
+    effects: list[Effect] = []
+    if options.diagnosis:
+        diagnosed, effects = load_effects(options.diagnosis)
+        if diagnosed != system.name:
+            raise InputError(f"{options.diagnosis}: a diagnosis of a {diagnosed}, where a {system.name} is given")
+    return effects + [_effect(text, system) for text in options.effect]
+
+
+def _effect(text: str, system: System) -> Effect:
+    name, _, rest = text.partition(":")
+    if name not in EFFECTS or EFFECTS[name] not in catalogue():
+        near = difflib.get_close_matches(name, [effect.name for effect in catalogue()], 1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise InputError(f"--effect {text}: there is no effect {name!r}; {hint}`visadapt effects` lists them")
+    if not isinstance(system, EFFECTS[name].systems):
+        kinds = " or a ".join(kind.name for kind in EFFECTS[name].systems)
+        raise InputError(f"--effect {text}: {name} acts on a {kinds}, not on a {system.name}")
+    values: dict[str, float] = {}
+    for part in rest.split(",") if rest else ():
+        parameter, _, number = part.partition("=")
+        try:
+            values[parameter] = float(number)
+        except ValueError:
+            raise InputError(f"--effect {text}: {part!r} is not of the form PARAMETER=NUMBER") from None
+        if not abs(values[parameter]) < float("inf"):
+            raise InputError(f"--effect {text}: {parameter} must be finite")
+    try:
+        return EFFECTS[name](**values)
+    except ValueError as error:
+        raise InputError(f"--effect {text}: {error}") from error
+
+
+def import_effects(options: argparse.Namespace) -> None:
+    """Import the file of --effects, if there is one, whose effects register themselves: before any that may be named.
+
+    Raises:
+        InputError: the file is missing, no Python, or raises; names its line.
+    """
+    if not options.effects:
+        return
+    path = Path(options.effects).absolute()  # as Python's own messages name it
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file")
+    # Under a name of its own, by which worker processes find its classes.
+    name = f"visadapt_effects_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise InputError(f"{path}: not a Python file; a name that ends in .py is right")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise InputError(f"{path}: {describe(error, str(path))}") from error
+
+
+def find_factory(name: str) -> Callable[[], Any]:
+    """What `package.module:factory` names; modules in the current directory are found too."""
+    module_name, _, attribute = name.partition(":")
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        module = importlib.import_module(module_name)
+    except Exception as error:
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        if missing and f"{module_name}.".startswith(f"{missing}."):
+            raise InputError(f"{name}: there is no module {missing!r}, installed or in {here}") from error
+        raise InputError(f"{name}: {describe(error)}") from error
+    factory = getattr(module, attribute, None)
+    if not callable(factory):
+        what = "nothing" if factory is None else f"a {type(factory).__name__}, not a function,"
+        raise InputError(f"{name}: {module.__file__} has {what} called {attribute!r}")
+    return factory
+
+
+def describe(error: Exception, path: str | None = None) -> str:
+    """An exception of a user's Python in one line, with the line of `path`, or of the file that raised it."""
+    if isinstance(error, SyntaxError):
+        where = "" if path else f"{error.filename}: "
+        return f"{where}line {error.lineno}: {type(error).__name__}: {error.msg}"
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if path in (None, frame.filename)]
+    where = "" if not own else f"line {own[-1].lineno}: " if path else f"{own[-1].filename}, line {own[-1].lineno}: "
+    return f"{where}{type(error).__name__}: {' '.join(str(error).split())}"

@@ -1,0 +1,89 @@
+"""A policy and the target that it is run on, as the command line names them, checked against each other."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import warnings
+from itertools import chain
+
+import torch
+
+from visadapt.cli.inputs import InputError, describe, find_factory
+from visadapt.policies import ImagePolicy, Policy
+from visadapt.setups.policy_file import load_policy, load_source
+from visadapt.targets import Target
+from visadapt.targets.env_map import EnvMap
+from visadapt.targets.gymnasium import GymnasiumTarget
+from visadapt.targets.rollout import see_frames
+from visadapt.world import World
+
+
+def load_both(options: argparse.Namespace) -> tuple[Policy, World, Target]:
+    """The policy, the world that it was trained in, and the target.
+
+    Raises:
+        InputError, TargetError: either cannot be had, or the two do not go together.
+        CheckpointError: the policy's file is missing, torn, or holds something else.
+    """
+    policy, source = load_policy(options.policy), load_source(options.policy)
+    target = load_target(options, source, policy.shown == "frame")
+    _check(options.policy, policy, source, target)
+    return policy, source, target
+
+
+def load_target(options: argparse.Namespace, source: World, frames: bool) -> Target:
+    """The target that --target and --map name; `frames`: whether a gymnasium environment has to draw."""
+    mapping = EnvMap.load(options.map) if options.map else None
+    name = env = options.target
+    # gymnasium too has ids of the form module:Name-v0, whose last part is no name of Python's.
+    if ":" in name and name.rpartition(":")[2].isidentifier():
+        factory = find_factory(name)
+        try:
+            made = factory()
+        except Exception as error:
+            raise InputError(f"{name}: {describe(error)}") from error
+        if isinstance(made, Target):
+            if mapping is not None:
+                raise InputError(f"{name}: returns a visadapt.Target, for which --map has no use: leave it out")
+            return made
+        if not hasattr(made, "action_space") or not hasattr(made, "reset"):
+            kind = type(made).__name__
+            raise InputError(f"{name}: returned a {kind}; a visadapt.Target or a gymnasium environment is needed")
+        if mapping is None:
+            raise InputError(f"{name}: returned a gymnasium environment, which needs --map MAP.toml")
+        env = chain([made], iter(factory, None)).__next__  # the one that is made already, then new ones
+    if mapping is None:
+        raise InputError(f"{name}: a gymnasium id needs --map MAP.toml; a target of your own is package.module:factory")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of an inherited period: said below
+        target = GymnasiumTarget(env, mapping, type(source.system), frames=frames, name=name)
+    if target.period_origin != "as given":
+        print(f"visadapt: {name}: {target.period:g} s between actions, from {target.period_origin}", file=sys.stderr)
+    return target
+
+
+def _check(path: str, policy: Policy, source: World, target: Target) -> None:
+    """Raises InputError where the policy cannot be run on the target."""
+    system = source.system
+    if target.n_action != policy.n_action:
+        raise InputError(
+            f"{path}: a policy of a {system.name}, with {policy.n_action} commands; {target.name} takes "
+            f"{target.n_action}: it is another system"
+        )
+    own = getattr(target, "system", system)
+    if own.name != system.name:
+        raise InputError(f"{path}: a policy of a {system.name}; {target.name} is a {own.name}")
+    if isinstance(policy, ImagePolicy):
+        # Only a picture says how large it is. A reset is no step: it is not counted.
+        shown = see_frames(target.reset(1, torch.Generator().manual_seed(0)))[0].shape
+        height, width = policy.perception.background.shape
+        if shown != (height, width):
+            raise InputError(
+                f"{target.name} shows frames of {shown[1]} x {shown[0]} px; {path} was trained on {width} x {height}"
+            )
+    if abs(target.period - source.period) > 1e-6:
+        raise InputError(
+            f"{target.name} has {target.period:g} s between actions, {path} was trained for {source.period:g} s: "
+            f"train with --period {target.period:g}, or give the target that period"
+        )
