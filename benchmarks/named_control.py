@@ -27,7 +27,7 @@ from visadapt.estimation.fit_states import neutral
 from visadapt.evaluation import CartPoleScore, kept_score
 from visadapt.evaluation.result_tables import print_speed, speed_row, write_rows
 from visadapt.learning.grounding import fit_named
-from visadapt.learning.ledger import Ledger
+from visadapt.learning.joint import Ledger
 from visadapt.learning.policy import TuneSettings, tune
 from visadapt.learning.windows import Windows
 from visadapt.policies import Policy

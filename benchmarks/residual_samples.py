@@ -121,9 +121,7 @@ def _share(setup: Setup, method: str, train: Windows, samples: int, test: Window
 
 def _first(windows: Windows, count: int) -> Windows:
     """The first windows only, of the same episodes."""
-    each = {field.name: getattr(windows, field.name) for field in dataclasses.fields(windows)}
-    whole = ("observations", "commands", "states")
-    return Windows(**{name: value if name in whole else value[:count] for name, value in each.items()})
+    return dataclasses.replace(windows, rows=windows.rows[:count])
 
 
 def _size(change: Tensor) -> float:

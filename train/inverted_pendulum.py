@@ -36,13 +36,14 @@ from visadapt.evaluation.result_tables import Row, speed_row, write_rows
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.films.plots import plot_losses
 from visadapt.learning.grounding import gap
+from visadapt.learning.joint import SetupSettings
 from visadapt.learning.perception import Paths, PerceptionSettings
 from visadapt.learning.policy import TuneSettings
 from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
 from visadapt.progress import Report, reporting, staged
 from visadapt.recordings import Episode
-from visadapt.setups.base import Setup, SetupSettings
+from visadapt.setups.base import Setup
 from visadapt.setups.cartpole_frames import cartpole_frames
 from visadapt.storage.atomic_files import replacing
 from visadapt.storage.run_folder import open_run, write_json

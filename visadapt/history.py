@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -14,8 +16,37 @@ HORIZON = 10
 """Actions planned at once, k in the paper; only the first is executed before planning again."""
 
 
+class Batch:
+    """Base of dataclasses of tensors, and of tuples of tensors, whose first axis numbers the rows of a batch."""
+
+    def detach(self) -> Self:
+        """The same, cut off from the graph."""
+        return _each(Tensor.detach, self)
+
+    def where(self, keep: Tensor, other: Self) -> Self:
+        """This batch in the rows where `keep` (B,) holds, `other` in the rest."""
+        return _each(lambda own, more: torch.where(keep.reshape(-1, *[1] * (own.dim() - 1)), own, more), self, other)
+
+    def joined(self, other: Self) -> Self:
+        """The rows of this batch and, after them, those of another."""
+        return _each(lambda *parts: torch.cat(parts), self, other)
+
+    def __getitem__(self, rows: Tensor | slice) -> Self:
+        return _each(lambda values: values[rows], self)
+
+
+def _each(do: Callable[..., Tensor], *batches: Any) -> Any:
+    """`do` of all tensors that stand in the same place of the batches."""
+    first = batches[0]
+    if isinstance(first, Tensor):
+        return do(*batches)
+    if isinstance(first, tuple):
+        return tuple(_each(do, *parts) for parts in zip(*batches, strict=True))
+    return type(first)(*(_each(do, *(getattr(each, part.name) for each in batches)) for part in fields(first)))
+
+
 @dataclass(frozen=True)
-class History:
+class History(Batch):
     """The last observations (B, L, ...), oldest first, and the last actions (B, L, n_action).
 
     For a policy the last action is the one before the last observation; for a residual (see `acting`) it is the
@@ -39,22 +70,3 @@ class History:
     def observing(self, observation: Tensor) -> History:
         """The same actions, with `observation` (B, ...) as the last observation."""
         return History(torch.cat((self.observations[:, 1:], observation[:, None]), 1), self.actions)
-
-    def where(self, keep: Tensor, other: History) -> History:
-        """This history in the rows where `keep` (B,) holds, `other` in the rest."""
-        rows = keep.reshape(-1, *[1] * (self.observations.dim() - 1))
-        return History(
-            torch.where(rows, self.observations, other.observations),
-            torch.where(keep[:, None, None], self.actions, other.actions),
-        )
-
-    def joined(self, other: History) -> History:
-        """The rows of this history and, after them, those of another."""
-        return History(torch.cat((self.observations, other.observations)), torch.cat((self.actions, other.actions)))
-
-    def detach(self) -> History:
-        """The same history, cut off from the graph."""
-        return History(self.observations.detach(), self.actions.detach())
-
-    def __getitem__(self, rows: Tensor | slice) -> History:
-        return History(self.observations[rows], self.actions[rows])

@@ -9,39 +9,19 @@ import torch
 from torch import Tensor, nn
 
 from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, Parameter, Residual, SensingEffect
-from visadapt.history import History
+from visadapt.history import Batch, History
 from visadapt.systems import SYSTEMS, System
 from visadapt.systems.integrators import INTEGRATORS
 
 
 @dataclass(frozen=True)
-class WorldState:
+class WorldState(Batch):
     """All that a step needs: the time since the episode began (B,), the state (B, n_state), what effects remember."""
 
     time: Tensor
     state: Tensor
     memory: tuple[Tensor, ...] = ()
     """what each actuation effect remembers, then what each sensing effect does, (B, any, any) each"""
-
-    def detach(self) -> WorldState:
-        """The same, cut off from the graph."""
-        return WorldState(self.time.detach(), self.state.detach(), tuple(m.detach() for m in self.memory))
-
-    def __getitem__(self, rows: Tensor) -> WorldState:
-        return WorldState(self.time[rows], self.state[rows], tuple(m[rows] for m in self.memory))
-
-    def joined(self, other: WorldState) -> WorldState:
-        """The rows of this world state and, after them, those of another."""
-        memory = tuple(torch.cat(pair) for pair in zip(self.memory, other.memory, strict=True))
-        return WorldState(torch.cat((self.time, other.time)), torch.cat((self.state, other.state)), memory)
-
-    def where(self, keep: Tensor, other: WorldState) -> WorldState:
-        """This world state in the rows where `keep` (B,) holds, `other` in the rest."""
-        return WorldState(
-            torch.where(keep, self.time, other.time),
-            torch.where(keep[:, None], self.state, other.state),
-            tuple(torch.where(keep[:, None, None], a, b) for a, b in zip(self.memory, other.memory, strict=True)),
-        )
 
 
 class World(nn.Module):

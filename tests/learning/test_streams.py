@@ -112,7 +112,7 @@ class TestSensors:
         world = world_with(delay)
         streams = streams_of(world, windows=windows, recorded=1.0)
         before = (windows.state[:, None] == streams.now.at.state).all(2).int().argmax(0)
-        late = windows.row[before] > 1
+        late = windows.time[before] > 1.5 * world.period
         action = torch.zeros(40, 1)
         streams.advance(world.step(streams.now.at, action), action, 1.0, torch.Generator().manual_seed(2))
         shown = streams.now.history.observations[:, -1]

@@ -258,7 +258,7 @@ class TestStreams:
             row = int(alike.nonzero()[0])
             found.add(row)
             here, there = off(now.at.state[b : b + 1], now.task_state[b : b + 1]), windows.state[row : row + 1]
-            torch.testing.assert_close(here, off(there, windows.task_state[row : row + 1, -1]), rtol=0, atol=1e-5)
+            torch.testing.assert_close(here, off(there, windows.task_states[windows.rows[row, -1:]]), rtol=0, atol=1e-5)
             past = unexplained(windows.history(torch.tensor([row])))
             torch.testing.assert_close(unexplained(now.history[b : b + 1]), past, rtol=0, atol=2e-3)
         assert len(found) > 12
@@ -276,12 +276,12 @@ class TestStreams:
         made.start(0.0, seeded(5))
         for b in range(20):
             # Both flights begin in the same state: their points tell them apart.
-            there = (target.first[windows.episode] == made.now.task_state[b]).all(1)
+            there = (windows.task_states[windows.rows[:, -1]] == made.now.task_state[b]).all(1)
             row = int(((windows.state == made.now.at.state[b]).all(1) & there).nonzero()[0])
             seen = windows.history(torch.tensor([row])).observations[0]
             assert torch.equal(made.now.history.observations[b, :, :13], seen)
             assert torch.equal(made.now.history.observations[b, :, 13:], made.now.task_state[b].expand(LENGTH, -1))
-            assert torch.equal(made.now.history.actions[b], windows.past_actions[row])
+            assert torch.equal(made.now.history.actions[b], windows.history(torch.tensor([row])).actions[0])
 
     def test_tuned_along_references_the_cost_of_a_plan_falls(self):
         torch.manual_seed(0)

@@ -23,8 +23,9 @@ from visadapt.cli.arguments import (
 from visadapt.cli.given_effects import add_effects, given_effects, import_given
 
 if TYPE_CHECKING:
+    from visadapt.learning.joint import SetupSettings
     from visadapt.learning.policy import TuneSettings
-    from visadapt.setups.base import Setup, SetupSettings
+    from visadapt.setups.base import Setup
 
 LONGEST_STEP = 0.05
 """s that the simulator integrates at once."""

@@ -8,7 +8,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from visadapt.history import History
+from visadapt.history import Batch, History
 from visadapt.learning.windows import Observe, Windows
 from visadapt.tasks.base import Task
 from visadapt.world import World, WorldState
@@ -21,28 +21,13 @@ PROBE = 0.5
 
 
 @dataclass(frozen=True)
-class StreamState:
+class StreamState(Batch):
     """The state of B streams: all that is needed to simulate on from here."""
 
     at: WorldState
     history: History
     task_state: Tensor
     """(B, ...) the task's"""
-
-    def where(self, keep: Tensor, other: StreamState) -> StreamState:
-        """These streams in the rows where `keep` (B,) holds, `other` in the rest."""
-        rows = keep.reshape(-1, *[1] * (self.task_state.dim() - 1))
-        task_state = torch.where(rows, self.task_state, other.task_state)
-        return StreamState(self.at.where(keep, other.at), self.history.where(keep, other.history), task_state)
-
-    def __getitem__(self, rows: Tensor) -> StreamState:
-        return StreamState(self.at[rows], self.history[rows], self.task_state[rows])
-
-    def joined(self, other: StreamState) -> StreamState:
-        """The rows of these streams and, after them, those of others."""
-        return StreamState(
-            self.at.joined(other.at), self.history.joined(other.history), torch.cat((self.task_state, other.task_state))
-        )
 
     def tree(self) -> dict[str, Any]:
         """All of it as a tree of tensors, for a checkpoint."""
@@ -138,7 +123,7 @@ class Streams:
         fresh = StreamState(at, history, task_state)
         if windows is None or self._recorded is None:
             return fresh
-        task_states = windows.task_state.to(task_state)
+        task_states = windows.task_states[windows.rows].to(task_state)
         # Recorded falls are left out: a stream that starts beyond delta_div ends at once, at a cost that outweighs all.
         near = (~self.task.diverged(windows.state, task_states[:, -1], progress)).nonzero()[:, 0]
         if not len(near):

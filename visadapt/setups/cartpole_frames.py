@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from renderers import LayeredRenderer, RendererError, load_renderer
+from visadapt.learning.joint import SetupSettings
 from visadapt.learning.perception import PerceptionSettings, learn_to_see
 from visadapt.learning.policy import TuneSettings
 from visadapt.learning.tracking import Tracker
 from visadapt.policies import ImagePolicy, Policy
 from visadapt.progress import Report, staged
 from visadapt.recordings import Episode
-from visadapt.setups.base import Setup, SetupSettings
+from visadapt.setups.base import Setup
 from visadapt.setups.residuals import residual_for
 from visadapt.storage.checkpoints import load_network, save_network
 from visadapt.systems import CartPole

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from visadapt.learning.joint import SetupSettings
 from visadapt.learning.policy import TuneSettings
 from visadapt.policies import StatePolicy
-from visadapt.setups.base import Setup, SetupSettings
+from visadapt.setups.base import Setup
 from visadapt.setups.residuals import residual_for
 from visadapt.systems import CartPole
 from visadapt.tasks.balance import Balance

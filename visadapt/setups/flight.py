@@ -6,9 +6,10 @@ import math
 from functools import partial
 
 from visadapt.learning.grounding import GroundSettings
+from visadapt.learning.joint import SetupSettings
 from visadapt.learning.policy import TuneSettings
 from visadapt.policies import FollowPolicy, ReachPolicy
-from visadapt.setups.base import Setup, SetupSettings
+from visadapt.setups.base import Setup
 from visadapt.setups.residuals import residual_for
 from visadapt.systems import FixedWing, Quadrotor, RigidBody
 from visadapt.targets import FlightTarget
