@@ -32,7 +32,7 @@ from visadapt.learning.policy import TuneSettings, tune
 from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
 from visadapt.recordings import Episode
-from visadapt.setups.cartpole_states import SETTINGS, cartpole_states
+from visadapt.setups.cartpole import FROM_STATES, cartpole_states
 from visadapt.storage.run_folder import open_run
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget
@@ -92,9 +92,9 @@ def _scores(settings: Settings, seed: int) -> dict[tuple[str, str], CartPoleScor
     torch.set_num_threads(1)
     folder = settings.work / f"seed-{seed}"
     own = replace(
-        SETTINGS,
-        source=replace(SETTINGS.source, iterations=settings.source_iterations),
-        tuning=replace(SETTINGS.tuning, iterations=settings.iterations),
+        FROM_STATES,
+        source=replace(FROM_STATES.source, iterations=settings.source_iterations),
+        tuning=replace(FROM_STATES.tuning, iterations=settings.iterations),
     )
     setup = cartpole_states(with_history=True, settings=own)
     numbers = {name: getattr(settings, name) for name in ("episodes", "samples", "exploration")}

@@ -30,8 +30,7 @@ from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
 from visadapt.policies.networks import FlightResidualNetwork, ResidualNetwork, StateResidualNetwork
 from visadapt.setups.base import Setup
-from visadapt.setups.flight import flight_target
-from visadapt.setups.flight_experiments import EXPERIMENTS
+from visadapt.setups.flight import EXPERIMENTS, flight_target
 from visadapt.systems import RigidBody
 from visadapt.systems.rigid_body import VELOCITY
 from visadapt.targets.rollout import run

@@ -44,15 +44,14 @@ from visadapt.policies import Policy
 from visadapt.progress import Report, reporting, staged
 from visadapt.recordings import Episode
 from visadapt.setups.base import Setup
-from visadapt.setups.cartpole_frames import cartpole_frames
+from visadapt.setups.cartpole import cartpole_frames
 from visadapt.storage.atomic_files import replacing
 from visadapt.storage.run_folder import open_run, write_json
 from visadapt.targets import Observation, SyntheticTarget, Target, TargetError
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.targets.inverted_pendulum import MAP, REACH_M, SOURCE, START, inverted_pendulum
 from visadapt.targets.rollout import Run, film_run
-from visadapt.tasks.balance import Balance
-from visadapt.tasks.cost import Cost
+from visadapt.tasks.balance import Balance, Cost
 from visadapt.world import World
 
 ANGLE_LIMIT = 0.2

@@ -39,8 +39,7 @@ from visadapt.storage.run_folder import once, open_run
 from visadapt.systems import CartPole
 from visadapt.targets import Observation, Start, SyntheticTarget
 from visadapt.targets.rollout import run
-from visadapt.tasks.balance import SwingUp, within_a_turn
-from visadapt.tasks.cost import SettlingCost
+from visadapt.tasks.balance import SettlingCost, SwingUp, within_a_turn
 from visadapt.world import World
 
 SAMPLES = 20_000

@@ -13,8 +13,7 @@ from visadapt.learning.windows import Windows
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import Episode
 from visadapt.systems import CartPole
-from visadapt.tasks.balance import Balance
-from visadapt.tasks.cost import PAPER_CARTPOLE
+from visadapt.tasks.balance import PAPER_CARTPOLE, Balance
 from visadapt.world import World
 
 WIDE = Balance(PAPER_CARTPOLE, divergence=(1e9,) * 4, first_divergence=1.0, kick=(0.0,) * 4)

@@ -15,8 +15,7 @@ from visadapt.storage.checkpoints import CheckpointError, load_tree
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, TargetError
 from visadapt.targets.synthetic import constant_force
-from visadapt.tasks.balance import Balance
-from visadapt.tasks.cost import PAPER_CARTPOLE
+from visadapt.tasks.balance import PAPER_CARTPOLE, Balance
 from visadapt.world import World
 
 TUNE = TuneSettings(

@@ -14,7 +14,7 @@ from visadapt.learning.streams import Streams, StreamSettings
 from visadapt.learning.windows import Windows
 from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.policies.networks import FlightResidualNetwork
-from visadapt.setups.residuals import source_steps
+from visadapt.setups.policy_file import source_steps
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
 from visadapt.targets.flight import FlightTarget

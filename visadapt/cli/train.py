@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _setup(options: argparse.Namespace) -> Setup:
     from visadapt.learning.perception import PerceptionSettings
-    from visadapt.setups import cartpole_frames as frames
+    from visadapt.setups.cartpole import cartpole_frames
     from visadapt.setups.training import setup_for
     from visadapt.systems import CartPole, Quadrotor
     from visadapt.tasks.references import read_reference
@@ -107,12 +107,12 @@ def _setup(options: argparse.Namespace) -> Setup:
         if not seen:
             setup = setup_for(world, references=references, with_history=options.with_history)
             return replace(setup, settings=replace(setup.settings, source=_source(setup.settings, options)))
-    own = frames.cartpole_frames(world, options.renderer).settings
+    own = cartpole_frames(world, options.renderer).settings
     own = replace(own, source=_source(own, options))
     if options.seeing:
         perception = own.perception or PerceptionSettings()
         own = replace(own, perception=replace(perception, iterations=options.seeing))
-    return frames.cartpole_frames(world, options.renderer, own)
+    return cartpole_frames(world, options.renderer, own)
 
 
 def _source(settings: SetupSettings, options: argparse.Namespace) -> TuneSettings:

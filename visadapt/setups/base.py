@@ -32,7 +32,7 @@ class Setup:
     in its settings, and the four fields without a default.
 
     >>> import visadapt as va
-    >>> from visadapt.setups.cartpole_states import cartpole_states
+    >>> from visadapt.setups.cartpole import cartpole_states
     >>> setup = cartpole_states(va.World(va.CartPole(pole_mass=0.2)))
     >>> setup.load(va.shipped("cartpole_states")).n_action
     1

@@ -13,8 +13,7 @@ from visadapt.learning.joint import Adapted
 from visadapt.policies import ImagePolicy, Policy, StatePolicy
 from visadapt.progress import Report
 from visadapt.setups.base import Setup
-from visadapt.setups.cartpole_frames import cartpole_frames
-from visadapt.setups.cartpole_states import cartpole_states
+from visadapt.setups.cartpole import cartpole_frames, cartpole_states
 from visadapt.setups.flight import fixed_wing, quadrotor
 from visadapt.setups.policy_file import save_policy
 from visadapt.systems import CartPole, FixedWing, Quadrotor

@@ -10,7 +10,7 @@ from torch import Tensor
 from visadapt.systems import RigidBody
 from visadapt.targets.base import Observation, Target, TargetError
 from visadapt.targets.synthetic import DrawEffects, no_effects
-from visadapt.tasks.flight import FlightTask
+from visadapt.tasks.base import FlightTask
 from visadapt.world import World, WorldState
 
 

@@ -9,9 +9,8 @@ from torch import Tensor
 
 from visadapt.history import HORIZON
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
-from visadapt.tasks.base import curriculum
+from visadapt.tasks.base import FlightTask, curriculum
 from visadapt.tasks.differential_flatness import demanded
-from visadapt.tasks.flight import FlightTask
 from visadapt.tasks.references import Reference
 
 

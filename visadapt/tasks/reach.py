@@ -10,7 +10,7 @@ from torch import Tensor
 
 from visadapt.systems import FixedWing
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
-from visadapt.tasks.flight import FlightTask
+from visadapt.tasks.base import FlightTask
 
 WALDOCK = FixedWing()
 

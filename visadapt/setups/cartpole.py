@@ -1,4 +1,4 @@
-"""The CartPole from pixels: encoder, policy and residual see through a learnt renderer (section 3.2.3)."""
+"""The cart-pole from states, and from pixels through a learnt renderer (the paper's sections 3.2.1 to 3.2.3)."""
 
 from __future__ import annotations
 
@@ -14,25 +14,50 @@ from visadapt.learning.joint import SetupSettings
 from visadapt.learning.perception import PerceptionSettings, learn_to_see
 from visadapt.learning.policy import TuneSettings
 from visadapt.learning.tracking import Tracker
-from visadapt.policies import ImagePolicy, Policy
+from visadapt.policies import ImagePolicy, Policy, StatePolicy
 from visadapt.progress import Report, staged
 from visadapt.recordings import Episode
 from visadapt.setups.base import Setup
-from visadapt.setups.residuals import residual_for
+from visadapt.setups.policy_file import residual_for
 from visadapt.storage.checkpoints import load_network, save_network
 from visadapt.systems import CartPole
-from visadapt.tasks.balance import Balance
-from visadapt.tasks.cost import CENTRED_CARTPOLE
+from visadapt.tasks.balance import CENTRED_CARTPOLE, PAPER_CARTPOLE, Balance
 from visadapt.weights import shipped
 from visadapt.world import World
+
+UNLIMITED = 1e9
+"""m, of the cart's position: nothing depends on it, and no camera loses the cart."""
+
+FROM_STATES = SetupSettings(
+    source=TuneSettings(
+        Balance(PAPER_CARTPOLE, divergence=(UNLIMITED, 4.0, 0.5, 10.0)),
+        iterations=3000,
+        learning_rate=3e-3,
+        observation_noise=0.0,
+    ),
+    tuning=TuneSettings(
+        Balance(
+            PAPER_CARTPOLE,
+            start_spread=(0.3, 0.2, 0.1, 0.2),
+            kick=(0.0, 0.0, 0.0, 0.0),
+            divergence=(UNLIMITED, 2.0, 0.25, 3.0),
+            first_divergence=0.4,
+        ),
+        iterations=400,
+        learning_rate=2e-3,
+        longest=25,
+        recorded=0.8,
+        observation_noise=0.0,
+    ),
+)
 
 CONTRAST = 0.2
 """Grey levels, of 1, that frames are divided by before the networks see them."""
 
 REACH = 1.45
-"""m to either side that a camera has to see for `SETTINGS`, of the drawn cart-pole, which sees 1.5 m."""
+"""m to either side that a camera has to see for `FROM_FRAMES`, of the drawn cart-pole, which sees 1.5 m."""
 
-SETTINGS = SetupSettings(
+FROM_FRAMES = SetupSettings(
     source=TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500),
     tuning=TuneSettings(
         Balance(
@@ -54,6 +79,23 @@ SETTINGS = SetupSettings(
 )
 
 
+def cartpole_states(
+    source: World | None = None, with_history: bool = False, settings: SetupSettings = FROM_STATES
+) -> Setup:
+    """The cart-pole that is shown its states.
+
+    Args:
+        source: the physics known beforehand; without it, the paper's CartPole, 0.05 s between commands.
+        with_history: whether policy and residual read 5 states and actions, or the last alone.
+    """
+    return Setup(
+        source=source or World(CartPole()),
+        policy=lambda: StatePolicy(n_state=4, with_history=with_history),
+        residual=residual_for,
+        settings=settings,
+    )
+
+
 def cartpole_frames(
     source: World | None = None,
     renderer: LayeredRenderer | Path | str | None = None,
@@ -65,7 +107,7 @@ def cartpole_frames(
         source: the physics known beforehand, whose states begin with x, x_dot, theta, theta_dot; without it, the
             paper's CartPole, 0.05 s between commands.
         renderer: states to frames, trained, or the file of one; without it, that of the drawn cart-pole.
-        settings: how the policy learns; without it, `SETTINGS`, narrowed to what the renderer's camera sees.
+        settings: how the policy learns; without it, `FROM_FRAMES`, narrowed to what the renderer's camera sees.
 
     Raises:
         RendererError: the file holds no layered renderer.
@@ -74,7 +116,7 @@ def cartpole_frames(
     seen = renderer if isinstance(renderer, LayeredRenderer) else _load(Path(renderer or shipped("renderer")))
     seen.requires_grad_(False).eval()
     tracker = Tracker(seen, source)
-    settings = settings or _narrowed(SETTINGS, seen)
+    settings = settings or _narrowed(FROM_FRAMES, seen)
     perception = settings.perception or PerceptionSettings()
 
     def observe(state: Tensor) -> Tensor:
