@@ -8,7 +8,7 @@ from visadapt.effects import EFFECTS, ActuatorDelay, AngleOffset, ConstantForce,
 from visadapt.history import History
 from visadapt.learning.grounding import gap
 from visadapt.learning.policy import imagine
-from visadapt.learning.streams import Streams, StreamSettings
+from visadapt.learning.streams import Streams
 from visadapt.learning.windows import Windows
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import Episode
@@ -46,7 +46,7 @@ def episodes_of(world, lengths=(30, 12, 21), seed=0):
 
 
 def streams_of(world, task=WIDE, observe=None, windows=None, recorded=0.0, count=40):
-    made = Streams(world, task, observe, windows, StreamSettings(count, 1000, recorded))
+    made = Streams(world, task, observe, windows, count, 1000, recorded)
     made.start(1.0, torch.Generator().manual_seed(1))
     return made
 

@@ -10,7 +10,7 @@ from tests.scenes import stir
 from visadapt.effects import LinearDrag, Residual
 from visadapt.history import HORIZON, LENGTH, History
 from visadapt.learning.policy import TuneSettings, imagine, tune
-from visadapt.learning.streams import Streams, StreamSettings
+from visadapt.learning.streams import Streams
 from visadapt.learning.windows import Windows
 from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.policies.networks import FlightResidualNetwork
@@ -39,7 +39,7 @@ def reaching(**changes):
 
 
 def streams(task, world, batch, longest=1000, seed=0):
-    made = Streams(world, task, identity, None, StreamSettings(batch, longest, 0.0))
+    made = Streams(world, task, identity, None, batch, longest, 0.0)
     made.start(0.0, seeded(seed))
     return made
 
@@ -212,7 +212,7 @@ class TestStreams:
 
     def test_one_that_has_gone_on_for_long_enough_starts_anew(self):
         made = self.middle()
-        made.settings = StreamSettings(6, 20, 0.0)
+        made.settings = 6, 20, 0.0
         made.age[5] = 19
         self.step(made, torch.zeros(6, 3), 1.0)
         assert made.age.tolist() == [8, 8, 8, 8, 8, 0]
@@ -240,7 +240,7 @@ class TestStreams:
         torch.manual_seed(0)
         flown = run(target, FollowPolicy(PERIOD), 2, 12, seeded(4))
         windows = Windows.cut([each.episode for each in flown], "state")
-        made = Streams(self.WORLD, task, identity, windows, StreamSettings(40, 1000, 1.0))
+        made = Streams(self.WORLD, task, identity, windows, 40, 1000, 1.0)
         made.start(0.0, seeded(5))
         network = FlightResidualNetwork(Quadrotor(), PERIOD, partial(source_steps, self.WORLD))
 
@@ -272,7 +272,7 @@ class TestStreams:
         torch.manual_seed(0)
         flown = run(target, ReachPolicy(), 2, 12, seeded(4))
         windows = Windows.cut([each.episode for each in flown], "state")
-        made = Streams(World(FixedWing(), period=0.05), task, identity, windows, StreamSettings(20, 1000, 1.0))
+        made = Streams(World(FixedWing(), period=0.05), task, identity, windows, 20, 1000, 1.0)
         made.start(0.0, seeded(5))
         for b in range(20):
             # Both flights begin in the same state: their points tell them apart.

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from visadapt.history import LENGTH, History
 from visadapt.policies.networks import FrameEncoder
 from visadapt.progress import Progress
-from visadapt.storage.training_state import CHECKPOINT_ITERATIONS, TrainingState
+from visadapt.storage.training_state import TrainingState
 
 
 @dataclass(frozen=True)
@@ -87,15 +87,11 @@ def learn_to_see(
     The loss weighs, beside positions and changes, the changes of changes: a force shows in them alone.
     """
     optimiser = torch.optim.AdamW(encoder.parameters(), weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, settings.learning_rate, total_steps=settings.iterations, pct_start=0.1
-    )
+    rate, steps = settings.learning_rate, settings.iterations
+    training = TrainingState(encoder, optimiser, generator, rate, steps, progress, checkpoint)
+    training.resume()
     unit = scale(settings, period)
-    training = TrainingState(encoder, optimiser, schedule, generator)
-    losses: list[float] = []
-    if checkpoint is not None and checkpoint.exists():
-        losses, _ = training.resume(checkpoint)
-    for iteration in range(len(losses), settings.iterations):
+    for _ in range(len(training.losses), steps):
         paths = [
             coordinate.draw(settings.streams, settings.length, period, generator)
             for coordinate in (settings.cart, settings.pole)
@@ -108,15 +104,6 @@ def learn_to_see(
         actions = torch.zeros(len(windows), LENGTH, encoder.n_action)
         error = encoder.kinematics(History(windows, actions)) - truth
         bends = torch.cat([error[:, 1:LENGTH].diff(dim=1), error[:, LENGTH + 1 :].diff(dim=1)], 1)
-        loss = error.square().mean() + 8 * bends.square().mean()
-        optimiser.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(encoder.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-        losses.append(float(loss.detach()))
-        if progress is not None:
-            progress(iteration + 1, settings.iterations, losses[-1])
-        if checkpoint is not None and (iteration + 1) % CHECKPOINT_ITERATIONS == 0:
-            training.keep(checkpoint, losses, {})
-    return losses
+        training.descend(error.square().mean() + 8 * bends.square().mean())
+        training.keep({})
+    return training.losses

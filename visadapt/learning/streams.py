@@ -47,33 +47,33 @@ class StreamState(Batch):
         return cls(at, History(tree["observations"], tree["actions"]), tree["task_state"])
 
 
-@dataclass(frozen=True)
-class StreamSettings:
-    """How streams run."""
-
-    count: int
-    longest: int
-    """steps after which a stream starts anew"""
-    recorded: float
-    """share of the starts that are recorded windows of the target, with their histories"""
-
-
 class Streams:
     """A batch of simulated episodes in progress.
 
     Args:
         observe: the camera through which the policy sees; None where it sees what the sensors measure.
         windows: recorded starts. Each begins at its time in its episode, with the memory that effects have there.
+        longest: steps after which a stream starts anew.
+        recorded: share of the starts that are windows, with their histories.
     """
 
     def __init__(
-        self, world: World, task: Task, observe: Observe | None, windows: Windows | None, settings: StreamSettings
+        self,
+        world: World,
+        task: Task,
+        observe: Observe | None,
+        windows: Windows | None,
+        count: int,
+        longest: int,
+        recorded: float,
     ) -> None:
         self.world = world
         self.task = task
         self.observe = observe
         self.windows = windows
-        self.settings = settings
+        self.count = count
+        self.longest = longest
+        self.recorded = recorded
         self.now: StreamState
         self.age: Tensor
         self._recorded: WorldState | None = None
@@ -83,14 +83,14 @@ class Streams:
                 state, _ = task.training_start(1, 0.0, torch.Generator().manual_seed(0))
             else:
                 times, state = windows.time, windows.state[:1]
-                self._recorded = windows.start(world) if settings.recorded > 0 else None
+                self._recorded = windows.start(world) if recorded > 0 else None
             self._times = times if _depends_on_time(world, times.unique(), state) else None
 
     @torch.no_grad()
     def start(self, progress: float, generator: torch.Generator) -> None:
         """Start all streams, at random ages, so that they do not end together."""
         self.now = self._fresh(progress, generator)
-        self.age = torch.randint(self.settings.longest, (self.settings.count,), generator=generator)
+        self.age = torch.randint(self.longest, (self.count,), generator=generator)
 
     @torch.no_grad()
     def advance(self, at: WorldState, action: Tensor, progress: float, generator: torch.Generator) -> None:
@@ -104,13 +104,13 @@ class Streams:
         history = self.now.history.acting(action).observing(self.task.show(seen, task_state)).detach()
         self.now = StreamState(at.detach(), history, task_state)
         self.age += 1
-        keep = (self.age < self.settings.longest) & ~self.task.diverged(at.state, task_state, progress)
+        keep = (self.age < self.longest) & ~self.task.diverged(at.state, task_state, progress)
         if not bool(keep.all()):
             self.now = self.now.where(keep, self._fresh(progress, generator))
             self.age = torch.where(keep, self.age, 0)
 
     def _fresh(self, progress: float, generator: torch.Generator) -> StreamState:
-        count, windows = self.settings.count, self.windows
+        count, windows = self.count, self.windows
         state, task_state = self.task.training_start(count, progress, generator)
         at = self.world.start(state)
         if self._times is not None:
@@ -128,7 +128,7 @@ class Streams:
         near = (~self.task.diverged(windows.state, task_states[:, -1], progress)).nonzero()[:, 0]
         if not len(near):
             return fresh
-        from_record = torch.rand(count, generator=generator) < self.settings.recorded
+        from_record = torch.rand(count, generator=generator) < self.recorded
         rows = near[torch.randint(len(near), (count,), generator=generator)]
         past = windows.history(rows)
         seen, now, where = self.task.augment(past.observations, windows.state[rows], task_states[rows], generator)

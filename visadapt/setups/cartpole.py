@@ -125,7 +125,7 @@ def cartpole_frames(
 
     def label(episodes: list[Episode]) -> list[Episode]:
         """The same episodes with states estimated from their frames; those of 1 or 2 rows are too short, and left."""
-        return [track.episode for track in tracker.track([episode for episode in episodes if len(episode.time) > 2])]
+        return tracker.track([episode for episode in episodes if len(episode.time) > 2])
 
     def prepare(policy: Policy, folder: Path, seed: int, report: Report | None) -> None:
         """Teach the policy's encoder to see, in `folder`, or take the one that is there."""

@@ -41,16 +41,14 @@ DRAG = 0.3
 FORCE = 2.0
 """N, amplitude of FORCE cos(t + phase)"""
 
+_learn = partial(TuneSettings, longest=100, observation_noise=0.0)
+
 References = Callable[[], tuple[Reference, Reference]]
 """Gives the references to train on, and those to be scored on, to who needs them."""
 
 
 def quadrotor(
-    train: Reference,
-    test: Reference | None = None,
-    source: World | None = None,
-    with_history: bool = False,
-    settings: SetupSettings | None = None,
+    train: Reference, test: Reference | None = None, source: World | None = None, with_history: bool = False
 ) -> Setup:
     """The quadrotor that follows references, (N, T, 3) or a single one, (T, 3).
 
@@ -69,19 +67,19 @@ def quadrotor(
         )
     train, test = train.as_many(), None if test is None else test.as_many()
     task, recover = Follow(train), Follow(train, RecoverCost(), divergence=3.0)
-    tuning = _learn(task, 200, 1e-3, curriculum=False)
+    tuning = _learn(task, 200, 256, 1e-3, curriculum=False)
     if with_history:
-        tuning = _learn(recover, 400, 2e-3, batch=128, curriculum=False, recorded=RECORDED)
+        tuning = _learn(recover, 400, 128, 2e-3, curriculum=False, recorded=RECORDED)
     return Setup(
         source=source or World(Quadrotor(), period=train.period, substeps=2),
         policy=lambda: FollowPolicy(train.period),
         residual=partial(residual_for, with_history=with_history),
-        settings=settings or _settings(_learn(task, 4000, 4e-3), tuning),
+        settings=_settings(_learn(task, 4000, 256, 4e-3), tuning),
         test=task if test is None else Follow(test),
     )
 
 
-def fixed_wing(source: World | None = None, with_history: bool = False, settings: SetupSettings | None = None) -> Setup:
+def fixed_wing(source: World | None = None, with_history: bool = False) -> Setup:
     """The fixed wing that flies through points 50 m ahead.
 
     Args:
@@ -92,12 +90,12 @@ def fixed_wing(source: World | None = None, with_history: bool = False, settings
     assert isinstance(source.system, FixedWing)
     task = Reach(source.period, source.system)
     recorded = RECORDED if with_history else 0.0
-    tuning = _learn(task, 200, 3e-4, batch=128, curriculum=False, recorded=recorded)
+    tuning = _learn(task, 200, 128, 3e-4, curriculum=False, recorded=recorded)
     return Setup(
         source=source,
         policy=ReachPolicy,
         residual=partial(residual_for, with_history=with_history),
-        settings=settings or _settings(_learn(task, 3000, 3e-3, batch=128), tuning),
+        settings=_settings(_learn(task, 3000, 128, 3e-3), tuning),
         test=task,
     )
 
@@ -113,21 +111,6 @@ def flight_target(
     assert isinstance(task, FlightTask)
     assert isinstance(system, RigidBody)
     return FlightTarget(task, system, draw_effects, reach=reach)
-
-
-def _learn(
-    task: FlightTask, iterations: int, rate: float, batch: int = 256, curriculum: bool = True, recorded: float = 0.0
-) -> TuneSettings:
-    return TuneSettings(
-        task,
-        iterations,
-        batch,
-        rate,
-        longest=100,
-        curriculum=curriculum,
-        recorded=recorded,
-        observation_noise=0.0,
-    )
 
 
 def _settings(source: TuneSettings, tuning: TuneSettings) -> SetupSettings:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from visadapt.storage.checkpoints import load_tree, load_weights, save_tree
 
@@ -17,30 +18,63 @@ CHECKPOINT_ITERATIONS = 100
 
 @dataclass
 class TrainingState:
-    """A network in training, its optimiser, learning-rate schedule and random generator."""
+    """A network in training, its optimiser, learning-rate schedule and random generator, and its losses so far."""
 
     network: nn.Module
     optimiser: torch.optim.Optimizer
-    schedule: torch.optim.lr_scheduler.LRScheduler
     generator: torch.Generator
+    learning_rate: float
+    """the highest of the schedule"""
+    iterations: int
+    progress: Callable[[int, int, float], None] | None
+    """called with (iterations done, iterations in total, loss)"""
+    path: Path | None
+    """file of the state; None keeps it nowhere"""
+    losses: list[float] = field(default_factory=list)
 
-    def keep(self, path: Path, losses: list[float], more: dict[str, Any]) -> None:
-        """Write the state to `path`, with the losses so far and `more`, whatever else the loop needs."""
-        tree = {
-            "network": self.network.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-            "schedule": self.schedule.state_dict(),
-            "generator": self.generator.get_state(),
-            "losses": losses,
-            "more": more,
-        }
-        save_tree(path, tree)
+    def __post_init__(self) -> None:
+        self.schedule = torch.optim.lr_scheduler.OneCycleLR(
+            self.optimiser, self.learning_rate, total_steps=self.iterations, pct_start=0.1
+        )
 
-    def resume(self, path: Path) -> tuple[list[float], dict[str, Any]]:
-        """Restore what `keep` wrote; returns the losses and `more`; raises CheckpointError where it does not fit."""
-        tree = load_tree(path)
-        load_weights(self.network, tree["network"], path)
+    def resume(self) -> dict[str, Any] | None:
+        """Restore what an interrupted training left; returns what else it kept, None where there is nothing.
+
+        Raises:
+            CheckpointError: it does not fit.
+        """
+        if self.path is None or not self.path.exists():
+            return None
+        tree = load_tree(self.path)
+        load_weights(self.network, tree["network"], self.path)
         self.optimiser.load_state_dict(tree["optimiser"])
         self.schedule.load_state_dict(tree["schedule"])
         self.generator.set_state(tree["generator"])
-        return tree["losses"], tree["more"]
+        self.losses = tree["losses"]
+        more: dict[str, Any] = tree["more"]
+        return more
+
+    def descend(self, loss: Tensor) -> None:
+        """One step against the gradient, of a norm of 1 at most."""
+        self.optimiser.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.optimiser.step()
+        self.schedule.step()
+        self.losses.append(float(loss.detach()))
+
+    def keep(self, more: dict[str, Any]) -> None:
+        """Report the iteration; every `CHECKPOINT_ITERATIONS` of them write the state, and what else the loop needs."""
+        done = len(self.losses)
+        if self.progress is not None:
+            self.progress(done, self.iterations, self.losses[-1])
+        if self.path is not None and done % CHECKPOINT_ITERATIONS == 0:
+            tree = {
+                "network": self.network.state_dict(),
+                "optimiser": self.optimiser.state_dict(),
+                "schedule": self.schedule.state_dict(),
+                "generator": self.generator.get_state(),
+                "losses": self.losses,
+                "more": more,
+            }
+            save_tree(self.path, tree)

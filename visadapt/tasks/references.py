@@ -1,7 +1,6 @@
 """References that a vehicle is to follow: positions and velocities on a steady clock, and their derivatives.
 
-A straight line to a target, the power loop, or one's own from a CSV file; `datasets.quadrotor_references` draws
-random ones.
+The power loop, or one's own from a CSV file; `datasets.quadrotor_references` draws random ones.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from torch import Tensor
 from visadapt.recordings import RecordingError
 from visadapt.recordings.table import Table
 from visadapt.systems import Quadrotor
-from visadapt.tasks.differential_flatness import commands, demanded
+from visadapt.tasks.differential_flatness import commands
 
 AXES = ("x", "y", "z")
 SPEEDS = ("x_dot", "y_dot", "z_dot")
@@ -61,30 +60,6 @@ class Reference:
             return self
         motion = torch.stack((self.positions, self.velocities, self.accelerations, self.jerks))
         return type(self).of(motion[:, None], self.period)
-
-    def states(self, gravity: float = 9.81) -> Tensor:
-        """The quadrotor's states (..., T, 13) on the reference; the first row is where an episode starts."""
-        return demanded(self.accelerations, self.jerks, gravity).state(self.positions, self.velocities)
-
-
-def line(start: Tensor, target: Tensor, speed: float, period: float = 0.1) -> Reference:
-    """From `start` (3,) straight to `target` (3,), in m, at a steady speed in m/s.
-
-    The speed is lowered a little where needed, so that the last row is the target.
-
-    Raises:
-        ValueError: a speed or period that is not positive, or a target nearer than one row.
-    """
-    _check_positive(speed=speed, period=period)
-    way = target - start
-    distance = float(way.norm())
-    if distance < speed * period:
-        raise ValueError(f"the target is {distance:g} m away, must be at least a row's {speed * period:g} m")
-    steps = ceil(distance / (speed * period) - 1e-6)
-    positions = start + way * torch.linspace(0, 1, steps + 1).to(way)[:, None]
-    velocities = (way / (steps * period)).expand_as(positions)
-    still = torch.zeros_like(positions)
-    return Reference(positions, velocities, still, still, period)
 
 
 def power_loop(speed: float, radius: float = LOOP_RADIUS, period: float = 0.1) -> Reference:
