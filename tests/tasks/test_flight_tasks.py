@@ -212,7 +212,7 @@ class TestStreams:
 
     def test_one_that_has_gone_on_for_long_enough_starts_anew(self):
         made = self.middle()
-        made.settings = 6, 20, 0.0
+        made.longest = 20
         made.age[5] = 19
         self.step(made, torch.zeros(6, 3), 1.0)
         assert made.age.tolist() == [8, 8, 8, 8, 8, 0]

@@ -123,7 +123,10 @@ def tune(
         if past is None:
             streams.advance(first, plan[:, 0].detach(), done, generator)
         elif (iteration + 1) % settings.every == 0:
-            streams.advance(*_step(world, policy, streams.now), done, generator)
+            with torch.no_grad():
+                action = policy.act(streams.now.history)
+                first = world.step(streams.now.at, action, streams.now.history)
+            streams.advance(first, action, done, generator)
             past = past.joined(streams.now)
         kept = {"now": streams.now.tree(), "age": streams.age}
         training.keep(kept if past is None else {**kept, "past": past.tree()})
@@ -152,13 +155,6 @@ def train_or_load(
     tune(policy, world, observe, settings, generator, progress=progress, checkpoint=partial_path)
     save_network(path, policy, about)
     partial_path.unlink(missing_ok=True)
-
-
-@torch.no_grad()
-def _step(world: World, policy: Policy, stream: StreamState) -> tuple[WorldState, Tensor]:
-    """The world a step on under the policy, and the action."""
-    action = policy.act(stream.history)
-    return world.step(stream.at, action, stream.history), action
 
 
 def imagine(

@@ -41,6 +41,8 @@ SMOOTHINGS = 4
 ACCELERATION = 10.0
 """m/s2 and rad/s2, what a load may do before anything is seen (standard deviation)."""
 
+LEAN = 0.5
+"""rad, largest |theta| at which the pole is looked for."""
 
 BRIDGED = 10
 """Rows in a row without a usable frame that the physics may bridge: upright, errors grow by e in about 5 rows."""
@@ -59,19 +61,15 @@ class Tracker:
 
     Args:
         renderer: learnt, of x (B,) in m and theta (B,) in rad to frames (B, H, W) in [0, 1].
-        world: the source physics, without effects.
-        reach: m, largest |x| at which the cart is looked for; None for the range of the system's table.
-        lean: rad, largest |theta| at which the pole is looked for.
+        world: the source physics, without effects; the cart is looked for within the range of its system's table.
 
     Raises:
         TrackingError: a world with effects, which would explain away the gap that is looked for.
     """
 
-    def __init__(self, renderer: nn.Module, world: World, reach: float | None = None, lean: float = 0.5) -> None:
+    def __init__(self, renderer: nn.Module, world: World) -> None:
         if len(world.effects):
-            raise TrackingError(
-                f"tracking needs the source physics alone, got a world with {len(world.effects)} effects"
-            )
+            raise TrackingError(f"tracking needs the source physics alone, not {len(world.effects)} effects")
         system = world.system
         self.world = world
         self._seen = [system.index("x"), system.index("theta")]
@@ -80,7 +78,7 @@ class Tracker:
         load = load_effect(type(system))
         nothing = load(**{parameter.name: 0.0 for parameter in load.table})
         self._pushed = World(system, (nothing,), world.period, world.integrator, world.substeps)
-        self.poses = PoseFinder(renderer, max(-across.low, across.high) if reach is None else reach, lean)
+        self.poses = PoseFinder(renderer, max(-across.low, across.high), LEAN)
 
     def track(self, episodes: Sequence[Episode]) -> list[Episode]:
         """The episodes with states from their frames and actions alone, with one noise fitted to all.

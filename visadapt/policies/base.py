@@ -71,12 +71,8 @@ class Policy(nn.Module):
         if self.residual is None:
             return observations.new_zeros(len(observations), self.n_state)
         with torch.no_grad():
-            out: Tensor = self.residual.network(history.acting(self._nothing(history)))
+            out: Tensor = self.residual.network(history.acting(torch.zeros_like(history.actions[:, 0])))
         return out
-
-    def _nothing(self, history: History) -> Tensor:
-        """An action (B, n_action) of zeros."""
-        return history.actions.new_zeros(len(history.actions), self.n_action)
 
 
 class AutoregressivePolicy(Policy):

@@ -56,7 +56,7 @@ class FlightPolicy(Policy):
         if not isinstance(network, FlightResidualNetwork):
             return history.actions.new_zeros(len(history.actions), N_DISTURBANCE)
         with torch.no_grad():
-            return network.disturbance(history.acting(self._nothing(history)))
+            return network.disturbance(history.acting(torch.zeros_like(history.actions[:, 0])))
 
     def plan(self, features: Tensor, correction: Tensor) -> Tensor:
         own, disturbance = features[:, :-N_DISTURBANCE], features[:, -N_DISTURBANCE:]

@@ -13,10 +13,11 @@ from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from visadapt.recordings import RecordingError
+from visadapt.recordings.checks import check_finite
+from visadapt.recordings.clock import RawEpisode, check_forward
 from visadapt.recordings.table import Table
 from visadapt.systems import Quadrotor
 from visadapt.tasks.differential_flatness import commands
@@ -56,10 +57,8 @@ class Reference:
 
     def as_many(self) -> Self:
         """With a leading axis that numbers references, (1, T, 3), where this is a single one; else itself."""
-        if self.positions.dim() > 2:
-            return self
         motion = torch.stack((self.positions, self.velocities, self.accelerations, self.jerks))
-        return type(self).of(motion[:, None], self.period)
+        return self if motion.dim() > 3 else type(self).of(motion[:, None], self.period)
 
 
 def power_loop(speed: float, radius: float = LOOP_RADIUS, period: float = 0.1) -> Reference:
@@ -130,7 +129,14 @@ def read_reference(path: str | os.PathLike[str], period: float = 0.1, max_speed:
         if name not in table.header:
             raise RecordingError(f"{path}: has no column {name!r}; its columns are {', '.join(table.header)}")
     values = table.numbers([table.header.index(name) for name in names])
-    _check_rows(table, names, values, period)
+    raw = RawEpisode(str(path), values[:, 0], values[:, :0], values[:, 1:], table.place)
+    check_finite(raw, names[1:], ())
+    check_forward(raw)
+    lasts = values[-1, 0] - values[0, 0]
+    if len(values) < 3 or lasts < 2 * period * (1 - 1e-6):
+        raise RecordingError(
+            f"{path}: {len(values)} rows over {lasts:g} s; at least 3 rows over {2 * period:g} s are right"
+        )
     time, places = torch.from_numpy(values[:, 0] - values[0, 0]), values[:, 1:4]
     slopes = values[:, 4:] if len(names) > 4 else np.gradient(places, values[:, 0], axis=0, edge_order=2)
     at = torch.arange(int(float(time[-1]) / period + 1e-5) + 1, dtype=torch.float64) * period
@@ -162,28 +168,6 @@ def cubic(time: Tensor, values: Tensor, slopes: Tensor, at: Tensor) -> Tensor:
     rise, fall = slopes[..., row, :] * step, slopes[..., row + 1, :] * step
     level = before * (1 + 2 * s) * (1 - s) ** 2 + after * s**2 * (3 - 2 * s)
     return level + rise * s * (1 - s) ** 2 - fall * s**2 * (1 - s)
-
-
-def _check_rows(table: Table, names: list[str], values: NDArray[np.float64], period: float) -> None:
-    bad = np.argwhere(~np.isfinite(values))
-    if len(bad):
-        row, column = bad[0]
-        raise RecordingError(
-            f"{table.path}: {table.place(int(row))}, column {names[column]!r} is {values[row, column]}; "
-            "a finite number is right"
-        )
-    backwards = np.flatnonzero(np.diff(values[:, 0]) <= 0)
-    if len(backwards):
-        row = int(backwards[0]) + 1
-        raise RecordingError(
-            f"{table.path}: {table.place(row)} is at {values[row, 0]:g} s, the row before it at "
-            f"{values[row - 1, 0]:g} s; times must rise"
-        )
-    lasts = values[-1, 0] - values[0, 0]
-    if len(values) < 3 or lasts < 2 * period * (1 - 1e-6):
-        raise RecordingError(
-            f"{table.path}: {len(values)} rows over {lasts:g} s; at least 3 rows over {2 * period:g} s are right"
-        )
 
 
 def _check_positive(**values: float) -> None:
