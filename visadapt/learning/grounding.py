@@ -108,7 +108,9 @@ def ground(
     network = residual.network
     if not isinstance(network, ResidualNetwork):
         raise TypeError(f"grounding fits the head of a ResidualNetwork, not a {type(network).__name__}")
-    seen = _embed(network, windows)
+    with torch.no_grad():
+        parts = torch.arange(len(windows)).split(256)
+        seen = torch.cat([network.embed(windows.history(p).acting(windows.action[p])) for p in parts])
     informed = network.informed(seen)
     if bool(informed.any()):
         seen, target = seen[informed], target[informed]
@@ -176,22 +178,11 @@ def _descend(
     return losses
 
 
-@torch.no_grad()
-def _embed(network: ResidualNetwork, windows: Windows) -> Tensor:
-    """What the head reads in every window, (N, ...)."""
-    parts = torch.arange(len(windows)).split(256)
-    return torch.cat([network.embed(windows.history(p).acting(windows.action[p])) for p in parts])
-
-
 def split(count: int, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Rows to train on and rows held out: stretches of 10 samples, since neighbouring ones are correlated."""
     stretches = torch.arange(count).split(10)
-    order = torch.randperm(len(stretches), generator=generator)
+    order = torch.randperm(len(stretches), generator=generator).tolist()
     held = max(1, round(share * len(stretches)))
     if held >= len(stretches):
-        every = torch.arange(count)
-        return every, every
-    return (
-        torch.cat([stretches[int(k)] for k in order[held:]]),
-        torch.cat([stretches[int(k)] for k in order[:held]]),
-    )
+        return torch.arange(count), torch.arange(count)
+    return torch.cat([stretches[k] for k in order[held:]]), torch.cat([stretches[k] for k in order[:held]])

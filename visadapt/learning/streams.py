@@ -47,44 +47,34 @@ class StreamState(Batch):
         return cls(at, History(tree["observations"], tree["actions"]), tree["task_state"])
 
 
+@dataclass
 class Streams:
-    """A batch of simulated episodes in progress.
+    """A batch of simulated episodes in progress."""
 
-    Args:
-        observe: the camera through which the policy sees; None where it sees what the sensors measure.
-        windows: recorded starts. Each begins at its time in its episode, with the memory that effects have there.
-        longest: steps after which a stream starts anew.
-        recorded: share of the starts that are windows, with their histories.
-    """
+    world: World
+    task: Task
+    observe: Observe | None
+    """the camera through which the policy sees; None where it sees what the sensors measure"""
+    windows: Windows | None
+    """recorded starts. Each begins at its time in its episode, with the memory that effects have there"""
+    count: int
+    longest: int
+    """steps after which a stream starts anew"""
+    recorded: float
+    """share of the starts that are windows, with their histories"""
 
-    def __init__(
-        self,
-        world: World,
-        task: Task,
-        observe: Observe | None,
-        windows: Windows | None,
-        count: int,
-        longest: int,
-        recorded: float,
-    ) -> None:
-        self.world = world
-        self.task = task
-        self.observe = observe
-        self.windows = windows
-        self.count = count
-        self.longest = longest
-        self.recorded = recorded
+    def __post_init__(self) -> None:
         self.now: StreamState
         self.age: Tensor
         self._recorded: WorldState | None = None
         with torch.no_grad():
-            if windows is None:
-                times = world.period * torch.arange(EPISODE_STEPS)
-                state, _ = task.training_start(1, 0.0, torch.Generator().manual_seed(0))
+            if self.windows is None:
+                times = self.world.period * torch.arange(EPISODE_STEPS)
+                state, _ = self.task.training_start(1, 0.0, torch.Generator().manual_seed(0))
             else:
-                times, state = windows.time, windows.state[:1]
-                self._recorded = windows.start(world) if recorded > 0 else None
-            self._times = times if _depends_on_time(world, times.unique(), state) else None
+                times, state = self.windows.time, self.windows.state[:1]
+                self._recorded = self.windows.start(self.world) if self.recorded > 0 else None
+            self._times = times if _depends_on_time(self.world, times.unique(), state) else None
 
     @torch.no_grad()
     def start(self, progress: float, generator: torch.Generator) -> None:

@@ -92,7 +92,7 @@ class Tracker:
         if not episodes:
             return []
         found = [self._see(number, episode) for number, episode in enumerate(episodes)]
-        commands = [torch.as_tensor(episode.action, dtype=torch.float64)[:-1] for episode in episodes]
+        commands = [torch.as_tensor(episode.action[:-1], dtype=torch.float64) for episode in episodes]
         paths = [self._first_guess(poses) for poses in found]
         noise: Noise | None = None
         for turn in range(SMOOTHINGS):

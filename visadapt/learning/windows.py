@@ -46,7 +46,7 @@ class Windows:
 
     @classmethod
     def cut(cls, episodes: Sequence[Episode], source: str, observe: Observe | None = None) -> Windows:
-        """Windows of all samples of the episodes; before an episode the first observation stands still.
+        """Windows of all samples of the episodes.
 
         Raises:
             ValueError: an unknown source, episodes without what it needs, or no sample at all.

@@ -18,9 +18,9 @@ from visadapt.history import HORIZON, History
 
 
 class Policy(nn.Module):
-    """Base of policies; subclasses give features, and the layers that turn them into a plan.
+    """Base of policies; subclasses give the layers that turn a history into a plan.
 
-    The correction enters in two ways, both of no weight at first: among the features, and straight into the plan as
+    The correction enters in two ways, both of no weight at first: beside the history, and straight into the plan as
     a feed-forward, since what is known to push can be pushed against. `learning.policy.initialise_feedforward` gives
     the feed-forward its weights once there is a residual; tuning changes all of them.
 
@@ -46,18 +46,14 @@ class Policy(nn.Module):
         nn.init.zeros_(self.feedforward.weight)
         self.residual: Residual | None = None
 
-    def features(self, history: History) -> Tensor:
-        """What the policy itself makes of a history, (B, F)."""
-        raise NotImplementedError
-
-    def plan(self, features: Tensor, correction: Tensor) -> Tensor:
-        """Commands (B, HORIZON * n_action) before the last tanh, from features and the correction (B, n_state)."""
+    def plan(self, history: History, correction: Tensor) -> Tensor:
+        """Commands (B, HORIZON * n_action) before the last tanh, from a history and the correction (B, n_state)."""
         raise NotImplementedError
 
     def forward(self, history: History) -> Tensor:
         """Planned actions (B, HORIZON, n_action)."""
         correction = self.correction(history)
-        out = (self.plan(self.features(history), correction) + self.feedforward(correction)).tanh()
+        out = (self.plan(history, correction) + self.feedforward(correction)).tanh()
         return out.unflatten(-1, (HORIZON, self.n_action))
 
     def act(self, history: History) -> Tensor:

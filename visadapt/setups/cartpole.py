@@ -90,7 +90,7 @@ def cartpole_states(
     """
     return Setup(
         source=source or World(CartPole()),
-        policy=lambda: StatePolicy(n_state=4, with_history=with_history),
+        policy=partial(StatePolicy, 4, with_history=with_history),
         residual=residual_for,
         settings=settings,
     )

@@ -43,9 +43,6 @@ FORCE = 2.0
 
 _learn = partial(TuneSettings, longest=100, observation_noise=0.0)
 
-References = Callable[[], tuple[Reference, Reference]]
-"""Gives the references to train on, and those to be scored on, to who needs them."""
-
 
 def quadrotor(
     train: Reference, test: Reference | None = None, source: World | None = None, with_history: bool = False
@@ -143,8 +140,8 @@ class FlightExperiment:
         """What a score of it is."""
         return "mean tracking error" if self.vehicle is Quadrotor else "miss of the target"
 
-    def setup(self, references: References) -> Setup:
-        """The vehicle; against a force that changes its residual reads the history."""
+    def setup(self, references: Callable[[], tuple[Reference, Reference]]) -> Setup:
+        """The vehicle, which may need references to train on and to be scored on; a force is read in the history."""
         with_history = self.hidden == "force"
         if self.vehicle is FixedWing:
             return fixed_wing(with_history=with_history)
@@ -190,8 +187,7 @@ class FlightExperiment:
 
         With an `explorer` that policy collects the data, in flights that end `reach` m off their task's line.
         """
-        target = flight_target(setup, self.effects(setup), test=False, reach=reach)
-        place = self.folder(work, seed)
+        target, place = flight_target(setup, self.effects(setup), False, reach), self.folder(work, seed)
         return setup.adapt(policy, target, place, self.budget, self.round_samples, seed, report, explorer)
 
 

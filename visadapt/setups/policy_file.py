@@ -19,12 +19,7 @@ from visadapt import policies
 from visadapt.effects import EFFECTS, Effect, Residual
 from visadapt.learning.perception import PerceptionSettings, scale
 from visadapt.policies import FlightPolicy, ImagePolicy, Policy, StatePolicy
-from visadapt.policies.networks import (
-    FlightResidualNetwork,
-    ImageResidualNetwork,
-    ResidualNetwork,
-    StateResidualNetwork,
-)
+from visadapt.policies.networks import FlightResidualNetwork, ImageResidualNetwork, StateResidualNetwork
 from visadapt.storage.checkpoints import CheckpointError, load_tree, load_weights, save_network
 from visadapt.systems import SYSTEMS, RigidBody
 from visadapt.world import World, WorldState
@@ -129,10 +124,8 @@ def _world(description: Mapping[str, Any], path: Path) -> World:
         if name not in SYSTEMS and name not in EFFECTS:
             raise CheckpointError(f"{path}: needs {name!r}, which is not known here: import the file that defines it")
     system = SYSTEMS[description["system"]](**description["parameters"])
-    effects = []
-    for one in description["effects"]:
-        values = {name: value for name, value in one.items() if name != "effect"}
-        effects.append(EFFECTS[one["effect"]](**values))
+    given = [dict(one) for one in description["effects"]]
+    effects = [EFFECTS[values.pop("effect")](**values) for values in given]
     clock = {name: description[name] for name in ("period", "integrator", "substeps")}
     return World(system, effects, **clock)
 
@@ -151,19 +144,15 @@ def residual_for(
         TypeError: a policy of a class that is not known here; give a `Setup` of its own.
     """
     system, period = source.system, source.period
-    network: ResidualNetwork
+    network: FlightResidualNetwork | ImageResidualNetwork | StateResidualNetwork
     if isinstance(policy, ImagePolicy):
         eyes = policy.perception
         unit = scale(perception or PerceptionSettings(), period)
         network = ImageResidualNetwork(eyes.background, float(eyes.contrast), system, period, unit)
         network.encoder.load_state_dict(eyes.state_dict())
     elif isinstance(policy, StatePolicy):
-        network = StateResidualNetwork(
-            policy.n_state,
-            policy.n_action,
-            system if policy.with_history else None,
-            period if policy.with_history else 0.0,
-        )
+        physics = system if policy.with_history else None
+        network = StateResidualNetwork(policy.n_state, policy.n_action, physics, period)
     elif isinstance(policy, FlightPolicy) and isinstance(system, RigidBody):
         network = FlightResidualNetwork(system, period, partial(source_steps, source) if with_history else None)
     else:

@@ -99,10 +99,8 @@ def train(
     if iterations is not None:
         settings = replace(setup.settings, source=replace(setup.settings.source, iterations=iterations))
         setup = replace(setup, settings=settings)
-    if path is not None:
-        return setup.pretrain(Path(path), seed, report)
-    with tempfile.TemporaryDirectory() as folder:
-        return setup.pretrain(Path(folder) / "policy.safetensors", seed, report)
+    with tempfile.TemporaryDirectory() as temporary:
+        return setup.pretrain(Path(path or Path(temporary, "policy.safetensors")), seed, report)
 
 
 @overload
