@@ -6,8 +6,9 @@
 A command that has succeeded at this commit is skipped, so an interrupted run is started again the same way. The commit
 is the last one that changed code or shipped weights: committing tables and pages starts nothing again. Intermediate
 results go to runs/all/<commit>/<name>, so none of another commit is taken over; recordings of the sealed check and
-references, under data/, are made once and kept. Each command writes runs/all/<name>.log and, after success alone, the
-stamp runs/all/<name>.json. `python -m benchmarks.pages` then writes the tables into the pages.
+references, under data/, are made once and kept. Each command writes runs/all/<name>.log and, after success alone, its
+date and commit into results/runs.json, which is committed with the tables, so that a run goes on on another machine.
+`python -m benchmarks.pages` then writes the tables into the pages.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ from visadapt.storage.atomic_files import replacing
 
 CODE = ("visadapt", "renderers", "datasets", "train", "benchmarks/*.py", "benchmarks/blind", "assets/*.safetensors")
 """What tables depend on, as git's path patterns."""
+RUNS = Path("results/runs.json")
+"""The `Stamp` of each command that has succeeded, by its name."""
 NOT_CODE = (":!benchmarks/all.py", ":!benchmarks/pages.py", ":!benchmarks/tables_*.py")
 """Scripts that no number depends on, excluded from CODE."""
 
@@ -154,8 +157,10 @@ class Stamp:
 
     commit: str
     date: str
-    minutes: float
+    """YYYY-MM-DD, UTC"""
     command: str
+    minutes: float | None = None
+    """wall time; None where it was not recorded"""
 
 
 def main(settings: Settings) -> int:
@@ -167,7 +172,7 @@ def main(settings: Settings) -> int:
     chosen = [command for command in COMMANDS if not settings.only or command.name in settings.only]
     if settings.list:
         for command in chosen:
-            print(described(command, settings.out, commit))
+            print(described(command, commit))
         return 0
     if changed := _git("status", "--porcelain", "--", *CODE, *NOT_CODE):
         raise SystemExit(f"code is not committed, so tables would not be of commit {commit}:\n{changed}")
@@ -177,9 +182,9 @@ def main(settings: Settings) -> int:
     return 1 if failed else 0
 
 
-def run_all(commands: Sequence[Command], out: Path, commit: str) -> list[str]:
+def run_all(commands: Sequence[Command], out: Path, commit: str, runs: Path = RUNS) -> list[str]:
     """Run those that are not done at this commit, and go on after one that fails; returns the names of those."""
-    return [command.name for command in commands if not _run(command, out, commit)]
+    return [command.name for command in commands if not _run(command, out, commit, runs)]
 
 
 def code_commit() -> str:
@@ -187,9 +192,9 @@ def code_commit() -> str:
     return _git("log", "-1", "--format=%h", "--", *CODE, *NOT_CODE)
 
 
-def is_done(command: Command, out: Path, commit: str) -> bool:
+def is_done(command: Command, commit: str, runs: Path = RUNS) -> bool:
     """Whether the command has succeeded at this commit, as it stands now, and its table is there."""
-    stamp = _stamp(command, out)
+    stamp = stamps(runs).get(command.name)
     return (
         stamp is not None
         and (stamp.commit, stamp.command) == (commit, command.shown)
@@ -197,11 +202,11 @@ def is_done(command: Command, out: Path, commit: str) -> bool:
     )
 
 
-def described(command: Command, out: Path, commit: str) -> str:
+def described(command: Command, commit: str, runs: Path = RUNS) -> str:
     """One line: name, state, minutes, needs and the command itself."""
-    stamp = _stamp(command, out)
-    state = "done" if is_done(command, out, commit) else f"last at {stamp.commit}" if stamp else "to do"
-    minutes = f"{stamp.minutes:.0f} min" if stamp else f"about {command.minutes} min"
+    stamp = stamps(runs).get(command.name)
+    state = "done" if is_done(command, commit, runs) else f"last at {stamp.commit}" if stamp else "to do"
+    minutes = f"{stamp.minutes:.0f} min" if stamp and stamp.minutes else f"about {command.minutes} min"
     needs = f"  [extra {command.extra}]" if command.extra else ""
     return f"{command.name:18} {state:16} {minutes:13} results/{command.table}: {command.shown}{needs}"
 
@@ -212,14 +217,14 @@ def folders(command: Command, out: Path, commit: str) -> list[str]:
     return [text for option, name in named for text in (option, str(out / commit / name))]
 
 
-def _stamp(command: Command, out: Path) -> Stamp | None:
-    path = out / f"{command.name}.json"
-    return Stamp(**json.loads(path.read_text())) if path.exists() else None
+def stamps(runs: Path = RUNS) -> dict[str, Stamp]:
+    """When and at which commit each command last succeeded, by its name."""
+    return {name: Stamp(**stamp) for name, stamp in json.loads(runs.read_text()).items()} if runs.exists() else {}
 
 
-def _run(command: Command, out: Path, commit: str) -> bool:
+def _run(command: Command, out: Path, commit: str, runs: Path) -> bool:
     """Whether the command is done at this commit, run where it was not."""
-    if is_done(command, out, commit):
+    if is_done(command, commit, runs):
         print(f"{command.name}: done at {commit}")
         return True
     if command.extra and find_spec(INSTALLED_BY[command.extra]) is None:
@@ -240,9 +245,10 @@ def _run(command: Command, out: Path, commit: str) -> bool:
     if ended.returncode:
         print(f"{command.name}: exit status {ended.returncode} after {minutes:.1f} min; see {log}", flush=True)
         return False
-    stamp = Stamp(commit, datetime.now(UTC).isoformat(timespec="seconds"), round(minutes, 1), command.shown)
-    with replacing(out / f"{command.name}.json") as temporary:
-        temporary.write_text(json.dumps(asdict(stamp), indent=2) + "\n")
+    stamp = Stamp(commit, f"{datetime.now(UTC):%Y-%m-%d}", command.shown, round(minutes, 1))
+    done = {**stamps(runs), command.name: stamp}
+    with replacing(runs) as temporary:
+        temporary.write_text(json.dumps({name: asdict(stamp) for name, stamp in sorted(done.items())}, indent=2) + "\n")
     return True
 
 

@@ -1,20 +1,19 @@
 """Writes what the pages take from elsewhere into README.md and docs/*.md: `python -m benchmarks.pages`.
 
 Each table stands between the lines `<!-- table: NAME -->` and `<!-- end -->`. Tables of results come from the CSVs
-under results/; in docs/results.md each is followed by the command that writes its CSV, and the date and commit at which
-git last saw that CSV change. The effects of docs/effects.md come from the registry.
+under results/; in docs/results.md each is followed by the commands that write its CSVs and, from results/runs.json, the
+date and commit at which each was run. The effects of docs/effects.md come from the registry.
 """
 
 from __future__ import annotations
 
 import re
-import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks import tables_adaptation as adaptation, tables_diagnosis as diagnosis
-from benchmarks.all import COMMANDS
+from benchmarks.all import COMMANDS, stamps
 from visadapt.effects.catalogue import catalogue_markdown
 from visadapt.evaluation.result_tables import read_rows
 from visadapt.storage.atomic_files import replacing
@@ -27,9 +26,6 @@ RESULTS_PAGE = "results.md"
 """The page that states command, date and commit of each table."""
 
 BLOCK = re.compile(r"<!-- table: (?P<name>[^>]+) -->\n.*?<!-- end -->", re.DOTALL)
-
-CHANGED = re.compile(r"last changed on [\d-]+ in commit \w+|not committed yet")
-"""Date and commit of a CSV: they change with each commit of it, after the page is written."""
 
 
 @dataclass(frozen=True)
@@ -107,23 +103,13 @@ def results_table(name: str, with_origin: bool) -> str:
 
 
 def origins(table: Table) -> list[str]:
-    """One line for each CSV: when it last changed, and what writes it."""
+    """One line for each command: its CSV, when and at which commit it was run, and the command itself."""
+    done = stamps()
     lines = []
-    for file in table.files:
-        commands = [f"`{BY_NAME[name].shown}`" for name in table.commands if BY_NAME[name].table == file]
-        lines.append(f"- `results/{file}`, {changed(Path('results') / file)}: {', '.join(commands)}")
+    for name in table.commands:
+        made = f"run on {done[name].date} at commit {done[name].commit}" if name in done else "not run yet"
+        lines.append(f"- `results/{BY_NAME[name].table}`, {made}: `{BY_NAME[name].shown}`")
     return lines
-
-
-def changed(path: Path) -> str:
-    """The date and commit at which git last saw a file change."""
-    if not path.exists() or _git("status", "--porcelain", "--", str(path)):
-        return "not committed yet"
-    return "last changed on " + _git("log", "-1", "--format=%cs in commit %h", "--", str(path))
-
-
-def _git(*arguments: str) -> str:
-    return subprocess.run(["git", *arguments], capture_output=True, text=True, check=True).stdout.strip()
 
 
 def markdown(lines: adaptation.Lines) -> str:

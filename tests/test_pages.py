@@ -15,7 +15,7 @@ import tyro
 
 import visadapt.diagnosis
 from benchmarks.all import COMMANDS
-from benchmarks.pages import BLOCK, CHANGED, GENERATED, PAGES, TABLES, filled
+from benchmarks.pages import BLOCK, GENERATED, PAGES, TABLES, filled
 from visadapt.cli import main
 from visadapt.effects import EFFECTS
 from visadapt.systems import CartPole
@@ -53,8 +53,7 @@ def test_every_page_is_there():
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
 def test_what_a_page_shows_is_what_the_script_writes(page):
-    shown, made = (CHANGED.sub("", text) for text in (page.read_text(), filled(page)))
-    assert shown == made, f"{page} differs from results/ or the registry: python -m benchmarks.pages"
+    assert page.read_text() == filled(page), f"{page} differs from results/ or the registry: python -m benchmarks.pages"
 
 
 def test_every_table_is_on_a_page():
@@ -81,7 +80,7 @@ def test_results_state_command_date_and_commit_of_every_csv():
     for command in COMMANDS:
         lines = [line for line in page.splitlines() if line.startswith(f"- `results/{command.table}`")]
         assert any(f"`{command.shown}`" in line for line in lines), command.name
-        assert all(CHANGED.search(line) for line in lines)
+        assert all(re.search(r"run on [\d-]+ at commit \w+|not run yet", line) for line in lines)
 
 
 def test_the_readme_has_at_most_150_lines():

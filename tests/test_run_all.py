@@ -1,9 +1,8 @@
 import importlib
-import json
 
 import tyro
 
-from benchmarks.all import COMMANDS, Command, Stamp, described, folders, is_done, run_all
+from benchmarks.all import COMMANDS, Command, described, folders, is_done, run_all, stamps
 
 
 def a_command(name, *arguments):
@@ -11,25 +10,25 @@ def a_command(name, *arguments):
 
 
 def test_what_is_done_at_a_commit_is_skipped(tmp_path):
-    command = a_command("tool", "json.tool", "--help")
-    assert run_all([command], tmp_path, "abc") == []
+    command, runs = a_command("tool", "json.tool", "--help"), tmp_path / "runs.json"
+    assert run_all([command], tmp_path, "abc", runs) == []
     assert "usage" in (tmp_path / "tool.log").read_text()
     (tmp_path / "tool.log").unlink()
-    assert is_done(command, tmp_path, "abc")
-    assert run_all([command], tmp_path, "abc") == []
+    assert is_done(command, "abc", runs)
+    assert run_all([command], tmp_path, "abc", runs) == []
     assert not (tmp_path / "tool.log").exists()
-    assert not is_done(command, tmp_path, "abd")
-    assert not is_done(a_command("tool", "json.tool"), tmp_path, "abc")
+    assert not is_done(command, "abd", runs)
+    assert not is_done(a_command("tool", "json.tool"), "abc", runs)
 
 
 def test_a_command_that_fails_leaves_no_stamp_and_the_next_one_runs(tmp_path):
     failing, fine = a_command("failing", "json.tool", "--no-such-option"), a_command("fine", "json.tool", "--help")
-    assert run_all([failing, fine], tmp_path, "abc") == ["failing"]
-    assert not (tmp_path / "failing.json").exists()
+    runs = tmp_path / "runs.json"
+    assert run_all([failing, fine], tmp_path, "abc", runs) == ["failing"]
     assert "no-such-option" in (tmp_path / "failing.log").read_text()
-    assert Stamp(**json.loads((tmp_path / "fine.json").read_text())).commit == "abc"
-    assert "done" in described(fine, tmp_path, "abc")
-    assert "last at abc" in described(fine, tmp_path, "abd")
+    assert [(name, stamp.commit) for name, stamp in stamps(runs).items()] == [("fine", "abc")]
+    assert "done" in described(fine, "abc", runs)
+    assert "last at abc" in described(fine, "abd", runs)
 
 
 def test_commands_read_what_an_earlier_one_kept_at_the_same_commit(tmp_path):
