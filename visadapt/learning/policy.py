@@ -8,11 +8,10 @@ delta_div grows as training goes on, so the policy learns to recover from ever f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,7 +22,6 @@ from visadapt.learning.streams import Streams, StreamState, look
 from visadapt.learning.windows import Observe, Windows
 from visadapt.policies import Policy
 from visadapt.progress import Progress
-from visadapt.storage.checkpoints import load_network, save_network
 from visadapt.storage.training_state import TrainingState
 from visadapt.tasks.base import Task
 from visadapt.world import World, WorldState
@@ -132,29 +130,6 @@ def tune(
         training.keep(kept if past is None else {**kept, "past": past.tree()})
     policy.eval()
     return training.losses
-
-
-def train_or_load(
-    path: Path,
-    policy: Policy,
-    world: World,
-    observe: Observe | None,
-    settings: TuneSettings,
-    generator: torch.Generator,
-    about: Mapping[str, Any],
-    progress: Progress | None = None,
-) -> None:
-    """Give `policy` the weights in `path`; where there are none yet, tune it, and keep it there with `about` it.
-
-    An interrupted training goes on from what it left beside `path`.
-    """
-    if path.exists():
-        load_network(path, policy)
-        return
-    partial_path = path.with_suffix(".partial.safetensors")
-    tune(policy, world, observe, settings, generator, progress=progress, checkpoint=partial_path)
-    save_network(path, policy, about)
-    partial_path.unlink(missing_ok=True)
 
 
 def imagine(

@@ -10,12 +10,13 @@ import torch
 
 from visadapt.effects import Residual
 from visadapt.learning.joint import Adapted, Label, SetupSettings, adapt
-from visadapt.learning.policy import train_or_load, tune
+from visadapt.learning.policy import tune
 from visadapt.learning.windows import Observe
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
 from visadapt.setups.policy_file import describe
 from visadapt.storage.checkpoints import load_network
+from visadapt.storage.training_state import train_or_load
 from visadapt.targets import Target
 from visadapt.tasks.base import Task
 from visadapt.world import World
@@ -69,7 +70,8 @@ class Setup:
         # Preparing draws from a generator of the seed itself.
         generator = torch.Generator().manual_seed(seed if self.prepare is None else seed + 1)
         progress = staged(report, f"{self.source.system.name}: source policy")
-        train_or_load(path, policy, self.source, self.observe, self.settings.source, generator, about, progress)
+        args = (policy, self.source, self.observe, self.settings.source, generator, None, progress)
+        train_or_load(path, policy, about, lambda partial: tune(*args, partial))
         return policy.eval()
 
     def load(self, path: Path) -> Policy:

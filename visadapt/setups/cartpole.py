@@ -19,7 +19,7 @@ from visadapt.progress import Report, staged
 from visadapt.recordings import Episode
 from visadapt.setups.base import Setup
 from visadapt.setups.policy_file import residual_for
-from visadapt.storage.checkpoints import load_network, save_network
+from visadapt.storage.training_state import train_or_load
 from visadapt.systems import CartPole
 from visadapt.tasks.balance import CENTRED_CARTPOLE, PAPER_CARTPOLE, Balance
 from visadapt.weights import shipped
@@ -130,16 +130,18 @@ def cartpole_frames(
     def prepare(policy: Policy, folder: Path, seed: int, report: Report | None) -> None:
         """Teach the policy's encoder to see, in `folder`, or take the one that is there."""
         assert isinstance(policy, ImagePolicy)
-        path, partial_path = folder / "encoder.safetensors", folder / "encoder.partial.safetensors"
-        if path.exists():
-            load_network(path, policy.perception)
-        else:
-            eyes = policy.perception.requires_grad_(True)
-            generator, progress = torch.Generator().manual_seed(seed), staged(report, "perception")
-            learn_to_see(eyes, seen, source.period, perception, generator, progress, partial_path)
-            save_network(path, eyes.requires_grad_(False), {"seed": seed, **asdict(perception)})
-            partial_path.unlink(missing_ok=True)
-        policy.encoder.load_state_dict(policy.perception.state_dict())
+        eyes = policy.perception.requires_grad_(True)
+        args = (
+            eyes,
+            seen,
+            source.period,
+            perception,
+            torch.Generator().manual_seed(seed),
+            staged(report, "perception"),
+        )
+        about = {"seed": seed, **asdict(perception)}
+        train_or_load(folder / "encoder.safetensors", eyes, about, lambda partial: learn_to_see(*args, partial))
+        policy.encoder.load_state_dict(eyes.requires_grad_(False).state_dict())
 
     return Setup(
         source=source,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from visadapt.storage.checkpoints import load_tree, load_weights, save_tree
+from visadapt.storage.checkpoints import load_network, load_tree, load_weights, save_network, save_tree
 
 CHECKPOINT_ITERATIONS = 100
 """Iterations between two checkpoints."""
@@ -78,3 +78,17 @@ class TrainingState:
                 "more": more,
             }
             save_tree(self.path, tree)
+
+
+def train_or_load(path: Path, network: nn.Module, about: Mapping[str, Any], train: Callable[[Path], object]) -> None:
+    """Give `network` the weights in `path`; where there are none yet, train it, and keep it there with `about` it.
+
+    `train` is given the file beside `path` that it keeps its state in, and from which an interrupted one goes on.
+    """
+    if path.exists():
+        load_network(path, network)
+        return
+    partial = path.with_suffix(".partial.safetensors")
+    train(partial)
+    save_network(path, network, about)
+    partial.unlink(missing_ok=True)

@@ -22,7 +22,6 @@ from visadapt.recordings.table import Table
 from visadapt.systems import Quadrotor
 from visadapt.tasks.differential_flatness import commands
 
-AXES = ("x", "y", "z")
 SPEEDS = ("x_dot", "y_dot", "z_dot")
 
 LOOP_RADIUS = 7.0
@@ -124,7 +123,7 @@ def read_reference(path: str | os.PathLike[str], period: float = 0.1, max_speed:
     _check_positive(period=period, max_speed=max_speed)
     path = Path(path)
     table = Table.open(path)
-    names = ["time", *AXES, *(SPEEDS if any(name in table.header for name in SPEEDS) else ())]
+    names = ["time", "x", "y", "z", *(SPEEDS if any(name in table.header for name in SPEEDS) else ())]
     for name in names:
         if name not in table.header:
             raise RecordingError(f"{path}: has no column {name!r}; its columns are {', '.join(table.header)}")
