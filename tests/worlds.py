@@ -1,4 +1,4 @@
-"""A system simple enough for closed forms, for the tests of effects and worlds."""
+"""A system simple enough for closed forms, and the energy of a cart-pole, for the tests of effects and worlds."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -46,3 +46,16 @@ def run(world, state, actions):
         at = world.step(at, action)
         states.append(at.state)
     return torch.stack(states)
+
+
+def energy_of(system, state):
+    """Kinetic plus potential energy of a cart-pole in J, (B,): conserved without command, load and friction."""
+    _, velocity, angle, angular_velocity = state.unbind(-1)
+    moment = system.pole_mass * system.pole_half_length
+    inertia = 4.0 / 3.0 * moment * system.pole_half_length
+    return (
+        0.5 * (system.cart_mass + system.pole_mass) * velocity.square()
+        + moment * velocity * angular_velocity * angle.cos()
+        + 0.5 * inertia * angular_velocity.square()
+        + moment * system.gravity * angle.cos()
+    )

@@ -2,47 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import Any, Self
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-LENGTH = 5
-"""Observations and actions kept (the paper, section 3.2.2)."""
+from visadapt.batch import Batch
 
-HORIZON = 10
-"""Actions planned at once, k in the paper; only the first is executed before planning again."""
+LENGTH = 5  # Observations and actions kept (the paper, section 3.2.2)
 
-
-class Batch:
-    """Base of dataclasses of tensors, and of tuples of tensors, whose first axis numbers the rows of a batch."""
-
-    def detach(self) -> Self:
-        """The same, cut off from the graph."""
-        return _each(Tensor.detach, self)
-
-    def where(self, keep: Tensor, other: Self) -> Self:
-        """This batch in the rows where `keep` (B,) holds, `other` in the rest."""
-        return _each(lambda own, more: torch.where(keep.reshape(-1, *[1] * (own.dim() - 1)), own, more), self, other)
-
-    def joined(self, other: Self) -> Self:
-        """The rows of this batch and, after them, those of another."""
-        return _each(lambda *parts: torch.cat(parts), self, other)
-
-    def __getitem__(self, rows: Tensor | slice) -> Self:
-        return _each(lambda values: values[rows], self)
-
-
-def _each(do: Callable[..., Tensor], *batches: Any) -> Any:
-    """`do` of all tensors that stand in the same place of the batches."""
-    first = batches[0]
-    if isinstance(first, Tensor):
-        return do(*batches)
-    if isinstance(first, tuple):
-        return tuple(_each(do, *parts) for parts in zip(*batches, strict=True))
-    return type(first)(*(_each(do, *(getattr(each, part.name) for each in batches)) for part in fields(first)))
+HORIZON = 10  # Actions planned at once, k in the paper; only the first is executed before planning again
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
+from visadapt.batch import Batch
 from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, Parameter, Residual, SensingEffect
-from visadapt.history import Batch, History
+from visadapt.effects.base import expect
+from visadapt.history import History
 from visadapt.systems import SYSTEMS, System
 from visadapt.systems.integrators import INTEGRATORS
 
@@ -60,9 +62,8 @@ class World(nn.Module):
             raise ValueError(f"period and substeps must be positive, got {period!r} s and {substeps!r}")
         for effect in effects:
             # A system of one's own may be near enough to the one that an effect was written for.
-            if type(system) in SYSTEMS.values() and not isinstance(system, effect.systems):
-                kinds = " or a ".join(getattr(kind, "name", kind.__name__) for kind in effect.systems)
-                raise TypeError(f"{effect.name} acts on a {kinds}, not on a {system.name}")
+            if type(system) in SYSTEMS.values():
+                expect(system, effect)
         self.system = system
         self.period = period
         self.integrator = integrator
@@ -103,11 +104,7 @@ class World(nn.Module):
         return made
 
     def start(
-        self,
-        state: Tensor,
-        time: Tensor | None = None,
-        commands: Tensor | None = None,
-        states: Tensor | None = None,
+        self, state: Tensor, time: Tensor | None = None, commands: Tensor | None = None, states: Tensor | None = None
     ) -> WorldState:
         """The world in the state (B, n_state), at the start of an episode or within one; its row is not read yet.
 

@@ -12,7 +12,7 @@ import torch
 
 from visadapt import diagnose
 from visadapt.cli.main import main
-from visadapt.diagnosis.search.catalogue import searched
+from visadapt.diagnosis.diagnose import searched
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.effects import ActuatorDelay, ConstantForce, LiftSlope, LinearDrag, ThrustGain, Wind
 from visadapt.effects.catalogue import catalogue

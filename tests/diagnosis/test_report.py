@@ -16,18 +16,17 @@ from visadapt.diagnosis.report.text import as_text, estimate, interval, number, 
 from visadapt.diagnosis.result import (
     VERDICTS,
     Cause,
+    Chart,
+    Curve,
     Diagnosis,
     Estimate,
     FigureData,
     Gap,
-    Growth,
     PolicyTerms,
     Prediction,
-    Profile,
     Ranked,
     RecordingSummary,
     Region,
-    Spectrum,
     Where,
 )
 
@@ -55,12 +54,23 @@ def some_figures(velocities=True):
     return FigureData(
         predictions=tuple(Prediction(episode, time, measured, truth + drift, truth) for episode in (3, 5, 8)),
         profiles=(
-            Profile("x", "m", "force on the cart", "N", centres, bump, error, 0.1 * bump, error),
-            Profile("time", "s", "force on the cart", "N", centres + 1, 0.1 * bump, error, 0.1 * bump, error),
+            Chart("x", "m", "force on the cart", "N", centres, curves(bump, 0.1 * bump, error=error)),
+            Chart("time", "s", "force on the cart", "N", centres + 1, curves(0.1 * bump, 0.1 * bump, error=error)),
         ),
-        growth=Growth(seconds, 1 + 8 * seconds**2, 1 + 0.3 * seconds, np.ones(10), 1 + 0.5 * seconds),
-        spectrum=Spectrum("force on the cart", "N2/Hz", frequency, 1 / frequency, 0.05 + 0 * frequency),
+        growth=Chart(
+            *("predicted ahead", "s", "error", "", seconds),
+            curves(1 + 8 * seconds**2, 1 + 0.3 * seconds, 1 + 0.5 * seconds, np.ones(10)),
+        ),
+        spectrum=Chart(
+            *("frequency", "Hz", "force on the cart", "N2/Hz", frequency),
+            curves(1 / frequency, 0.05 + 0 * frequency),
+        ),
     )
+
+
+def curves(*values, error=None):
+    labels = ("simulator", "with the causes", "black box", "noise")
+    return tuple(Curve(label, each, error) for label, each in zip(labels, values, strict=False))
 
 
 PATCH = Cause(

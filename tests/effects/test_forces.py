@@ -7,7 +7,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.integrate import solve_ivp
 
 from tests.effects.test_effects import build, from_table, inputs, world_of
-from tests.worlds import Mass, columns, run
+from tests.worlds import Mass, columns, energy_of, run
 from visadapt.effects import (
     CartMass,
     ConstantForce,
@@ -129,11 +129,11 @@ def test_pole_damping_takes_energy_at_the_pivot_alone():
     world = World(CartPole(), [PoleDamping(coefficient=0.05).double()], 0.002)
     at, energy, work = world.start(state), [], 0.0
     for _ in range(200):
-        energy.append(float(CartPole().energy(at.state).detach()))
+        energy.append(float(energy_of(CartPole(), at.state).detach()))
         rate = at.state[0, 3]
         at = world.step(at, torch.zeros(1, 1, dtype=torch.float64))
         work += 0.05 * float((rate.square() + at.state[0, 3].square()).detach()) / 2 * 0.002
-    assert energy[0] - float(CartPole().energy(at.state).detach()) == pytest.approx(work, rel=1e-4)
+    assert energy[0] - float(energy_of(CartPole(), at.state).detach()) == pytest.approx(work, rel=1e-4)
 
 
 class TestTrackTilt:

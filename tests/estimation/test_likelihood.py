@@ -53,7 +53,7 @@ def test_information_is_the_curvature_of_the_likelihood(viscous):
         model.low = model.high = best.theta[0] + side
         from visadapt.estimation.likelihood import fit  # the one place that needs the bare fit
 
-        held = best.select(torch.tensor([0]))
+        held = best[torch.tensor([0])]
         object.__setattr__(held, "theta", best.theta + side)
         losses.append(float(best.likelihood[0] - fit([model], held, torch.ones(1, viscous.shape[0]), 10).likelihood[0]))
     assert sum(losses) / 2 == pytest.approx(0.5, rel=0.1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import torch
 
@@ -20,16 +20,23 @@ from visadapt.diagnosis.result import (
     Region,
     Where,
 )
-from visadapt.diagnosis.search import heldout, localisation
-from visadapt.diagnosis.search.catalogue import searched
-from visadapt.diagnosis.search.causes import Alternative, alternatives, causes, ranking, stage_shares
-from visadapt.diagnosis.search.disturbance import Disturbance
+from visadapt.diagnosis.search import heldout
+from visadapt.diagnosis.search.causes import (
+    Alternative,
+    alternatives,
+    causes,
+    errors_with_repeats,
+    ranking,
+    repeated_reading_causes,
+    stage_shares,
+)
+from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
 from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
 from visadapt.diagnosis.search.preparation import prepare
-from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
 from visadapt.effects import EFFECTS, Effect
-from visadapt.effects.catalogue import catalogue as all_effects
+from visadapt.effects.catalogue import catalogue as all_effects, twins
+from visadapt.estimation.effect_fit import remembers
 from visadapt.estimation.profiles import profile_of
 from visadapt.progress import Report, staged
 from visadapt.recordings import Recording
@@ -42,10 +49,10 @@ MIN_GAP_CLOSED = 0.95
 CLEAR_OF_NOISE = 3.0
 """Error of the corrected predictions over the noise, above which the share of the gap closed decides the verdict."""
 
-RUNNERS_UP = 2
-"""Sets after the best for which the share of the gap that they close is computed."""
+RUNNERS_UP = 2  # Sets after the best for which the share of the gap that they close is computed
 
 
+@torch.inference_mode()
 def diagnose(
     recording: Recording,
     world: World,
@@ -84,23 +91,12 @@ def diagnose(
     """
     if len(world.effects):
         raise ValueError("diagnose: the world is the source and has no effects; give the bare system")
-    profile_of(world.system)
+    system = world.system
+    profile = profile_of(system)
     torch.set_num_threads(jobs)
-    effects = list(all_effects(world.system) if catalogue is None else catalogue)
-    with torch.inference_mode():
-        if policy is not None:
-            policy_bound.check(policy, world.system)
-        return _diagnose(recording, world.system, effects, seed, progress, policy)
-
-
-def _diagnose(
-    recording: Recording,
-    system: System,
-    effects: list[type[Effect]],
-    seed: int,
-    progress: Report | None,
-    policy: policy_bound.StatesToActions | None,
-) -> Diagnosis:
+    effects = list(all_effects(system) if catalogue is None else catalogue)
+    if policy is not None:
+        policy_bound.check(policy, system)
     prepared = prepare(recording, system)
     rows = prepared.rows
     search = Search(system, rows, searched(effects, system), prepared.source)
@@ -109,7 +105,7 @@ def _diagnose(
     best = comparison.best
     groups = alternatives(comparison, effects, system)
     repeats = repeated_reading_causes(prepared, search, comparison)
-    repeat_causes = [each.cause for each in repeats]
+    repeat_causes = [cause for cause, _ in repeats]
 
     # Predictions of the source, the best set, each cause alone and the runners-up, on held-out episodes.
     alone = [search.single(effect) for effect in dict.fromkeys(one.canonical for group in groups for one in group)]
@@ -120,7 +116,8 @@ def _diagnose(
     source = errors_with_repeats(prepared, search) if repeats else predicted[frozenset()]
     corrected = predicted[frozenset(best.names)]
     black_box = heldout.held_out(system, rows, [((), search.source.fits)], black_box=True)[0]
-    errors = Errors.from_rollouts(source, corrected, black_box, (best.fits.log_noise[0] / 2).exp())
+    noise = (best.fits.log_noise[0] / 2).exp()
+    errors = Errors(source.rms(noise), corrected.rms(noise), corrected.floor(noise), black_box.rms(noise), noise)
     gap_closed = {names: errors.closed_by(each) for names, each in predicted.items()}
 
     verdict = _verdict(comparison, errors, bool(repeats))
@@ -130,13 +127,13 @@ def _diagnose(
         if any(cause.indistinguishable_from for cause in found):
             verdict = AMBIGUOUS
     before, after = disturbances(search, comparison)
-    regions = _regions(found, before if found else after, effects, profile_of(system).region_variables, seed)
+    regions = _regions(found, before if found else after, effects, profile.region_variables, seed)
     return Diagnosis(
         system=system.name,
         recording=RecordingSummary(len(recording.episodes), recording.samples, float(f"{recording.period:.9g}")),
         verdict=verdict,
         where=Where(
-            stage_shares(search, comparison, [each.cost for each in repeats]),
+            stage_shares(search, comparison, [cost for _, cost in repeats]),
             errors.by_state(system, rows.channels, bool(found)),
             regions,
         ),
@@ -148,6 +145,16 @@ def _diagnose(
         figures=figure_data(search, source, corrected, errors, before, after, regions),
         policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, best),
     )
+
+
+def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:
+    """The first effect of each group of twins; without effects that repeat readings, which are found by another method,
+    and without sensors with memory, which candidate models cannot linearise by the present state."""
+    out: list[type[Effect]] = []
+    for effect in effects:
+        if not (twins(effect, out, system) or effect.repeats_readings or remembers(effect)):
+            out.append(effect)
+    return out
 
 
 def _verdict(comparison: ModelComparison, errors: Errors, repeats: bool) -> str:
@@ -179,10 +186,10 @@ def _regions(
         if edges is not None and edges[0].unit in variables:
             start, end = (cause.parameters[edge.name] for edge in edges)
             variable = variables[start.unit]
-            share = localisation.share(disturbance, variable, start.value, end.value)
+            share = share_between(disturbance, variable, start.value, end.value)
             fitted.append(Region(variable, start.value, end.value, share, 1 - cause.probability))
     taken = {region.variable for region in fitted}
-    return (*fitted, *(one for one in localisation.regions(disturbance, seed) if one.variable not in taken))
+    return (*fitted, *(one for one in regions_of(disturbance, seed) if one.variable not in taken))
 
 
 def _next(comparison: ModelComparison, verdict: str, groups: Sequence[Sequence[Alternative]], system: System) -> str:

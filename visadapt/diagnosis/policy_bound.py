@@ -21,7 +21,6 @@ white noise, which it is not, it would be far too large.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -41,20 +40,7 @@ from visadapt.systems import System
 StatesToActions = Policy | Callable[[Tensor], Any]
 """A policy on states: a `Policy`, or a function from states (N, n_state) to actions (N, n_action) in [-1, 1]."""
 
-COMMAND_POINTS = 41
-"""Commands from -1 to 1 at which a step is computed; between them it is interpolated linearly."""
-
-
-@dataclass(frozen=True)
-class EstimatedSteps:
-    """Estimates of the machine's steps from every row but the last of W windows of T rows."""
-
-    state: Tensor
-    """(W, T - 1, n) smoothed states, the angle within [-pi, pi]"""
-    disturbance: Tensor
-    """(W, T - 1, n) smoothed change of the next state that the best set does not explain"""
-    variance: Tensor
-    """(W, T - 1) posterior variance of the next state due to the set's parameters, summed over the states"""
+COMMAND_POINTS = 41  # Commands from -1 to 1 at which a step is computed; between them it is interpolated linearly
 
 
 def check(policy: StatesToActions, system: System) -> None:
@@ -95,17 +81,25 @@ def policy_terms(policy: StatesToActions, system: System, rows: Segments, best: 
     The policy acts on the sensors' readings of the states, as it does on the machine.
     """
     corrected = CandidateModel(system, best.effects, rows)
-    steps = _estimated_steps(corrected, best)
-    histories, complete = _histories(corrected.at(best.fits.theta[0]).reading(steps.state.flatten(0, 1)), rows)
-    acted = actions(policy, histories).reshape(steps.variance.shape)
+    state, disturbance, variance = _estimated_steps(corrected, best)
+    histories, complete = _histories(corrected.at(best.fits.theta[0]).reading(state.flatten(0, 1)), rows)
+    acted = actions(policy, histories).reshape(variance.shape)
     source, no_values = CandidateModel(system, (), rows), best.fits.theta[0, :0]
-    before = ModelSteps.from_states(source, no_values, steps.state, acted, complete)
-    after = ModelSteps.from_states(corrected, best.fits.theta[0], steps.state, acted, complete)
-    machine, variance = after.next_state + steps.disturbance[complete], steps.variance[complete]
-    return PolicyTerms(*zip(before.terms(machine, variance), after.terms(machine, variance), strict=True))
+    before = _steps(source, no_values, state, acted, complete)
+    after = _steps(corrected, best.fits.theta[0], state, acted, complete)
+    machine = after[0] + disturbance[complete], variance[complete]
+    reference, acted = (1 - 1 / HORIZON) * state[complete], acted[complete]
+    pairs = (_terms(*steps, *machine, acted, reference) for steps in (before, after))
+    return PolicyTerms(*zip(*pairs, strict=True))
 
 
-def _estimated_steps(model: CandidateModel, best: ScoredModel) -> EstimatedSteps:
+def _estimated_steps(model: CandidateModel, best: ScoredModel) -> tuple[Tensor, Tensor, Tensor]:
+    """The machine's steps from every row but the last of W windows of T rows.
+
+    The smoothed states (W, T - 1, n), the angle within [-pi, pi]; the smoothed change (W, T - 1, n) of the next state
+    that the best set does not explain; the posterior variance (W, T - 1) of the next state due to the set's parameters,
+    summed over the states.
+    """
     fits = best.fits
     problem = linear_problem([model], fits)
     process, noise = variances(model, fits.log_process, fits.log_noise)
@@ -117,7 +111,7 @@ def _estimated_steps(model: CandidateModel, best: ScoredModel) -> EstimatedSteps
     state = (fits.state[0] + smoothed[..., 0])[:, :-1]
     angle = model.system.index("theta")
     state[..., angle] = torch.atan2(state[..., angle].sin(), state[..., angle].cos())
-    return EstimatedSteps(state, disturbance, variance)
+    return state, disturbance, variance
 
 
 def _histories(seen: Tensor, rows: Segments) -> tuple[History, Tensor]:
@@ -134,44 +128,36 @@ def _histories(seen: Tensor, rows: Segments) -> tuple[History, Tensor]:
     return History(observations.flatten(0, 1), given.flatten(0, 1)), complete & (rows.inside[:, 1:] > 0)
 
 
-@dataclass(frozen=True)
-class ModelSteps:
-    """A model's steps from N states."""
+def _steps(model: CandidateModel, theta: Tensor, state: Tensor, acted: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
+    """A model's next states (N, n) under actions (W, T - 1), and (N, COMMAND_POINTS, n) under commands from -1 to 1.
 
-    next_state: Tensor
-    """(N, n) under the policy's actions"""
-    acted: Tensor
-    """(N,) the policy's actions"""
-    nodes: Tensor
-    """(N, COMMAND_POINTS, n) next states under commands from -1 to 1"""
-    reference: Tensor
-    """(N, n) nu"""
+    From the `chosen` (W, T - 1) of the states (W, T - 1, n), with parameters (P,).
+    """
+    tried = torch.cat((acted[..., None], _grid().expand(*acted.shape, -1)), -1)[chosen]
+    count = 1 + COMMAND_POINTS
+    start = model.started(theta, state)[chosen.flatten()][torch.arange(len(tried)).repeat_interleave(count)]
+    stepped = model.at(theta).step(start, tried.flatten()[:, None]).state.reshape(len(tried), count, -1)
+    return stepped[:, 0], stepped[:, 1:]
 
-    @classmethod
-    def from_states(
-        cls, model: CandidateModel, theta: Tensor, state: Tensor, acted: Tensor, chosen: Tensor
-    ) -> ModelSteps:
-        """Parameters (P,), from the `chosen` (W, T - 1) of states (W, T - 1, n), under actions (W, T - 1)."""
-        tried = torch.cat((acted[..., None], _grid().expand(*acted.shape, -1)), -1)[chosen]
-        current = state[chosen]
-        count = 1 + COMMAND_POINTS
-        start = model.started(theta, state)[chosen.flatten()][torch.arange(len(current)).repeat_interleave(count)]
-        stepped = model.at(theta).step(start, tried.flatten()[:, None]).state.reshape(len(current), count, -1)
-        return cls(stepped[:, 0], acted[chosen], stepped[:, 1:], (1 - 1 / HORIZON) * current)
 
-    def terms(self, machine: Tensor, variance: Tensor) -> tuple[float, float, float, float]:
-        """delta, L, E|pi - pi_hat| and E[zeta], given the machine's next states (N, n) and their variance (N,)."""
-        delta = ((self.next_state - machine).square().sum(-1) + variance).sqrt()
-        width = 2 / (COMMAND_POINTS - 1)
-        slopes = self.nodes.diff(dim=1) / width
-        # The point of each linear piece nearest to the reference, then the nearest of all.
-        away = self.reference[:, None] - self.nodes[:, :-1]
-        along = (away * slopes).sum(-1) / slopes.square().sum(-1).clamp(min=1e-300)
-        along = along.clamp(0, width)
-        zeta, piece = (along[..., None] * slopes - away).norm(dim=-1).min(1)
-        best = _grid()[piece] + along.gather(1, piece[:, None])[:, 0]
-        gap = (self.acted - best).abs()
-        return float(delta.mean()), float(slopes.norm(dim=-1).max()), float(gap.mean()), float(zeta.mean())
+def _terms(
+    next_state: Tensor, nodes: Tensor, machine: Tensor, variance: Tensor, acted: Tensor, reference: Tensor
+) -> tuple[float, float, float, float]:
+    """delta, L, E|pi - pi_hat| and E[zeta] from a model's steps.
+
+    The machine's next states (N, n) have the variance (N,); actions are (N,), references nu (N, n).
+    """
+    delta = ((next_state - machine).square().sum(-1) + variance).sqrt()
+    width = 2 / (COMMAND_POINTS - 1)
+    slopes = nodes.diff(dim=1) / width
+    # The point of each linear piece nearest to the reference, then the nearest of all.
+    away = reference[:, None] - nodes[:, :-1]
+    along = (away * slopes).sum(-1) / slopes.square().sum(-1).clamp(min=1e-300)
+    along = along.clamp(0, width)
+    zeta, piece = (along[..., None] * slopes - away).norm(dim=-1).min(1)
+    best = _grid()[piece] + along.gather(1, piece[:, None])[:, 0]
+    gap = (acted - best).abs()
+    return float(delta.mean()), float(slopes.norm(dim=-1).max()), float(gap.mean()), float(zeta.mean())
 
 
 def _grid() -> Tensor:

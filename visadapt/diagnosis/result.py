@@ -7,18 +7,26 @@ determined is NaN, null in the JSON.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from visadapt.diagnosis.result_json import as_json
 from visadapt.effects import EFFECTS, Effect
 
 IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP = "identified", "ambiguous", "unexplained", "no_gap"
 VERDICTS = (IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP)
+
+SCHEMA_VERSION = 1  # Version of `schema.json`
+
+KEYS = {"start": "from", "end": "to"}
+NOT_IN_JSON = ("figures", "policy")
+SHARES = ("probability", "share", "p_value", "stages", "states")
+"""Fields whose JSON keys differ from their names, fields that only the report shows, and fields with numbers from 0 to
+1, which are rounded to 12 digits so that a rounding error does not exceed 1."""
 
 
 @dataclass(frozen=True)
@@ -26,26 +34,19 @@ class Region:
     """An interval of one variable: a state, an action, `time` in s since the episode started, or `episode`."""
 
     variable: str
-    start: float
-    """the JSON's "from", in the variable's unit"""
-    end: float
-    """the JSON's "to", in the variable's unit"""
-    share: float
-    """of the gap that lies in it"""
-    p_value: float
-    """probability that chance concentrates as much of the gap in any interval that was tried"""
+    start: float  # the JSON's "from", in the variable's unit
+    end: float  # the JSON's "to", in the variable's unit
+    share: float  # of the gap that lies in it
+    p_value: float  # probability that chance concentrates as much of the gap in any interval that was tried
 
 
 @dataclass(frozen=True)
 class Where:
     """Shares of the gap by stage and by state, and the regions where it is concentrated."""
 
-    stages: Mapping[str, float]
-    """of the explained gap: actuation, dynamics, sensing, camera"""
-    states: Mapping[str, float]
-    """every state of the system; NaN where it was not measured"""
-    regions: tuple[Region, ...] = ()
-    """fitted regions of causes first, then lowest p-value first"""
+    stages: Mapping[str, float]  # of the explained gap: actuation, dynamics, sensing, camera
+    states: Mapping[str, float]  # every state of the system; NaN where it was not measured
+    regions: tuple[Region, ...] = ()  # fitted regions of causes first, then lowest p-value first
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,7 @@ class Estimate:
 
     value: float
     unit: str
-    ci90: tuple[float, float]
-    """90 % confidence interval; NaN on a side on which it is open"""
+    ci90: tuple[float, float]  # 90 % confidence interval; NaN on a side on which it is open
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,8 @@ class Cause:
     effect: str
     parameters: Mapping[str, Estimate]
     probability: float
-    gap_closed: float
-    """by this cause alone, on held-out episodes"""
-    indistinguishable_from: tuple[str, ...] = ()
-    """effects that fit this recording equally well"""
+    gap_closed: float  # by this cause alone, on held-out episodes
+    indistinguishable_from: tuple[str, ...] = ()  # effects that fit this recording equally well
 
 
 @dataclass(frozen=True)
@@ -77,26 +75,19 @@ class Ranked:
 
     effects: tuple[str, ...]
     probability: float
-    gap_closed: float
-    """by the set, on held-out episodes"""
+    gap_closed: float  # by the set, on held-out episodes
 
 
 @dataclass(frozen=True)
 class Gap:
     """The error of predictions several steps ahead on held-out episodes."""
 
-    measure: str
-    """what the other numbers are, in words, with the unit"""
-    before: float
-    """of the source"""
-    after: float
-    """of the source with the causes"""
-    floor: float
-    """of the measurement noise alone"""
-    black_box: float
-    """of the source with a black box of smooth functions"""
-    closed: float
-    """(before - after) / (before - floor)"""
+    measure: str  # what the other numbers are, in words, with the unit
+    before: float  # of the source
+    after: float  # of the source with the causes
+    floor: float  # of the measurement noise alone
+    black_box: float  # of the source with a black box of smooth functions
+    closed: float  # (before - after) / (before - floor)
 
 
 @dataclass(frozen=True)
@@ -104,10 +95,8 @@ class RecordingSummary:
     """Size of the recording."""
 
     episodes: int
-    samples: int
-    """actions that were executed"""
-    period: float
-    """s between rows"""
+    samples: int  # actions that were executed
+    period: float  # s between rows
 
 
 @dataclass(frozen=True)
@@ -115,61 +104,31 @@ class Prediction:
     """One held-out window, predicted from its start with the actions that were commanded."""
 
     episode: int
-    time: NDArray[np.floating]
-    """(K,) s since the episode started"""
-    measured: NDArray[np.floating]
-    """(K, n_state); NaN in the columns of states that were not measured"""
-    source: NDArray[np.floating]
-    """(K, n_state) prediction of the source"""
-    corrected: NDArray[np.floating]
-    """(K, n_state) prediction of the source with the best set of effects"""
+    time: NDArray[np.floating]  # (K,) s since the episode started
+    measured: NDArray[np.floating]  # (K, n_state); NaN in the columns of states that were not measured
+    source: NDArray[np.floating]  # (K, n_state) prediction of the source
+    corrected: NDArray[np.floating]  # (K, n_state) prediction of the source with the best set of effects
 
 
 @dataclass(frozen=True)
-class Profile:
-    """The mean residual over one variable, in bins."""
+class Curve:
+    """One curve of a chart."""
 
-    variable: str
-    """a state, an action, `time` or `episode`"""
+    label: str
+    values: NDArray[np.floating]  # (N,); NaN where there is none
+    error: NDArray[np.floating] | None = None  # (N,) standard error of the values
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Curves over one variable: a mean residual, the error over the horizon, or a spectrum."""
+
+    variable: str  # a state, an action, `time`, `episode`, or words
     variable_unit: str
-    quantity: str
-    """the residual in words, such as "force on the cart" """
+    quantity: str  # in words, such as "force on the cart"
     quantity_unit: str
-    centres: NDArray[np.floating]
-    """(N,) means of the variable in the bins"""
-    before: NDArray[np.floating]
-    """(N,) mean under the source; NaN in empty bins"""
-    before_error: NDArray[np.floating]
-    """(N,) its standard error"""
-    after: NDArray[np.floating]
-    """(N,) mean with the causes"""
-    after_error: NDArray[np.floating]
-    """(N,) its standard error"""
-
-
-@dataclass(frozen=True)
-class Growth:
-    """The errors of `Gap` at each of K horizons, all (K,)."""
-
-    seconds: NDArray[np.floating]
-    before: NDArray[np.floating]
-    after: NDArray[np.floating]
-    floor: NDArray[np.floating]
-    black_box: NDArray[np.floating]
-
-
-@dataclass(frozen=True)
-class Spectrum:
-    """Power spectral density of the residual, all (F,)."""
-
-    quantity: str
-    """the residual in words, such as "force on the cart" """
-    unit: str
-    """of the density, such as "N2/Hz" """
-    frequency: NDArray[np.floating]
-    """Hz"""
-    before: NDArray[np.floating]
-    after: NDArray[np.floating]
+    x: NDArray[np.floating]  # (N,)
+    curves: tuple[Curve, ...]  # of the source and, second, of the source with the causes
 
 
 @dataclass(frozen=True)
@@ -182,12 +141,10 @@ class PolicyTerms:
 
     delta: tuple[float, float]
     """error of the model's step under the policy, E|f_hat(s, pi(s)) - f*(s, pi(s))| (equation 6)"""
-    lipschitz: tuple[float, float]
-    """L, largest change of the model's step per unit of command (equation 7)"""
+    lipschitz: tuple[float, float]  # L, largest change of the model's step per unit of command (equation 7)
     action_gap: tuple[float, float]
     """distance of the policy's action from the model's best, E|pi(s) - pi_hat(s)|, in units of command"""
-    zeta: tuple[float, float]
-    """distance from the reference under this best action, E[zeta] (equation 5)"""
+    zeta: tuple[float, float]  # distance from the reference under this best action, E[zeta] (equation 5)
 
     @property
     def bound(self) -> tuple[float, float]:
@@ -201,12 +158,11 @@ class PolicyTerms:
 class FigureData:
     """What the report plots; what is empty or None is not plotted."""
 
-    predictions: tuple[Prediction, ...] = ()
-    """held-out windows, that of the source's largest error first"""
-    profiles: tuple[Profile, ...] = ()
-    """the variables of `Where.regions` first"""
-    growth: Growth | None = None
-    spectrum: Spectrum | None = None
+    predictions: tuple[Prediction, ...] = ()  # held-out windows, that of the source's largest error first
+    profiles: tuple[Chart, ...] = ()
+    """the mean residual over a variable, in bins; the variables of `Where.regions` first"""
+    growth: Chart | None = None  # the errors of `Gap` by horizon
+    spectrum: Chart | None = None  # power spectral density of the residual
 
 
 @dataclass(frozen=True)
@@ -226,21 +182,15 @@ class Diagnosis:
 
     system: str
     recording: RecordingSummary
-    verdict: str
-    """one of VERDICTS"""
+    verdict: str  # one of VERDICTS
     where: Where
-    causes: tuple[Cause, ...]
-    """empty for no_gap and unexplained; for ambiguous, all that fit equally well"""
-    ranking: tuple[Ranked, ...]
-    """all sets that were compared, the most probable first"""
+    causes: tuple[Cause, ...]  # empty for no_gap and unexplained; for ambiguous, all that fit equally well
+    ranking: tuple[Ranked, ...]  # all sets that were compared, the most probable first
     gap: Gap
-    next_experiment: str
-    """what to record to settle open questions; empty where there are none"""
-    warnings: tuple[str, ...] = ()
-    """of loading the recording, and of the diagnosis"""
+    next_experiment: str  # what to record to settle open questions; empty where there are none
+    warnings: tuple[str, ...] = ()  # of loading the recording, and of the diagnosis
     figures: FigureData = FigureData()
-    policy: PolicyTerms | None = None
-    """terms of Theorem 1, where a policy was given"""
+    policy: PolicyTerms | None = None  # terms of Theorem 1, where a policy was given
 
     def __post_init__(self) -> None:
         if self.verdict not in VERDICTS:
@@ -274,25 +224,47 @@ class Diagnosis:
         >>> [(effect.name, round(effect.coefficient.item(), 2)) for effect in world.effects]
         [('viscous_friction', 2.1)]
         """
-        if not self.causes:
-            raise ValueError(
-                f"the verdict is {self.verdict}: the diagnosis named no cause to put into a world; "
-                + ("the source explains the recording as it is" if self.verdict == NO_GAP else "adapt with a residual")
-            )
-        taken: list[Cause] = []
-        for cause in self.causes:
-            if not any(cause.effect in (one.effect, *one.indistinguishable_from) for one in taken):
-                taken.append(cause)
-        return [_effect(cause) for cause in taken]
+        return named_effects(self.verdict, self.causes)
 
     def to_json(self) -> dict[str, Any]:
         """The result as json.dumps takes it; keys and their order are those of `schema.json`, NaN becomes None."""
-        return as_json(self)
+        content = {"schema": SCHEMA_VERSION, **_plain(self)}
+        content["where"]["pixels"] = None
+        return content
 
 
-def _effect(cause: Cause) -> Effect:
-    values = {name: estimate.value for name, estimate in cause.parameters.items()}
-    for name, value in values.items():
-        if not math.isfinite(value):
-            raise ValueError(f"{cause.effect}: the recording does not determine its {name}; record what does")
-    return EFFECTS[cause.effect](**values)
+def named_effects(verdict: str, causes: Sequence[Cause]) -> list[Effect]:
+    """`Diagnosis.effects` of a verdict with its causes."""
+    if not causes:
+        raise ValueError(
+            f"the verdict is {verdict}: the diagnosis named no cause to put into a world; "
+            + ("the source explains the recording as it is" if verdict == NO_GAP else "adapt with a residual")
+        )
+    taken: list[Cause] = []
+    for cause in causes:
+        if not any(cause.effect in (one.effect, *one.indistinguishable_from) for one in taken):
+            taken.append(cause)
+    for cause in taken:
+        for name, estimate in cause.parameters.items():
+            if not math.isfinite(estimate.value):
+                raise ValueError(f"{cause.effect}: the recording does not determine its {name}; record what does")
+    return [EFFECTS[cause.effect](**{name: one.value for name, one in cause.parameters.items()}) for cause in taken]
+
+
+def _plain(value: Any, is_share: bool = False) -> Any:
+    """The fields of dataclasses in their order, as plain numbers; what is not finite becomes None."""
+    if is_dataclass(value):
+        names = [field.name for field in fields(value) if field.name not in NOT_IN_JSON]
+        return {KEYS.get(name, name): _plain(getattr(value, name), name in SHARES) for name in names}
+    if isinstance(value, Mapping):
+        return {key: _plain(each, is_share) for key, each in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(each) for each in value]
+    if isinstance(value, str):
+        return value
+    if isinstance(value, Integral):
+        return int(value)
+    number = float(value)
+    if not math.isfinite(number):
+        return None
+    return round(number, 12) if is_share else number

@@ -5,17 +5,11 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from visadapt.diagnosis.result import (
-    Cause,
-    Diagnosis,
-    Estimate,
-    Gap,
-    RecordingSummary,
-    Where,
-)
-from visadapt.diagnosis.result_json import SCHEMA_VERSION
+from visadapt.diagnosis.result import SCHEMA_VERSION, Cause, Estimate, named_effects
 from visadapt.effects import EFFECTS, Effect
 
 
@@ -41,33 +35,20 @@ def load_effects(path: str | os.PathLike[str]) -> tuple[str, list[Effect]]:
             f"{path}: no diagnosis of version {SCHEMA_VERSION}, such as `visadapt diagnose --json` writes"
         )
     try:
-        found = Diagnosis(
-            system=content["system"],
-            recording=RecordingSummary(**content["recording"]),
-            verdict=content["verdict"],
-            where=Where({}, {}),
-            causes=tuple(_cause(each) for each in content["causes"]),
-            ranking=(),
-            gap=Gap("", *[math.nan] * 5),
-            next_experiment=content["next_experiment"],
-        )
-        for cause in found.causes:
+        causes = tuple(_cause(each) for each in content["causes"])
+        for cause in causes:
             if cause.effect not in EFFECTS:
                 raise ValueError(f"names {cause.effect}, which is not known here: give the file that defines it")
-        return found.system, found.effects()
-    except (KeyError, TypeError) as error:
+        return content["system"], named_effects(content["verdict"], causes)
+    except (KeyError, TypeError, AttributeError) as error:
         raise DiagnosisFileError(f"{path}: not a whole diagnosis: {error}") from error
     except ValueError as error:
         raise DiagnosisFileError(f"{path}: {error}") from error
 
 
-def _cause(content: dict[str, object]) -> Cause:
-    parameters = content["parameters"]
-    assert isinstance(parameters, dict)
+def _cause(content: Mapping[str, Any]) -> Cause:
     values = {
         name: Estimate(math.nan if one["value"] is None else float(one["value"]), one["unit"], (math.nan, math.nan))
-        for name, one in parameters.items()
+        for name, one in content["parameters"].items()
     }
-    alike = content["indistinguishable_from"]
-    assert isinstance(alike, list)
-    return Cause(str(content["effect"]), values, math.nan, math.nan, tuple(alike))
+    return Cause(content["effect"], values, math.nan, math.nan, tuple(content["indistinguishable_from"]))

@@ -6,30 +6,19 @@ All depend on the velocity relative to the air, so that a wind changes each of t
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TypeAlias
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from visadapt.effects.base import DynamicsEffect, Effect, Parameter, Role, expect, with_parameters
+from visadapt.effects.base import DynamicsEffect, Parameter, Role, expect
 from visadapt.systems import FixedWing, Quadrotor, System
 from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, beside, rotation, times
 
 Vehicle: TypeAlias = Quadrotor | FixedWing
-VEHICLES: tuple[type[System], ...] = (Quadrotor, FixedWing)
-"""The systems that have a wind."""
-
-
-def expect_vehicle(system: System, effect: Effect) -> Vehicle:
-    """The system as one of `VEHICLES`.
-
-    Raises:
-        TypeError: it is another.
-    """
-    if not isinstance(system, Quadrotor | FixedWing):
-        raise TypeError(f"{effect.name} acts on a quadrotor or a fixed_wing, not on a {system.name}")
-    return system
+VEHICLES: tuple[type[System], ...] = (Quadrotor, FixedWing)  # The systems that have a wind
 
 
 def airspeed(state: Tensor, vehicle: Vehicle) -> Tensor:
@@ -46,7 +35,7 @@ class AirDrag(DynamicsEffect):
     systems = VEHICLES
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        velocity = airspeed(state, expect_vehicle(system, self))
+        velocity = airspeed(state, expect(system, self))
         return pad(-self.value("coefficient", state)[..., None] * velocity, (0, 3))
 
 
@@ -79,7 +68,7 @@ class RotorDrag(DynamicsEffect):
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         turned = rotation(state[:, ATTITUDE])
-        velocity = times(turned.mT, airspeed(state, expect(system, Quadrotor, self)))
+        velocity = times(turned.mT, airspeed(state, expect(system, self)))
         coefficients = torch.stack([self.value(p.name, state) for p in self.table], -1)
         return pad(-times(turned, coefficients * velocity), (0, 3))
 
@@ -97,7 +86,7 @@ class TranslationalLift(DynamicsEffect):
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         turned = rotation(state[:, ATTITUDE])
-        velocity = times(turned.mT, airspeed(state, expect(system, Quadrotor, self)))
+        velocity = times(turned.mT, airspeed(state, expect(system, self)))
         lift = self.value("coefficient", state) * velocity[:, :2].square().sum(1)
         return pad(lift[:, None] * turned[:, :, 2], (0, 3))
 
@@ -114,24 +103,13 @@ class Wind(AirDrag):
     equation = "F = coefficient (w - v), w = (velocity_x, velocity_y, velocity_z); to the wing, v - w is v"
     source = "Beard and McLain (2012), Small Unmanned Aircraft, section 2.4; Faessler, Franchi and Scaramuzza (2017)"
     table = (
-        Parameter("velocity_x", "m/s", -10.0, 10.0, 0.0),
-        Parameter("velocity_y", "m/s", -10.0, 10.0, 0.0),
-        Parameter("velocity_z", "m/s", -10.0, 10.0, 0.0),
+        *(Parameter(f"velocity_{axis}", "m/s", -10.0, 10.0, 0.0) for axis in "xyz"),
         Parameter("coefficient", "N s/m", 0.0, 3.0, 0.0),
     )
 
-    velocity_x: Tensor
-    velocity_y: Tensor
-    velocity_z: Tensor
-
     def alter(self, system: System) -> System:
-        air = expect_vehicle(system, self)
-        return with_parameters(
-            air,
-            wind_x=air.wind_x + self.velocity_x,
-            wind_y=air.wind_y + self.velocity_y,
-            wind_z=air.wind_z + self.velocity_z,
-        )
+        air = expect(system, self)
+        return replace(air, **{f"wind_{k}": getattr(air, f"wind_{k}") + getattr(self, f"velocity_{k}") for k in "xyz"})
 
 
 class PeriodicWind(AirDrag):
@@ -155,9 +133,7 @@ class PeriodicWind(AirDrag):
     )
 
     def vary(self, system: System, time: Tensor, state: Tensor) -> System:
-        air = expect_vehicle(system, self)
+        air = expect(system, self)
         angle = 2 * math.pi * self.value("frequency", state) * time + self.value("phase", state)
         speed, direction = self.value("amplitude", state) * angle.cos(), self.value("direction", state)
-        return with_parameters(
-            air, wind_x=air.wind_x + speed * direction.cos(), wind_y=air.wind_y + speed * direction.sin()
-        )
+        return replace(air, wind_x=air.wind_x + speed * direction.cos(), wind_y=air.wind_y + speed * direction.sin())

@@ -9,16 +9,14 @@ adding an effect means adding one class.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeAlias
 
 import torch
 from torch import Tensor, nn
 
 from visadapt.systems import System
-
-SystemKind = TypeVar("SystemKind", bound=System)
 
 
 class Stage(StrEnum):
@@ -33,16 +31,11 @@ class Stage(StrEnum):
 class Role(StrEnum):
     """What a parameter stands for, where a fit must treat it in a special way."""
 
-    PLAIN = "plain"
-    """Nothing special: a strength, or a shape such as a spring's rest position."""
-    START = "start"
-    """Where a region of a state or of time starts; searched within what the recording covers."""
-    END = "end"
-    """Where that region ends."""
-    FREQUENCY = "frequency"
-    """In Hz; searched on a logarithmic grid."""
-    PHASE = "phase"
-    """In rad; equal modulo a turn."""
+    PLAIN = "plain"  # Nothing special: a strength, or a shape such as a spring's rest position
+    START = "start"  # Where a region of a state or of time starts; searched within what the recording covers
+    END = "end"  # Where that region ends
+    FREQUENCY = "frequency"  # In Hz; searched on a logarithmic grid
+    PHASE = "phase"  # In rad; equal modulo a turn
 
 
 @dataclass(frozen=True)
@@ -225,6 +218,9 @@ class DynamicsEffect(Effect):
         return torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)
 
 
+Reading: TypeAlias = tuple[Tensor, Tensor]  # what a sensor reads of a row (B, n_state), and its new memory
+
+
 class SensingEffect(Effect):
     """Changes what is measured of the state, row by row.
 
@@ -244,9 +240,7 @@ class SensingEffect(Effect):
         """
         return state[:, None, :0]
 
-    def apply_to(
-        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
-    ) -> tuple[Tensor, Tensor]:
+    def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
         """The reading of one row (B, n_state) and the new memory; rows are `period` s apart.
 
         Only random effects need the `generator`.
@@ -254,22 +248,16 @@ class SensingEffect(Effect):
         raise NotImplementedError
 
 
-def expect(system: System, kind: type[SystemKind], effect: Effect) -> SystemKind:
-    """The system as one of the `kind` that an effect acts on.
+def expect(system: System, effect: Effect) -> Any:
+    """The system, which has the parameters of those that the effect acts on.
 
     Raises:
         TypeError: it is another.
     """
-    if not isinstance(system, kind):
-        raise TypeError(f"{effect.name} acts on a {kind.name}, not on a {system.name}")
+    if not isinstance(system, effect.systems):
+        kinds = " or a ".join(getattr(kind, "name", kind.__name__) for kind in effect.systems)
+        raise TypeError(f"{effect.name} acts on a {kinds}, not on a {system.name}")
     return system
-
-
-def with_parameters(system: SystemKind, **values: float | Tensor) -> SystemKind:
-    """The system with other values of the parameters that are named."""
-    itself: Any = system  # a dataclass, which the base of all systems is not
-    changed: SystemKind = replace(itself, **values)
-    return changed
 
 
 def inside(place: Tensor, start: Tensor, end: Tensor, width: float) -> Tensor:
@@ -280,5 +268,4 @@ def inside(place: Tensor, start: Tensor, end: Tensor, width: float) -> Tensor:
     return (((place - start) / width).sigmoid() - ((place - end) / width).sigmoid()).clamp_min(0)
 
 
-EFFECTS: dict[str, type[Effect]] = {}
-"""Every effect by its standard name."""
+EFFECTS: dict[str, type[Effect]] = {}  # Every effect by its standard name

@@ -95,8 +95,7 @@ class Gust(CartForce):
         Parameter("force", "N", -15.0, 15.0, 0.0, linear=True),
     )
 
-    EDGE: ClassVar[float] = 0.004
-    """s"""
+    EDGE: ClassVar[float] = 0.004  # s
 
     def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         start, end = self.value("start", state), self.value("end", state)
@@ -109,10 +108,7 @@ class Spring(CartForce):
     name = "spring"
     equation = "F = -stiffness (x - rest)"
     source = "Hooke's law"
-    table = (
-        Parameter("stiffness", "N/m", 0.0, 50.0, 0.0, linear=True),
-        Parameter("rest", "m", -1.5, 1.5, None),
-    )
+    table = (Parameter("stiffness", "N/m", 0.0, 50.0, 0.0, linear=True), Parameter("rest", "m", -1.5, 1.5, None))
 
     def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         return -self.value("stiffness", state) * (state[:, 0] - self.value("rest", state))
@@ -141,7 +137,7 @@ class TrackTilt(DynamicsEffect):
     systems = (CartPole,)
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        cart_pole = expect(system, CartPole, self)
+        cart_pole = expect(system, self)
         tilt, theta = self.value("angle", state), state[:, 2]
         weight = (cart_pole.cart_mass + cart_pole.pole_mass) * cart_pole.gravity
         moment = cart_pole.pole_mass * cart_pole.pole_half_length * cart_pole.gravity

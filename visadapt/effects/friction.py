@@ -50,13 +50,11 @@ class CoulombFriction(CartForce):
     source = "Olsson et al. (1998), Friction models and friction compensation, section 2"
     table = (Parameter("force", "N", 0.0, 6.0, 0.0),)
 
-    RATE: ClassVar[float] = 180.0
-    """1/s, at which the smooth friction brings a slow cart to rest"""
-    SLOWEST: ClassVar[float] = 5e-4
-    """m/s, the width where the force tends to 0"""
+    RATE: ClassVar[float] = 180.0  # 1/s, at which the smooth friction brings a slow cart to rest
+    SLOWEST: ClassVar[float] = 5e-4  # m/s, the width where the force tends to 0
 
     def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        cart_pole = expect(system, CartPole, self)
+        cart_pole = expect(system, self)
         force = self.value("force", state)
         # The effective mass that a force on the cart accelerates while the pole is near upright and free to turn.
         mass = cart_pole.cart_mass + cart_pole.pole_mass / 4
@@ -98,8 +96,7 @@ class FrictionPatch(CartForce):
         Parameter("coefficient", "N s/m", 0.0, 40.0, 0.0, linear=True),
     )
 
-    EDGE: ClassVar[float] = 0.004
-    """m"""
+    EDGE: ClassVar[float] = 0.004  # m
 
     def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         start, end = self.value("start", state), self.value("end", state)

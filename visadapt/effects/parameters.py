@@ -1,24 +1,34 @@
-"""Effects that scale some parameters of a system and leave the others unchanged."""
+"""Effects that change some parameters of a system and leave the others as they are."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar
 
-from visadapt.effects.base import DynamicsEffect, Parameter, expect, with_parameters
+from visadapt.effects.base import DynamicsEffect, Parameter, expect
 from visadapt.systems import CartPole, System
 
 
 class ParameterScale(DynamicsEffect):
     """Scale factors on parameters of the system that a subclass acts on; adds no load."""
 
-    scaled: ClassVar[dict[str, str]]
-    """the system's parameter for each of the effect's"""
+    scaled: ClassVar[dict[str, str]]  # the system's parameter for each of the effect's
 
     def alter(self, system: System) -> System:
-        own = expect(system, self.systems[0], self)
-        return with_parameters(
-            own, **{field: getattr(self, factor) * getattr(own, field) for factor, field in self.scaled.items()}
-        )
+        own = expect(system, self)
+        values = {field: getattr(self, factor) * getattr(own, field) for factor, field in self.scaled.items()}
+        return replace(own, **values)
+
+
+class ParameterShift(DynamicsEffect):
+    """Amounts added to parameters of the system that a subclass acts on; adds no load."""
+
+    shifted: ClassVar[dict[str, str]]  # the effect's parameter for each of the system's
+
+    def alter(self, system: System) -> System:
+        own = expect(system, self)
+        values = {field: getattr(own, field) + getattr(self, amount) for field, amount in self.shifted.items()}
+        return replace(own, **values)
 
 
 class CartMass(ParameterScale):

@@ -7,7 +7,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from visadapt.effects.base import Parameter, Role, SensingEffect, inside
+from visadapt.effects.base import Parameter, Reading, Role, SensingEffect, inside
 from visadapt.systems import CartPole
 
 
@@ -37,9 +37,7 @@ class MeasurementDelay(SensingEffect):
         row = torch.cat((state, torch.full_like(state[:, :1], -1)), 1)
         return row[:, None].expand(-1, int(shift.max().floor()) + 1, -1)
 
-    def apply_to(
-        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
-    ) -> tuple[Tensor, Tensor]:
+    def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
         number = memory[:, -1, -1] + 1
         rows = torch.cat((memory, torch.cat((measured, number[:, None]), 1)[:, None]), 1)
         shift = self._shift(measured, period)
@@ -83,15 +81,12 @@ class FrozenZone(SensingEffect):
         Parameter("end", "rad", -0.5, 0.5, 0.0, role=Role.END),
     )
 
-    EDGE: ClassVar[float] = 0.001
-    """rad"""
+    EDGE: ClassVar[float] = 0.001  # rad
 
     def memory(self, state: Tensor, period: float) -> Tensor:
         return state[:, None, _POLE]
 
-    def apply_to(
-        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
-    ) -> tuple[Tensor, Tensor]:
+    def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
         pole = measured[:, _POLE]
         start, end = self.value("start", measured), self.value("end", measured)
         frozen = inside(pole[:, 0], start, end, self.EDGE)[:, None]
@@ -114,9 +109,7 @@ class SensorScale(SensingEffect):
         Parameter("angle", "1", 0.5, 2.0, 1.0, linear=True),
     )
 
-    def apply_to(
-        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
-    ) -> tuple[Tensor, Tensor]:
+    def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
         position = self.value("position", measured).expand(len(measured))
         angle = self.value("angle", measured).expand(len(measured))
         return measured * torch.stack((position, position, angle, angle), 1), memory
@@ -126,12 +119,9 @@ class SensorOffset(SensingEffect):
     """An offset, () or (B,), on the reading of one state."""
 
     systems = (CartPole,)
-    state: ClassVar[str]
-    """its name in the system"""
+    state: ClassVar[str]  # its name in the system
 
-    def apply_to(
-        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
-    ) -> tuple[Tensor, Tensor]:
+    def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
         out = measured.clone()
         column = CartPole.index(self.state)
         out[:, column] = out[:, column] + self.value("offset", measured)
@@ -182,9 +172,7 @@ class Dropout(SensingEffect):
         # The row measured last, then a flag: 1 if there is one.
         return torch.cat((state, torch.zeros_like(state[:, :1])), 1)[:, None]
 
-    def apply_to(
-        self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None
-    ) -> tuple[Tensor, Tensor]:
+    def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
         if generator is None:
             raise ValueError("dropout is random: it needs a torch.Generator")
         drawn = torch.rand(len(measured), generator=generator, device=generator.device).to(measured)

@@ -8,24 +8,23 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
-from visadapt.effects.aerial import VEHICLES, Vehicle, expect_vehicle
-from visadapt.effects.base import ActuationEffect, DynamicsEffect, Parameter, expect, with_parameters
-from visadapt.effects.parameters import ParameterScale
+from visadapt.effects.aerial import VEHICLES, Vehicle
+from visadapt.effects.base import ActuationEffect, DynamicsEffect, Parameter, expect
+from visadapt.effects.parameters import ParameterScale, ParameterShift
 from visadapt.systems import Quadrotor, System
 from visadapt.systems.rigid_body import beside
 
 
 def with_thrust(vehicle: Vehicle, factor: Tensor) -> Vehicle:
     """The vehicle whose thrust is multiplied by a factor, () or (B,), at every command."""
-    most = factor * vehicle.max_thrust
-    if isinstance(vehicle, Quadrotor):
-        return with_parameters(vehicle, min_thrust=factor * vehicle.min_thrust, max_thrust=most)
-    return with_parameters(vehicle, max_thrust=most)
+    ends = ("min_thrust", "max_thrust") if isinstance(vehicle, Quadrotor) else ("max_thrust",)
+    return replace(vehicle, **{end: factor * getattr(vehicle, end) for end in ends})
 
 
 class ThrustGain(DynamicsEffect):
@@ -44,7 +43,7 @@ class ThrustGain(DynamicsEffect):
     scale: Tensor
 
     def alter(self, system: System) -> System:
-        return with_thrust(expect_vehicle(system, self), self.scale)
+        return with_thrust(expect(system, self), self.scale)
 
 
 class MotorLag(ActuationEffect):
@@ -72,7 +71,7 @@ class MotorLag(ActuationEffect):
     """1/s, gain and damping of the loop around each command: 0 for the thrust; None (no loop) until bound"""
 
     def acting_on(self, system: System) -> Self:
-        own = expect(system, Quadrotor, self)
+        own = expect(system, self)
         scales = (own.inertia_scale_x, own.inertia_scale_y, own.inertia_scale_z)
         gains = zip((own.roll_gain, own.roll_gain, own.yaw_gain), scales, strict=True)
         dampings = zip((own.damping_x, own.damping_y, own.damping_z), scales, strict=True)
@@ -118,7 +117,7 @@ class MotorLag(ActuationEffect):
         return whole[..., :2, :2], whole[..., :2, 2]
 
 
-class RateDamping(DynamicsEffect):
+class RateDamping(ParameterShift):
     """Aerodynamic damping of rotations: an arm that moves down meets air from below, which raises its rotor's thrust.
 
     Rates are per moment of inertia, like the derivatives L_p, M_q and N_r of flight dynamics, so that they compare
@@ -130,19 +129,7 @@ class RateDamping(DynamicsEffect):
     source = "Padfield (2007), Helicopter Flight Dynamics, chapter 4 (L_p, M_q and N_r)"
     table = tuple(Parameter(f"rate_{axis}", "1/s", 0.0, 20.0, 0.0) for axis in "xyz")
     systems = (Quadrotor,)
-
-    rate_x: Tensor
-    rate_y: Tensor
-    rate_z: Tensor
-
-    def alter(self, system: System) -> System:
-        own = expect(system, Quadrotor, self)
-        return with_parameters(
-            own,
-            damping_x=own.damping_x + self.rate_x,
-            damping_y=own.damping_y + self.rate_y,
-            damping_z=own.damping_z + self.rate_z,
-        )
+    shifted: ClassVar[dict[str, str]] = {f"damping_{axis}": f"rate_{axis}" for axis in "xyz"}
 
 
 class BatterySag(DynamicsEffect):
@@ -155,7 +142,7 @@ class BatterySag(DynamicsEffect):
     systems = (Quadrotor,)
 
     def vary(self, system: System, time: Tensor, state: Tensor) -> System:
-        return with_thrust(expect(system, Quadrotor, self), (-self.value("rate", state) * time).exp())
+        return with_thrust(expect(system, self), (-self.value("rate", state) * time).exp())
 
 
 class GroundEffect(DynamicsEffect):
@@ -174,11 +161,10 @@ class GroundEffect(DynamicsEffect):
     table = (Parameter("radius", "m", 0.0, 1.0, 0.0), Parameter("ground", "m", -3.0, 3.0, None))
     systems = (Quadrotor,)
 
-    LEAST: ClassVar[float] = 1e-30
-    """m8, keeps the root positive where both height and radius are 0"""
+    LEAST: ClassVar[float] = 1e-30  # m8, keeps the root positive where both height and radius are 0
 
     def vary(self, system: System, time: Tensor, state: Tensor) -> System:
-        vehicle = expect(system, Quadrotor, self)
+        vehicle = expect(system, self)
         height = (state[:, 2] - self.value("ground", state)).clamp_min(0)
         square = self.value("radius", state).square()
         # x / (1 + (4 x)^4)^(1/4), multiplied out: neither a height of 0 nor a radius of 0 is divided by.
@@ -211,7 +197,7 @@ class Inertia(ParameterScale):
     scaled: ClassVar[dict[str, str]] = {f"scale_{axis}": f"inertia_scale_{axis}" for axis in "xyz"}
 
 
-class Payload(DynamicsEffect):
+class Payload(ParameterShift):
     """A point mass at the quadrotor's centre that the flight controller does not account for.
 
     Weight and translational inertia grow, the rotors' force does not. Without other forces the motion is exactly that
@@ -224,15 +210,10 @@ class Payload(DynamicsEffect):
     table = (Parameter("mass", "kg", 0.0, 1.0, 0.0),)
     systems = (Quadrotor,)
     indistinguishable_from = ("thrust_gain",)
-
-    mass: Tensor
-
-    def alter(self, system: System) -> System:
-        own = expect(system, Quadrotor, self)
-        return with_parameters(own, mass=own.mass + self.mass, payload=own.payload + self.mass)
+    shifted: ClassVar[dict[str, str]] = {"mass": "mass", "payload": "mass"}
 
 
-class CenterOfMassOffset(DynamicsEffect):
+class CenterOfMassOffset(ParameterShift):
     """A centre of mass beside the centre of the rotors: x ahead, y to the left.
 
     The state is that of the centre of mass, where the weight acts, so only thrust has a lever arm. Moments of inertia
@@ -244,10 +225,4 @@ class CenterOfMassOffset(DynamicsEffect):
     source = "Stevens, Lewis and Johnson (2016), Aircraft Control and Simulation, section 2.3 (moment transfer)"
     table = (Parameter("x", "m", -0.1, 0.1, 0.0), Parameter("y", "m", -0.1, 0.1, 0.0))
     systems = (Quadrotor,)
-
-    x: Tensor
-    y: Tensor
-
-    def alter(self, system: System) -> System:
-        own = expect(system, Quadrotor, self)
-        return with_parameters(own, centre_x=own.centre_x + self.x, centre_y=own.centre_y + self.y)
+    shifted: ClassVar[dict[str, str]] = {"centre_x": "x", "centre_y": "y"}

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import ClassVar
 
-from torch import Tensor
-
-from visadapt.effects.base import DynamicsEffect, Parameter, expect, with_parameters
+from visadapt.effects.base import DynamicsEffect, Parameter, expect
 from visadapt.effects.parameters import ParameterScale
 from visadapt.systems import FixedWing, System
 
@@ -76,13 +75,9 @@ class TrimOffset(DynamicsEffect):
     )
     systems = (FixedWing,)
 
-    elevator: Tensor
-    aileron: Tensor
-    rudder: Tensor
-
     def alter(self, system: System) -> System:
-        wing = expect(system, FixedWing, self)
-        return with_parameters(
+        wing = expect(system, self)
+        return replace(
             wing,
             lift_zero=wing.lift_zero + wing.lift_elevator * self.elevator,
             drag_zero=wing.drag_zero + wing.drag_elevator * self.elevator,

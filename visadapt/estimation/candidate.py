@@ -22,13 +22,9 @@ and for reported results."""
 
 
 class CandidateModel:
-    """A source with a set of effects, whose P parameters in all are arguments of its methods.
+    """A source with a set of effects along W windows of T rows; their P parameters in all are arguments of its methods.
 
-    Args:
-        system: the source.
-        effects: the set.
-        rows: the recording, W windows of T rows.
-        accuracy: COARSEST, COARSE or FINE.
+    `accuracy` is COARSEST, COARSE or FINE.
     """
 
     def __init__(self, system: System, effects: Sequence[type[Effect]], rows: Segments, accuracy: int = FINE) -> None:
@@ -85,18 +81,12 @@ class CandidateModel:
 class Linearised:
     """Step and measurement of a candidate model along states (W, T, n), with derivatives; K parameters in all."""
 
-    next_state: Tensor
-    """(W, T - 1, n) the state one period after each row but the last"""
-    transition: Tensor
-    """(W, T - 1, n, n) its derivative by the state"""
-    by_parameter: Tensor
-    """(W, T - 1, n, K) its derivative by the parameters"""
-    measured: Tensor
-    """(W, T, m)"""
-    sensing: Tensor
-    """(W, T, m, n) its derivative by the state"""
-    sensing_by_parameter: Tensor
-    """(W, T, m, K) its derivative by the parameters"""
+    next_state: Tensor  # (W, T - 1, n) the state one period after each row but the last
+    transition: Tensor  # (W, T - 1, n, n) its derivative by the state
+    by_parameter: Tensor  # (W, T - 1, n, K) its derivative by the parameters
+    measured: Tensor  # (W, T, m)
+    sensing: Tensor  # (W, T, m, n) its derivative by the state
+    sensing_by_parameter: Tensor  # (W, T, m, K) its derivative by the parameters
 
 
 def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised:

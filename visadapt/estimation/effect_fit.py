@@ -31,9 +31,8 @@ from visadapt.estimation.fit_states import (
 )
 from visadapt.estimation.likelihood import FitState, fit
 from visadapt.estimation.profiles import profile_of
-from visadapt.estimation.repeated_readings import SMOOTHING_RATIO, RepeatedReadings, find_repeats, zone
 from visadapt.estimation.screening import screen
-from visadapt.estimation.segments import Segments, cut
+from visadapt.estimation.segments import SMOOTHING_RATIO, RepeatedReadings, Segments, cut, find_repeats, zone
 from visadapt.systems import System
 from visadapt.world import World
 
@@ -42,21 +41,14 @@ from visadapt.world import World
 class EffectFit:
     """Effects fitted to episodes."""
 
-    values: dict[type[Effect], Tensor]
-    """(P,) parameters of each effect, in the order of its table"""
-    covariance: dict[type[Effect], Tensor]
-    """(P, P) of each effect's parameters"""
-    states: list[Tensor]
-    """(T, n_state) of each episode: the true states, smoothed"""
+    values: dict[type[Effect], Tensor]  # (P,) parameters of each effect, in the order of its table
+    covariance: dict[type[Effect], Tensor]  # (P, P) of each effect's parameters
+    states: list[Tensor]  # (T, n_state) of each episode: the true states, smoothed
 
 
 @torch.no_grad()
 def fit_effects(
-    system: System,
-    effects: Sequence[Effect],
-    measured: Sequence[Tensor],
-    commands: Sequence[Tensor],
-    period: float,
+    system: System, effects: Sequence[Effect], measured: Sequence[Tensor], commands: Sequence[Tensor], period: float
 ) -> EffectFit:
     """Fit the parameters of `effects`, all together, within the ranges that they state.
 

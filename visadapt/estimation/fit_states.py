@@ -59,7 +59,7 @@ def stacked(fits: Sequence[FitState]) -> FitState:
 
 def single_fit(fits: FitState, index: int, count: int) -> FitState:
     """The fit of one set of a batch, without the padding of its `count` parameters."""
-    one = fits.select(torch.tensor([index]))
+    one = fits[torch.tensor([index])]
     return replace(one, theta=one.theta[:, :count], information=one.information[:, :count, :count])
 
 

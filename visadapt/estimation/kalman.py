@@ -22,18 +22,12 @@ from torch import Tensor
 class Linear:
     """N systems over T rows with n states and m channels."""
 
-    transition: Tensor
-    """(N, T - 1, n, n) A"""
-    drive: Tensor
-    """(N, T - 1, n, M) c"""
-    sensing: Tensor
-    """(N, T, m, n) H; zero where nothing was measured"""
-    reading: Tensor
-    """(N, T, m, M) r; zero where nothing was measured"""
-    start: Tensor
-    """(N, n, M) the mean of x_0"""
-    spread: Tensor
-    """(n,) p"""
+    transition: Tensor  # (N, T - 1, n, n) A
+    drive: Tensor  # (N, T - 1, n, M) c
+    sensing: Tensor  # (N, T, m, n) H; zero where nothing was measured
+    reading: Tensor  # (N, T, m, M) r; zero where nothing was measured
+    start: Tensor  # (N, n, M) the mean of x_0
+    spread: Tensor  # (n,) p
 
     def data(self) -> Linear:
         """The same systems with the first column, the data, alone."""
@@ -49,18 +43,12 @@ class Linear:
 class Filtered:
     """The result of the forward pass."""
 
-    predicted: list[Tensor]
-    """T of (N, n, M): x_t given rows before t"""
-    covariance: list[Tensor]
-    """T of (N, n, n): its covariance"""
-    root: list[Tensor]
-    """T of (N, m, m): lower factors of the innovations' covariances"""
-    cross: list[Tensor]
-    """T of (N, m, n): change of the states per unit of a whitened innovation"""
-    innovation: Tensor
-    """(N, T, m, M) of each channel, given the rows before and the channels before it"""
-    variance: Tensor
-    """(N, T, m) variances of the innovations"""
+    predicted: list[Tensor]  # T of (N, n, M): x_t given rows before t
+    covariance: list[Tensor]  # T of (N, n, n): its covariance
+    root: list[Tensor]  # T of (N, m, m): lower factors of the innovations' covariances
+    cross: list[Tensor]  # T of (N, m, n): change of the states per unit of a whitened innovation
+    innovation: Tensor  # (N, T, m, M) of each channel, given the rows before and the channels before it
+    variance: Tensor  # (N, T, m) variances of the innovations
 
     @property
     def white(self) -> Tensor:

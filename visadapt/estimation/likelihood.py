@@ -14,12 +14,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+from visadapt.batch import Batch
 from visadapt.estimation.candidate import CandidateModel, linearise
 from visadapt.estimation.kalman import Linear, backward, forward, log_likelihood
 from visadapt.estimation.profiles import profile_of
@@ -34,14 +35,11 @@ MIN_LOG_PROCESS = math.log(1e-4**2)
 MAX_LOG_PROCESS = math.log(3.0**2)
 """Bounds of the log process noise variance of the driven velocities, (m/s)^2 and (rad/s)^2."""
 
-MIN_ITERATION_GAIN = 0.02
-"""Log likelihood; a fit stops after two iterations in a row that gain less."""
+MIN_ITERATION_GAIN = 0.02  # Log likelihood; a fit stops after two iterations in a row that gain less
 
-MIN_MEASUREMENT_VARIANCE = 1e-12
-"""Lower bound of a measurement's variance, in its unit squared."""
+MIN_MEASUREMENT_VARIANCE = 1e-12  # Lower bound of a measurement's variance, in its unit squared
 
-MAX_DAMPING = 100.0
-"""Damping at which a fit stops, since its steps have become too short to gain anything."""
+MAX_DAMPING = 100.0  # Damping at which a fit stops, since its steps have become too short to gain anything
 
 LOG_VARIANCE_STEP = 1e-3
 MAX_LOG_VARIANCE_CHANGE = 1.5
@@ -49,25 +47,15 @@ MAX_LOG_VARIANCE_CHANGE = 1.5
 
 
 @dataclass(frozen=True)
-class FitState:
+class FitState(Batch):
     """Estimates for C sets of effects."""
 
-    theta: Tensor
-    """(C, K) parameters, padded with 0 where a set has fewer than K"""
-    state: Tensor
-    """(C, W, T, n) states along which the models are linearised"""
-    log_process: Tensor
-    """(C, G) log process noise variances of the driven velocities, by group"""
-    log_noise: Tensor
-    """(C, m) log variances of the measurements"""
-    likelihood: Tensor
-    """(C,) log likelihood of the windows that the fit used"""
-    information: Tensor
-    """(C, K, K) Fisher information of the parameters"""
-
-    def select(self, chosen: Tensor) -> FitState:
-        """The fits of these sets, by index."""
-        return FitState(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
+    theta: Tensor  # (C, K) parameters, padded with 0 where a set has fewer than K
+    state: Tensor  # (C, W, T, n) states along which the models are linearised
+    log_process: Tensor  # (C, G) log process noise variances of the driven velocities, by group
+    log_noise: Tensor  # (C, m) log variances of the measurements
+    likelihood: Tensor  # (C,) log likelihood of the windows that the fit used
+    information: Tensor  # (C, K, K) Fisher information of the parameters
 
 
 def initial_states(rows: Segments, system: System) -> Tensor:
@@ -148,21 +136,16 @@ Batched = TypeVar("Batched", "FitState", "Derivatives")
 
 
 @dataclass(frozen=True)
-class Derivatives:
+class Derivatives(Batch):
     """Likelihood of C fits, with its derivatives."""
 
-    likelihood: Tensor
-    """(C,)"""
-    information: Tensor
-    """(C, K, K)"""
-    gradient: Tensor
-    """(C, K) of the log likelihood by the parameters"""
+    likelihood: Tensor  # (C,)
+    information: Tensor  # (C, K, K)
+    gradient: Tensor  # (C, K) of the log likelihood by the parameters
     noise_information: Tensor
     """(C, G + S, G + S) Fisher information of the log variances of process noise groups and kinds of sensors"""
-    noise_gradient: Tensor
-    """(C, G + S) of the log likelihood by these"""
-    smoothed: Tensor
-    """(C, W, T, n, 1 + K) smoothed correction of the states, and its derivative by each parameter"""
+    noise_gradient: Tensor  # (C, G + S) of the log likelihood by these
+    smoothed: Tensor  # (C, W, T, n, 1 + K) smoothed correction of the states, and its derivative by each parameter
 
 
 def differentiate(models: Sequence[CandidateModel], fits: FitState, window_used: Tensor) -> Derivatives:
@@ -201,20 +184,11 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState, window_used:
 
 
 def fit(
-    models: Sequence[CandidateModel],
-    start: FitState,
-    window_used: Tensor,
-    iterations: int,
-    process_noise: bool = True,
+    models: Sequence[CandidateModel], start: FitState, window_used: Tensor, iterations: int, process_noise: bool = True
 ) -> FitState:
-    """The best fits found from `start` by damped Gauss-Newton steps.
+    """The best fits of C models of the same rows in at most `iterations` damped Gauss-Newton steps from `start`.
 
-    Args:
-        models: C candidate models of the same rows.
-        start: a start for each of them.
-        window_used: (C, W) 1 for the windows that each fit uses.
-        iterations: the most that are made.
-        process_noise: whether process noise is estimated; without, it stays at its lower bound.
+    `window_used` (C, W) is 1 for the windows that each fit uses. Without `process_noise` that stays at its lower bound.
     """
     if not process_noise:
         start = replace(start, log_process=torch.full_like(start.log_process, MIN_LOG_PROCESS))
@@ -232,8 +206,8 @@ def fit(
         if (iteration + 1) % period == 0:
             for model in models:
                 model.slopes = None
-        now = differentiate([models[k] for k in active.tolist()], here.select(active), window_used[active])
-        tried = replace(here.select(active), likelihood=now.likelihood, information=now.information)
+        now = differentiate([models[k] for k in active.tolist()], here[active], window_used[active])
+        tried = replace(here[active], likelihood=now.likelihood, information=now.information)
         if at is None:
             best, at = tried, now
         else:
@@ -285,9 +259,4 @@ def _step(
 
 def _replaced(into: Batched, indices: Tensor, values: Batched, chosen: Tensor) -> Batched:
     """`into` with its members at `indices` replaced by the `chosen` members of `values`."""
-    out = {}
-    for field in fields(into):
-        tensor = getattr(into, field.name).clone()
-        tensor[indices] = getattr(values, field.name)[chosen]
-        out[field.name] = tensor
-    return replace(into, **out)
+    return into.map(lambda old, new: old.index_put((indices,), new[chosen]), values)

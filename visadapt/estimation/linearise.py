@@ -18,11 +18,9 @@ from visadapt.effects import DynamicsEffect, Parameter, Role
 from visadapt.systems import System
 from visadapt.world import World
 
-STATE_STEP = 1e-6
-"""Finite difference of a state, in its SI unit, and of a command."""
+STATE_STEP = 1e-6  # Finite difference of a state, in its SI unit, and of a command
 
-PARAMETER_STEP = 1e-6
-"""Finite difference of a parameter, as a share of the range in which it is searched."""
+PARAMETER_STEP = 1e-6  # Finite difference of a parameter, as a share of the range in which it is searched
 
 PHASE_MARGIN = 4 * math.pi
 """rad by which a phase may leave its range during a fit: the best phase may lie up to two turns outside it."""
@@ -32,14 +30,10 @@ PHASE_MARGIN = 4 * math.pi
 class Tangent:
     """A function of N states and of P parameters, with its first derivatives."""
 
-    value: Tensor
-    """(N, m)"""
-    by_state: Tensor
-    """(N, m, n); no columns where it was not asked for"""
-    by_parameter: Tensor
-    """(N, m, P)"""
-    by_command: Tensor
-    """(N, m, n_action); no columns where it was not asked for"""
+    value: Tensor  # (N, m)
+    by_state: Tensor  # (N, m, n); no columns where it was not asked for
+    by_parameter: Tensor  # (N, m, P)
+    by_command: Tensor  # (N, m, n_action); no columns where it was not asked for
 
 
 @cache

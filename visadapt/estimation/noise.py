@@ -14,15 +14,13 @@ from torch import Tensor
 
 from visadapt.estimation.kalman import Filtered, Linear, forward, log_likelihood
 
-PROCESS_PRIOR = (-1.0, 1.5)
-"""Mean and standard deviation of the normal prior of log10 q."""
+PROCESS_PRIOR = (-1.0, 1.5)  # Mean and standard deviation of the normal prior of log10 q
 
 MEASUREMENT_PRIOR = (0.5, 0.5)
 """Mean and standard deviation of the normal prior of log10 s; s above 1 is likelier, since errors of neighbouring
 pixels are correlated and a fit that assumes them independent understates its standard deviation."""
 
-MAX_ROUNDS = 12
-"""Rounds of the pattern search; each tries all combinations of steps -1, 0, 1 in every parameter."""
+MAX_ROUNDS = 12  # Rounds of the pattern search; each tries all combinations of steps -1, 0, 1 in every parameter
 
 FIRST_STEP, REFINED_STEP, LAST_STEP = 0.8, 0.3, 0.15
 """Step lengths in prior standard deviations: the first, the first when a guess is given, and the shortest."""
@@ -32,12 +30,9 @@ FIRST_STEP, REFINED_STEP, LAST_STEP = 0.8, 0.3, 0.15
 class UnknownNoise:
     """One episode of T rows with unknown noise; float64."""
 
-    system: Linear
-    """one system (N = 1); readings in units of their stated standard deviations, uncorrelated"""
-    used: Tensor
-    """(1, T, m) 1 where something was measured"""
-    shapes: Tensor
-    """(D, n, n) covariances Q_d for unit intensity"""
+    system: Linear  # one system (N = 1); readings in units of their stated standard deviations, uncorrelated
+    used: Tensor  # (1, T, m) 1 where something was measured
+    shapes: Tensor  # (D, n, n) covariances Q_d for unit intensity
 
     def filtered(self, noise: Noise) -> Filtered:
         """The forward pass under K candidates of the noise."""
@@ -50,17 +45,14 @@ class UnknownNoise:
 class Noise:
     """K candidates."""
 
-    process: Tensor
-    """(K, D) intensities q"""
-    measurement: Tensor
-    """(K,) factors s on the stated standard deviations of the measurements"""
+    process: Tensor  # (K, D) intensities q
+    measurement: Tensor  # (K,) factors s on the stated standard deviations of the measurements
 
 
 def most_probable_noise(episodes: Sequence[UnknownNoise], guess: Noise | None = None) -> Noise:
     """The noise (K = 1) of largest posterior density over all episodes, by pattern search (Hooke and Jeeves 1961).
 
-    Args:
-        guess: the start of the search (K = 1); by default the mean of the prior.
+    It starts at `guess` (K = 1), by default at the mean of the prior.
     """
     width = len(episodes[0].shapes)
     middle, spread = torch.tensor([PROCESS_PRIOR] * width + [MEASUREMENT_PRIOR], dtype=torch.float64).T

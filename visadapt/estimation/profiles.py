@@ -16,12 +16,9 @@ Columns = tuple[int, ...]
 class Convention:
     """Signs with which a recording may differ from the source."""
 
-    name: str
-    """the quantity of opposite sign, as the warning calls it"""
-    angle: float
-    """factor of the angle and its rate: 1 or -1"""
-    command: float
-    """factor of the command: 1 or -1"""
+    name: str  # the quantity of opposite sign, as the warning calls it
+    angle: float  # factor of the angle and its rate: 1 or -1
+    command: float  # factor of the command: 1 or -1
 
 
 @dataclass(frozen=True)
@@ -33,24 +30,17 @@ class SystemProfile:
     have the same noise variance"""
     position_of: Mapping[int, int]
     """column of a velocity to the column of its position, for velocities that a recording may lack"""
-    sensors: tuple[Columns, ...]
-    """columns that one kind of sensor measures, with the same noise variance"""
-    quaternion: Columns
-    """columns of the attitude quaternion, which means the same with either sign; empty without one"""
+    sensors: tuple[Columns, ...]  # columns that one kind of sensor measures, with the same noise variance
+    quaternion: Columns  # columns of the attitude quaternion, which means the same with either sign; empty without one
     initial_variance: tuple[float, ...]
     """(n,) variance of the first state of a window around its measurement, in the states' units squared"""
-    region_variables: Mapping[str, str]
-    """unit of a region's edges to the variable along which that region lies"""
-    plotted_variables: tuple[str, ...]
-    """variables over which the report plots the residual, the most instructive first"""
-    residual_name: str
-    """the first load in words, as the report's figures label it"""
+    region_variables: Mapping[str, str]  # unit of a region's edges to the variable along which that region lies
+    plotted_variables: tuple[str, ...]  # variables over which the report plots the residual, the most instructive first
+    residual_name: str  # the first load in words, as the report's figures label it
     black_box_factors: Mapping[str, tuple[str | None, ...]]
     """load to the variables that multiply a black-box function on it (None: no factor); (None,) for loads not listed"""
-    max_rows: int = 1600
-    """rows that a search uses; of a longer recording, windows spread evenly over it"""
-    is_aircraft: bool = False
-    """whether experiments are advised as flights instead of motions on a track"""
+    max_rows: int = 1600  # rows that a search uses; of a longer recording, windows spread evenly over it
+    is_aircraft: bool = False  # whether experiments are advised as flights instead of motions on a track
     window_rows: int = 120
     """rows of a window; longer episodes are cut, which loses little since states far apart hardly inform each other"""
     longest_step: float = float("inf")
@@ -63,26 +53,18 @@ class SystemProfile:
     check_sensors: bool = True
     """whether to look for defective angle sensors, other sign conventions, and velocities differentiated from
     positions"""
-    angle_sensor: Columns = ()
-    """columns of the angle, and of its rate, whose sensor is checked for defects"""
+    angle_sensor: Columns = ()  # columns of the angle, and of its rate, whose sensor is checked for defects
     sign_conventions: tuple[Convention, ...] = ()
     """sign conventions, other than the source's, in which a recording may be"""
-    min_gain: float = 1.0
-    """log likelihood that an effect must gain in the screening to be fitted"""
-    min_gain_per_parameter: float = 0.0
-    """log likelihood required in addition for each of the effect's parameters"""
-    min_gain_share: float = 0.0
-    """share of the best candidate's gain that a candidate must reach to be fitted"""
+    min_gain: float = 1.0  # log likelihood that an effect must gain in the screening to be fitted
+    min_gain_per_parameter: float = 0.0  # log likelihood required in addition for each of the effect's parameters
+    min_gain_share: float = 0.0  # share of the best candidate's gain that a candidate must reach to be fitted
     refit_subsets: bool = False
     """whether a subset that was fitted before is fitted again, starting from the larger set's parameters"""
-    black_box_threshold: float = 4.0
-    """log odds above which a black-box function counts as something unexplained"""
-    compared_models: int = 8
-    """models, the most probable ones, that are compared"""
-    folds: int = 4
-    """folds of the cross-validation"""
-    beam_width: int = 3
-    """models of each size to which the search adds another effect"""
+    black_box_threshold: float = 4.0  # log odds above which a black-box function counts as something unexplained
+    compared_models: int = 8  # models, the most probable ones, that are compared
+    folds: int = 4  # folds of the cross-validation
+    beam_width: int = 3  # models of each size to which the search adds another effect
     screening_rows: float = float("inf")
     """rows times parameter points per effect; above it the screening uses every 2nd, 4th, ... window"""
 

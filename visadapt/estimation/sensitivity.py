@@ -1,4 +1,4 @@
-"""The change of a fitted set's innovations when an effect is added, at any parameter values, without a new fit."""
+"""The whitened innovations of a fitted set, and how they change when an effect is added, without a new fit."""
 
 from __future__ import annotations
 
@@ -10,16 +10,42 @@ from torch import Tensor
 
 from visadapt.effects import Effect
 from visadapt.estimation.candidate import COARSEST, CandidateModel
-from visadapt.estimation.innovations import Innovations
-from visadapt.estimation.likelihood import FitState
+from visadapt.estimation.kalman import forward, respond
+from visadapt.estimation.likelihood import FitState, linear_problem, variances
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
+
+
+class Innovations:
+    """Innovations over their standard deviations, of N readings in all, projected off the derivatives by the set's own
+    parameters: what refitting those would explain is not attributed to anything new. The set has one fit (C = 1)."""
+
+    def __init__(self, model: CandidateModel, fits: FitState) -> None:
+        rows = model.rows
+        self.rows = rows
+        self._problem = linear_problem([model], fits)
+        self._filtered = forward(self._problem, *variances(model, fits.log_process, fits.log_noise))
+        white = self._white(self._filtered.innovation)
+        self._known, _ = torch.linalg.qr(white[:, 1:])
+        self.error: Tensor = self._projected(white[:, :1])[:, 0]
+        """(N,)"""
+
+    def response(self, drive: Tensor, reading: Tensor) -> Tensor:
+        """Change (N, M) of the innovations with M inputs: `drive` (W, T - 1, n, M) and `reading` (W, T, m, M)."""
+        return self._projected(self._white(respond(self._problem, self._filtered, drive, reading)))
+
+    def _white(self, innovation: Tensor) -> Tensor:
+        white = innovation / self._filtered.variance.sqrt()[..., None] * self.rows.used[..., None]
+        return white.reshape(-1, white.shape[-1])
+
+    def _projected(self, white: Tensor) -> Tensor:
+        return white - self._known @ (self._known.T @ white)
+
 
 PROBE_SHARE = 0.02
 """Share of the range, from neutral, at which a parameter is probed that the effect is proportional to."""
 
-DIFFERENCE_SHARE = 1e-4
-"""Share of its range by which a parameter is moved to take a finite difference."""
+DIFFERENCE_SHARE = 1e-4  # Share of its range by which a parameter is moved to take a finite difference
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from visadapt.history import Batch, History
+from visadapt.batch import Batch
+from visadapt.history import History
 from visadapt.learning.windows import Observe, Windows
 from visadapt.tasks.base import Task
 from visadapt.world import World, WorldState
@@ -26,8 +27,7 @@ class StreamState(Batch):
 
     at: WorldState
     history: History
-    task_state: Tensor
-    """(B, ...) the task's"""
+    task_state: Tensor  # (B, ...) the task's
 
     def tree(self) -> dict[str, Any]:
         """All of it as a tree of tensors, for a checkpoint."""
@@ -53,15 +53,11 @@ class Streams:
 
     world: World
     task: Task
-    observe: Observe | None
-    """the camera through which the policy sees; None where it sees what the sensors measure"""
-    windows: Windows | None
-    """recorded starts. Each begins at its time in its episode, with the memory that effects have there"""
+    observe: Observe | None  # the camera through which the policy sees; None where it sees what the sensors measure
+    windows: Windows | None  # recorded starts, each at its time in its episode, with the memory that effects have there
     count: int
-    longest: int
-    """steps after which a stream starts anew"""
-    recorded: float
-    """share of the starts that are windows, with their histories"""
+    longest: int  # steps after which a stream starts anew
+    recorded: float  # share of the starts that are windows, with their histories
 
     def __post_init__(self) -> None:
         self.now: StreamState

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Collection
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
+import torch
 from torch import Tensor
 
 
@@ -61,6 +64,16 @@ class System(ABC):
         itself: Any = self  # subclasses are dataclasses, this base is not
         values = {field.name: getattr(self, field.name) for field in fields(itself)}
         return replace(itself, **{k: value.to(like) for k, value in values.items() if isinstance(value, Tensor)})
+
+    def check_parameters(self, either_sign: Collection[str] = (), may_be_zero: Collection[str] = ()) -> None:
+        """Raise ValueError if a parameter is not positive or, where it may have either sign, not finite."""
+        itself: Any = self
+        for field in fields(itself):
+            value = getattr(self, field.name)
+            least = 0.0 if field.name in may_be_zero else torch.finfo(torch.float32).tiny
+            if not holds(abs(value) < math.inf if field.name in either_sign else value >= least):
+                right = "finite" if field.name in either_sign else "positive"
+                raise ValueError(f"{self.name}: {field.name} must be {right}, got {value!r}")
 
     @classmethod
     def index(cls, name: str) -> int:

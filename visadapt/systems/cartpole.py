@@ -7,13 +7,13 @@ problems", appendix, without their friction terms (friction is an effect). A pos
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from visadapt.systems.base import System, Variable, holds
+from visadapt.systems.base import System, Variable
 
 
 @dataclass(frozen=True)
@@ -27,16 +27,11 @@ class CartPole(System):
     ['x', 'x_dot', 'theta', 'theta_dot']
     """
 
-    cart_mass: float | Tensor = 1.0
-    """kg"""
-    pole_mass: float | Tensor = 0.1
-    """kg"""
-    pole_half_length: float | Tensor = 0.5
-    """m, from the hinge to the pole's centre of mass"""
-    max_force: float | Tensor = 30.0
-    """N on the cart at a command of 1"""
-    gravity: float | Tensor = 9.8
-    """m/s2"""
+    cart_mass: float | Tensor = 1.0  # kg
+    pole_mass: float | Tensor = 0.1  # kg
+    pole_half_length: float | Tensor = 0.5  # m, from the hinge to the pole's centre of mass
+    max_force: float | Tensor = 30.0  # N on the cart at a command of 1
+    gravity: float | Tensor = 9.8  # m/s2
 
     name: ClassVar[str] = "cartpole"
     states: ClassVar[tuple[Variable, ...]] = (
@@ -52,10 +47,7 @@ class CartPole(System):
     )
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not holds(value > 0):
-                raise ValueError(f"cartpole: {field.name} must be positive, got {value!r}")
+        self.check_parameters()
 
     def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:
         """Equations of Barto et al. with a force on the cart (N) and a torque at the pivot (N m) as loads."""
@@ -70,15 +62,3 @@ class CartPole(System):
         )
         acceleration = push - pole_moment * angular_acceleration * cosine / total_mass
         return torch.stack((velocity, acceleration, angular_velocity, angular_acceleration), -1)
-
-    def energy(self, state: Tensor) -> Tensor:
-        """Kinetic plus potential energy in J, (B,): conserved without command, load and friction."""
-        _, velocity, angle, angular_velocity = state.unbind(-1)
-        moment = self.pole_mass * self.pole_half_length
-        inertia = 4.0 / 3.0 * moment * self.pole_half_length
-        return (
-            0.5 * (self.cart_mass + self.pole_mass) * velocity.square()
-            + moment * velocity * angular_velocity * angle.cos()
-            + 0.5 * inertia * angular_velocity.square()
-            + moment * self.gravity * angle.cos()
-        )

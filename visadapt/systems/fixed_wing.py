@@ -56,103 +56,55 @@ class FixedWing(RigidBody):
     (torch.Size([1, 13]), torch.Size([1, 4]))
     """
 
-    mass: float | Tensor = 1.01
-    """kg"""
-    inertia_x: float | Tensor = 0.04766
-    """kg m2, J_x, roll"""
-    inertia_y: float | Tensor = 0.05005
-    """kg m2, J_y, pitch"""
-    inertia_z: float | Tensor = 0.09558
-    """kg m2, J_z, yaw"""
-    inertia_xz: float | Tensor = -0.00105
-    """kg m2, J_xz, the integral of x z dm with z down, as in the book"""
-    wing_area: float | Tensor = 0.276
-    """m2, S"""
-    span: float | Tensor = 1.54
-    """m, b"""
-    chord: float | Tensor = 0.185
-    """m, c, mean"""
-    air_density: float | Tensor = 1.225
-    """kg/m3"""
-    gravity: float | Tensor = 9.81
-    """m/s2"""
-    max_thrust: float | Tensor = 7.0
-    """N at a command of 1"""
-    max_elevator: float | Tensor = 20 * _DEGREE
-    """rad at a command of 1"""
-    max_aileron: float | Tensor = 2.5 * _DEGREE
-    """rad at a command of 1"""
-    max_rudder: float | Tensor = 20 * _DEGREE
-    """rad at a command of 1"""
-    linear_range: float | Tensor = 10 * _DEGREE
-    """rad; angle of attack and sideslip beyond which coefficients stay as they are there"""
-    wind_x: float | Tensor = 0.0
-    """m/s, velocity of the air in world axes"""
-    wind_y: float | Tensor = 0.0
-    """m/s"""
-    wind_z: float | Tensor = 0.0
-    """m/s"""
+    mass: float | Tensor = 1.01  # kg
+    inertia_x: float | Tensor = 0.04766  # kg m2, J_x, roll
+    inertia_y: float | Tensor = 0.05005  # kg m2, J_y, pitch
+    inertia_z: float | Tensor = 0.09558  # kg m2, J_z, yaw
+    inertia_xz: float | Tensor = -0.00105  # kg m2, J_xz, the integral of x z dm with z down, as in the book
+    wing_area: float | Tensor = 0.276  # m2, S
+    span: float | Tensor = 1.54  # m, b
+    chord: float | Tensor = 0.185  # m, c, mean
+    air_density: float | Tensor = 1.225  # kg/m3
+    gravity: float | Tensor = 9.81  # m/s2
+    max_thrust: float | Tensor = 7.0  # N at a command of 1
+    max_elevator: float | Tensor = 20 * _DEGREE  # rad at a command of 1
+    max_aileron: float | Tensor = 2.5 * _DEGREE  # rad at a command of 1
+    max_rudder: float | Tensor = 20 * _DEGREE  # rad at a command of 1
+    linear_range: float | Tensor = 10 * _DEGREE  # rad of attack and sideslip, beyond which coefficients stay constant
+    wind_x: float | Tensor = 0.0  # m/s, velocity of the air in world axes
+    wind_y: float | Tensor = 0.0  # m/s
+    wind_z: float | Tensor = 0.0  # m/s
 
-    lift_zero: float | Tensor = 0.39
-    """C_L0"""
-    lift_attack: float | Tensor = 4.5321
-    """C_Lalpha, the lift slope"""
-    lift_pitch_rate: float | Tensor = 0.318
-    """C_Lq"""
-    lift_elevator: float | Tensor = 0.527
-    """C_Ldelta_e"""
-    drag_zero: float | Tensor = 0.0765
-    """C_D0"""
-    drag_attack: float | Tensor = 0.3346
-    """C_Dalpha"""
-    drag_pitch_rate: float | Tensor = 0.354
-    """C_Dq"""
-    drag_elevator: float | Tensor = 0.004
-    """C_Ddelta_e"""
-    side_zero: float | Tensor = 0.0
-    """C_Y0"""
-    side_sideslip: float | Tensor = -0.033
-    """C_Ybeta"""
-    side_roll_rate: float | Tensor = -0.1
-    """C_Yp"""
-    side_yaw_rate: float | Tensor = 0.039
-    """C_Yr"""
-    side_aileron: float | Tensor = 0.0
-    """C_Ydelta_a"""
-    side_rudder: float | Tensor = 0.225
-    """C_Ydelta_r"""
-    roll_zero: float | Tensor = 0.0
-    """C_l0"""
-    roll_sideslip: float | Tensor = -0.081
-    """C_lbeta"""
-    roll_roll_rate: float | Tensor = -0.529
-    """C_lp"""
-    roll_yaw_rate: float | Tensor = 0.159
-    """C_lr"""
-    roll_aileron: float | Tensor = -0.453
-    """C_ldelta_a"""
-    roll_rudder: float | Tensor = 0.005
-    """C_ldelta_r"""
-    pitch_zero: float | Tensor = 0.02
-    """C_m0"""
-    pitch_attack: float | Tensor = -1.4037
-    """C_malpha"""
-    pitch_pitch_rate: float | Tensor = -0.1324
-    """C_mq"""
-    pitch_elevator: float | Tensor = -0.4236
-    """C_mdelta_e"""
-    yaw_zero: float | Tensor = 0.0
-    """C_n0"""
-    yaw_sideslip: float | Tensor = 0.189
-    """C_nbeta"""
-    yaw_roll_rate: float | Tensor = -0.083
-    """C_np"""
-    yaw_yaw_rate: float | Tensor = -0.948
-    """C_nr"""
-    yaw_aileron: float | Tensor = -0.041
-    """C_ndelta_a"""
-    yaw_rudder: float | Tensor = -0.077
-    """C_ndelta_r"""
+    lift_zero: float | Tensor = 0.39  # C_L0
+    lift_attack: float | Tensor = 4.5321  # C_Lalpha, the lift slope
+    lift_pitch_rate: float | Tensor = 0.318  # C_Lq
+    lift_elevator: float | Tensor = 0.527  # C_Ldelta_e
+    drag_zero: float | Tensor = 0.0765  # C_D0
+    drag_attack: float | Tensor = 0.3346  # C_Dalpha
+    drag_pitch_rate: float | Tensor = 0.354  # C_Dq
+    drag_elevator: float | Tensor = 0.004  # C_Ddelta_e
+    side_zero: float | Tensor = 0.0  # C_Y0
+    side_sideslip: float | Tensor = -0.033  # C_Ybeta
+    side_roll_rate: float | Tensor = -0.1  # C_Yp
+    side_yaw_rate: float | Tensor = 0.039  # C_Yr
+    side_aileron: float | Tensor = 0.0  # C_Ydelta_a
+    side_rudder: float | Tensor = 0.225  # C_Ydelta_r
+    roll_zero: float | Tensor = 0.0  # C_l0
+    roll_sideslip: float | Tensor = -0.081  # C_lbeta
+    roll_roll_rate: float | Tensor = -0.529  # C_lp
+    roll_yaw_rate: float | Tensor = 0.159  # C_lr
+    roll_aileron: float | Tensor = -0.453  # C_ldelta_a
+    roll_rudder: float | Tensor = 0.005  # C_ldelta_r
+    pitch_zero: float | Tensor = 0.02  # C_m0
+    pitch_attack: float | Tensor = -1.4037  # C_malpha
+    pitch_pitch_rate: float | Tensor = -0.1324  # C_mq
+    pitch_elevator: float | Tensor = -0.4236  # C_mdelta_e
+    yaw_zero: float | Tensor = 0.0  # C_n0
+    yaw_sideslip: float | Tensor = 0.189  # C_nbeta
+    yaw_roll_rate: float | Tensor = -0.083  # C_np
+    yaw_yaw_rate: float | Tensor = -0.948  # C_nr
+    yaw_aileron: float | Tensor = -0.041  # C_ndelta_a
+    yaw_rudder: float | Tensor = -0.077  # C_ndelta_r
 
     name: ClassVar[str] = "fixed_wing"
     actions: ClassVar[tuple[Variable, ...]] = tuple(
@@ -160,13 +112,8 @@ class FixedWing(RigidBody):
     )
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name == "inertia_xz" or field.name.startswith((*_EFFECTS, "wind")):
-                if not holds(abs(value) < math.inf):
-                    raise ValueError(f"fixed_wing: {field.name} must be finite, got {value!r}")
-            elif not holds(value > 0):
-                raise ValueError(f"fixed_wing: {field.name} must be positive, got {value!r}")
+        signed = ("inertia_xz", *(f.name for f in fields(self) if f.name.startswith((*_EFFECTS, "wind"))))
+        self.check_parameters(either_sign=signed)
         if not holds(self.inertia_xz**2 < self.inertia_x * self.inertia_z):
             raise ValueError(
                 "fixed_wing: inertia_xz must be smaller than the geometric mean of inertia_x and inertia_z, "

@@ -14,7 +14,7 @@ import math
 import os
 import tomllib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from visadapt.systems import System
 
@@ -56,15 +56,11 @@ def load_parameters(path: str | os.PathLike[str], system_class: type[SystemT]) -
     for key, value in parameters.items():
         if key not in names:
             raise ParameterFileError(f"{path}: unknown key {key!r} in [parameters]; there are {known}")
-        _check_number(path, key, value)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ParameterFileError(f"{path}: {key} must be a number in SI units, got {value!r}")
+        if not math.isfinite(value):
+            raise ParameterFileError(f"{path}: {key} must be finite, got {value!r}")
     try:
         return system_class(**{key: float(value) for key, value in parameters.items()})
     except ValueError as error:
         raise ParameterFileError(f"{path}: {error}") from error
-
-
-def _check_number(path: str | os.PathLike[str], key: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ParameterFileError(f"{path}: {key} must be a number in SI units, got {value!r}")
-    if not math.isfinite(value):
-        raise ParameterFileError(f"{path}: {key} must be finite, got {value!r}")

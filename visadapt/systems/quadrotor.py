@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -28,73 +28,41 @@ class Quadrotor(RigidBody):
     ['thrust', 'rate_x', 'rate_y', 'rate_z']
     """
 
-    mass: float | Tensor = 1.0
-    """kg"""
-    arm_length: float | Tensor = 0.2
-    """m, from the centre to a rotor"""
-    roll_gain: float | Tensor = 16.6
-    """1/s, of the loops on roll and pitch rates"""
-    yaw_gain: float | Tensor = 5.0
-    """1/s"""
-    min_thrust: float | Tensor = 2.21
-    """m/s2, mass-normalised, at a command of -1"""
-    max_thrust: float | Tensor = 17.31
-    """m/s2, mass-normalised, at a command of 1"""
-    max_rate: float | Tensor = 0.5
-    """rad/s at a command of 1"""
-    gravity: float | Tensor = 9.81
-    """m/s2"""
-    torque_to_thrust: float | Tensor = 0.016
-    """m, a rotor's torque about its axis for each newton of its thrust"""
+    mass: float | Tensor = 1.0  # kg
+    arm_length: float | Tensor = 0.2  # m, from the centre to a rotor
+    roll_gain: float | Tensor = 16.6  # 1/s, of the loops on roll and pitch rates
+    yaw_gain: float | Tensor = 5.0  # 1/s
+    min_thrust: float | Tensor = 2.21  # m/s2, mass-normalised, at a command of -1
+    max_thrust: float | Tensor = 17.31  # m/s2, mass-normalised, at a command of 1
+    max_rate: float | Tensor = 0.5  # rad/s at a command of 1
+    gravity: float | Tensor = 9.81  # m/s2
+    torque_to_thrust: float | Tensor = 0.016  # m, a rotor's torque about its axis for each newton of its thrust
 
     # Deviations that the flight controller does not know of; none by default. Effects and parameter files set them.
-    payload: float | Tensor = 0.0
-    """kg, the part of `mass` that is a load at the centre"""
-    centre_x: float | Tensor = 0.0
-    """m, position of the centre of mass ahead of the rotors' centre"""
-    centre_y: float | Tensor = 0.0
-    """m, to the left of it"""
-    inertia_scale_x: float | Tensor = 1.0
-    """true moment of inertia about x over the one that the rate loops assume"""
-    inertia_scale_y: float | Tensor = 1.0
-    """the same about y"""
-    inertia_scale_z: float | Tensor = 1.0
-    """the same about z"""
-    damping_x: float | Tensor = 0.0
-    """1/s, aerodynamic damping about x: torque against a rate, over that rate and the inertia the rate loops assume"""
-    damping_y: float | Tensor = 0.0
-    """the same about y"""
-    damping_z: float | Tensor = 0.0
-    """the same about z"""
-    rotor_1: float | Tensor = 1.0
-    """thrust of the front left rotor over the thrust commanded of it"""
-    rotor_2: float | Tensor = 1.0
-    """of the front right rotor"""
-    rotor_3: float | Tensor = 1.0
-    """of the rear right rotor"""
-    rotor_4: float | Tensor = 1.0
-    """of the rear left rotor"""
-    wind_x: float | Tensor = 0.0
-    """m/s, velocity of the air in world axes; only effects such as drag depend on it"""
-    wind_y: float | Tensor = 0.0
-    """m/s"""
-    wind_z: float | Tensor = 0.0
-    """m/s"""
+    payload: float | Tensor = 0.0  # kg, the part of `mass` that is a load at the centre
+    centre_x: float | Tensor = 0.0  # m, position of the centre of mass ahead of the rotors' centre
+    centre_y: float | Tensor = 0.0  # m, to the left of it
+    inertia_scale_x: float | Tensor = 1.0  # true moment of inertia about x over the one that the rate loops assume
+    inertia_scale_y: float | Tensor = 1.0  # the same about y
+    inertia_scale_z: float | Tensor = 1.0  # the same about z
+    damping_x: float | Tensor = 0.0  # 1/s, aerodynamic torque over the rate and the inertia that the rate loops assume
+    damping_y: float | Tensor = 0.0  # the same about y
+    damping_z: float | Tensor = 0.0  # the same about z
+    rotor_1: float | Tensor = 1.0  # thrust of the front left rotor over the thrust commanded of it
+    rotor_2: float | Tensor = 1.0  # of the front right rotor
+    rotor_3: float | Tensor = 1.0  # of the rear right rotor
+    rotor_4: float | Tensor = 1.0  # of the rear left rotor
+    wind_x: float | Tensor = 0.0  # m/s, velocity of the air in world axes; only effects such as drag depend on it
+    wind_y: float | Tensor = 0.0  # m/s
+    wind_z: float | Tensor = 0.0  # m/s
 
     name: ClassVar[str] = "quadrotor"
-    actions: ClassVar[tuple[Variable, ...]] = (
-        Variable("thrust", "1", -1.0, 1.0),
-        *(Variable(name, "1", -1.0, 1.0) for name in ("rate_x", "rate_y", "rate_z")),
+    actions: ClassVar[tuple[Variable, ...]] = tuple(
+        Variable(name, "1", -1.0, 1.0) for name in ("thrust", "rate_x", "rate_y", "rate_z")
     )
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name in _EITHER_SIGN:
-                if not holds(abs(value) < math.inf):
-                    raise ValueError(f"quadrotor: {field.name} must be finite, got {value!r}")
-            elif not holds(value >= (0.0 if field.name in _MAY_BE_ZERO else torch.finfo(torch.float32).tiny)):
-                raise ValueError(f"quadrotor: {field.name} must be positive, got {value!r}")
+        self.check_parameters(either_sign=_EITHER_SIGN, may_be_zero=_MAY_BE_ZERO)
         if not holds(self.max_thrust > self.min_thrust):
             raise ValueError(
                 f"quadrotor: max_thrust must exceed min_thrust, got {self.max_thrust!r} and {self.min_thrust!r}"
@@ -154,8 +122,7 @@ class Quadrotor(RigidBody):
         return delivered[:, 0], delivered[:, 1:]
 
 
-_EITHER_SIGN = ("centre_x", "centre_y", "wind_x", "wind_y", "wind_z")
-"""Parameters that may be negative."""
+_EITHER_SIGN = ("centre_x", "centre_y", "wind_x", "wind_y", "wind_z")  # Parameters that may be negative
 _MAY_BE_ZERO = (
     *("min_thrust", "payload", "rotor_1", "rotor_2", "rotor_3", "rotor_4"),
     *("damping_x", "damping_y", "damping_z"),

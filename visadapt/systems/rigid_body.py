@@ -13,6 +13,7 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from visadapt.systems.base import System, Variable
 
@@ -20,52 +21,18 @@ POSITION, VELOCITY, ATTITUDE, RATES = slice(0, 3), slice(3, 6), slice(6, 10), sl
 """Columns of the state."""
 
 
-def _bilinear(entries: dict[tuple[int, int], dict[int, float]], shape: tuple[int, int, int]) -> Tensor:
-    """A matrix (I J, K) that maps the flattened products of two vectors, (I,) and (J,), to a vector (K,).
+_HAMILTON = torch.tensor([[1, 2, 3, 4], [2, -1, 4, -3], [3, -4, -1, 2], [4, 3, -2, -1]])
+"""The product of the quaternion units i and j: its sign, and 1 + its index."""
+_PRODUCT = one_hot(_HAMILTON.abs() - 1) * _HAMILTON.sign()[..., None]
+"""(4, 4, 4): (p q)_k = sum over i, j of p_i q_j _PRODUCT[i, j, k]."""
 
-    One matrix product is faster than many small operations. `entries` are the coefficients: {(i, j): {k: value}}.
-    """
-    out = torch.zeros(shape)
-    for (i, j), results in entries.items():
-        for k, value in results.items():
-            out[i, j, k] = value
-    return out.flatten(0, 1)
-
-
-_ROTATION = _bilinear(
-    {
-        # R = (w^2 - |v|^2) I + 2 v v^T + 2 w [v]x for q = (w, v); results count the entries of R by rows.
-        (0, 0): {0: 1, 4: 1, 8: 1},
-        (1, 1): {0: 1, 4: -1, 8: -1},
-        (2, 2): {0: -1, 4: 1, 8: -1},
-        (3, 3): {0: -1, 4: -1, 8: 1},
-        (1, 2): {1: 2, 3: 2},
-        (1, 3): {2: 2, 6: 2},
-        (2, 3): {5: 2, 7: 2},
-        (0, 3): {1: -2, 3: 2},
-        (0, 2): {2: 2, 6: -2},
-        (0, 1): {5: -2, 7: 2},
-    },
-    (4, 4, 9),
-)
-_TURNING = _bilinear(
-    {
-        # q' = q (0, rates) / 2, the quaternion product; results count w, x, y, z.
-        (0, 0): {1: 0.5},
-        (0, 1): {2: 0.5},
-        (0, 2): {3: 0.5},
-        (1, 0): {0: -0.5},
-        (1, 1): {3: 0.5},
-        (1, 2): {2: -0.5},
-        (2, 0): {3: -0.5},
-        (2, 1): {0: -0.5},
-        (2, 2): {1: 0.5},
-        (3, 0): {2: 0.5},
-        (3, 1): {1: -0.5},
-        (3, 2): {0: -0.5},
-    },
-    (4, 3, 4),
-)
+# Matrices (I J, K) that map the flattened products of two vectors, (I,) and (J,), to a vector (K,): one matrix product
+# is faster than many small operations.
+_TURNING = _PRODUCT[:, 1:].flatten(0, 1) / 2  # q' = q (0, rates) / 2
+_CONJUGATE = torch.tensor([1, -1, -1, -1])
+_TURNED = torch.einsum("iml,ljk,j->kmij", _PRODUCT[:, 1:], _PRODUCT[..., 1:], _CONJUGATE)
+_ROTATION = (_TURNED.triu() + _TURNED.tril(-1).mT).reshape(9, 16).T.contiguous().float()
+"""R v = q (0, v) q*, with the entries of R by rows; q_i q_j = q_j q_i is counted once."""
 
 
 class RigidBody(System):
@@ -86,10 +53,8 @@ class RigidBody(System):
     )
     """A force in world axes and a torque in body axes."""
 
-    mass: float | Tensor
-    """kg"""
-    gravity: float | Tensor
-    """m/s2"""
+    mass: float | Tensor  # kg
+    gravity: float | Tensor  # m/s2
 
     @abstractmethod
     def wrench(self, velocity: Tensor, rates: Tensor, command: Tensor) -> tuple[Tensor, Tensor]:

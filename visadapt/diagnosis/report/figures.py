@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from visadapt.diagnosis.report.text import plain
-from visadapt.diagnosis.result import Growth, Prediction, Profile, Region, Spectrum
+from visadapt.diagnosis.result import Chart, Prediction, Region
 from visadapt.systems import System
 
 INK, MUTED, LINE = "#1f2933", "#6e7a88", "#d8dde3"
@@ -23,11 +23,9 @@ BEFORE, AFTER, BLACK_BOX = "#de7416", "#2f67c9", "#0e7a70"
 CSS_VARIABLES = {INK: "ink", MUTED: "muted", LINE: "line", BEFORE: "before", AFTER: "after", BLACK_BOX: "black-box"}
 """Colours in matplotlib, and the page's CSS variables that replace them."""
 
-MAX_STATES = 5
-"""States of a prediction that are plotted."""
+MAX_STATES = 5  # States of a prediction that are plotted
 
-FIGURE_WIDTH = 4.0
-"""inches; at the font size of STYLE, the text is readable on a phone"""
+FIGURE_WIDTH = 4.0  # inches; at the font size of STYLE, the text is readable on a phone
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # letters as text, not as paths
     "svg.hashsalt": "visadapt",  # fixed ids: equal diagnoses give equal pages
@@ -81,60 +79,52 @@ def _most_wrong(one: Prediction, measured: Sequence[int]) -> list[int]:
     return sorted(measured[k] for k in np.argsort(-relative)[:MAX_STATES])
 
 
-def profile(one: Profile, regions: Sequence[Region], corrected: bool) -> str:
+def profile(one: Chart, regions: Sequence[Region], corrected: bool) -> str:
     """The mean residual over a variable with 90 % confidence bands; regions are shaded."""
     with matplotlib.rc_context(STYLE):
-        figure, axes = _one_plot()
+        figure, axes = _one_plot(one)
         for region in regions:
             if region.variable == one.variable:
                 axes.axvspan(region.start, region.end, color=LINE, alpha=0.7, zorder=0, linewidth=0)
         axes.axhline(0, color=MUTED, linewidth=0.8)
-        _band(axes, one.centres, one.before, one.before_error, BEFORE, "simulator")
-        if corrected:
-            _band(axes, one.centres, one.after, one.after_error, AFTER, "with the causes")
-        axes.set_xlabel(_labelled(one.variable, one.variable_unit))
-        axes.set_ylabel(_labelled(one.quantity, one.quantity_unit))
+        for curve, colour in zip(one.curves[: 1 + corrected], (BEFORE, AFTER), strict=False):
+            assert curve.error is not None
+            low, high = curve.values - 1.645 * curve.error, curve.values + 1.645 * curve.error
+            axes.fill_between(one.x, low, high, color=colour, alpha=0.22, linewidth=0)
+            axes.plot(one.x, curve.values, color=colour, linewidth=1.6, marker="o", markersize=3, label=curve.label)
         _legend(figure, axes)
         return _svg(figure, f"residual {one.quantity} over {one.variable}")
 
 
-def growth(one: Growth, corrected: bool) -> str:
+def growth(one: Chart, corrected: bool) -> str:
     """The error over the horizon of prediction."""
     with matplotlib.rc_context(STYLE):
-        figure, axes = _one_plot()
-        axes.plot(one.seconds, one.before, color=BEFORE, linewidth=1.8, label="simulator")
-        if corrected:
-            axes.plot(one.seconds, one.after, color=AFTER, linewidth=1.8, label="with the causes")
-        axes.plot(one.seconds, one.black_box, color=BLACK_BOX, linewidth=1.4, linestyle="--", label="black box")
-        axes.plot(one.seconds, one.floor, color=MUTED, linewidth=1.4, linestyle=":", label="noise")
+        figure, axes = _one_plot(one)
+        styles = ((BEFORE, 1.8, "-"), (AFTER, 1.8, "-"), (BLACK_BOX, 1.4, "--"), (MUTED, 1.4, ":"))
+        for k, (curve, (colour, width, dashes)) in enumerate(zip(one.curves, styles, strict=True)):
+            if k != 1 or corrected:
+                axes.plot(one.x, curve.values, color=colour, linewidth=width, linestyle=dashes, label=curve.label)
         axes.set_ylim(bottom=0)
-        axes.set_xlabel("predicted ahead [s]")
-        axes.set_ylabel("error")
         _legend(figure, axes)
         return _svg(figure, "error over the horizon of prediction")
 
 
-def spectrum(one: Spectrum, corrected: bool) -> str:
+def spectrum(one: Chart, corrected: bool) -> str:
     """The residual's power over frequency."""
     with matplotlib.rc_context(STYLE):
-        figure, axes = _one_plot()
-        axes.semilogy(one.frequency, one.before, color=BEFORE, linewidth=1.6, label="simulator")
-        if corrected:
-            axes.semilogy(one.frequency, one.after, color=AFTER, linewidth=1.6, label="with the causes")
-        axes.set_xlabel("frequency [Hz]")
-        axes.set_ylabel(_labelled(one.quantity, one.unit))
+        figure, axes = _one_plot(one)
+        for curve, colour in zip(one.curves[: 1 + corrected], (BEFORE, AFTER), strict=False):
+            axes.semilogy(one.x, curve.values, color=colour, linewidth=1.6, label=curve.label)
         _legend(figure, axes)
         return _svg(figure, f"spectrum of the residual {one.quantity}")
 
 
-def _one_plot() -> tuple[Figure, Axes]:
+def _one_plot(one: Chart) -> tuple[Figure, Axes]:
     figure = Figure((FIGURE_WIDTH, 2.7), layout="constrained")
-    return figure, figure.subplots()
-
-
-def _band(axes: Axes, x: np.ndarray, mean: np.ndarray, error: np.ndarray, colour: str, label: str) -> None:
-    axes.fill_between(x, mean - 1.645 * error, mean + 1.645 * error, color=colour, alpha=0.22, linewidth=0)
-    axes.plot(x, mean, color=colour, linewidth=1.6, marker="o", markersize=3, label=label)
+    axes = figure.subplots()
+    axes.set_xlabel(_labelled(one.variable, one.variable_unit))
+    axes.set_ylabel(_labelled(one.quantity, one.quantity_unit))
+    return figure, axes
 
 
 def _labelled(name: str, unit: str) -> str:

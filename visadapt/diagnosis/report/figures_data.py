@@ -10,11 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from visadapt.diagnosis.result import FigureData, Gap, Growth, Prediction, Profile, Region, Spectrum
+from visadapt.diagnosis.result import Chart, Curve, FigureData, Gap, Prediction, Region
 from visadapt.diagnosis.search import heldout
-from visadapt.diagnosis.search.disturbance import Disturbance, disturbance
+from visadapt.diagnosis.search.disturbance import Disturbance, binned, disturbance
 from visadapt.diagnosis.search.heldout import RolloutErrors
-from visadapt.diagnosis.search.localisation import binned
 from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.estimation.candidate import CandidateModel
@@ -23,29 +22,19 @@ from visadapt.systems import System
 MAX_PREDICTIONS, MAX_PROFILES = 3, 3
 """Figures of held-out predictions, and of the residual over a variable; more would hide the instructive ones."""
 
+SOURCE, CORRECTED = "simulator", "with the causes"
+"""Labels of curves."""
+
 
 @dataclass(frozen=True)
 class Errors:
     """Root mean square errors of held-out predictions by horizon and channel (H, m), in units of `deviation`."""
 
-    before: Tensor
-    """of the source"""
-    after: Tensor
-    """of the source with the causes"""
-    floor: Tensor
-    """of the states that the smoother estimates: noise"""
-    black_box: Tensor
-    """of the source with a black box"""
-    deviation: Tensor
-    """(m,) standard deviations of the measurement noise, in the states' units"""
-
-    @classmethod
-    def from_rollouts(
-        cls, source: RolloutErrors, corrected: RolloutErrors, black_box: RolloutErrors, deviation: Tensor
-    ) -> Errors:
-        """From predictions of the source, of the source with the causes, and of the source with a black box."""
-        after, floor = corrected.rms(deviation), corrected.floor(deviation)
-        return cls(source.rms(deviation), after, floor, black_box.rms(deviation), deviation)
+    before: Tensor  # of the source
+    after: Tensor  # of the source with the causes
+    floor: Tensor  # of the states that the smoother estimates: noise
+    black_box: Tensor  # of the source with a black box
+    deviation: Tensor  # (m,) standard deviations of the measurement noise, in the states' units
 
     def closed_by(self, rollouts: RolloutErrors) -> float:
         """Share of the gap that the set with these predictions closes."""
@@ -61,11 +50,11 @@ class Errors:
         )
         return Gap(measure, before, after, floor, box, heldout.closed(before, after, floor))
 
-    def growth(self, period: float) -> Growth:
+    def growth(self, period: float) -> Chart:
         """The errors over the horizon, over all channels; `period` in s."""
-        seconds = period * np.arange(1, len(self.before) + 1)
-        every = (heldout.overall(e).numpy() for e in (self.before, self.after, self.floor, self.black_box))
-        return Growth(seconds, *every)
+        errors = {SOURCE: self.before, CORRECTED: self.after, "black box": self.black_box, "noise": self.floor}
+        curves = tuple(Curve(label, heldout.overall(error).numpy()) for label, error in errors.items())
+        return Chart("predicted ahead", "s", "error", "", period * np.arange(1, len(self.before) + 1), curves)
 
     def by_state(self, system: System, channels: Sequence[int], explained: bool) -> dict[str, float]:
         """Share by state of the squared error above `after` if the causes explain the gap, else above the noise floor.
@@ -142,30 +131,31 @@ def _predictions(search: Search, source: RolloutErrors, corrected: RolloutErrors
     return tuple(out)
 
 
-def _profile(name: str, unit: str, quantity: str, before: Disturbance, after: Disturbance) -> Profile:
+def _profile(name: str, unit: str, quantity: str, before: Disturbance, after: Disturbance) -> Chart:
     """The mean disturbance on the first load over one variable, without and with the causes."""
     here = before.valid.flatten() > 0
     values = before.variables[name].flatten()[here]
     edges, bins = binned(values)
     count = len(edges) - 1
-    means = []
-    for found in (before, after):
+    curves = []
+    for label, found in ((SOURCE, before), (CORRECTED, after)):
         load = found.load[..., 0].flatten()[here]
         binned_load = [load[bins == k] for k in range(count)]
-        means.append(np.array([float(s.mean()) if len(s) else math.nan for s in binned_load]))
-        means.append(np.array([float(s.std() / math.sqrt(len(s))) if len(s) > 1 else math.nan for s in binned_load]))
+        mean = np.array([float(s.mean()) if len(s) else math.nan for s in binned_load])
+        error = np.array([float(s.std() / math.sqrt(len(s))) if len(s) > 1 else math.nan for s in binned_load])
+        curves.append(Curve(label, mean, error))
     centres = np.array([float(values[bins == k].mean()) if bool((bins == k).any()) else math.nan for k in range(count)])
-    return Profile(name, unit, quantity, "N", centres, *means)
+    return Chart(name, unit, quantity, "N", centres, tuple(curves))
 
 
-def _spectrum(quantity: str, before: Disturbance, after: Disturbance, period: float) -> Spectrum:
+def _spectrum(quantity: str, before: Disturbance, after: Disturbance, period: float) -> Chart:
     """Power spectral density of the disturbance on the first load, averaged over windows (Welch 1967, one Hann window
     each)."""
-    densities = []
-    for found in (before, after):
+    curves = []
+    for label, found in ((SOURCE, before), (CORRECTED, after)):
         load = found.load[..., 0]
         window = torch.hann_window(load.shape[1], dtype=load.dtype)
         power = torch.fft.rfft(load * window, dim=1).abs().square().mean(0)
-        densities.append((2 * period * power / window.square().sum()).numpy())
+        curves.append(Curve(label, (2 * period * power / window.square().sum()).numpy()))
     frequency = np.fft.rfftfreq(before.load.shape[1], period)
-    return Spectrum(quantity, "N2/Hz", frequency, *densities)
+    return Chart("frequency", "Hz", quantity, "N2/Hz", frequency, tuple(curves))

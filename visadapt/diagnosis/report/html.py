@@ -7,8 +7,6 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-import jinja2
-
 from visadapt.diagnosis.report import figures, text
 from visadapt.diagnosis.result import Diagnosis
 from visadapt.effects import EFFECTS
@@ -17,12 +15,7 @@ from visadapt.systems import SYSTEMS
 
 
 def write_report(path: str | os.PathLike[str], diagnosis: Diagnosis, settings: Mapping[str, str]) -> None:
-    """Write the page, atomically.
-
-    Args:
-        path: of the page.
-        diagnosis: its content.
-        settings: what the diagnosis depends on (files, seed, versions), for the footer.
+    """Write the page, atomically; `settings` for its foot are what the diagnosis depends on (files, seed, versions).
 
     Raises:
         DiskFullError: the disk is full; an earlier file at `path` is kept.
@@ -34,32 +27,14 @@ def write_report(path: str | os.PathLike[str], diagnosis: Diagnosis, settings: M
 
 def as_html(diagnosis: Diagnosis, settings: Mapping[str, str]) -> str:
     """The page: no scripts, no external resources; light or dark as the browser prefers."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("visadapt.diagnosis.report", "."),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-    )
-    environment.filters |= {
-        "plain": text.plain,
-        "number": text.number,
-        "percent": text.percent,
-        "estimate": text.estimate,
-        "interval": text.interval,
-        "effects": text.effects,
-        "either": lambda names: text.listed(names, "or"),
-        "region": lambda region: text.region(region, diagnosis.system),
-    }
     gaps = _gaps(diagnosis)
-    return environment.get_template("page.html").render(
-        diagnosis=diagnosis,
-        sentence=text.sentence(diagnosis),
+    return text.rendered(
+        "page.html",
+        diagnosis,
         gaps=gaps,
         largest=max((value for _, value, _ in gaps if math.isfinite(value)), default=0.0),
         equations={name: effect.equation for name, effect in EFFECTS.items()},
         figures=_figures(diagnosis),
-        corrected=text.corrected(diagnosis),
-        policy=text.policy_terms(diagnosis),
         settings=settings,
     )
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jinja2
 
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, Cause, Diagnosis, Estimate, Region
 from visadapt.systems import SYSTEMS
@@ -157,53 +160,27 @@ def policy_terms(diagnosis: Diagnosis) -> list[tuple[str, tuple[float, float]]]:
     ]
 
 
+def shares(table: Mapping[str, float]) -> str:
+    """Shares by name, without those that are 0 or unknown."""
+    return ", ".join(f"{name} {percent(share)}" for name, share in table.items() if share > 0) or "none"
+
+
+def rendered(template: str, diagnosis: Diagnosis, **values: Any) -> str:
+    """A template of this folder, filled with a diagnosis and further values."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("visadapt.diagnosis.report", "."),
+        autoescape=template.endswith(".html"),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+    )
+    for function in (plain, number, percent, estimate, interval, effects, shares):
+        environment.filters[function.__name__] = function
+    environment.filters["either"] = lambda names: listed(names, "or")
+    environment.filters["region"] = lambda one: region(one, diagnosis.system)
+    common = {"sentence": sentence(diagnosis), "corrected": corrected(diagnosis), "policy": policy_terms(diagnosis)}
+    return environment.get_template(template).render(diagnosis=diagnosis, **common, **values)
+
+
 def as_text(diagnosis: Diagnosis) -> str:
     """The diagnosis for the terminal."""
-    gap, recording = diagnosis.gap, diagnosis.recording
-    lines = [
-        f"{diagnosis.verdict}: {sentence(diagnosis)}",
-        "",
-        f"Recording  {recording.episodes} episodes, {recording.samples} samples, {recording.period:.4g} s apart",
-        f"Gap        {gap.measure}",
-        f"           before {number(gap.before)}, after {number(gap.after)}, noise floor {number(gap.floor)}, "
-        f"black box {number(gap.black_box)}; closed {percent(gap.closed)}",
-    ]
-    for cause in diagnosis.causes:
-        lines += [
-            "",
-            f"Cause      {cause.effect}: probability {cause.probability:.2f}, closes {percent(cause.gap_closed)} alone",
-            *(f"           {name} = {estimate(one)} (90 %: {interval(one)})" for name, one in cause.parameters.items()),
-        ]
-        if cause.indistinguishable_from:
-            lines.append(f"           cannot be told from {listed(cause.indistinguishable_from, 'or')}")
-    lines += ["", *_where(diagnosis)]
-    if diagnosis.ranking:
-        lines += ["", "Ranking    probability, gap closed, effects"]
-        lines += [
-            f"           {ranked.probability:.3f}  {percent(ranked.gap_closed):>7}  {effects(ranked.effects)}"
-            for ranked in diagnosis.ranking[:5]
-        ]
-    terms = policy_terms(diagnosis)
-    if terms:
-        lines += ["", f"Policy     Theorem 1, a step of the policy in SI units: simulator, {corrected(diagnosis)}"]
-        lines += [f"           {number(pair[0]):>7}  {number(pair[1]):>7}  {name}" for name, pair in terms]
-    if diagnosis.next_experiment:
-        lines += ["", f"Next       {diagnosis.next_experiment}"]
-    lines += [f"Warning    {warning}" for warning in diagnosis.warnings]
-    return "\n".join(lines)
-
-
-def _where(diagnosis: Diagnosis) -> list[str]:
-    where = diagnosis.where
-    shares = [
-        ", ".join(f"{name} {percent(share)}" for name, share in table.items() if share > 0) or "none"
-        for table in (where.stages, where.states)
-    ]
-    return [
-        f"Where      by stage: {shares[0]}",
-        f"           by state: {shares[1]}",
-        *(
-            f"           {region(one, diagnosis.system)}: {percent(one.share)} of the gap (p = {one.p_value:.2g})"
-            for one in where.regions
-        ),
-    ]
+    return rendered("terminal.txt", diagnosis).rstrip("\n")

@@ -25,11 +25,9 @@ from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
 
-PREDICTION_TIME = 0.5
-"""s; the horizon at which the gap is measured."""
+PREDICTION_TIME = 0.5  # s; the horizon at which the gap is measured
 
-REFIT_ITERATIONS = 5
-"""Iterations of a fit without a fold, which starts from the fit to all episodes."""
+REFIT_ITERATIONS = 5  # Iterations of a fit without a fold, which starts from the fit to all episodes
 
 STATE_LIMIT = 1e3
 """Bound on predicted states, in their units, so that an unstable prediction gives a large but finite error."""
@@ -41,10 +39,8 @@ class RolloutErrors:
 
     error: Tensor
     """(H + 1, W, T, m) prediction minus measurement, at the row where the prediction ends; 0 where not `valid`"""
-    valid: Tensor
-    """(H + 1, W, T, m) 1 where there are both a prediction and a measurement"""
-    predicted: Tensor
-    """(W, T, H + 1, n) states predicted from each row"""
+    valid: Tensor  # (H + 1, W, T, m) 1 where there are both a prediction and a measurement
+    predicted: Tensor  # (W, T, H + 1, n) states predicted from each row
 
     def rms(self, deviation: Tensor) -> Tensor:
         """(H, m) root mean square errors 1 to H rows ahead, in units of `deviation` (m,)."""
@@ -77,14 +73,7 @@ def folds(rows: Segments, most: int) -> Tensor:
 def held_out(
     system: System, rows: Segments, sets: Sequence[tuple[Effects, FitState]], black_box: bool = False
 ) -> list[RolloutErrors]:
-    """Cross-validated predictions of each set.
-
-    Args:
-        system: the source.
-        rows: the recording.
-        sets: each set of effects and its fit to all rows.
-        black_box: whether to add a black box to the fitted sets.
-    """
+    """Cross-validated predictions of each set of effects, given its fit to all rows, perhaps with a black box added."""
     out = folds(rows, profile_of(system).folds)
     count = len(out)
     models = [CandidateModel(system, effects, rows, COARSE) for effects, _ in sets for _ in range(count)]

@@ -11,10 +11,8 @@ from visadapt.diagnosis.search.search import ScoredModel, Search
 from visadapt.diagnosis.search.unexplained import BlackBoxFunction, black_box_functions
 from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel
-from visadapt.estimation.fit_states import Effects
 
-COMPARE_WITHIN = 10.0
-"""Log posterior odds; models further behind the best are not compared."""
+COMPARE_WITHIN = 10.0  # Log posterior odds; models further behind the best are not compared
 
 MIN_LEFTOVER = 5.0
 """Log likelihood that process noise must add to a model for something to count as unexplained, and the most that a
@@ -32,26 +30,20 @@ class ComparedModel:
     """A fitted model and its posterior probability."""
 
     model: ScoredModel
-    probability: float
-    """among the models compared; log odds are lowered by what process noise adds to the model"""
+    probability: float  # among the models compared; log odds are lowered by what process noise adds to the model
 
 
 @dataclass(frozen=True)
 class ModelComparison:
     """The models that were compared, and what the best leaves unexplained."""
 
-    models: list[ComparedModel]
-    """the most probable first"""
-    leftover: float
-    """log likelihood that process noise adds to the best"""
-    functions: list[BlackBoxFunction]
-    """of a black box added to the best, the largest log odds first"""
+    models: list[ComparedModel]  # the most probable first
+    leftover: float  # log likelihood that process noise adds to the best
+    functions: list[BlackBoxFunction]  # of a black box added to the best, the largest log odds first
     alternatives: dict[type[Effect], list[ComparedModel]]
     """for each effect of the best: the models with another effect in its place that fit as well"""
-    gained: float
-    """log likelihood of the best minus that of the source"""
-    threshold: float
-    """log odds of a function above which it counts as something unexplained"""
+    gained: float  # log likelihood of the best minus that of the source
+    threshold: float  # log odds of a function above which it counts as something unexplained
 
     @property
     def best(self) -> ScoredModel:
@@ -108,8 +100,3 @@ def _alternatives(models: Sequence[ComparedModel], effect: type[Effect]) -> list
         members.append(rival)
         reached += rival.probability
     return members
-
-
-def exchanged(first: Effects, other: Effects) -> type[Effect]:
-    """The one effect of `other` that is not in `first`."""
-    return next(e for e in other if e not in first)

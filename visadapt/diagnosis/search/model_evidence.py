@@ -13,11 +13,9 @@ from visadapt.estimation.likelihood import FitState
 MAX_VARIANCE_RATIO = 0.1
 """Posterior over prior variance of a parameter, above which the recording counts as uninformative about it."""
 
-PRIOR_DECADES = 3
-"""Decades over which the prior of a strength is spread."""
+PRIOR_DECADES = 3  # Decades over which the prior of a strength is spread
 
-LOG_PRIOR_ODDS = -1.0
-"""Log prior odds that there is one more effect, shared evenly by all effects of the catalogue."""
+LOG_PRIOR_ODDS = -1.0  # Log prior odds that there is one more effect, shared evenly by all effects of the catalogue
 
 
 def log_posterior_odds(effects: Effects, fits: FitState, catalogue: int) -> float:

@@ -29,8 +29,7 @@ from visadapt.estimation.segments import Segments
 from visadapt.progress import Progress
 from visadapt.systems import System
 
-MAX_EFFECTS = 6
-"""Effects in a set at most."""
+MAX_EFFECTS = 6  # Effects in a set at most
 
 MAX_CANDIDATES, MAX_EXCHANGES = 8, 5
 """Effects that are fitted in addition to each set when sets grow, and when one effect is exchanged."""
@@ -50,10 +49,8 @@ class ScoredModel:
     """One set of effects, fitted to a recording."""
 
     effects: Effects
-    fits: FitState
-    """of this set alone (C = 1), parameters in the order of the effects"""
-    log_odds: float
-    """log posterior odds, up to a constant"""
+    fits: FitState  # of this set alone (C = 1), parameters in the order of the effects
+    log_odds: float  # log posterior odds, up to a constant
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -62,21 +59,13 @@ class ScoredModel:
 
 
 class Search:
-    """The sets of effects fitted so far to one recording, and how to fit more.
+    """The sets of effects of a catalogue fitted so far to one recording, and how to fit more.
 
-    Args:
-        system: the source.
-        rows: the recording.
-        catalogue: the effects that are searched.
-        source: the fit of the source to these rows, if it is already known.
+    `source` is the fit of the source to these rows, if it is already known.
     """
 
     def __init__(
-        self,
-        system: System,
-        rows: Segments,
-        catalogue: Sequence[type[Effect]],
-        source: FitState | None = None,
+        self, system: System, rows: Segments, catalogue: Sequence[type[Effect]], source: FitState | None = None
     ) -> None:
         self.system = system
         self.profile = profile_of(system)
@@ -106,7 +95,9 @@ class Search:
         self._settle()
         if self.leftover([self.best])[0] > WIDEN_ABOVE:
             # Something is unexplained: perhaps two effects that only together beat single effects which fit fairly.
-            self._widen()
+            for size in (1, 2):
+                bases = [f for f in self.ranked if len(f.effects) == size and f.log_odds > -math.inf]
+                self.extend(bases[:WIDEN_MODELS])
             self._settle()
         if progress is not None:
             progress(MAX_EFFECTS, MAX_EFFECTS, -self.best.log_odds)
@@ -119,12 +110,6 @@ class Search:
             self.polish()
             if self.best.names == before.names:
                 return
-
-    def _widen(self) -> None:
-        """Extend more of the sets of one effect, then of two."""
-        for size in (1, 2):
-            bases = [f for f in self.ranked if len(f.effects) == size and f.log_odds > -math.inf][:WIDEN_MODELS]
-            self.extend(bases)
 
     @property
     def source(self) -> ScoredModel:

@@ -16,18 +16,15 @@ import torch
 from torch import Tensor
 
 from visadapt.estimation.candidate import CandidateModel, linearise
-from visadapt.estimation.innovations import Innovations
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.linearise import load_effect
+from visadapt.estimation.sensitivity import Innovations
 
-BUMPS = 10
-"""Gaussian bumps of a function."""
+BUMPS = 10  # Gaussian bumps of a function
 
-MAX_FUNCTIONS = 8
-"""Functions of a black box at most."""
+MAX_FUNCTIONS = 8  # Functions of a black box at most
 
-PREVIOUS_PREFIX = "previous_"
-"""Prefix of the name of a command in the period before."""
+PREVIOUS_PREFIX = "previous_"  # Prefix of the name of a command in the period before
 
 PRIOR_DEVIATIONS = (0.03, 0.3, 3.0, 30.0)
 """Prior standard deviations that are tried for the change of the whitened innovations by all bumps together."""
@@ -37,12 +34,9 @@ PRIOR_DEVIATIONS = (0.03, 0.3, 3.0, 30.0)
 class BlackBoxFunction:
     """One function of the black box, fitted alone."""
 
-    port: str
-    """the load, or the state whose reading is in error"""
-    variable: str
-    """a state, a command, a command of the period before, or time"""
-    log_odds: float
-    """that it is there, at even prior odds"""
+    port: str  # the load, or the state whose reading is in error
+    variable: str  # a state, a command, a command of the period before, or time
+    log_odds: float  # that it is there, at even prior odds
 
 
 @dataclass(frozen=True)
@@ -51,10 +45,8 @@ class Block:
 
     port: str
     variable: str
-    drive: Tensor
-    """(W, T - 1, n, BUMPS) to the states"""
-    reading: Tensor
-    """(W, T, m, BUMPS) to the readings"""
+    drive: Tensor  # (W, T - 1, n, BUMPS) to the states
+    reading: Tensor  # (W, T, m, BUMPS) to the readings
 
 
 def black_box_functions(model: CandidateModel, fits: FitState) -> list[BlackBoxFunction]:
@@ -104,7 +96,7 @@ def _blocks(model: CandidateModel, fits: FitState) -> list[Block]:
     no_reading = torch.zeros(*rows.used.shape, BUMPS, dtype=torch.float64)
     out = []
     for name, values in variables.items():
-        bumps = _bumps(values, _ends(values, rows.inside > 0))
+        bumps = _bumps(values, rows.inside > 0)
         inner = bumps[:, :-1] * rows.inside[:, 1:, None]
         for k, load in enumerate(system.loads):
             for factor in model.profile.black_box_factors.get(load.name, (None,)):
@@ -140,15 +132,10 @@ def loads_of(model: CandidateModel, fits: FitState) -> Tensor:
     return linearise(loaded, theta, fits.state[0]).by_parameter[..., -count:]
 
 
-def _ends(values: Tensor, inside: Tensor) -> tuple[float, float]:
-    """The 1 % and 99 % quantiles of values (W, T)."""
+def _bumps(values: Tensor, inside: Tensor) -> Tensor:
+    """Bumps (W, T, BUMPS) at values (W, T), with centres evenly spaced from their 1 % to their 99 % quantile."""
     low, high = torch.quantile(values[inside], torch.tensor([0.01, 0.99], dtype=values.dtype)).tolist()
-    return low, max(high, low + 1e-9)
-
-
-def _bumps(values: Tensor, ends: tuple[float, float]) -> Tensor:
-    """Bumps (..., BUMPS) at values (...), with centres evenly spaced between the ends."""
-    centres = torch.linspace(*ends, BUMPS, dtype=values.dtype)
+    centres = torch.linspace(low, max(high, low + 1e-9), BUMPS, dtype=values.dtype)
     width = centres[1] - centres[0]
     return torch.exp(-0.5 * ((values[..., None] - centres) / width).square())
 

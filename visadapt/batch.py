@@ -1,0 +1,43 @@
+"""Dataclasses of tensors with one row for each member of a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+
+class Batch:
+    """Base of dataclasses whose fields are tensors (B, ...), tuples of these, or batches themselves."""
+
+    def map(self, function: Callable[..., Tensor], *others: Self) -> Self:
+        """The batch with every tensor replaced by a function of it and of those in its place in `others`."""
+        values: Any = self
+        names = [field.name for field in fields(values)]
+        return type(self)(*(_mapped(function, [getattr(one, name) for one in (self, *others)]) for name in names))
+
+    def detach(self) -> Self:
+        """The same, cut off from the graph."""
+        return self.map(Tensor.detach)
+
+    def __getitem__(self, rows: Tensor | slice) -> Self:
+        return self.map(lambda tensor: tensor[rows])
+
+    def joined(self, other: Self) -> Self:
+        """The rows of this batch and, after them, those of another."""
+        return self.map(lambda *pair: torch.cat(pair), other)
+
+    def where(self, keep: Tensor, other: Self) -> Self:
+        """The rows of this batch where `keep` (B,) holds, those of `other` in the rest."""
+        return self.map(lambda a, b: torch.where(keep.reshape(-1, *[1] * (a.dim() - 1)), a, b), other)
+
+
+def _mapped(function: Callable[..., Tensor], values: list[Any]) -> Any:
+    if isinstance(values[0], Batch):
+        return values[0].map(function, *values[1:])
+    if isinstance(values[0], tuple):
+        return tuple(function(*each) for each in zip(*values, strict=True))
+    return function(*values)

@@ -1,0 +1,158 @@
+"""Sensors that are not as the source assumes: other signs, velocities that were derived, a defective angle sensor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from visadapt.diagnosis.search.disturbance import disturbance
+from visadapt.diagnosis.search.search import Search
+from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.likelihood import FitState
+from visadapt.estimation.profiles import Convention, profile_of
+from visadapt.estimation.segments import Segments
+from visadapt.systems import System
+
+SUSPICIOUS_LOG_PROCESS = math.log(0.02**2)
+"""Log variance of the velocities' process noise, (m/s)^2 and (rad/s)^2, above which the source fits so badly that signs
+and sensors are checked."""
+
+MIN_GAIN_PER_READING = 0.1
+"""Log likelihood per reading that another convention must gain to be taken for that of the recording."""
+
+
+def continuous_quaternion(measured: Tensor, quaternion: Sequence[int]) -> Tensor:
+    """An episode (T, m) whose quaternion, in these columns, does not jump to the opposite sign."""
+    if not quaternion:
+        return measured
+    values = measured[:, quaternion]
+    jumps = (values[1:] * values[:-1]).sum(1) < 0
+    out = measured.clone()
+    out[1:, quaternion] *= torch.where(jumps, -1.0, 1.0).to(measured).cumprod(0)[:, None]
+    return out
+
+
+def opposite_signs(system: System, rows: Segments, source: FitState, fitted: FitState | None) -> Convention | None:
+    """The convention in which the recording is far likelier than in the source's, if there is one.
+
+    `source` is a fit of the source before bad readings were excluded, `fitted` that to `rows`, if known.
+    """
+    profile = profile_of(system)
+    if not profile.sign_conventions or float(source.log_process.max()) < SUSPICIOUS_LOG_PROCESS:
+        return None
+    fitted = fitted or Search(system, rows, ()).source.fits
+    likelihoods = [
+        float(Search(system, to_source(rows, other, profile.angle_sensor), ()).source.fits.likelihood[0])
+        for other in profile.sign_conventions
+    ]
+    best = max(range(len(likelihoods)), key=likelihoods.__getitem__)
+    gained = likelihoods[best] - float(fitted.likelihood[0])
+    return profile.sign_conventions[best] if gained > MIN_GAIN_PER_READING * float(rows.used.sum()) else None
+
+
+def to_source(rows: Segments, convention: Convention, angle_sensor: Sequence[int]) -> Segments:
+    """Rows of another convention in that of the source."""
+    signs = [convention.angle if channel in angle_sensor else 1.0 for channel in rows.channels]
+    sign = torch.tensor(signs, dtype=torch.float64)
+    return replace(rows, measured=rows.measured * sign, command=rows.command * convention.command)
+
+
+MAX_LAG = 0.2
+"""Largest lag, in periods, of a measured velocity behind the slope of its position; backward differences lag by 0.5."""
+
+
+def derived_velocities(system: System, rows: Segments) -> dict[str, float]:
+    """Names of velocities that lag behind the slope of their position, with the lag in s.
+
+    Differences of past positions lag, and filtered ones do more. Position and slope are those of the states that the
+    source fits to the positions alone.
+    """
+    position_of = profile_of(system).position_of
+    positions = [k for k, channel in enumerate(rows.channels) if channel not in position_of]
+    velocities = [k for k, channel in enumerate(rows.channels) if position_of.get(channel) in rows.channels]
+    if not velocities:
+        return {}
+    state = Search(system, rows.with_channels(positions), ()).source.fits.state[0]
+    inside = rows.inside[:, 2:] * rows.inside[:, :-2]
+    out = {}
+    for k in velocities:
+        velocity = state[..., rows.channels[k]]
+        acceleration = (velocity[:, 2:] - velocity[:, :-2]) / (2 * rows.period)
+        used = inside * rows.used[:, 1:-1, k]
+        error = rows.measured[:, 1:-1, k] - velocity[:, 1:-1]
+        # Least squares of error = -lag acceleration.
+        lag = float(-(error * acceleration * used).sum() / (acceleration.square() * used).sum())
+        if lag > MAX_LAG * rows.period:
+            out[system.states[rows.channels[k]].name] = lag
+    return out
+
+
+BAND = 0.1  # rad, width of the bands of angle that are tested
+
+POWER_RATIO = 25.0
+MIN_BAND_ROWS = 5
+MAX_ROWS_SHARE = 0.15
+"""A band is defective if the mean square of the disturbance torque in it exceeds POWER_RATIO times the median
+over bands, on at least MIN_BAND_ROWS rows; all defective bands together hold at most MAX_ROWS_SHARE of the rows."""
+
+FULL_TURN_SHARE = 0.8  # Share of the circle's bands that the pole visits, above which it turns all the way round
+
+MIN_STRETCH_ROWS = 15  # Rows between two passes of a defective band for them to be used
+
+
+def angle_defect(system: System, rows: Segments, fits: FitState) -> tuple[tuple[float, float], bool] | None:
+    """The band of angles where following the readings takes far greater torques than elsewhere, by the source's fit.
+
+    Its edges in rad, and whether the pole turns all the way round; None where there is no such band.
+    """
+    angle_sensor = profile_of(system).angle_sensor
+    if not angle_sensor or float(fits.log_process[0, 1]) < SUSPICIOUS_LOG_PROCESS:
+        return None
+    found = disturbance(CandidateModel(system, (), rows), fits, fits.log_process)
+    here = found.valid > 0
+    theta = found.variables[system.states[angle_sensor[0]].name][here]
+    band = ((torch.atan2(theta.sin(), theta.cos()) + math.pi) / BAND).long()
+    power = found.load[..., 1][here].square()
+    count = torch.zeros(int(2 * math.pi / BAND) + 1, dtype=power.dtype).index_add_(0, band, torch.ones_like(power))
+    mean = torch.zeros_like(count).index_add_(0, band, power) / count.clamp(min=1)
+    defective = (mean > POWER_RATIO * mean[count > 0].median()) & (count >= MIN_BAND_ROWS)
+    if not bool(defective.any()) or float(count[defective].sum()) > MAX_ROWS_SHARE * float(count.sum()):
+        return None
+    bands = defective.nonzero()[:, 0]
+    low, high = (BAND * float(edge) - math.pi for edge in (bands.min(), bands.max() + 1))
+    return (low, high), float((count > 0).double().mean()) > FULL_TURN_SHARE
+
+
+def between(theta: Tensor, low: float, high: float) -> Tensor:
+    """Whether angles, wrapped to [-pi, pi], lie between two others."""
+    wrapped = torch.atan2(theta.sin(), theta.cos())
+    return (wrapped >= low) & (wrapped <= high)
+
+
+def on_one_turn(measured: Tensor, angle: int, edge: float) -> Tensor:
+    """Measurements (T, m) with the angle's column on the turn that starts or ends at `edge` and contains upright, 0."""
+    start = edge if edge < 0 else edge - 2 * math.pi
+    out = measured.clone()
+    out[:, angle] = (measured[:, angle] - start).remainder(2 * math.pi) + start
+    return out
+
+
+def stretches_without(bad: Sequence[Tensor]) -> list[tuple[int, int, int]]:
+    """Stretches of episodes without bad rows (T,): episode index, first row, row past the last."""
+    out = []
+    for index, rows in enumerate(bad):
+        edges = [-1, *rows.nonzero()[:, 0].tolist(), len(rows)]
+        out += [(index, a + 1, b) for a, b in pairwise(edges) if b - a - 1 >= MIN_STRETCH_ROWS]
+    return out
+
+
+def without_angles(rows: Segments, angle_sensor: Sequence[int], low: float, high: float) -> Segments:
+    """Rows in which the angle sensor's readings between two angles are not used."""
+    bad = between(rows.measured[..., rows.channels.index(angle_sensor[0])], low, high)
+    affected = torch.tensor([channel in angle_sensor for channel in rows.channels])
+    return replace(rows, used=rows.used * ~(bad[..., None] & affected))
