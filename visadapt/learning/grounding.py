@@ -26,21 +26,16 @@ from visadapt.world import World
 class GroundSettings:
     """How a residual is fitted; all but the first two are for heads fitted by descent."""
 
-    ridge: float = 10.0
-    """weight of the squared coefficients of a linear head, in samples"""
+    ridge: float = 10.0  # weight of the squared coefficients of a linear head, in samples
     negligible: float = 0.0
     """smallest unit of a gap, as a share of the root mean square by which a state changes in a period"""
-    steps: int = 2000
-    """optimisation steps at most"""
+    steps: int = 2000  # optimisation steps at most
     batch: int = 64
     learning_rate: float = 2e-3
     weight_decay: float = 1e-2
-    held_out: float = 0.2
-    """share of the samples, whole stretches of time, that only choose when to stop"""
-    every: int = 25
-    """steps between looks at the held-out samples"""
-    patience: int = 12
-    """looks without a better held-out loss before stopping"""
+    held_out: float = 0.2  # share of the samples, whole stretches of time, that only choose when to stop
+    every: int = 25  # steps between looks at the held-out samples
+    patience: int = 12  # looks without a better held-out loss before stopping
 
 
 class GroundLoss(NamedTuple):

@@ -29,14 +29,11 @@ from visadapt.targets import Target, TargetError
 from visadapt.targets.rollout import run
 from visadapt.world import World
 
-EXPLORATION = 0.05
-"""Standard deviation of white noise on the commands while data are collected."""
+EXPLORATION = 0.05  # Standard deviation of white noise on the commands while data are collected
 
-FILES = ("recording.h5", "residual.safetensors", "policy.safetensors")
-"""What the stages of a round leave in its folder."""
+FILES = ("recording.h5", "residual.safetensors", "policy.safetensors")  # What the stages of a round leave in its folder
 
-Label = Callable[[list[Episode]], list[Episode]]
-"""Gives the episodes of a round the states that grounding learns from."""
+Label = Callable[[list[Episode]], list[Episode]]  # Gives the episodes of a round the states that grounding learns from
 
 
 class BudgetExceeded(RuntimeError):
@@ -47,10 +44,8 @@ class BudgetExceeded(RuntimeError):
 class Ledger:
     """Counts the steps of a target. Only the final evaluation is free, and is not entered."""
 
-    budget: int
-    """steps of the target allowed in all"""
-    entries: list[tuple[str, int]] = field(default_factory=list)
-    """(purpose, steps), in order"""
+    budget: int  # steps of the target allowed in all
+    entries: list[tuple[str, int]] = field(default_factory=list)  # (purpose, steps), in order
 
     @property
     def used(self) -> int:
@@ -98,10 +93,8 @@ class Round:
     """What a round did: its losses over optimisation steps, and the samples counted when it began to learn."""
 
     samples: int
-    grounding: Sequence[tuple[int, float, float]]
-    """(step, training loss, held-out loss)"""
-    policy: list[float]
-    """loss by iteration"""
+    grounding: Sequence[tuple[int, float, float]]  # (step, training loss, held-out loss)
+    policy: list[float]  # loss by iteration
 
 
 @dataclass(frozen=True)

@@ -26,12 +26,9 @@ class Paths:
     Uniform position; normal velocity; at every period a new normal acceleration.
     """
 
-    reach: float
-    """half-width of the first position"""
-    velocity: float
-    """standard deviation, per s"""
-    acceleration: float
-    """standard deviation, per s2"""
+    reach: float  # half-width of the first position
+    velocity: float  # standard deviation, per s
+    acceleration: float  # standard deviation, per s2
 
     def draw(self, batch: int, length: int, period: float, generator: torch.Generator) -> Tensor:
         """Positions (batch, length), `period` s apart."""
@@ -52,13 +49,10 @@ class PerceptionSettings:
     """How an encoder learns to see."""
 
     iterations: int = 4000
-    streams: int = 32
-    """paths rendered in an iteration"""
-    length: int = 8
-    """frames of a path; each gives length - 4 windows"""
+    streams: int = 32  # paths rendered in an iteration
+    length: int = 8  # frames of a path; each gives length - 4 windows
     learning_rate: float = 2e-3
-    pixel_noise: float = 0.004
-    """standard deviation of white noise on the frames"""
+    pixel_noise: float = 0.004  # standard deviation of white noise on the frames
     cart: Paths = Paths(reach=1.3, velocity=0.4, acceleration=2.0)
     pole: Paths = Paths(reach=0.2, velocity=0.4, acceleration=4.0)
 

@@ -39,19 +39,15 @@ class TuneSettings:
     iterations: int
     batch: int = 64
     learning_rate: float = 1e-3
-    longest: int = 150
-    """steps after which a stream starts anew"""
+    longest: int = 150  # steps after which a stream starts anew
     streams: int | None = None
     """number of streams where that is not `batch`: the states that they pass through are then kept, and each batch is
     drawn from all of them, so that few steps are simulated"""
-    every: int = 1
-    """iterations between two steps of the streams"""
+    every: int = 1  # iterations between two steps of the streams
     curriculum: bool = True
     """whether streams start, and are kept, closer to the reference at first; not for a trained policy"""
-    recorded: float = 0.0
-    """share of the starts that are recorded windows of the target, with their histories"""
-    observation_noise: float = 0.01
-    """standard deviation of white noise on what the policy sees"""
+    recorded: float = 0.0  # share of the starts that are recorded windows of the target, with their histories
+    observation_noise: float = 0.01  # standard deviation of white noise on what the policy sees
 
 
 def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None:

@@ -35,14 +35,11 @@ from visadapt.world import World
 SHOCK = 0.03
 """m/s2, the unit of shocks: they are expected to be smaller than what a load drifts by in a period (unit 1 m/s2)."""
 
-SMOOTHINGS = 4
-"""Times that the physics are linearised around the path so far; the noise is fitted in the first two."""
+SMOOTHINGS = 4  # Times that the physics are linearised around the path so far; the noise is fitted in the first two
 
-ACCELERATION = 10.0
-"""m/s2 and rad/s2, what a load may do before anything is seen (standard deviation)."""
+ACCELERATION = 10.0  # m/s2 and rad/s2, what a load may do before anything is seen (standard deviation)
 
-LEAN = 0.5
-"""rad, largest |theta| at which the pole is looked for."""
+LEAN = 0.5  # rad, largest |theta| at which the pole is looked for
 
 BRIDGED = 10
 """Rows in a row without a usable frame that the physics may bridge: upright, errors grow by e in about 5 rows."""

@@ -29,18 +29,12 @@ class Windows:
     All is kept once, for the R rows of the recording, one episode after the other; a window refers to its rows.
     """
 
-    lengths: list[int]
-    """(E,) rows of each episode"""
-    observations: Tensor
-    """(R, ...): uint8 frames, or states"""
-    actions: Tensor
-    """(R, n_action); zero in the last row of an episode"""
-    states: Tensor
-    """(R, n_state)"""
-    times: Tensor
-    """(R,) s from the begin of the episode"""
-    task_states: Tensor
-    """(R, n_task_state); of width 0 where the target has none"""
+    lengths: list[int]  # (E,) rows of each episode
+    observations: Tensor  # (R, ...): uint8 frames, or states
+    actions: Tensor  # (R, n_action); zero in the last row of an episode
+    states: Tensor  # (R, n_state)
+    times: Tensor  # (R,) s from the begin of the episode
+    task_states: Tensor  # (R, n_task_state); of width 0 where the target has none
     rows: Tensor
     """(N, LENGTH) rows that a window shows, up to that of s_t; before an episode its first row stands still"""
 

@@ -25,8 +25,7 @@ from visadapt.tasks.balance import CENTRED_CARTPOLE, PAPER_CARTPOLE, Balance
 from visadapt.weights import shipped
 from visadapt.world import World
 
-UNLIMITED = 1e9
-"""m, of the cart's position: nothing depends on it, and no camera loses the cart."""
+UNLIMITED = 1e9  # m, of the cart's position: nothing depends on it, and no camera loses the cart
 
 FROM_STATES = SetupSettings(
     source=TuneSettings(
@@ -51,11 +50,9 @@ FROM_STATES = SetupSettings(
     ),
 )
 
-CONTRAST = 0.2
-"""Grey levels, of 1, that frames are divided by before the networks see them."""
+CONTRAST = 0.2  # Grey levels, of 1, that frames are divided by before the networks see them
 
-REACH = 1.45
-"""m to either side that a camera has to see for `FROM_FRAMES`, of the drawn cart-pole, which sees 1.5 m."""
+REACH = 1.45  # m to either side that a camera has to see for `FROM_FRAMES`, of the drawn cart-pole, which sees 1.5 m
 
 FROM_FRAMES = SetupSettings(
     source=TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500),

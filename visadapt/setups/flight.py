@@ -36,10 +36,8 @@ GROUND = GroundSettings(ridge=0.1, negligible=0.1)
 RECORDED = 0.8
 """Share of the streams that start in a recorded flight, history and all, where the residual reads the history: without
 it, a stream would meet no force that changes, or one that its residual makes up."""
-DRAG = 0.3
-"""1/s, r in v' = ... - r v"""
-FORCE = 2.0
-"""N, amplitude of FORCE cos(t + phase)"""
+DRAG = 0.3  # 1/s, r in v' = ... - r v
+FORCE = 2.0  # N, amplitude of FORCE cos(t + phase)
 
 _learn = partial(TuneSettings, longest=100, observation_noise=0.0)
 

@@ -20,20 +20,16 @@ from torch import Tensor
 
 from visadapt.systems import Quadrotor
 
-SHIFT = 1e-4
-"""s, of the difference that takes the place of a derivative: in float64, right to about 1e-7 rad/s2."""
+SHIFT = 1e-4  # s, of the difference that takes the place of a derivative: in float64, right to about 1e-7 rad/s2
 
 
 @dataclass(frozen=True)
 class Demand:
     """What a motion asks for, for each of its instants."""
 
-    thrust: Tensor
-    """(...) m/s2, mass-normalised"""
-    attitude: Tensor
-    """(..., 4) quaternion w, x, y, z, with w positive"""
-    rates: Tensor
-    """(..., 3) rad/s, about the body's axes"""
+    thrust: Tensor  # (...) m/s2, mass-normalised
+    attitude: Tensor  # (..., 4) quaternion w, x, y, z, with w positive
+    rates: Tensor  # (..., 3) rad/s, about the body's axes
 
     def state(self, position: Tensor, velocity: Tensor) -> Tensor:
         """The quadrotor's state (..., 13) at positions (..., 3) and velocities (..., 3)."""

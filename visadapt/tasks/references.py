@@ -29,24 +29,18 @@ LOOP_RADIUS = 7.0
 5 m/s, leaves the controller a tenth of the range of commands (`smallest_loop`), rounded up to half a metre."""
 RAMP = 0.5
 """rad, by which a power loop turns while its curvature grows from none to the circle's, and again on the way out."""
-STRAIGHT = 1.0
-"""s of straight flight at least, before and after a power loop."""
+STRAIGHT = 1.0  # s of straight flight at least, before and after a power loop
 
 
 @dataclass(frozen=True)
 class Reference:
     """One reference, or many of one length: leading axes (...) number them, the next is time. World axes, z up."""
 
-    positions: Tensor
-    """(..., T, 3) m"""
-    velocities: Tensor
-    """(..., T, 3) m/s"""
-    accelerations: Tensor
-    """(..., T, 3) m/s2"""
-    jerks: Tensor
-    """(..., T, 3) m/s3"""
-    period: float
-    """s between rows"""
+    positions: Tensor  # (..., T, 3) m
+    velocities: Tensor  # (..., T, 3) m/s
+    accelerations: Tensor  # (..., T, 3) m/s2
+    jerks: Tensor  # (..., T, 3) m/s3
+    period: float  # s between rows
 
     @classmethod
     def of(cls, motion: Tensor, period: float) -> Self:
