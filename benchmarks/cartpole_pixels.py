@@ -24,7 +24,7 @@ from renderers import DrawnCartPole
 from visadapt.evaluation import CartPoleScore, kept_score
 from visadapt.evaluation.result_tables import print_speed, read_rows, speed_row, write_rows
 from visadapt.films.plots import plot_curve
-from visadapt.setups.cartpole_frames import cartpole_frames
+from visadapt.setups.cartpole import cartpole_frames
 from visadapt.storage.run_folder import open_run
 from visadapt.targets import SyntheticTarget, no_effects, sine_force
 from visadapt.weights import shipped

@@ -34,8 +34,7 @@ from visadapt.learning.grounding import gap, left_over
 from visadapt.learning.windows import Windows
 from visadapt.policies import AutoregressivePolicy, Policy
 from visadapt.setups.base import Setup
-from visadapt.setups.flight import flight_target
-from visadapt.setups.flight_experiments import EXPERIMENTS
+from visadapt.setups.flight import EXPERIMENTS, flight_target
 from visadapt.storage.run_folder import once
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import VELOCITY

@@ -31,8 +31,7 @@ from visadapt.evaluation.result_tables import miss_row, read_rows, write_rows
 from visadapt.films.plots import Chart, plot_charts, plot_losses
 from visadapt.policies import Policy
 from visadapt.setups.base import Setup
-from visadapt.setups.flight import flight_target
-from visadapt.setups.flight_experiments import EXPERIMENTS
+from visadapt.setups.flight import EXPERIMENTS, flight_target
 from visadapt.targets.synthetic import DrawEffects, no_effects
 from visadapt.weights import shipped
 

@@ -27,12 +27,12 @@ from visadapt.estimation.fit_states import neutral
 from visadapt.evaluation import CartPoleScore, kept_score
 from visadapt.evaluation.result_tables import print_speed, speed_row, write_rows
 from visadapt.learning.grounding import fit_named
-from visadapt.learning.ledger import Ledger
+from visadapt.learning.joint import Ledger
 from visadapt.learning.policy import TuneSettings, tune
 from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
 from visadapt.recordings import Episode
-from visadapt.setups.cartpole_states import SETTINGS, cartpole_states
+from visadapt.setups.cartpole import FROM_STATES, cartpole_states
 from visadapt.storage.run_folder import open_run
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget
@@ -92,9 +92,9 @@ def _scores(settings: Settings, seed: int) -> dict[tuple[str, str], CartPoleScor
     torch.set_num_threads(1)
     folder = settings.work / f"seed-{seed}"
     own = replace(
-        SETTINGS,
-        source=replace(SETTINGS.source, iterations=settings.source_iterations),
-        tuning=replace(SETTINGS.tuning, iterations=settings.iterations),
+        FROM_STATES,
+        source=replace(FROM_STATES.source, iterations=settings.source_iterations),
+        tuning=replace(FROM_STATES.tuning, iterations=settings.iterations),
     )
     setup = cartpole_states(with_history=True, settings=own)
     numbers = {name: getattr(settings, name) for name in ("episodes", "samples", "exploration")}

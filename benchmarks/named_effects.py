@@ -24,8 +24,7 @@ from datasets import quadrotor_references
 from visadapt.effects import ConstantForce, Effect, LinearDrag, ThrustGain
 from visadapt.evaluation import FlightScore, kept_score
 from visadapt.evaluation.result_tables import miss_row, write_rows
-from visadapt.setups.flight import flight_target, quadrotor
-from visadapt.setups.flight_experiments import EXPERIMENTS
+from visadapt.setups.flight import EXPERIMENTS, flight_target, quadrotor
 from visadapt.storage.run_folder import open_run
 from visadapt.systems import Quadrotor
 from visadapt.weights import shipped

@@ -30,8 +30,7 @@ from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
 from visadapt.policies.networks import FlightResidualNetwork, ResidualNetwork, StateResidualNetwork
 from visadapt.setups.base import Setup
-from visadapt.setups.flight import flight_target
-from visadapt.setups.flight_experiments import EXPERIMENTS
+from visadapt.setups.flight import EXPERIMENTS, flight_target
 from visadapt.systems import RigidBody
 from visadapt.systems.rigid_body import VELOCITY
 from visadapt.targets.rollout import run
@@ -121,9 +120,7 @@ def _share(setup: Setup, method: str, train: Windows, samples: int, test: Window
 
 def _first(windows: Windows, count: int) -> Windows:
     """The first windows only, of the same episodes."""
-    each = {field.name: getattr(windows, field.name) for field in dataclasses.fields(windows)}
-    whole = ("observations", "commands", "states")
-    return Windows(**{name: value if name in whole else value[:count] for name, value in each.items()})
+    return dataclasses.replace(windows, rows=windows.rows[:count])
 
 
 def _size(change: Tensor) -> float:

@@ -7,6 +7,7 @@ import torch
 
 from visadapt.effects import ConstantForce, LinearDrag
 from visadapt.setups.flight import quadrotor
+from visadapt.tasks.differential_flatness import demanded
 from visadapt.tasks.references import Reference
 
 PERIOD = 0.1
@@ -32,6 +33,12 @@ def straight(count=2, rows=41, dtype=torch.float32):
     position = velocity * PERIOD * torch.arange(rows)[:, None] + 1.0
     still = torch.zeros_like(velocity)
     return Reference.of(torch.stack((position, velocity, still, still)).to(dtype), PERIOD)
+
+
+def states_on(reference):
+    """The quadrotor's states (..., T, 13) on a reference."""
+    demand = demanded(reference.accelerations, reference.jerks)
+    return demand.state(reference.positions, reference.velocities)
 
 
 def small_quadrotor(rows=21, with_history=False, **training):

@@ -27,7 +27,7 @@ from visadapt.evaluation import CartPoleScore, kept_score
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.films.plots import plot_losses
 from visadapt.progress import reporting, staged
-from visadapt.setups.cartpole_frames import cartpole_frames
+from visadapt.setups.cartpole import cartpole_frames
 from visadapt.storage.run_folder import open_run, write_json
 from visadapt.targets import SyntheticTarget, Target, TargetError, no_effects, sine_force
 from visadapt.targets.rollout import Run, film_run

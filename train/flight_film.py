@@ -29,8 +29,7 @@ from visadapt.films.flight_panel import FlightPanel
 from visadapt.policies import Policy
 from visadapt.progress import reporting, staged
 from visadapt.setups.base import Setup
-from visadapt.setups.flight import flight_target
-from visadapt.setups.flight_experiments import EXPERIMENTS
+from visadapt.setups.flight import EXPERIMENTS, flight_target
 from visadapt.targets import TargetError
 from visadapt.targets.rollout import run
 from visadapt.targets.synthetic import DrawEffects, no_effects

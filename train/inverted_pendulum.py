@@ -36,22 +36,22 @@ from visadapt.evaluation.result_tables import Row, speed_row, write_rows
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.films.plots import plot_losses
 from visadapt.learning.grounding import gap
+from visadapt.learning.joint import SetupSettings
 from visadapt.learning.perception import Paths, PerceptionSettings
 from visadapt.learning.policy import TuneSettings
 from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
 from visadapt.progress import Report, reporting, staged
 from visadapt.recordings import Episode
-from visadapt.setups.base import Setup, SetupSettings
-from visadapt.setups.cartpole_frames import cartpole_frames
+from visadapt.setups.base import Setup
+from visadapt.setups.cartpole import cartpole_frames
 from visadapt.storage.atomic_files import replacing
 from visadapt.storage.run_folder import open_run, write_json
 from visadapt.targets import Observation, SyntheticTarget, Target, TargetError
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.targets.inverted_pendulum import MAP, REACH_M, SOURCE, START, inverted_pendulum
 from visadapt.targets.rollout import Run, film_run
-from visadapt.tasks.balance import Balance
-from visadapt.tasks.cost import Cost
+from visadapt.tasks.balance import Balance, Cost
 from visadapt.world import World
 
 ANGLE_LIMIT = 0.2

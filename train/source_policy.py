@@ -17,8 +17,7 @@ import tyro
 
 from visadapt.progress import reporting
 from visadapt.setups.base import Setup
-from visadapt.setups.cartpole_frames import cartpole_frames
-from visadapt.setups.cartpole_states import cartpole_states
+from visadapt.setups.cartpole import cartpole_frames, cartpole_states
 from visadapt.storage.run_folder import open_run
 
 

@@ -31,7 +31,8 @@ from torch import Tensor
 from visadapt.evaluation import SCORE_SEED
 from visadapt.evaluation.result_tables import Row, write_rows
 from visadapt.films.swing_up_film import SwingUpFilm, SwingUpPanel
-from visadapt.learning.policy import TuneSettings, train_or_load
+from visadapt.learning.policy import TuneSettings, tune
+from visadapt.learning.training_state import train_or_load
 from visadapt.policies import StatePolicy
 from visadapt.progress import reporting, staged
 from visadapt.storage.checkpoints import load_network
@@ -39,8 +40,7 @@ from visadapt.storage.run_folder import once, open_run
 from visadapt.systems import CartPole
 from visadapt.targets import Observation, Start, SyntheticTarget
 from visadapt.targets.rollout import run
-from visadapt.tasks.balance import SwingUp, within_a_turn
-from visadapt.tasks.cost import SettlingCost
+from visadapt.tasks.balance import SettlingCost, SwingUp, within_a_turn
 from visadapt.world import World
 
 SAMPLES = 20_000
@@ -177,7 +177,8 @@ def _seed(settings: Settings, seed: int) -> Score:
     policy = StatePolicy(n_state=4)
     generator = torch.Generator().manual_seed(seed)
     about = {"seed": seed, "samples": SAMPLES}
-    train_or_load(folder / POLICY, policy, World(CartPole()), None, LEARN, generator, about)
+    args = (policy, World(CartPole()), None, LEARN, generator, None, None)
+    train_or_load(folder / POLICY, policy, about, lambda partial: tune(*args, partial))
     return Score(**once(folder / "score.json", lambda: asdict(score(policy, settings.episodes))))
 
 

@@ -26,11 +26,10 @@ class History(Batch):
     actions: Tensor
 
     @classmethod
-    def start(cls, observation: Tensor, n_action: int, length: int = LENGTH) -> History:
+    def start(cls, observation: Tensor, n_action: int) -> History:
         """At the start of an episode: the first observation (B, ...) repeated, and zero actions."""
-        repeated = observation[:, None].expand(-1, length, *observation.shape[1:])
-        actions = torch.zeros(len(observation), length, n_action, device=observation.device, dtype=observation.dtype)
-        return cls(repeated.clone(), actions)
+        repeated = observation[:, None].expand(-1, LENGTH, *observation.shape[1:])
+        return cls(repeated.clone(), observation.new_zeros(len(observation), LENGTH, n_action))
 
     def acting(self, action: Tensor) -> History:
         """The same observations, with `action` (B, n_action) as the last action."""

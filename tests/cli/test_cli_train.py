@@ -72,7 +72,7 @@ def test_effects_of_one_s_own(here, diagnosis):
 
 
 def test_interrupted_it_goes_on_to_the_same_policy(here, monkeypatch):
-    monkeypatch.setattr("visadapt.learning.policy.CHECKPOINT_ITERATIONS", 4)
+    monkeypatch.setattr("visadapt.learning.training_state.CHECKPOINT_ITERATIONS", 4)
     command = (*CARTPOLE[:3], "--iterations", 9)
     assert run(*command, "--out", "whole.safetensors") == 0
     calls = []

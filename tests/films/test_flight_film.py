@@ -23,7 +23,7 @@ from visadapt.recordings import Episode
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import from_angles, rotation
 from visadapt.targets.rollout import Run
-from visadapt.tasks.flight import FlightTask
+from visadapt.tasks.base import FlightTask
 from visadapt.tasks.follow import Follow
 from visadapt.tasks.reach import Reach
 from visadapt.tasks.references import Reference

@@ -16,7 +16,7 @@ from visadapt.learning.policy import imagine
 from visadapt.learning.windows import Windows
 from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.recordings import Episode
-from visadapt.setups.residuals import source_steps
+from visadapt.setups.policy_file import source_steps
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION, VELOCITY
 from visadapt.world import World

@@ -19,8 +19,7 @@ from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import Episode
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget
-from visadapt.tasks.balance import Balance
-from visadapt.tasks.cost import PAPER_CARTPOLE, Cost
+from visadapt.tasks.balance import PAPER_CARTPOLE, Balance, Cost
 from visadapt.world import World
 
 COST = Cost((5.0, 3.0, 10.0, 1.0))

@@ -8,13 +8,12 @@ from visadapt.effects import EFFECTS, ActuatorDelay, AngleOffset, ConstantForce,
 from visadapt.history import History
 from visadapt.learning.grounding import gap
 from visadapt.learning.policy import imagine
-from visadapt.learning.streams import Streams, StreamSettings
+from visadapt.learning.streams import Streams
 from visadapt.learning.windows import Windows
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import Episode
 from visadapt.systems import CartPole
-from visadapt.tasks.balance import Balance
-from visadapt.tasks.cost import PAPER_CARTPOLE
+from visadapt.tasks.balance import PAPER_CARTPOLE, Balance
 from visadapt.world import World
 
 WIDE = Balance(PAPER_CARTPOLE, divergence=(1e9,) * 4, first_divergence=1.0, kick=(0.0,) * 4)
@@ -47,7 +46,7 @@ def episodes_of(world, lengths=(30, 12, 21), seed=0):
 
 
 def streams_of(world, task=WIDE, observe=None, windows=None, recorded=0.0, count=40):
-    made = Streams(world, task, observe, windows, StreamSettings(count, 1000, recorded))
+    made = Streams(world, task, observe, windows, count, 1000, recorded)
     made.start(1.0, torch.Generator().manual_seed(1))
     return made
 
@@ -112,7 +111,7 @@ class TestSensors:
         world = world_with(delay)
         streams = streams_of(world, windows=windows, recorded=1.0)
         before = (windows.state[:, None] == streams.now.at.state).all(2).int().argmax(0)
-        late = windows.row[before] > 1
+        late = windows.time[before] > 1.5 * world.period
         action = torch.zeros(40, 1)
         streams.advance(world.step(streams.now.at, action), action, 1.0, torch.Generator().manual_seed(2))
         shown = streams.now.history.observations[:, -1]

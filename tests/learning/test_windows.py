@@ -37,7 +37,7 @@ class TestAlignment:
         assert windows.state[:, 1].tolist() == [value + 0.25 for value in windows.state[:, 0].tolist()]
         actions = [0.010, 0.011, 0.012, 0.013, 0.014, 0.015, 0.016, 0.020, 0.021]
         assert windows.action[:, 0].tolist() == pytest.approx(actions)
-        assert windows.episode.tolist() == [0] * 7 + [1] * 2
+        assert windows.lengths == [8, 3]
 
     def test_the_history_shows_the_5_latest_rows_and_stands_still_before_the_episode(self):
         windows = Windows.cut(TWO, "state")
@@ -78,16 +78,16 @@ class TestAlignment:
     def test_task_states_are_those_of_the_rows_that_it_shows_and_none_where_there_are_none(self):
         placed = [replace(each, task_state=np.stack([each.time, -each.time], 1)) for each in TWO]
         windows = Windows.cut(placed, "state")
-        assert windows.task_state.shape == (len(windows), LENGTH, 2)
+        assert windows.task_states[windows.rows].shape == (len(windows), LENGTH, 2)
         for row in (0, 3, 6):
             first = [max(row - back, 0) for back in range(LENGTH - 1, -1, -1)]
-            np.testing.assert_array_equal(windows.task_state[row, :, 0], TWO[0].time[first])
-        assert Windows.cut(TWO, "state").task_state.shape == (len(windows), LENGTH, 0)
+            np.testing.assert_array_equal(windows.task_states[windows.rows[row], 0], TWO[0].time[first])
+        assert Windows.cut(TWO, "state").task_states.shape == (11, 0)
 
     def test_the_action_of_the_last_row_was_not_executed_and_is_nowhere(self):
         windows = Windows.cut(TWO, "state")
         assert windows.action.max() < 1
-        assert windows.past_actions.max() < 1
+        assert windows.history(torch.arange(9)).actions.max() < 1
 
     def test_an_episode_of_one_row_adds_no_sample_and_shifts_no_other(self):
         windows = Windows.cut([episode(1, 3), episode(3, 1), episode(2, 3)], "camera")

@@ -9,7 +9,7 @@ from visadapt.effects import Residual
 from visadapt.history import LENGTH, History
 from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.policies.networks import FlightResidualNetwork
-from visadapt.setups.residuals import source_steps
+from visadapt.setups.policy_file import source_steps
 from visadapt.storage.checkpoints import CheckpointError, load_network, save_network
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION

@@ -213,7 +213,7 @@ class TestAdapt:
     def test_interrupted_and_started_again_it_ends_with_the_same_weights(
         self, whole, tmp_path, monkeypatch, stage, after
     ):
-        monkeypatch.setattr("visadapt.learning.policy.CHECKPOINT_ITERATIONS", 2)
+        monkeypatch.setattr("visadapt.learning.training_state.CHECKPOINT_ITERATIONS", 2)
 
         def report(name, done, total, loss):
             if name == stage and done == after:

@@ -4,28 +4,26 @@ import pytest
 import torch
 
 from tests.scenes import state_residual_network
-from visadapt.effects import Residual
+from visadapt.effects import AngleOffset, Residual
 from visadapt.learning.grounding import GroundSettings
-from visadapt.learning.joint import AdaptSettings, adapt
-from visadapt.learning.ledger import BudgetExceeded, Ledger
+from visadapt.learning.joint import BudgetExceeded, Ledger, SetupSettings, adapt
 from visadapt.learning.policy import TuneSettings
 from visadapt.policies import StatePolicy
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import read_recording
-from visadapt.storage.checkpoints import CheckpointError
+from visadapt.storage.checkpoints import CheckpointError, load_tree
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, TargetError
 from visadapt.targets.synthetic import constant_force
-from visadapt.tasks.balance import Balance
-from visadapt.tasks.cost import PAPER_CARTPOLE
+from visadapt.tasks.balance import PAPER_CARTPOLE, Balance
 from visadapt.world import World
 
 TUNE = TuneSettings(
     Balance(PAPER_CARTPOLE), iterations=105, batch=4, learning_rate=3e-3, observation_noise=0.0, recorded=0.5
 )
 GROUND = GroundSettings(steps=60, every=20)
-SMALL = AdaptSettings(TUNE, GROUND, budget=50, round_samples=30, observations="state", longest_episode=12, seed=1)
-QUICK = dataclasses.replace(SMALL, tune=dataclasses.replace(TUNE, iterations=3))
+SMALL = SetupSettings(TUNE, TUNE, GROUND, longest_episode=12)
+QUICK = dataclasses.replace(SMALL, tuning=dataclasses.replace(TUNE, iterations=3))
 
 
 class Counted(SyntheticTarget):
@@ -52,22 +50,15 @@ class Counted(SyntheticTarget):
         return seen
 
 
-def run(folder, settings, target=None, report=None, with_history=False):
+def run(
+    folder, settings, target=None, report=None, with_history=False, budget=50, round_samples=30, seed=1, label=None
+):
     torch.manual_seed(0)
     policy = StatePolicy(4, with_history=with_history)
     residual = Residual(state_residual_network(with_history), torch.ones(4))
     source = World(CartPole(), integrator="euler")
-    adapted = adapt(
-        policy,
-        residual,
-        source,
-        target or Counted(),
-        lambda state: state,
-        settings,
-        folder,
-        report=report,
-    )
-    return policy, adapted
+    args = (policy, residual, source, target or Counted(), settings, folder, budget, round_samples, seed)
+    return policy, adapt(*args, lambda state: state, label, report)
 
 
 class TestLedger:
@@ -84,8 +75,7 @@ class TestLedger:
     @pytest.mark.parametrize(("budget", "size", "rounds"), [(50, 30, [30, 20]), (20, 20, [20]), (7, 3, [3, 3, 1])])
     def test_it_counts_exactly_the_steps_that_the_target_took(self, tmp_path, budget, size, rounds):
         target = Counted()
-        settings = dataclasses.replace(QUICK, budget=budget, round_samples=size)
-        _, adapted = run(tmp_path, settings, target)
+        _, adapted = run(tmp_path, QUICK, target, budget=budget, round_samples=size)
         assert adapted.ledger.used == target.steps == budget
         assert sum(episode.samples for episode in adapted.episodes) == budget
         for number, samples in enumerate(rounds, 1):
@@ -104,19 +94,19 @@ class TestLedger:
     def test_a_folder_that_holds_more_samples_than_the_budget_is_refused(self, tmp_path):
         run(tmp_path, QUICK)
         with pytest.raises(BudgetExceeded, match="of 25 are left"):
-            run(tmp_path, dataclasses.replace(QUICK, budget=25, round_samples=25))
+            run(tmp_path, QUICK, budget=25, round_samples=25)
 
 
 class TestSettings:
-    def test_a_budget_smaller_than_a_round_is_one_clear_line(self):
+    def test_a_budget_smaller_than_a_round_is_one_clear_line(self, tmp_path):
         with pytest.raises(ValueError, match=r"N = 20 .* B = 30 ") as caught:
-            AdaptSettings(TUNE, GROUND, budget=20, round_samples=30)
+            run(tmp_path, QUICK, budget=20, round_samples=30)
         assert "\n" not in str(caught.value)
 
     @pytest.mark.parametrize("size", [0, -5])
-    def test_a_round_needs_a_sample(self, size):
+    def test_a_round_needs_a_sample(self, tmp_path, size):
         with pytest.raises(ValueError, match=f"B = {size}"):
-            AdaptSettings(TUNE, GROUND, budget=20, round_samples=size)
+            run(tmp_path, QUICK, budget=20, round_samples=size)
 
 
 @pytest.fixture(scope="module")
@@ -169,6 +159,26 @@ class TestInterruption:
         for key, value in weights.items():
             assert torch.equal(value, policy.state_dict()[key]), key
 
+    def test_the_true_states_behind_a_biased_sensor_are_kept_and_read_again(self, tmp_path):
+        policies = []
+        for after in (None, 0, 2):
+            torch.manual_seed(0)
+            policy, residual = StatePolicy(4), Residual(StateResidualNetwork(4), torch.ones(4))
+            args = (World(CartPole(), [AngleOffset(offset=0.0)]), Counted(), QUICK, tmp_path / str(after), 50, 30, 1)
+            if after is not None:
+                with pytest.raises(KeyboardInterrupt):
+                    adapt(policy, residual, *args, report=stopping("round 2/2: tune", after))
+                policy, residual = StatePolicy(4), Residual(StateResidualNetwork(4), torch.ones(4))
+            adapt(policy, residual, *args)
+            policies.append(policy)
+        for policy in policies[1:]:
+            for key, value in policies[0].state_dict().items():
+                assert torch.equal(value, policy.state_dict()[key]), key
+        kept = load_tree(tmp_path / "None" / "round-01" / "residual.safetensors")["states"]
+        read = [torch.as_tensor(each.state) for each in read_recording(tmp_path / "None" / "round-01" / "recording.h5")]
+        assert kept.shape == torch.cat(read).shape
+        assert not torch.equal(kept, torch.cat(read))
+
     def test_no_leftovers_lie_in_the_folder_of_a_finished_run(self, whole):
         found = sorted(str(path.relative_to(whole[2])) for path in whole[2].rglob("*") if path.is_file())
         files = ("policy.safetensors", "recording.h5", "residual.safetensors")
@@ -192,13 +202,13 @@ class TestLearning:
 
     @pytest.mark.parametrize("feedforward", [True, False])
     def test_the_policy_begins_by_opposing_what_the_residual_expects_if_it_is_to(self, tmp_path, feedforward):
-        settings = dataclasses.replace(QUICK, tune=dataclasses.replace(QUICK.tune, learning_rate=0.0))
+        settings = dataclasses.replace(QUICK, tuning=dataclasses.replace(QUICK.tuning, learning_rate=0.0))
         policy, _ = run(tmp_path, dataclasses.replace(settings, feedforward=feedforward))
         assert bool(policy.feedforward.weight.any()) == feedforward
 
     def test_each_round_and_each_seed_meets_the_target_in_other_states(self, whole, tmp_path):
         _, adapted, _ = whole
-        _, other = run(tmp_path, dataclasses.replace(QUICK, seed=2))
+        _, other = run(tmp_path, QUICK, seed=2)
         starts = [tuple(episode.state[0]) for episode in [*adapted.episodes, *other.episodes]]
         assert len(set(starts)) == len(starts)
 
@@ -206,12 +216,7 @@ class TestLearning:
         def label(episodes):
             return [dataclasses.replace(episode, state=episode.state + 1.0) for episode in episodes]
 
-        torch.manual_seed(0)
-        policy = StatePolicy(4)
-        residual = Residual(StateResidualNetwork(4), torch.ones(4))
-        source = World(CartPole(), integrator="euler")
-        args = (source, Counted(), lambda state: state, QUICK, tmp_path)
-        adapted = adapt(policy, residual, *args, label=label)
+        _, adapted = run(tmp_path, QUICK, label=label)
         recorded = [
             episode for number in (1, 2) for episode in read_recording(tmp_path / f"round-0{number}/recording.h5")
         ]

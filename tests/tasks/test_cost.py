@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from visadapt.systems import CartPole
-from visadapt.tasks.cost import CENTRED_CARTPOLE, PAPER_CARTPOLE, Cost, SettlingCost
+from visadapt.tasks.balance import CENTRED_CARTPOLE, PAPER_CARTPOLE, Cost, SettlingCost
 from visadapt.world import World
 
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from tests.flying import PERIOD, seeded, straight, waves
+from tests.flying import PERIOD, seeded, states_on, straight, waves
 from visadapt.history import HORIZON
 from visadapt.systems import FixedWing
 from visadapt.systems.rigid_body import POSITION, VELOCITY
@@ -22,7 +22,7 @@ class TestFollow:
         state, task_state = task.evaluation_start(4, seeded())
         assert state.shape == (4, 13)
         assert task_state[:, 1].tolist() == [0] * 4
-        torch.testing.assert_close(state, task.references.states()[task_state[:, 0], 0])
+        torch.testing.assert_close(state, states_on(task.references)[task_state[:, 0], 0])
         assert task.steps == ROWS - 1
 
     @pytest.mark.parametrize(("batch", "counts"), [(4, {1}), (6, {1}), (12, {2}), (15, {2, 3})])
@@ -62,7 +62,7 @@ class TestFollow:
 
     def test_a_miss_is_the_distance_to_the_row_that_is_due_and_the_first_row_is_none(self, task):
         task_state = torch.tensor([[2, 0], [5, 0]])
-        states = task.references.states()[task_state[:, 0]].clone()
+        states = states_on(task.references)[task_state[:, 0]].clone()
         states[:, 0, POSITION] += 100.0
         states[0, 1:, POSITION] += torch.tensor([0.3, 0.0, -0.4])
         states[1, 8, POSITION] += torch.tensor([0.0, 2.0, 0.0])

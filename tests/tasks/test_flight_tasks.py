@@ -10,11 +10,11 @@ from tests.scenes import stir
 from visadapt.effects import LinearDrag, Residual
 from visadapt.history import HORIZON, LENGTH, History
 from visadapt.learning.policy import TuneSettings, imagine, tune
-from visadapt.learning.streams import Streams, StreamSettings
+from visadapt.learning.streams import Streams
 from visadapt.learning.windows import Windows
 from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.policies.networks import FlightResidualNetwork
-from visadapt.setups.residuals import source_steps
+from visadapt.setups.policy_file import source_steps
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
 from visadapt.targets.rollout import run
@@ -39,7 +39,7 @@ def reaching(**changes):
 
 
 def streams(task, world, batch, longest=1000, seed=0):
-    made = Streams(world, task, identity, None, StreamSettings(batch, longest, 0.0))
+    made = Streams(world, task, identity, None, batch, longest, 0.0)
     made.start(0.0, seeded(seed))
     return made
 
@@ -212,7 +212,7 @@ class TestStreams:
 
     def test_one_that_has_gone_on_for_long_enough_starts_anew(self):
         made = self.middle()
-        made.settings = StreamSettings(6, 20, 0.0)
+        made.longest = 20
         made.age[5] = 19
         self.step(made, torch.zeros(6, 3), 1.0)
         assert made.age.tolist() == [8, 8, 8, 8, 8, 0]
@@ -240,7 +240,7 @@ class TestStreams:
         torch.manual_seed(0)
         flown = run(target, FollowPolicy(PERIOD), 2, 12, seeded(4))
         windows = Windows.cut([each.episode for each in flown], "state")
-        made = Streams(self.WORLD, task, identity, windows, StreamSettings(40, 1000, 1.0))
+        made = Streams(self.WORLD, task, identity, windows, 40, 1000, 1.0)
         made.start(0.0, seeded(5))
         network = FlightResidualNetwork(Quadrotor(), PERIOD, partial(source_steps, self.WORLD))
 
@@ -258,7 +258,7 @@ class TestStreams:
             row = int(alike.nonzero()[0])
             found.add(row)
             here, there = off(now.at.state[b : b + 1], now.task_state[b : b + 1]), windows.state[row : row + 1]
-            torch.testing.assert_close(here, off(there, windows.task_state[row : row + 1, -1]), rtol=0, atol=1e-5)
+            torch.testing.assert_close(here, off(there, windows.task_states[windows.rows[row, -1:]]), rtol=0, atol=1e-5)
             past = unexplained(windows.history(torch.tensor([row])))
             torch.testing.assert_close(unexplained(now.history[b : b + 1]), past, rtol=0, atol=2e-3)
         assert len(found) > 12
@@ -272,16 +272,16 @@ class TestStreams:
         torch.manual_seed(0)
         flown = run(target, ReachPolicy(), 2, 12, seeded(4))
         windows = Windows.cut([each.episode for each in flown], "state")
-        made = Streams(World(FixedWing(), period=0.05), task, identity, windows, StreamSettings(20, 1000, 1.0))
+        made = Streams(World(FixedWing(), period=0.05), task, identity, windows, 20, 1000, 1.0)
         made.start(0.0, seeded(5))
         for b in range(20):
             # Both flights begin in the same state: their points tell them apart.
-            there = (target.first[windows.episode] == made.now.task_state[b]).all(1)
+            there = (windows.task_states[windows.rows[:, -1]] == made.now.task_state[b]).all(1)
             row = int(((windows.state == made.now.at.state[b]).all(1) & there).nonzero()[0])
             seen = windows.history(torch.tensor([row])).observations[0]
             assert torch.equal(made.now.history.observations[b, :, :13], seen)
             assert torch.equal(made.now.history.observations[b, :, 13:], made.now.task_state[b].expand(LENGTH, -1))
-            assert torch.equal(made.now.history.actions[b], windows.past_actions[row])
+            assert torch.equal(made.now.history.actions[b], windows.history(torch.tensor([row])).actions[0])
 
     def test_tuned_along_references_the_cost_of_a_plan_falls(self):
         torch.manual_seed(0)

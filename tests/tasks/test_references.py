@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from datasets.quadrotor_references import SPLINE_DEGREE, Settings, basis, main, make, read
+from tests.flying import states_on
 from visadapt.recordings import RecordingError
 from visadapt.systems import Quadrotor
 from visadapt.systems.rigid_body import rotation
 from visadapt.tasks.differential_flatness import commands, demanded
-from visadapt.tasks.references import LOOP_RADIUS, Reference, cubic, line, power_loop, read_reference, smallest_loop
+from visadapt.tasks.references import LOOP_RADIUS, Reference, cubic, power_loop, read_reference, smallest_loop
 from visadapt.world import World
 
 SMALL = Settings(train=60, test=20)
@@ -40,7 +41,7 @@ def fly_blind(reference):
     asked = asked_by(reference)
     assert asked.abs().max() <= 1
     world = World(Quadrotor(), period=reference.period)
-    at = world.start(reference.states()[:, 0].double())
+    at = world.start(states_on(reference)[:, 0].double())
     away = []
     for row in range(1, asked.shape[1]):
         at = world.step(at, (asked[:, row - 1] + asked[:, row]) / 2)
@@ -91,7 +92,7 @@ def test_rows_and_the_origin(drawn):
     assert test.jerks.shape == (20, 101, 3)
     assert train.positions.dtype == torch.float32
     assert (train.positions[:, 0] == 0).all()
-    assert train.states().shape == (60, 101, 13)
+    assert states_on(train).shape == (60, 101, 13)
 
 
 def test_all_are_feasible_with_the_margin_and_within_the_bounds_on_speed(drawn):
@@ -199,22 +200,6 @@ def test_between_rows_cubics_are_the_reference_itself(fine):
     torch.testing.assert_close(between, fine.positions[:, : 50 * (len(time) - 1) + 1 : 5], atol=2e-5, rtol=0)
 
 
-def test_a_line_ends_at_its_target_at_a_steady_speed():
-    start, target = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([4.0, 2.0, -1.0])
-    there = line(start, target, speed=2.0)
-    assert there.positions[0].tolist() == [1, 2, 3]
-    assert there.positions[-1].tolist() == [4, 2, -1]
-    assert there.positions.shape == (26, 3)
-    torch.testing.assert_close(there.velocities.norm(dim=1), torch.full((26,), 2.0))
-    torch.testing.assert_close(there.positions.diff(dim=0) / 0.1, there.velocities[1:], rtol=1e-4, atol=1e-5)
-    assert there.states()[0, 6:].tolist() == pytest.approx([1, 0, 0, 0, 0, 0, 0])
-    assert line(start, target, speed=2.1).velocities[0].norm() < 2.1
-    with pytest.raises(ValueError, match=r"the target is 0 m away, must be at least a row's 0.2 m"):
-        line(start, start, 2.0)
-    with pytest.raises(ValueError, match="speed is -1, must be positive"):
-        line(start, target, -1)
-
-
 @pytest.mark.parametrize("speed", [2.6, 3.4, 4.1, 4.6, 5.0])
 def test_a_power_loop_is_closed_steady_and_feasible(speed):
     loop = power_loop(speed, period=0.02)
@@ -233,7 +218,7 @@ def test_a_power_loop_is_closed_steady_and_feasible(speed):
     assert ((curved - 1).abs() < 1e-4).float().sum() * 0.02 > 5 * LOOP_RADIUS / speed
     assert 0 <= float(loop.positions[:, 2].max()) - 2 * LOOP_RADIUS < 0.2
     # Upright all along, within nine tenths of the commands.
-    assert (rotation(loop.states()[:, 6:10])[:, 2, 2] > 0.5).all()
+    assert (rotation(states_on(loop)[:, 6:10])[:, 2, 2] > 0.5).all()
     assert smallest_loop(speed, Quadrotor()) < LOOP_RADIUS
     assert demanded(loop.accelerations, loop.jerks).rates.abs().max() < 0.45
 
@@ -283,7 +268,7 @@ def test_a_reference_of_ones_own_is_resampled_to_the_period(tmp_path, spacing, w
     np.testing.assert_allclose(own.velocities, fast, atol=0.05)
     np.testing.assert_allclose(own.accelerations[1:-1].norm(dim=1), 1.28, atol=0.15)
     assert own.positions.dtype == torch.float32
-    assert torch.isfinite(own.states()).all()
+    assert torch.isfinite(states_on(own)).all()
 
 
 GOOD = table_of(np.arange(0, 1.05, 0.1), circle(np.arange(0, 1.05, 0.1))[0])
@@ -296,7 +281,10 @@ GOOD = table_of(np.arange(0, 1.05, 0.1), circle(np.arange(0, 1.05, 0.1))[0])
         (lambda text: text.replace("z\n", "height\n"), "has no column 'z'"),
         (lambda text: text.replace("z\n", "x_dot\n"), "has no column 'z'"),
         (lambda text: text.replace("\n0.3,", "\nnan,"), r"row 4 \(line 5\), column 'time' is nan; a finite number"),
-        (lambda text: text.replace("\n0.3,", "\n0.1,"), r"row 4 \(line 5\) is at 0.1 s, the row before it at 0.2 s"),
+        (
+            lambda text: text.replace("\n0.3,", "\n0.1,"),
+            r"row 4 \(line 5\), column 'time': the clock runs backward \(from 0.2",
+        ),
         (lambda text: "\n".join(text.split("\n")[:3]), r"2 rows over 0.1 s; at least 3 rows over 0.2 s"),
         (lambda text: text.replace("\n0.5,", "\n0.5,9"), r"it moves at .* m/s; at most 5 m/s is right"),
         (lambda text: text.replace("\n0.5,", "\n0.5,x"), r"row 6 \(line 7\), column 'x' is"),

@@ -7,7 +7,7 @@ from renderers import LayeredRenderer
 from train.inverted_pendulum import ANGLE_LIMIT, GUESS, SeenSource, _gap
 from visadapt.effects import ViscousFriction
 from visadapt.recordings import Episode
-from visadapt.setups.cartpole_frames import cartpole_frames
+from visadapt.setups.cartpole import cartpole_frames
 from visadapt.targets.inverted_pendulum import SOURCE
 from visadapt.world import World
 

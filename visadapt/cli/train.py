@@ -19,7 +19,7 @@ from visadapt.cli.inputs import (
 )
 from visadapt.learning.perception import PerceptionSettings
 from visadapt.setups.base import Setup
-from visadapt.setups.cartpole_frames import cartpole_frames
+from visadapt.setups.cartpole import cartpole_frames
 from visadapt.setups.training import setup_for
 from visadapt.storage.atomic_files import replacing
 from visadapt.systems import CartPole, Quadrotor

@@ -9,7 +9,7 @@
 Equation 5 bounds the distance for every action; the proof needs it at pi_hat alone, where it is smallest. Norms are
 Euclidean over one step's state in SI units, as in the theorem; weights of a training cost would hide the states that
 the cost ignores (the paper's ignores the cart's position). The states s are those that the smoother estimates in the
-recording; the reference nu is the first state of the line to the goal (`tasks.cost`).
+recording; the reference nu is the first state of the line to the goal (`tasks.balance`).
 
 f* is unknown. Its estimate is the step of the best set of effects plus the smoothed disturbance. |.| in delta is the
 root mean square over the posterior of the effects' parameters, so that delta does not fall below the remaining

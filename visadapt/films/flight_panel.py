@@ -14,7 +14,7 @@ from visadapt.films.canvas import Floats
 from visadapt.systems import RigidBody
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, VELOCITY, rotation
 from visadapt.targets.rollout import Run
-from visadapt.tasks.flight import FlightTask
+from visadapt.tasks.base import FlightTask
 from visadapt.tasks.follow import Follow
 from visadapt.tasks.reach import Reach
 from visadapt.tasks.references import cubic

@@ -8,13 +8,14 @@ one by ridge regression, an MLP by gradient descent from its weights of the last
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from visadapt.effects import Effect, Residual, SensingEffect
-from visadapt.estimation.effect_fit import EffectFit, fit_effects
+from visadapt.estimation.effect_fit import fit_effects
 from visadapt.learning.windows import Windows
 from visadapt.policies.networks import ResidualNetwork
 from visadapt.progress import Progress
@@ -25,25 +26,19 @@ from visadapt.world import World
 class GroundSettings:
     """How a residual is fitted; all but the first two are for heads fitted by descent."""
 
-    ridge: float = 10.0
-    """weight of the squared coefficients of a linear head, in samples"""
+    ridge: float = 10.0  # weight of the squared coefficients of a linear head, in samples
     negligible: float = 0.0
     """smallest unit of a gap, as a share of the root mean square by which a state changes in a period"""
-    steps: int = 2000
-    """optimisation steps at most"""
+    steps: int = 2000  # optimisation steps at most
     batch: int = 64
     learning_rate: float = 2e-3
     weight_decay: float = 1e-2
-    held_out: float = 0.2
-    """share of the samples, whole stretches of time, that only choose when to stop"""
-    every: int = 25
-    """steps between looks at the held-out samples"""
-    patience: int = 12
-    """looks without a better held-out loss before stopping"""
+    held_out: float = 0.2  # share of the samples, whole stretches of time, that only choose when to stop
+    every: int = 25  # steps between looks at the held-out samples
+    patience: int = 12  # looks without a better held-out loss before stopping
 
 
-@dataclass(frozen=True)
-class GroundLoss:
+class GroundLoss(NamedTuple):
     """Mean squared error in units of the residual's scale: 1 is what a residual of zero would get."""
 
     step: int
@@ -67,45 +62,21 @@ def left_over(residual: Residual, source: World, windows: Windows) -> Tensor:
 def fit_named(source: World, windows: Windows) -> Windows:
     """Fit the parameters of the source's own effects to all episodes so far, in place, within their ranges.
 
-    By maximum likelihood over whole episodes (`estimation.effect_fit`). Returns the windows with true states.
+    By maximum likelihood over whole episodes (`estimation.effect_fit`). Where the source has sensing effects, the
+    windows returned have smoothed true states in place of those recorded: the residual corrects true states, and
+    streams start from them; what policies see stays as recorded.
     """
     named = [effect for effect in source.effects if isinstance(effect, Effect)]
     if not named:
         return windows
-    fit = _fit(source, windows)
+    measured, commands = (list(values.split(windows.lengths)) for values in (windows.states, windows.actions))
+    fit = fit_effects(source.system, named, measured, commands, source.period)
     for effect in named:
         for parameter, value in zip(effect.table, fit.values[type(effect)].tolist(), strict=True):
             getattr(effect, parameter.name).data.fill_(min(max(value, parameter.low), parameter.high))
-    return _with_true_states(source, windows, fit)
-
-
-def with_true_states(source: World, windows: Windows) -> Windows:
-    """The windows with smoothed true states in place of those recorded, where the source has sensing effects.
-
-    The residual corrects true states, and streams start from them; what policies see stays as recorded.
-    """
-    return _with_true_states(source, windows, _fit(source, windows)) if _senses(source) else windows
-
-
-def _fit(source: World, windows: Windows) -> EffectFit:
-    lengths = (windows.episode.bincount(minlength=len(windows.states)) + 1).tolist()
-    measured = [states[:length] for states, length in zip(windows.states, lengths, strict=True)]
-    commands = [given[:length] for given, length in zip(windows.commands, lengths, strict=True)]
-    named = [effect for effect in source.effects if isinstance(effect, Effect)]
-    return fit_effects(source.system, named, measured, commands, source.period)
-
-
-def _with_true_states(source: World, windows: Windows, fit: EffectFit) -> Windows:
-    if not _senses(source):
+    if not any(isinstance(effect, SensingEffect) for effect in named):
         return windows
-    states = windows.states.clone()
-    for own, found in zip(states, fit.states, strict=True):
-        own[: len(found)], own[len(found) :] = found.to(own), found[-1].to(own)
-    return windows.with_states(states)
-
-
-def _senses(source: World) -> bool:
-    return any(isinstance(effect, SensingEffect) for effect in source.effects)
+    return replace(windows, states=torch.cat(fit.states).to(windows.states))
 
 
 def rescale(residual: Residual, source: World, windows: Windows, negligible: float = 0.0) -> None:
@@ -132,7 +103,9 @@ def ground(
     network = residual.network
     if not isinstance(network, ResidualNetwork):
         raise TypeError(f"grounding fits the head of a ResidualNetwork, not a {type(network).__name__}")
-    seen = _embed(network, windows)
+    with torch.no_grad():
+        parts = torch.arange(len(windows)).split(256)
+        seen = torch.cat([network.embed(windows.history(p).acting(windows.action[p])) for p in parts])
     informed = network.informed(seen)
     if bool(informed.any()):
         seen, target = seen[informed], target[informed]
@@ -180,15 +153,14 @@ def _descend(
                 score = float((head(seen[held_out]) - target[held_out]).square().mean())
             losses.append(GroundLoss(step, running / settings.every if step else score, score))
             running = 0.0
-            if progress is not None:
-                progress(step, settings.steps, score)
             if score < best:
                 best, best_weights, waited = score, copy.deepcopy(head.state_dict()), 0
             else:
                 waited += 1
-            if waited > settings.patience and progress is not None:
-                progress(settings.steps, settings.steps, best)
-            if waited > settings.patience or step == settings.steps:
+            ends = waited > settings.patience or step == settings.steps
+            if progress is not None:
+                progress(settings.steps if ends else step, settings.steps, score)
+            if ends:
                 break
         rows = train[torch.randint(len(train), (settings.batch,), generator=generator)]
         loss = (head(seen[rows]) - target[rows]).square().mean()
@@ -201,22 +173,11 @@ def _descend(
     return losses
 
 
-@torch.no_grad()
-def _embed(network: ResidualNetwork, windows: Windows) -> Tensor:
-    """What the head reads in every window, (N, ...)."""
-    parts = torch.arange(len(windows)).split(256)
-    return torch.cat([network.embed(windows.history(p).acting(windows.action[p])) for p in parts])
-
-
 def split(count: int, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Rows to train on and rows held out: stretches of 10 samples, since neighbouring ones are correlated."""
     stretches = torch.arange(count).split(10)
-    order = torch.randperm(len(stretches), generator=generator)
+    order = torch.randperm(len(stretches), generator=generator).tolist()
     held = max(1, round(share * len(stretches)))
     if held >= len(stretches):
-        every = torch.arange(count)
-        return every, every
-    return (
-        torch.cat([stretches[int(k)] for k in order[held:]]),
-        torch.cat([stretches[int(k)] for k in order[:held]]),
-    )
+        return torch.arange(count), torch.arange(count)
+    return torch.cat([stretches[k] for k in order[held:]]), torch.cat([stretches[k] for k in order[:held]])

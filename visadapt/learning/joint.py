@@ -8,62 +8,84 @@ under its final name only once it is whole; an interrupted run goes on after the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from visadapt.effects import Residual
-from visadapt.learning.grounding import GroundLoss, GroundSettings, fit_named, ground, rescale, with_true_states
-from visadapt.learning.ledger import Ledger
+from visadapt.learning.grounding import GroundLoss, GroundSettings, fit_named, ground, rescale
+from visadapt.learning.perception import PerceptionSettings
 from visadapt.learning.policy import TuneSettings, initialise_feedforward, tune
 from visadapt.learning.windows import Observe, Windows
 from visadapt.policies import Policy
-from visadapt.progress import Progress, Report, staged
+from visadapt.progress import Report, staged
 from visadapt.recordings import Episode, read_recording, write_recording
 from visadapt.storage.checkpoints import load_tree, load_weights, save_tree
 from visadapt.targets import Target, TargetError
 from visadapt.targets.rollout import run
 from visadapt.world import World
 
-Label = Callable[[list[Episode]], list[Episode]]
-"""Gives the episodes of a round the states that grounding learns from."""
+EXPLORATION = 0.05  # Standard deviation of white noise on the commands while data are collected
+
+FILES = ("recording.h5", "residual.safetensors", "policy.safetensors")  # What the stages of a round leave in its folder
+
+Label = Callable[[list[Episode]], list[Episode]]  # Gives the episodes of a round the states that grounding learns from
+
+
+class BudgetExceeded(RuntimeError):
+    """A step of the target was asked for that the budget does not hold."""
+
+
+@dataclass
+class Ledger:
+    """Counts the steps of a target. Only the final evaluation is free, and is not entered."""
+
+    budget: int  # steps of the target allowed in all
+    entries: list[tuple[str, int]] = field(default_factory=list)  # (purpose, steps), in order
+
+    @property
+    def used(self) -> int:
+        """Steps counted so far."""
+        return sum(steps for _, steps in self.entries)
+
+    @property
+    def left(self) -> int:
+        """Steps that may still be taken."""
+        return self.budget - self.used
+
+    def count(self, purpose: str, steps: int) -> None:
+        """Enter steps before they are taken; raises BudgetExceeded where they would overdraw the budget."""
+        if steps > self.left:
+            raise BudgetExceeded(f"{purpose}: {steps} target steps asked for, {self.left} of {self.budget} are left")
+        self.entries.append((purpose, steps))
 
 
 @dataclass(frozen=True)
-class AdaptSettings:
-    """How a policy is adapted to a target."""
+class SetupSettings:
+    """How a policy is trained and adapted."""
 
-    tune: TuneSettings
-    ground: GroundSettings
-    budget: int = 1000
-    """N: target samples in all"""
-    round_samples: int = 200
-    """B: target samples in a round"""
-    observations: str = "camera"
-    """what grounding shows the residual: one of `windows.SOURCES`"""
+    source: TuneSettings
+    """the policy in the source"""
+    tuning: TuneSettings
+    """the policy in the grounded source, in each round"""
+    ground: GroundSettings = field(default_factory=GroundSettings)
+    """the residual"""
+    observations: str = "state"
+    """what grounding shows the residual: one of `learning.windows.SOURCES`"""
     longest_episode: int = 250
-    """steps"""
-    exploration: float = 0.05
-    """standard deviation of white noise on the commands while data are collected"""
+    """steps of an episode of the target while data are collected"""
     feedforward: bool = True
     """begin with a policy that opposes what the residual expects; False where one command cannot undo it in a period"""
-    seed: int = 0
+    perception: PerceptionSettings | None = None
+    """how an encoder learns to see, where the policy is shown frames"""
 
-    def __post_init__(self) -> None:
-        if self.round_samples < 1:
-            raise ValueError(f"a round needs at least 1 sample, got B = {self.round_samples}")
-        if self.budget < self.round_samples:
-            raise ValueError(
-                f"the budget N = {self.budget} is smaller than a round of B = {self.round_samples} samples: "
-                "raise N or lower B"
-            )
-
-    @property
-    def rounds(self) -> int:
-        """ceil(N / B)"""
-        return math.ceil(self.budget / self.round_samples)
+    def numbers(self) -> dict[str, Any]:
+        """All of them as JSON takes them, for a run's folder; a task's tensors, such as references, are left out."""
+        return asdict(self, dict_factory=lambda each: {k: value for k, value in each if not isinstance(value, Tensor)})
 
 
 @dataclass(frozen=True)
@@ -71,10 +93,8 @@ class Round:
     """What a round did: its losses over optimisation steps, and the samples counted when it began to learn."""
 
     samples: int
-    grounding: list[tuple[int, float, float]]
-    """(step, training loss, held-out loss)"""
-    policy: list[float]
-    """loss by iteration"""
+    grounding: Sequence[tuple[int, float, float]]  # (step, training loss, held-out loss)
+    policy: list[float]  # loss by iteration
 
 
 @dataclass(frozen=True)
@@ -113,9 +133,12 @@ def adapt(
     residual: Residual,
     source: World,
     target: Target,
-    observe: Observe | None,
-    settings: AdaptSettings,
+    settings: SetupSettings,
     folder: Path,
+    budget: int,
+    round_samples: int,
+    seed: int,
+    observe: Observe | None = None,
     label: Label | None = None,
     report: Report | None = None,
     explorer: Policy | None = None,
@@ -125,44 +148,64 @@ def adapt(
     Args:
         policy, residual: the networks, changed in place; the policy listens to the residual.
         source: the physics known beforehand; effects that it has are named guesses, whose parameters are fitted.
+        budget, round_samples: N and B, target samples in all and in a round.
         observe: the camera of simulated states, a learnt renderer; None where the policy sees what sensors measure.
         label: estimates the states from the camera's frames; without it, the target's own states are used.
         explorer: the policy that collects the target's data, in place of the one that is tuned (Algorithm 1).
 
     Raises:
+        ValueError: an empty round, or a budget that is smaller than a round.
         TargetError: the target misbehaves. BudgetExceeded: a step more than the budget.
         CheckpointError: `folder` holds a run of other networks.
     """
+    if round_samples < 1:
+        raise ValueError(f"a round needs at least 1 sample, got B = {round_samples}")
+    if budget < round_samples:
+        raise ValueError(
+            f"the budget N = {budget} is smaller than a round of B = {round_samples} samples: raise N or lower B"
+        )
     effects = [*source.effects, residual]
     grounded = World(source.system, effects, source.period, source.integrator, source.substeps)
     policy.residual = residual
-    ledger = Ledger(settings.budget)
+    ledger = Ledger(budget)
     episodes: list[Episode] = []
     rounds: list[Round] = []
-    for number in range(settings.rounds):
-        here = _weights(folder, number).parent
-        name = f"round {number + 1}/{settings.rounds}"
-        wanted = min(settings.round_samples, ledger.left)
-        collector = policy if explorer is None else explorer
-        drawn = _generator(settings, number, 0)
-        new = _collected(here / "recording.h5", collector, target, wanted, settings, drawn)
+    count = math.ceil(budget / round_samples)
+    for number in range(count):
+        name = f"round {number + 1}/{count}"
+        recording, fitted, tuned = (_weights(folder, number).with_name(file) for file in FILES)
+        # Each stage draws from its own stream, so that a resumed run draws the same.
+        drawn = [torch.Generator().manual_seed(1_000_000 * seed + 10 * number + stage) for stage in range(3)]
+        if not recording.exists():
+            wanted = min(round_samples, ledger.left)
+            write_recording(recording, _collect(explorer or policy, target, wanted, settings.longest_episode, drawn[0]))
+        new = read_recording(recording)
         for episode in new:
             ledger.count(f"{name}: data", episode.samples)
         episodes += new if label is None else label(new)
         windows = Windows.cut(episodes, settings.observations, observe)
-
-        def fit(progress: Progress | None, windows: Windows = windows, number: int = number) -> list[GroundLoss]:
-            windows = fit_named(source, windows)
+        if not fitted.exists():
+            true = fit_named(source, windows)
             if number == 0:
-                rescale(residual, source, windows, settings.ground.negligible)
-            return ground(residual, source, windows, settings.ground, _generator(settings, number, 1), progress)
-
-        grounding = _grounded(here / "residual.safetensors", fit, grounded, staged(report, f"{name}: ground"))
-        windows = with_true_states(source, windows)
+                rescale(residual, source, true, settings.ground.negligible)
+            losses = ground(residual, source, true, settings.ground, drawn[1], staged(report, f"{name}: ground"))
+            states = None if true is windows else true.states
+            save_tree(fitted, {"weights": grounded.state_dict(), "losses": losses, "states": states})
+        tree = load_tree(fitted)
+        load_weights(grounded, tree["weights"], fitted)
+        grounding = [GroundLoss(*each) for each in tree["losses"]]
+        if tree.get("states") is not None:
+            windows = replace(windows, states=tree["states"])
         if number == 0 and settings.feedforward:
             initialise_feedforward(policy, source, residual.scale)
-        losses = _tuned(here, policy, grounded, observe, settings, windows, number, staged(report, f"{name}: tune"))
-        rounds.append(Round(ledger.used, grounding, losses))
+        if not tuned.exists():
+            partial, progress = tuned.with_suffix(".partial.safetensors"), staged(report, f"{name}: tune")
+            found = tune(policy, grounded, observe, settings.tuning, drawn[2], windows, progress, partial)
+            save_tree(tuned, {"weights": policy.state_dict(), "losses": found})
+            partial.unlink(missing_ok=True)
+        tree = load_tree(tuned)
+        load_weights(policy, tree["weights"], tuned)
+        rounds.append(Round(ledger.used, grounding, tree["losses"]))
     return Adapted(policy, ledger, rounds, episodes, folder)
 
 
@@ -171,68 +214,12 @@ def _weights(folder: Path, number: int) -> Path:
     return folder / f"round-{number + 1:02d}" / "policy.safetensors"
 
 
-def _generator(settings: AdaptSettings, number: int, stage: int) -> torch.Generator:
-    """Each stage draws from its own stream, so that a resumed run draws the same."""
-    return torch.Generator().manual_seed(1_000_000 * settings.seed + 10 * number + stage)
-
-
-def _collected(
-    path: Path,
-    policy: Policy,
-    target: Target,
-    wanted: int,
-    settings: AdaptSettings,
-    generator: torch.Generator,
-) -> list[Episode]:
+def _collect(policy: Policy, target: Target, wanted: int, longest: int, generator: torch.Generator) -> list[Episode]:
     """Episodes of `wanted` samples under `policy`, one after the other as on a machine."""
-    if path.exists():
-        return read_recording(path)
     episodes: list[Episode] = []
-    left = wanted
-    while left > 0:
-        steps = min(left, settings.longest_episode)
-        episode = run(target, policy, 1, steps, generator, settings.exploration)[0].episode
-        if episode.samples == 0:
+    while wanted > 0:
+        episodes.append(run(target, policy, 1, min(wanted, longest), generator, EXPLORATION)[0].episode)
+        if episodes[-1].samples == 0:
             raise TargetError(f"{target.name}: the episode is over before its first step")
-        episodes.append(episode)
-        left -= episode.samples
-    write_recording(path, episodes)
+        wanted -= episodes[-1].samples
     return episodes
-
-
-def _grounded(
-    path: Path,
-    fit: Callable[[Progress | None], list[GroundLoss]],
-    grounded: World,
-    progress: Progress | None,
-) -> list[tuple[int, float, float]]:
-    if path.exists():
-        tree = load_tree(path)
-        load_weights(grounded, tree["weights"], path)
-        return [(int(step), float(train), float(held)) for step, train, held in tree["losses"]]
-    losses = [(loss.step, loss.train, loss.held_out) for loss in fit(progress)]
-    save_tree(path, {"weights": grounded.state_dict(), "losses": losses})
-    return losses
-
-
-def _tuned(
-    here: Path,
-    policy: Policy,
-    grounded: World,
-    observe: Observe | None,
-    settings: AdaptSettings,
-    windows: Windows,
-    number: int,
-    progress: Progress | None,
-) -> list[float]:
-    path, partial = here / "policy.safetensors", here / "policy.partial.safetensors"
-    if path.exists():
-        tree = load_tree(path)
-        load_weights(policy, tree["weights"], path)
-        losses: list[float] = tree["losses"]
-        return losses
-    generator = _generator(settings, number, 2)
-    losses = tune(policy, grounded, observe, settings.tune, generator, windows, progress, partial)
-    save_tree(path, {"weights": policy.state_dict(), "losses": losses})
-    partial.unlink(missing_ok=True)
-    return losses

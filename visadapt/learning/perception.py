@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from visadapt.history import LENGTH, History
+from visadapt.learning.training_state import TrainingState
 from visadapt.policies.networks import FrameEncoder
 from visadapt.progress import Progress
-from visadapt.storage.checkpoints import CHECKPOINT_ITERATIONS, TrainingState
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,9 @@ class Paths:
     Uniform position; normal velocity; at every period a new normal acceleration.
     """
 
-    reach: float
-    """half-width of the first position"""
-    velocity: float
-    """standard deviation, per s"""
-    acceleration: float
-    """standard deviation, per s2"""
+    reach: float  # half-width of the first position
+    velocity: float  # standard deviation, per s
+    acceleration: float  # standard deviation, per s2
 
     def draw(self, batch: int, length: int, period: float, generator: torch.Generator) -> Tensor:
         """Positions (batch, length), `period` s apart."""
@@ -52,13 +49,10 @@ class PerceptionSettings:
     """How an encoder learns to see."""
 
     iterations: int = 4000
-    streams: int = 32
-    """paths rendered in an iteration"""
-    length: int = 8
-    """frames of a path; each gives length - 4 windows"""
+    streams: int = 32  # paths rendered in an iteration
+    length: int = 8  # frames of a path; each gives length - 4 windows
     learning_rate: float = 2e-3
-    pixel_noise: float = 0.004
-    """standard deviation of white noise on the frames"""
+    pixel_noise: float = 0.004  # standard deviation of white noise on the frames
     cart: Paths = Paths(reach=1.3, velocity=0.4, acceleration=2.0)
     pole: Paths = Paths(reach=0.2, velocity=0.4, acceleration=4.0)
 
@@ -87,15 +81,11 @@ def learn_to_see(
     The loss weighs, beside positions and changes, the changes of changes: a force shows in them alone.
     """
     optimiser = torch.optim.AdamW(encoder.parameters(), weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, settings.learning_rate, total_steps=settings.iterations, pct_start=0.1
-    )
+    rate, steps = settings.learning_rate, settings.iterations
+    training = TrainingState(encoder, optimiser, generator, rate, steps, progress, checkpoint)
+    training.resume()
     unit = scale(settings, period)
-    training = TrainingState(encoder, optimiser, schedule, generator)
-    losses: list[float] = []
-    if checkpoint is not None and checkpoint.exists():
-        losses, _ = training.resume(checkpoint)
-    for iteration in range(len(losses), settings.iterations):
+    for _ in range(len(training.losses), steps):
         paths = [
             coordinate.draw(settings.streams, settings.length, period, generator)
             for coordinate in (settings.cart, settings.pole)
@@ -108,15 +98,6 @@ def learn_to_see(
         actions = torch.zeros(len(windows), LENGTH, encoder.n_action)
         error = encoder.kinematics(History(windows, actions)) - truth
         bends = torch.cat([error[:, 1:LENGTH].diff(dim=1), error[:, LENGTH + 1 :].diff(dim=1)], 1)
-        loss = error.square().mean() + 8 * bends.square().mean()
-        optimiser.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(encoder.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-        losses.append(float(loss.detach()))
-        if progress is not None:
-            progress(iteration + 1, settings.iterations, losses[-1])
-        if checkpoint is not None and (iteration + 1) % CHECKPOINT_ITERATIONS == 0:
-            training.keep(checkpoint, losses, {})
-    return losses
+        training.descend(error.square().mean() + 8 * bends.square().mean())
+        training.keep({})
+    return training.losses

@@ -8,22 +8,21 @@ delta_div grows as training goes on, so the policy learns to recover from ever f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from visadapt.estimation.linearise import linearise_step
 from visadapt.history import HORIZON, History
-from visadapt.learning.streams import Streams, StreamSettings, StreamState, look
+from visadapt.learning.streams import Streams, StreamState, look
+from visadapt.learning.training_state import TrainingState
 from visadapt.learning.windows import Observe, Windows
 from visadapt.policies import Policy
 from visadapt.progress import Progress
-from visadapt.storage.checkpoints import CHECKPOINT_ITERATIONS, TrainingState, load_network, save_network
 from visadapt.tasks.base import Task
 from visadapt.world import World, WorldState
 
@@ -40,19 +39,15 @@ class TuneSettings:
     iterations: int
     batch: int = 64
     learning_rate: float = 1e-3
-    longest: int = 150
-    """steps after which a stream starts anew"""
+    longest: int = 150  # steps after which a stream starts anew
     streams: int | None = None
     """number of streams where that is not `batch`: the states that they pass through are then kept, and each batch is
     drawn from all of them, so that few steps are simulated"""
-    every: int = 1
-    """iterations between two steps of the streams"""
+    every: int = 1  # iterations between two steps of the streams
     curriculum: bool = True
     """whether streams start, and are kept, closer to the reference at first; not for a trained policy"""
-    recorded: float = 0.0
-    """share of the starts that are recorded windows of the target, with their histories"""
-    observation_noise: float = 0.01
-    """standard deviation of white noise on what the policy sees"""
+    recorded: float = 0.0  # share of the starts that are recorded windows of the target, with their histories
+    observation_noise: float = 0.01  # standard deviation of white noise on what the policy sees
 
 
 def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None:
@@ -84,30 +79,27 @@ def tune(
         observe: the camera through which the policy sees, differentiable for the sake of a residual that reads frames;
             None for a policy on states, which sees what the world's sensors measure.
         windows: recorded starts, where settings.recorded asks for them, and the times at which other starts begin.
-        checkpoint: file of the training state, written every `CHECKPOINT_ITERATIONS` iterations and resumed from.
+        checkpoint: file of the training state, written every so often and resumed from.
 
     Raises:
         DivergedError: the loss is not finite.
     """
     world.requires_grad_(False)
     optimiser = torch.optim.Adam(policy.parameters())
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, settings.learning_rate, total_steps=settings.iterations, pct_start=0.1
-    )
-    training = TrainingState(policy, optimiser, schedule, generator)
+    steps = settings.iterations
+    training = TrainingState(policy, optimiser, generator, settings.learning_rate, steps, progress, checkpoint)
     task = settings.task
-    running = StreamSettings(settings.streams or settings.batch, settings.longest, settings.recorded)
-    streams = Streams(world, task, observe, windows, running)
+    count = settings.streams or settings.batch
+    streams = Streams(world, task, observe, windows, count, settings.longest, settings.recorded)
     past: StreamState | None = None
-    losses: list[float] = []
-    if checkpoint is not None and checkpoint.exists():
-        losses, kept = training.resume(checkpoint)
+    kept = training.resume()
+    if kept is not None:
         streams.now, streams.age = StreamState.of(kept["now"]), kept["age"]
         past = StreamState.of(kept["past"]) if "past" in kept else None
     else:
         streams.start(0.0 if settings.curriculum else 1.0, generator)
     policy.train()
-    for iteration in range(len(losses), settings.iterations):
+    for iteration in range(len(training.losses), steps):
         stream = streams.now
         if settings.streams is not None:
             past = past or stream
@@ -120,55 +112,20 @@ def tune(
         loss = task.cost(states, plan, stream.at.state, stream.task_state).mean()
         if not bool(loss.isfinite()):
             raise DivergedError(f"the policy's loss is {float(loss.detach())} at iteration {iteration}")
-        optimiser.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-        done = iteration / settings.iterations if settings.curriculum else 1.0
+        training.descend(loss)
+        done = iteration / steps if settings.curriculum else 1.0
         if past is None:
             streams.advance(first, plan[:, 0].detach(), done, generator)
         elif (iteration + 1) % settings.every == 0:
-            streams.advance(*_step(world, policy, streams.now), done, generator)
+            with torch.no_grad():
+                action = policy.act(streams.now.history)
+                first = world.step(streams.now.at, action, streams.now.history)
+            streams.advance(first, action, done, generator)
             past = past.joined(streams.now)
-        losses.append(float(loss.detach()))
-        if progress is not None:
-            progress(iteration + 1, settings.iterations, losses[-1])
-        if checkpoint is not None and (iteration + 1) % CHECKPOINT_ITERATIONS == 0:
-            kept = {"now": streams.now.tree(), "age": streams.age}
-            training.keep(checkpoint, losses, kept if past is None else {**kept, "past": past.tree()})
+        kept = {"now": streams.now.tree(), "age": streams.age}
+        training.keep(kept if past is None else {**kept, "past": past.tree()})
     policy.eval()
-    return losses
-
-
-def train_or_load(
-    path: Path,
-    policy: Policy,
-    world: World,
-    observe: Observe | None,
-    settings: TuneSettings,
-    generator: torch.Generator,
-    about: Mapping[str, Any],
-    progress: Progress | None = None,
-) -> None:
-    """Give `policy` the weights in `path`; where there are none yet, tune it, and keep it there with `about` it.
-
-    An interrupted training goes on from what it left beside `path`.
-    """
-    if path.exists():
-        load_network(path, policy)
-        return
-    partial_path = path.with_suffix(".partial.safetensors")
-    tune(policy, world, observe, settings, generator, progress=progress, checkpoint=partial_path)
-    save_network(path, policy, about)
-    partial_path.unlink(missing_ok=True)
-
-
-@torch.no_grad()
-def _step(world: World, policy: Policy, stream: StreamState) -> tuple[WorldState, Tensor]:
-    """The world a step on under the policy, and the action."""
-    action = policy.act(stream.history)
-    return world.step(stream.at, action, stream.history), action
+    return training.losses
 
 
 def imagine(

@@ -14,19 +14,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-SPACING = 0.05
-"""m and rad between the poses of the grid: about 2 px for a camera that sees 3 m in 120 px."""
+SPACING = 0.05  # m and rad between the poses of the grid: about 2 px for a camera that sees 3 m in 120 px
 
 DIFFERENCE = 0.0125
 """m and rad, half-width of the central differences: half a pixel, so that the kinks of interpolated pictures, which
 have no use here, are smoothed over (and grid_sample has no forward-mode derivative)."""
 
 STEPS = 6
-FRESH = 3
-"""Steps taken, and for how many of them the Jacobian is computed anew: the last ones only polish."""
+FRESH = 3  # Steps taken, and for how many of them the Jacobian is computed anew: the last ones only polish
 
-CHUNK = 64
-"""Frames rendered at a time: what fits a processor's cache."""
+CHUNK = 64  # Frames rendered at a time: what fits a processor's cache
 
 UNEXPLAINED = 0.35
 """A frame is unexplained if its misfit exceeds this share of how much frames differ over the grid of poses."""
@@ -36,14 +33,11 @@ UNEXPLAINED = 0.35
 class Poses:
     """What was found in T frames; on the CPU, whatever drew them."""
 
-    place: Tensor
-    """(T, 2) float64: x in m, theta in rad"""
+    place: Tensor  # (T, 2) float64: x in m, theta in rad
     covariance: Tensor
     """(T, 2, 2) float64, misfit^2 (J'J)^-1: what white pixel errors of the size of the misfit would do to `place`"""
-    misfit: Tensor
-    """(T,) root mean square of frame less rendered frame, in grey levels of [0, 1]"""
-    explained: Tensor
-    """(T,) whether the renderer explains the frame at all"""
+    misfit: Tensor  # (T,) root mean square of frame less rendered frame, in grey levels of [0, 1]
+    explained: Tensor  # (T,) whether the renderer explains the frame at all
 
 
 class PoseFinder:

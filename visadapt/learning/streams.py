@@ -47,48 +47,36 @@ class StreamState(Batch):
         return cls(at, History(tree["observations"], tree["actions"]), tree["task_state"])
 
 
-@dataclass(frozen=True)
-class StreamSettings:
-    """How streams run."""
+@dataclass
+class Streams:
+    """A batch of simulated episodes in progress."""
 
+    world: World
+    task: Task
+    observe: Observe | None  # the camera through which the policy sees; None where it sees what the sensors measure
+    windows: Windows | None  # recorded starts, each at its time in its episode, with the memory that effects have there
     count: int
     longest: int  # steps after which a stream starts anew
-    recorded: float  # share of the starts that are recorded windows of the target, with their histories
+    recorded: float  # share of the starts that are windows, with their histories
 
-
-class Streams:
-    """A batch of simulated episodes in progress.
-
-    Args:
-        observe: the camera through which the policy sees; None where it sees what the sensors measure.
-        windows: recorded starts. Each begins at its time in its episode, with the memory that effects have there.
-    """
-
-    def __init__(
-        self, world: World, task: Task, observe: Observe | None, windows: Windows | None, settings: StreamSettings
-    ) -> None:
-        self.world = world
-        self.task = task
-        self.observe = observe
-        self.windows = windows
-        self.settings = settings
+    def __post_init__(self) -> None:
         self.now: StreamState
         self.age: Tensor
         self._recorded: WorldState | None = None
         with torch.no_grad():
-            if windows is None:
-                times = world.period * torch.arange(EPISODE_STEPS)
-                state, _ = task.training_start(1, 0.0, torch.Generator().manual_seed(0))
+            if self.windows is None:
+                times = self.world.period * torch.arange(EPISODE_STEPS)
+                state, _ = self.task.training_start(1, 0.0, torch.Generator().manual_seed(0))
             else:
-                times, state = windows.time, windows.state[:1]
-                self._recorded = windows.start(world) if settings.recorded > 0 else None
-            self._times = times if _depends_on_time(world, times.unique(), state) else None
+                times, state = self.windows.time, self.windows.state[:1]
+                self._recorded = self.windows.start(self.world) if self.recorded > 0 else None
+            self._times = times if _depends_on_time(self.world, times.unique(), state) else None
 
     @torch.no_grad()
     def start(self, progress: float, generator: torch.Generator) -> None:
         """Start all streams, at random ages, so that they do not end together."""
         self.now = self._fresh(progress, generator)
-        self.age = torch.randint(self.settings.longest, (self.settings.count,), generator=generator)
+        self.age = torch.randint(self.longest, (self.count,), generator=generator)
 
     @torch.no_grad()
     def advance(self, at: WorldState, action: Tensor, progress: float, generator: torch.Generator) -> None:
@@ -102,13 +90,13 @@ class Streams:
         history = self.now.history.acting(action).observing(self.task.show(seen, task_state)).detach()
         self.now = StreamState(at.detach(), history, task_state)
         self.age += 1
-        keep = (self.age < self.settings.longest) & ~self.task.diverged(at.state, task_state, progress)
+        keep = (self.age < self.longest) & ~self.task.diverged(at.state, task_state, progress)
         if not bool(keep.all()):
             self.now = self.now.where(keep, self._fresh(progress, generator))
             self.age = torch.where(keep, self.age, 0)
 
     def _fresh(self, progress: float, generator: torch.Generator) -> StreamState:
-        count, windows = self.settings.count, self.windows
+        count, windows = self.count, self.windows
         state, task_state = self.task.training_start(count, progress, generator)
         at = self.world.start(state)
         if self._times is not None:
@@ -121,12 +109,12 @@ class Streams:
         fresh = StreamState(at, history, task_state)
         if windows is None or self._recorded is None:
             return fresh
-        task_states = windows.task_state.to(task_state)
+        task_states = windows.task_states[windows.rows].to(task_state)
         # Recorded falls are left out: a stream that starts beyond delta_div ends at once, at a cost that outweighs all.
         near = (~self.task.diverged(windows.state, task_states[:, -1], progress)).nonzero()[:, 0]
         if not len(near):
             return fresh
-        from_record = torch.rand(count, generator=generator) < self.settings.recorded
+        from_record = torch.rand(count, generator=generator) < self.recorded
         rows = near[torch.randint(len(near), (count,), generator=generator)]
         past = windows.history(rows)
         seen, now, where = self.task.augment(past.observations, windows.state[rows], task_states[rows], generator)

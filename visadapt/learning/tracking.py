@@ -19,14 +19,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from visadapt.estimation.kalman import Linear, backward, smoothed_covariance
+from visadapt.estimation.kalman import Linear, backward
 from visadapt.estimation.linearise import linearise_step, load_effect
 from visadapt.estimation.noise import Noise, UnknownNoise, most_probable_noise
 from visadapt.learning.poses import PoseFinder, Poses
@@ -36,12 +35,11 @@ from visadapt.world import World
 SHOCK = 0.03
 """m/s2, the unit of shocks: they are expected to be smaller than what a load drifts by in a period (unit 1 m/s2)."""
 
-SMOOTHINGS = 4
-"""Times that the physics are linearised around the path so far; the noise is fitted in the first two."""
+SMOOTHINGS = 4  # Times that the physics are linearised around the path so far; the noise is fitted in the first two
 
-ACCELERATION = 10.0
-"""m/s2 and rad/s2, what a load may do before anything is seen (standard deviation)."""
+ACCELERATION = 10.0  # m/s2 and rad/s2, what a load may do before anything is seen (standard deviation)
 
+LEAN = 0.5  # rad, largest |theta| at which the pole is looked for
 
 BRIDGED = 10
 """Rows in a row without a usable frame that the physics may bridge: upright, errors grow by e in about 5 rows."""
@@ -55,38 +53,20 @@ class TrackingWarning(UserWarning):
     """Some frames were left out: the renderer does not explain them."""
 
 
-@dataclass(frozen=True)
-class Track:
-    """An episode with the states that its frames tell, and how they were found."""
-
-    episode: Episode
-    """with `state` (T, n_state)"""
-    deviation: NDArray[np.floating]
-    """(T, n_state) standard deviation of the states"""
-    misfit: NDArray[np.floating]
-    """(T,) root mean square of frame less rendered frame, in grey levels of [0, 1]"""
-    explained: NDArray[np.bool_]
-    """(T,) whether the frame was used"""
-
-
 class Tracker:
     """Estimates states from frames; the grid of rendered poses is made once, for all episodes.
 
     Args:
         renderer: learnt, of x (B,) in m and theta (B,) in rad to frames (B, H, W) in [0, 1].
-        world: the source physics, without effects.
-        reach: m, largest |x| at which the cart is looked for; None for the range of the system's table.
-        lean: rad, largest |theta| at which the pole is looked for.
+        world: the source physics, without effects; the cart is looked for within the range of its system's table.
 
     Raises:
         TrackingError: a world with effects, which would explain away the gap that is looked for.
     """
 
-    def __init__(self, renderer: nn.Module, world: World, reach: float | None = None, lean: float = 0.5) -> None:
+    def __init__(self, renderer: nn.Module, world: World) -> None:
         if len(world.effects):
-            raise TrackingError(
-                f"tracking needs the source physics alone, got a world with {len(world.effects)} effects"
-            )
+            raise TrackingError(f"tracking needs the source physics alone, not {len(world.effects)} effects")
         system = world.system
         self.world = world
         self._seen = [system.index("x"), system.index("theta")]
@@ -95,10 +75,10 @@ class Tracker:
         load = load_effect(type(system))
         nothing = load(**{parameter.name: 0.0 for parameter in load.table})
         self._pushed = World(system, (nothing,), world.period, world.integrator, world.substeps)
-        self.poses = PoseFinder(renderer, max(-across.low, across.high) if reach is None else reach, lean)
+        self.poses = PoseFinder(renderer, max(-across.low, across.high), LEAN)
 
-    def track(self, episodes: Sequence[Episode]) -> list[Track]:
-        """Tracks of episodes (frames and actions; states, if any, are not read), with one noise fitted to all.
+    def track(self, episodes: Sequence[Episode]) -> list[Episode]:
+        """The episodes with states from their frames and actions alone, with one noise fitted to all.
 
         Raises:
             TrackingError: an episode without frames, with frames of another size or a clock of another period, or
@@ -109,7 +89,7 @@ class Tracker:
         if not episodes:
             return []
         found = [self._see(number, episode) for number, episode in enumerate(episodes)]
-        commands = [torch.as_tensor(episode.action, dtype=torch.float64)[:-1] for episode in episodes]
+        commands = [torch.as_tensor(episode.action[:-1], dtype=torch.float64) for episode in episodes]
         paths = [self._first_guess(poses) for poses in found]
         noise: Noise | None = None
         for turn in range(SMOOTHINGS):
@@ -117,14 +97,12 @@ class Tracker:
             if turn < 2:
                 noise = most_probable_noise(problems, noise)
             assert noise is not None
-            filtered = [problem.filtered(noise) for problem in problems]
-            paths = [
-                backward(problem.system, each)[0][0, ..., 0] for problem, each in zip(problems, filtered, strict=True)
-            ]
-        spread = [
-            smoothed_covariance(problem.system, each)[0] for problem, each in zip(problems, filtered, strict=True)
+            paths = [backward(each.system, each.filtered(noise))[0][0, ..., 0] for each in problems]
+        n = len(self.world.system.states)
+        return [
+            replace(episode, state=path[:, :n].numpy().astype(episode.action.dtype))
+            for episode, path in zip(episodes, paths, strict=True)
         ]
-        return [self._track(*parts) for parts in zip(episodes, found, paths, spread, strict=True)]
 
     def _see(self, number: int, episode: Episode) -> Poses:
         if episode.frame is None:
@@ -179,14 +157,13 @@ class Tracker:
         wide = torch.tensor([(v.high - v.low) / 2 for v in self.world.system.states], dtype=path.dtype)
         used = poses.explained[:, None].to(path)
         seen = used[..., None] * torch.eye(n, dtype=path.dtype)[self._seen]
+        place = used * poses.place.nan_to_num()
         root = torch.linalg.cholesky(torch.where(used[..., None] > 0, poses.covariance, torch.eye(2).to(path)))
         system = Linear(
             transition=transition[None],
             drive=offset[None, ..., None],
             sensing=torch.linalg.solve_triangular(root, seen, upper=False)[None],
-            reading=torch.linalg.solve_triangular(root, (used * poses.place.nan_to_num())[..., None], upper=False)[
-                None
-            ],
+            reading=torch.linalg.solve_triangular(root, place[..., None], upper=False)[None],
             start=path.new_zeros(1, n, 1),
             spread=torch.cat((wide, ACCELERATION * unit)).square(),
         )
@@ -215,17 +192,6 @@ class Tracker:
         both[self._rates], both[self._seen], late[self._seen] = pushed * h, pushed * h**2 / 2, pushed * h**2 / 12**0.5
         drift[-1] = both.outer(both) + late.outer(late)
         return unit, drift
-
-    def _track(self, episode: Episode, poses: Poses, path: Tensor, covariance: Tensor) -> Track:
-        n = len(self.world.system.states)
-        kind = episode.action.dtype
-        deviation = covariance.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()
-        return Track(
-            episode=replace(episode, state=path[:, :n].numpy().astype(kind)),
-            deviation=deviation[:, :n].numpy().astype(kind),
-            misfit=poses.misfit.numpy(),
-            explained=poses.explained.numpy(),
-        )
 
 
 def _longest(missed: Tensor) -> int:

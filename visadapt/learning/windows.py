@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
+from torch.nn.utils.rnn import pad_sequence
 
 from visadapt.history import LENGTH, History
 from visadapt.recordings import Episode
@@ -25,38 +26,21 @@ SOURCES = ("camera", "rendered", "state")
 class Windows:
     """N samples (s_t, a_t, s_{t+1}) of E recorded episodes, each with the history a policy had before a_t.
 
-    Observations are kept once, by row of the recording; a window refers to the rows that it shows. Episodes are kept
-    whole as well: effects with memory depend on all commands and states since the episode began.
+    All is kept once, for the R rows of the recording, one episode after the other; a window refers to its rows.
     """
 
-    observations: Tensor
-    """(R, ...): uint8 frames, or states"""
-    commands: Tensor
-    """(E, T, n_action) of whole episodes, from their begin; zero after their end"""
-    states: Tensor
-    """(E, T, n_state) of whole episodes; after their end the last state repeats"""
+    lengths: list[int]  # (E,) rows of each episode
+    observations: Tensor  # (R, ...): uint8 frames, or states
+    actions: Tensor  # (R, n_action); zero in the last row of an episode
+    states: Tensor  # (R, n_state)
+    times: Tensor  # (R,) s from the begin of the episode
+    task_states: Tensor  # (R, n_task_state); of width 0 where the target has none
     rows: Tensor
-    """(N, LENGTH) rows of `observations`"""
-    past_actions: Tensor
-    """(N, LENGTH, n_action) actions before a_t"""
-    action: Tensor
-    """(N, n_action) a_t"""
-    state: Tensor
-    """(N, n_state) s_t"""
-    next_state: Tensor
-    """(N, n_state) s_{t+1}"""
-    episode: Tensor
-    """(N,) number of the episode"""
-    task_state: Tensor
-    """(N, LENGTH, n_task_state) the task states of the rows that it shows; of width 0 where the target has none"""
-    time: Tensor
-    """(N,) s from the begin of the episode to s_t"""
-    row: Tensor
-    """(N,) row of s_t in its episode"""
+    """(N, LENGTH) rows that a window shows, up to that of s_t; before an episode its first row stands still"""
 
     @classmethod
     def cut(cls, episodes: Sequence[Episode], source: str, observe: Observe | None = None) -> Windows:
-        """Windows of all samples of the episodes; before an episode the first observation stands still.
+        """Windows of all samples of the episodes.
 
         Raises:
             ValueError: an unknown source, episodes without what it needs, or no sample at all.
@@ -65,66 +49,67 @@ class Windows:
             raise ValueError(f"unknown source of observations {source!r}; there are {', '.join(SOURCES)}")
         dtype = torch.get_default_dtype()
         parts: list[tuple[Tensor, ...]] = []
-        observations: list[Tensor] = []
-        commands: list[Tensor] = []
-        states: list[Tensor] = []
-        longest = max((len(episode.time) for episode in episodes), default=0)
         first = 0
         for number, episode in enumerate(episodes):
             if episode.state is None:
                 raise ValueError(f"episode {number} has no states to learn from: estimate them first")
             state = torch.as_tensor(episode.state, dtype=dtype)
-            action = torch.as_tensor(episode.action, dtype=dtype)
-            observations.append(_seen(episode, number, state, source, observe))
-            count = episode.samples
-            has_task = episode.task_state is not None
-            task_state = torch.as_tensor(episode.task_state) if has_task else torch.zeros(len(state), 0)
-            back = torch.arange(-LENGTH + 1, 1) + torch.arange(count)[:, None]
-            padded = torch.cat((torch.zeros(LENGTH, action.shape[1], dtype=dtype), action))
+            seen = _seen(episode, number, state, source, observe)
+            action = pad(torch.as_tensor(episode.action[:-1], dtype=dtype), (0, 0, 0, 1))
             time = torch.as_tensor(episode.time - episode.time[0], dtype=dtype)
-            commands.append(pad(action[:count], (0, 0, 0, longest - count)))
-            states.append(torch.cat((state, state[-1:].expand(longest - len(state), -1))))
-            parts.append(
-                (
-                    first + back.clamp(min=0),
-                    padded[(back + LENGTH - 1)],
-                    action[:count],
-                    state[:count],
-                    state[1 : count + 1],
-                    torch.full((count,), number),
-                    task_state[back.clamp(min=0)],
-                    time[:count],
-                    torch.arange(count),
-                )
-            )
+            task_state = state[:, :0] if episode.task_state is None else torch.as_tensor(episode.task_state)
+            back = torch.arange(-LENGTH + 1, 1) + torch.arange(episode.samples)[:, None]
+            parts.append((seen, action, state, time, task_state, first + back.clamp(min=0)))
             first += len(state)
-        if not parts or not sum(len(part[0]) for part in parts):
+        if first == len(episodes):
             raise ValueError("the recording holds no sample: every episode has a single row")
-        joined = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
-        return cls(torch.cat(observations), torch.stack(commands), torch.stack(states), *joined)
+        return cls([len(each.time) for each in episodes], *(torch.cat(own) for own in zip(*parts, strict=True)))
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    @property
+    def state(self) -> Tensor:
+        """(N, n_state) s_t"""
+        return self.states[self.rows[:, -1]]
+
+    @property
+    def next_state(self) -> Tensor:
+        """(N, n_state) s_{t+1}"""
+        return self.states[self.rows[:, -1] + 1]
+
+    @property
+    def action(self) -> Tensor:
+        """(N, n_action) a_t"""
+        return self.actions[self.rows[:, -1]]
+
+    @property
+    def time(self) -> Tensor:
+        """(N,) s from the begin of the episode to s_t"""
+        return self.times[self.rows[:, -1]]
 
     def start(self, world: World) -> WorldState:
         """`world` at s_t of every window (N rows): at its time, with the memory that its episode's past leaves there.
 
         Rows are not read yet.
         """
-        memory = world.memories(self.states[:, 0], self.commands, self.states)
-        return WorldState(self.time, self.state, tuple(each[self.episode, self.row] for each in memory))
-
-    def with_states(self, states: Tensor) -> Windows:
-        """The same windows with other states (E, T, n_state), say smoothed ones; observations stay as recorded."""
-        state, following = states[self.episode, self.row], states[self.episode, self.row + 1]
-        return replace(self, states=states, state=state, next_state=following)
+        commands, states = (
+            pad_sequence(values.split(self.lengths), batch_first=True) for values in (self.actions, self.states)
+        )
+        memory = [
+            torch.cat([own[:length] for own, length in zip(each, self.lengths, strict=True)])[self.rows[:, -1]]
+            for each in world.memories(states[:, 0], commands, states)
+        ]
+        return WorldState(self.time, self.state, tuple(memory))
 
     def history(self, index: Tensor) -> History:
         """What the policy had seen and done before the action of these windows."""
-        seen = self.observations[self.rows[index]]
+        rows = self.rows[index]
+        seen = self.observations[rows]
         if seen.dtype == torch.uint8:
-            seen = seen.to(self.state) / 255
-        return History(seen, self.past_actions[index])
+            seen = seen.to(self.states) / 255
+        # Before the first row of an episode comes the last one of another, in which the action is zero.
+        return History(seen, self.actions[rows - 1])
 
 
 def _seen(episode: Episode, number: int, state: Tensor, source: str, observe: Observe | None) -> Tensor:

@@ -1,7 +1,6 @@
 """Policies and networks: what the last observations and actions say to the next HORIZON actions."""
 
-from visadapt.policies.autoregressive import AutoregressivePolicy
-from visadapt.policies.base import Policy
+from visadapt.policies.base import AutoregressivePolicy, Policy
 from visadapt.policies.cartpole import ImagePolicy, StatePolicy
 from visadapt.policies.flight import FlightPolicy, FollowPolicy, ReachPolicy
 

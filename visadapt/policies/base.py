@@ -18,9 +18,9 @@ from visadapt.history import HORIZON, History
 
 
 class Policy(nn.Module):
-    """Base of policies; subclasses give features, and the layers that turn them into a plan.
+    """Base of policies; subclasses give the layers that turn a history into a plan.
 
-    The correction enters in two ways, both of no weight at first: among the features, and straight into the plan as
+    The correction enters in two ways, both of no weight at first: beside the history, and straight into the plan as
     a feed-forward, since what is known to push can be pushed against. `learning.policy.initialise_feedforward` gives
     the feed-forward its weights once there is a residual; tuning changes all of them.
 
@@ -46,18 +46,14 @@ class Policy(nn.Module):
         nn.init.zeros_(self.feedforward.weight)
         self.residual: Residual | None = None
 
-    def features(self, history: History) -> Tensor:
-        """What the policy itself makes of a history, (B, F)."""
-        raise NotImplementedError
-
-    def plan(self, features: Tensor, correction: Tensor) -> Tensor:
-        """Commands (B, HORIZON * n_action) before the last tanh, from features and the correction (B, n_state)."""
+    def plan(self, history: History, correction: Tensor) -> Tensor:
+        """Commands (B, HORIZON * n_action) before the last tanh, from a history and the correction (B, n_state)."""
         raise NotImplementedError
 
     def forward(self, history: History) -> Tensor:
         """Planned actions (B, HORIZON, n_action)."""
         correction = self.correction(history)
-        out = (self.plan(self.features(history), correction) + self.feedforward(correction)).tanh()
+        out = (self.plan(history, correction) + self.feedforward(correction)).tanh()
         return out.unflatten(-1, (HORIZON, self.n_action))
 
     def act(self, history: History) -> Tensor:
@@ -71,12 +67,30 @@ class Policy(nn.Module):
         if self.residual is None:
             return observations.new_zeros(len(observations), self.n_state)
         with torch.no_grad():
-            out: Tensor = self.residual.network(history.acting(self._nothing(history)))
+            out: Tensor = self.residual.network(history.acting(torch.zeros_like(history.actions[:, 0])))
         return out
 
-    def _nothing(self, history: History) -> Tensor:
-        """An action (B, n_action) of zeros."""
-        return history.actions.new_zeros(len(history.actions), self.n_action)
+
+class AutoregressivePolicy(Policy):
+    """A random policy: commands (n_action,) about `rest` that the noise of `rollout.run` drives, and that last a while.
+
+    Each is the last one, nearer to rest by the factor `keep`: it has nothing to draw, so that a run that is interrupted
+    and goes on draws the same.
+    """
+
+    rest: Tensor
+
+    def __init__(self, n_state: int, rest: Tensor, keep: float) -> None:
+        super().__init__(n_state, len(rest))
+        self.register_buffer("rest", rest.clone())
+        self.keep = keep
+
+    def forward(self, history: History) -> Tensor:
+        # Before an episode all actions are zero, which is nobody's command: it begins at rest.
+        begun = history.actions.flatten(1).any(1, keepdim=True)
+        away = torch.where(begun, history.actions[:, -1] - self.rest, 0.0)
+        lasting = self.keep ** torch.arange(1, HORIZON + 1).to(away)
+        return self.rest + away[:, None] * lasting[:, None]
 
 
 def ignore_correction(layer: nn.Linear, n_state: int) -> None:

@@ -30,12 +30,8 @@ class ImagePolicy(Policy):
         self.out = nn.Linear(64, HORIZON * n_action)
         ignore_correction(self.hidden, n_state)
 
-    def features(self, history: History) -> Tensor:
-        out: Tensor = self.encoder(history)
-        return out
-
-    def plan(self, features: Tensor, correction: Tensor) -> Tensor:
-        out: Tensor = self.out(self.hidden(torch.cat((features, correction), 1)).relu())
+    def plan(self, history: History, correction: Tensor) -> Tensor:
+        out: Tensor = self.out(self.hidden(torch.cat((self.encoder(history), correction), 1)).relu())
         return out
 
 
@@ -51,11 +47,8 @@ class StatePolicy(Policy):
         self.rest = mlp(32, 64, 64, 32, HORIZON * n_action)
         ignore_correction(self.first, n_state)
 
-    def features(self, history: History) -> Tensor:
-        if self.with_history:
-            return torch.cat((history.observations.flatten(1), history.actions.flatten(1)), 1)
-        return history.observations[:, -1]
-
-    def plan(self, features: Tensor, correction: Tensor) -> Tensor:
-        out: Tensor = self.rest(self.first(torch.cat((features, correction), 1)).tanh())
+    def plan(self, history: History, correction: Tensor) -> Tensor:
+        states, actions = history.observations, history.actions
+        seen = (states.flatten(1), actions.flatten(1)) if self.with_history else (states[:, -1],)
+        out: Tensor = self.rest(self.first(torch.cat((*seen, correction), 1)).tanh())
         return out

@@ -43,12 +43,15 @@ class FlightPolicy(Policy):
         """What the goal (B, n_goal) is to a vehicle in a state (B, 13): (B, n_aim)."""
         raise NotImplementedError
 
-    def features(self, history: History) -> Tensor:
+    def plan(self, history: History, correction: Tensor) -> Tensor:
         shown = history.observations[:, -1]
         state, goal = shown[:, : self.n_state], shown[:, self.n_state :]
         velocity, turned = state[:, VELOCITY], rotation(state[:, ATTITUDE])
-        own = (velocity, times(turned.mT, velocity), turned[:, :, :2].flatten(1), state[:, RATES])
-        return torch.cat((*own, self.aim(state, goal), self.disturbance(history)), 1)
+        moving = (velocity, times(turned.mT, velocity), turned[:, :, :2].flatten(1), state[:, RATES])
+        own, disturbance = torch.cat((*moving, self.aim(state, goal)), 1), self.disturbance(history)
+        hidden = self.rest((self.first(torch.cat((own, correction), 1)) + self.hearing(disturbance)).tanh()).tanh()
+        out: Tensor = self.out(hidden) + self.straight(own) + self.answer(disturbance)
+        return out
 
     def disturbance(self, history: History) -> Tensor:
         """The residual's disturbance estimate and its rate, (B, N_DISTURBANCE), by which a plan foresees a force."""
@@ -56,13 +59,7 @@ class FlightPolicy(Policy):
         if not isinstance(network, FlightResidualNetwork):
             return history.actions.new_zeros(len(history.actions), N_DISTURBANCE)
         with torch.no_grad():
-            return network.disturbance(history.acting(self._nothing(history)))
-
-    def plan(self, features: Tensor, correction: Tensor) -> Tensor:
-        own, disturbance = features[:, :-N_DISTURBANCE], features[:, -N_DISTURBANCE:]
-        hidden = self.rest((self.first(torch.cat((own, correction), 1)) + self.hearing(disturbance)).tanh()).tanh()
-        out: Tensor = self.out(hidden) + self.straight(own) + self.answer(disturbance)
-        return out
+            return network.disturbance(history.acting(torch.zeros_like(history.actions[:, 0])))
 
 
 class FollowPolicy(FlightPolicy):

@@ -13,14 +13,11 @@ from visadapt.history import LENGTH, History
 from visadapt.systems import System
 from visadapt.systems.rigid_body import ATTITUDE, RATES, VELOCITY, RigidBody, rotation
 
-N_FEATURES = 128
-"""Width of the frame encoder's features."""
+N_FEATURES = 128  # Width of the frame encoder's features
 N_KINEMATICS = 2 * LENGTH
 """Width of the encoder's readout: latest position and its LENGTH - 1 changes, of cart and pole."""
-N_DISTURBANCE = 12
-"""Width of `FlightResidualNetwork.disturbance`."""
-ACCELERATION_UNIT = 2.0
-"""m/s2 and rad/s2, unit of the unexplained accelerations that a network reads"""
+N_DISTURBANCE = 12  # Width of `FlightResidualNetwork.disturbance`
+ACCELERATION_UNIT = 2.0  # m/s2 and rad/s2, unit of the unexplained accelerations that a network reads
 HISTORY_ACCELERATION_UNIT = 0.2
 """m/s2 and rad/s2, their unit in the history that a vehicle's residual reads. The small unit makes these inputs large,
 so that ridge regression predicts the disturbance from its own history rather than from velocities and attitudes that

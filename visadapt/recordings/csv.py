@@ -83,8 +83,7 @@ class Table:
         if not self.rows:
             raise RecordingError(f"{self.path}: has no rows below its line of names")
         values = []
-        for row, (_, line) in enumerate(self.rows):
-            (cells,) = csv.reader([line], delimiter=self.separator)
+        for row, cells in enumerate(csv.reader((line for _, line in self.rows), delimiter=self.separator)):
             where = f"{self.path}: {self.place(row)}"
             if len(cells) < len(self.header):
                 raise RecordingError(

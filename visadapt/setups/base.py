@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import Tensor
 
 from visadapt.effects import Residual
-from visadapt.learning.grounding import GroundSettings
-from visadapt.learning.joint import Adapted, AdaptSettings, Label, adapt
-from visadapt.learning.perception import PerceptionSettings
-from visadapt.learning.policy import TuneSettings, train_or_load, tune
+from visadapt.learning.joint import Adapted, Label, SetupSettings, adapt
+from visadapt.learning.policy import tune
+from visadapt.learning.training_state import train_or_load
 from visadapt.learning.windows import Observe
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
@@ -29,31 +26,6 @@ Prepare = Callable[[Policy, Path, int, Report | None], None]
 
 
 @dataclass(frozen=True)
-class SetupSettings:
-    """How a policy is trained and adapted."""
-
-    source: TuneSettings
-    """the policy in the source"""
-    tuning: TuneSettings
-    """the policy in the grounded source, in each round"""
-    ground: GroundSettings = field(default_factory=GroundSettings)
-    """the residual"""
-    observations: str = "state"
-    """what grounding shows the residual: one of `learning.windows.SOURCES`"""
-    longest_episode: int = 250
-    """steps of an episode of the target while data are collected"""
-    feedforward: bool = True
-    """begin with a policy that opposes what the residual expects; False where one command cannot undo it in a period"""
-    perception: PerceptionSettings | None = None
-    """how an encoder learns to see, where the policy is shown frames"""
-
-    def numbers(self) -> dict[str, Any]:
-        """All of them as JSON takes them, for a run's folder; a task's tensors, such as references, are left out."""
-        out: dict[str, Any] = _numbers(self)
-        return out
-
-
-@dataclass(frozen=True)
 class Setup:
     """One control problem: a source, what the policy is to do and is shown, and how it learns.
 
@@ -61,7 +33,7 @@ class Setup:
     in its settings, and the four fields without a default.
 
     >>> import visadapt as va
-    >>> from visadapt.setups.cartpole_states import cartpole_states
+    >>> from visadapt.setups.cartpole import cartpole_states
     >>> setup = cartpole_states(va.World(va.CartPole(pole_mass=0.2)))
     >>> setup.load(va.shipped("cartpole_states")).n_action
     1
@@ -93,12 +65,13 @@ class Setup:
         policy = self.policy()
         if self.prepare is not None and not path.exists():
             self.prepare(policy, path.parent, seed, report)
-        settings, name = self.settings.source, self.source.system.name
-        about = {"arguments": policy.arguments, "source": describe(self.source), "seed": seed, **_numbers(settings)}
+        numbers = self.settings.numbers()["source"]
+        about = {"arguments": policy.arguments, "source": describe(self.source), "seed": seed, **numbers}
         # Preparing draws from a generator of the seed itself.
         generator = torch.Generator().manual_seed(seed if self.prepare is None else seed + 1)
-        progress = staged(report, f"{name}: source policy")
-        train_or_load(path, policy, self.source, self.observe, settings, generator, about, progress)
+        progress = staged(report, f"{self.source.system.name}: source policy")
+        args = (policy, self.source, self.observe, self.settings.source, generator, None, progress)
+        train_or_load(path, policy, about, lambda partial: tune(*args, partial))
         return policy.eval()
 
     def load(self, path: Path) -> Policy:
@@ -143,19 +116,8 @@ class Setup:
         self.check_target(target)
         torch.manual_seed(seed)
         residual = self.residual(policy, self.source)
-        own = self.settings
-        settings = AdaptSettings(
-            own.tuning,
-            own.ground,
-            budget,
-            round_samples,
-            own.observations,
-            longest_episode=own.longest_episode,
-            feedforward=own.feedforward,
-            seed=seed,
-        )
-        args = (policy, residual, self.source, target, self.observe, settings, folder, self.label)
-        adapted = adapt(*args, report=report, explorer=explorer)
+        args = (policy, residual, self.source, target, self.settings, folder, budget, round_samples, seed)
+        adapted = adapt(*args, self.observe, self.label, report, explorer)
         policy.grounded_in = describe(self.source)
         return adapted
 
@@ -180,10 +142,3 @@ class Setup:
             raise ValueError(
                 f"{target.name} takes {target.n_action} actions, a {self.source.system.name} has {actions}"
             )
-
-
-def _numbers(value: Any) -> Any:
-    if is_dataclass(value) and not isinstance(value, type):
-        parts = {each.name: getattr(value, each.name) for each in fields(value)}
-        return {name: _numbers(part) for name, part in parts.items() if not isinstance(part, Tensor)}
-    return value

@@ -8,16 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from visadapt import policies
-from visadapt.effects import EFFECTS, Effect
-from visadapt.policies import Policy
-from visadapt.setups.residuals import residual_for
+from visadapt.effects import EFFECTS, Effect, Residual
+from visadapt.learning.perception import PerceptionSettings, scale
+from visadapt.policies import FlightPolicy, ImagePolicy, Policy, StatePolicy
+from visadapt.policies.networks import FlightResidualNetwork, ImageResidualNetwork, StateResidualNetwork
 from visadapt.storage.checkpoints import CheckpointError, load_tree, load_weights, save_network
-from visadapt.systems import SYSTEMS
-from visadapt.world import World
+from visadapt.systems import SYSTEMS, RigidBody
+from visadapt.world import World, WorldState
 
 KINDS: dict[str, type[Policy]] = {
     name: kind for name, kind in vars(policies).items() if isinstance(kind, type) and issubclass(kind, Policy)
@@ -119,9 +124,48 @@ def _world(description: Mapping[str, Any], path: Path) -> World:
         if name not in SYSTEMS and name not in EFFECTS:
             raise CheckpointError(f"{path}: needs {name!r}, which is not known here: import the file that defines it")
     system = SYSTEMS[description["system"]](**description["parameters"])
-    effects = []
-    for one in description["effects"]:
-        values = {name: value for name, value in one.items() if name != "effect"}
-        effects.append(EFFECTS[one["effect"]](**values))
+    given = [dict(one) for one in description["effects"]]
+    effects = [EFFECTS[values.pop("effect")](**values) for values in given]
     clock = {name: description[name] for name in ("period", "integrator", "substeps")}
     return World(system, effects, **clock)
+
+
+def residual_for(
+    policy: Policy, source: World, with_history: bool = False, perception: PerceptionSettings | None = None
+) -> Residual:
+    """A new residual of `source` that begins at zero.
+
+    Args:
+        with_history: for flights: whether it also reads what the source left unexplained over the last periods, in
+            which a force that changes shows. Policies on frames and on states say so themselves.
+        perception: for frames: how the policy's encoder learnt to see; the default settings without it.
+
+    Raises:
+        TypeError: a policy of a class that is not known here; give a `Setup` of its own.
+    """
+    system, period = source.system, source.period
+    network: FlightResidualNetwork | ImageResidualNetwork | StateResidualNetwork
+    if isinstance(policy, ImagePolicy):
+        eyes = policy.perception
+        unit = scale(perception or PerceptionSettings(), period)
+        network = ImageResidualNetwork(eyes.background, float(eyes.contrast), system, period, unit)
+        network.encoder.load_state_dict(eyes.state_dict())
+    elif isinstance(policy, StatePolicy):
+        physics = system if policy.with_history else None
+        network = StateResidualNetwork(policy.n_state, policy.n_action, physics, period)
+    elif isinstance(policy, FlightPolicy) and isinstance(system, RigidBody):
+        network = FlightResidualNetwork(system, period, partial(source_steps, source) if with_history else None)
+    else:
+        raise TypeError(f"no residual is known for a {type(policy).__name__} of a {system.name}")
+    return Residual(network, torch.ones(policy.n_state))
+
+
+def source_steps(source: World, states: Tensor, actions: Tensor) -> Tensor:
+    """The source's step from each of the states (B, T, n) that follow each other, under actions (B, T, n_action).
+
+    Actuators remember the actions before; what was given earlier, and the time in the episode, a history does not hold.
+    """
+    memory = source.memories(states[:, 0], actions, states)
+    before = tuple(each[:, :-1].flatten(0, 1) for each in memory)
+    at = WorldState(states.new_zeros(states[..., 0].numel()), states.flatten(0, 1), before)
+    return source.step(at, actions.flatten(0, 1)).state.unflatten(0, states.shape[:2])

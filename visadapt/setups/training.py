@@ -13,8 +13,7 @@ from visadapt.learning.joint import Adapted
 from visadapt.policies import ImagePolicy, Policy, StatePolicy
 from visadapt.progress import Report
 from visadapt.setups.base import Setup
-from visadapt.setups.cartpole_frames import cartpole_frames
-from visadapt.setups.cartpole_states import cartpole_states
+from visadapt.setups.cartpole import cartpole_frames, cartpole_states
 from visadapt.setups.flight import fixed_wing, quadrotor
 from visadapt.setups.policy_file import save_policy
 from visadapt.systems import CartPole, FixedWing, Quadrotor
@@ -100,10 +99,8 @@ def train(
     if iterations is not None:
         settings = replace(setup.settings, source=replace(setup.settings.source, iterations=iterations))
         setup = replace(setup, settings=settings)
-    if path is not None:
-        return setup.pretrain(Path(path), seed, report)
-    with tempfile.TemporaryDirectory() as folder:
-        return setup.pretrain(Path(folder) / "policy.safetensors", seed, report)
+    with tempfile.TemporaryDirectory() as temporary:
+        return setup.pretrain(Path(path or Path(temporary, "policy.safetensors")), seed, report)
 
 
 @overload

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
@@ -21,8 +19,6 @@ from visadapt.storage.atomic_files import replacing
 
 TREE_KEY = "visadapt.tree"
 """Key of the JSON in the header of the safetensors file."""
-CHECKPOINT_ITERATIONS = 100
-"""Iterations between two states of a training."""
 
 
 class CheckpointError(ValueError):
@@ -89,30 +85,6 @@ def load_network(path: Path, network: nn.Module) -> dict[str, Any]:
         raise CheckpointError(f"{path}: holds a {tree['class']}, a {type(network).__name__} is needed")
     load_weights(network, tree["weights"], path)
     return tree["settings"]
-
-
-@dataclass
-class TrainingState:
-    """A training that can be interrupted: all that is needed to go on to the same numbers."""
-
-    network: nn.Module
-    optimiser: torch.optim.Optimizer
-    schedule: torch.optim.lr_scheduler.LRScheduler
-    generator: torch.Generator
-
-    def keep(self, path: Path, losses: list[float], more: dict[str, Any]) -> None:
-        """Write the state to `path`, with the losses so far and `more`, whatever else the loop needs."""
-        parts = {name: getattr(self, name).state_dict() for name in ("network", "optimiser", "schedule")}
-        save_tree(path, {**parts, "generator": self.generator.get_state(), "losses": losses, "more": more})
-
-    def resume(self, path: Path) -> tuple[list[float], dict[str, Any]]:
-        """Restore what `keep` wrote; returns the losses and `more`; raises CheckpointError where it does not fit."""
-        tree = load_tree(path)
-        load_weights(self.network, tree["network"], path)
-        self.optimiser.load_state_dict(tree["optimiser"])
-        self.schedule.load_state_dict(tree["schedule"])
-        self.generator.set_state(tree["generator"])
-        return tree["losses"], tree["more"]
 
 
 def _strip(node: Any, tensors: dict[str, Tensor]) -> Any:

@@ -13,7 +13,7 @@ from renderers import DrawnCartPole
 from visadapt.effects import ConstantForce, Effect, PeriodicForce
 from visadapt.systems import CartPole, RigidBody, System
 from visadapt.targets.base import Observation, Target, TargetError
-from visadapt.tasks.flight import FlightTask
+from visadapt.tasks.base import FlightTask
 from visadapt.world import World, WorldState
 
 DrawEffects = Callable[[int, torch.Generator], Sequence[Effect]]

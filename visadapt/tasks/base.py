@@ -16,7 +16,7 @@ class Task(ABC):
 
     >>> import torch, visadapt as va
     >>> from visadapt.tasks.balance import Balance
-    >>> from visadapt.tasks.cost import PAPER_CARTPOLE
+    >>> from visadapt.tasks.balance import PAPER_CARTPOLE
     >>> task = Balance(PAPER_CARTPOLE)
     >>> state, task_state = task.training_start(3, 0.0, torch.Generator().manual_seed(0))
     >>> isinstance(task, va.Task), state.shape, task_state.shape
@@ -61,3 +61,36 @@ class Task(ABC):
 def curriculum(first: float, progress: float) -> float:
     """A share that grows from `first` to 1 over the first half of the training."""
     return first + (1 - first) * min(1.0, 2 * progress)
+
+
+class FlightTask(Task):
+    """A task of a rigid body, whose policy is shown its state and, after it, its goal."""
+
+    @property
+    @abstractmethod
+    def period(self) -> float:
+        """s between commands."""
+
+    @property
+    @abstractmethod
+    def steps(self) -> int:
+        """Periods in a flight that is scored."""
+
+    @abstractmethod
+    def evaluation_start(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """States (batch, 13) at the start of flights that are scored, and their task states."""
+
+    @abstractmethod
+    def goal(self, task_state: Tensor) -> Tensor:
+        """What a policy is shown beside its state: (B, n_goal)."""
+
+    @abstractmethod
+    def misses(self, states: Tensor, task_state: Tensor) -> Tensor:
+        """Errors in m, (B, any), of flights (B, steps + 1, 13) that started at `task_state`; their mean is scored."""
+
+    @abstractmethod
+    def distance_off(self, state: Tensor, task_state: Tensor) -> Tensor:
+        """Distance (B,) in m of states (B, 13) from the point, or the line, where they should be."""
+
+    def show(self, observed: Tensor, task_state: Tensor) -> Tensor:
+        return torch.cat((observed, self.goal(task_state)), 1)

@@ -13,7 +13,6 @@ not zero, though yaw stands still. Vectors a (acceleration) and j (jerk) are in 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,20 +20,16 @@ from torch import Tensor
 
 from visadapt.systems import Quadrotor
 
-SHIFT = 1e-4
-"""s, of the difference that takes the place of a derivative: in float64, right to about 1e-7 rad/s2."""
+SHIFT = 1e-4  # s, of the difference that takes the place of a derivative: in float64, right to about 1e-7 rad/s2
 
 
 @dataclass(frozen=True)
 class Demand:
     """What a motion asks for, for each of its instants."""
 
-    thrust: Tensor
-    """(...) m/s2, mass-normalised"""
-    attitude: Tensor
-    """(..., 4) quaternion w, x, y, z, with w positive"""
-    rates: Tensor
-    """(..., 3) rad/s, about the body's axes"""
+    thrust: Tensor  # (...) m/s2, mass-normalised
+    attitude: Tensor  # (..., 4) quaternion w, x, y, z, with w positive
+    rates: Tensor  # (..., 3) rad/s, about the body's axes
 
     def state(self, position: Tensor, velocity: Tensor) -> Tensor:
         """The quadrotor's state (..., 13) at positions (..., 3) and velocities (..., 3)."""
@@ -63,24 +58,16 @@ def commands(acceleration: Tensor, jerk: Tensor, snap: Tensor, quadrotor: Quadro
     """Commands (..., 4) that carry out a motion exactly, lag of the rate loop included; in [-1, 1] if it is feasible.
 
     The loop closes omega' = gain (asked - omega), so it is asked for omega + omega' / gain. omega', which needs the
-    snap (..., 3) in m/s4, is the difference of omega a little earlier and later. The quadrotor's
-    parameters are numbers.
+    snap (..., 3) in m/s4, is the difference of omega a little earlier and later.
     """
-
-    motion = [derivative.double() for derivative in (acceleration, jerk, snap)]
-    before, now, after = (_a_little_later(motion, shift, float(quadrotor.gravity)) for shift in (-SHIFT, 0.0, SHIFT))
+    a, j, s = (derivative.double() for derivative in (acceleration, jerk, snap))
+    before, now, after = (demanded(a + h * j, j + h * s, float(quadrotor.gravity)) for h in (-SHIFT, 0.0, SHIFT))
     thrust, rates, change = now.thrust, now.rates, (after.rates - before.rates) / (2 * SHIFT)
     gain = rates.new_tensor([float(g) for g in (quadrotor.roll_gain, quadrotor.roll_gain, quadrotor.yaw_gain)])
     low, high = float(quadrotor.min_thrust), float(quadrotor.max_thrust)
     lift = (2 * thrust - high - low) / (high - low)
     asked = torch.cat((lift[..., None], (rates + change / gain) / float(quadrotor.max_rate)), -1)
     return asked.to(acceleration)
-
-
-def _a_little_later(motion: Sequence[Tensor], shift: float, gravity: float) -> Demand:
-    """The demand of acceleration, jerk and snap (..., 3), `shift` seconds on."""
-    acceleration, jerk, snap = motion
-    return demanded(acceleration + shift * jerk, jerk + shift * snap, gravity)
 
 
 def _attitude(rotation: Tensor) -> Tensor:
@@ -90,12 +77,6 @@ def _attitude(rotation: Tensor) -> Tensor:
     """
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
     w = (1 + trace).sqrt() / 2
-    xyz = torch.stack(
-        (
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ),
-        -1,
-    )
+    turned = rotation - rotation.mT
+    xyz = torch.stack((turned[..., 2, 1], turned[..., 0, 2], turned[..., 1, 0]), -1)
     return torch.cat((w[..., None], xyz / (4 * w[..., None])), -1)

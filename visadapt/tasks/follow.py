@@ -9,9 +9,8 @@ from torch import Tensor
 
 from visadapt.history import HORIZON
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
-from visadapt.tasks.base import curriculum
+from visadapt.tasks.base import FlightTask, curriculum
 from visadapt.tasks.differential_flatness import demanded
-from visadapt.tasks.flight import FlightTask
 from visadapt.tasks.references import Reference
 
 
@@ -53,10 +52,8 @@ class RecoverCost(FollowCost):
     """
 
     final: float = 10.0
-    beyond: float = 1.0
-    """s"""
-    floor: float = 0.01
-    """keeps the root differentiable at zero; about the cost of a plan with 1 cm of error all along"""
+    beyond: float = 1.0  # s
+    floor: float = 0.01  # keeps the root differentiable at zero; about the cost of a plan with 1 cm of error all along
 
     def __call__(self, states: Tensor, plan: Tensor, reference: Tensor) -> Tensor:
         away = (states[..., : VELOCITY.stop] - reference)[:, -1]
@@ -68,17 +65,14 @@ class RecoverCost(FollowCost):
 class Follow(FlightTask):
     """Fly along one of many references, from its first row to its last. A task state is (reference, row)."""
 
-    references: Reference
-    """(N, T, 3)"""
+    references: Reference  # (N, T, 3)
     cost_of: FollowCost = FollowCost()
-    start_spread: tuple[float, float] = (0.1, 0.2)
-    """standard deviation in m and m/s of the start around the reference"""
+    start_spread: tuple[float, float] = (0.1, 0.2)  # standard deviation in m and m/s of the start around the reference
     divergence: float = 2.0
     """m, delta_div at the end of the curriculum: a stream further from its reference starts anew"""
     first_divergence: float = 0.05
     """share of `divergence` that the curriculum begins with; it reaches 1 at half of the iterations"""
-    candidates: int = 64
-    """rows of references drawn at random, of which `augment` takes the one flown most alike"""
+    candidates: int = 64  # rows of references drawn at random, of which `augment` takes the one flown most alike
 
     @property
     def period(self) -> float:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from visadapt.systems import FixedWing
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
-from visadapt.tasks.flight import FlightTask
+from visadapt.tasks.base import FlightTask
 
 WALDOCK = FixedWing()
 
@@ -25,24 +25,18 @@ class Reach(FlightTask):
     with e_k = x_{t+k} - nu_{t+k}. The paper weighs both by 10; but what decides is to be on the line, not when.
     """
 
-    period: float = 0.05
-    """s between commands"""
-    system: FixedWing = WALDOCK
-    """whose level flight at `speed` flights start in"""
-    distance: float = 50.0
-    """m ahead"""
-    sideways: float = 5.0
-    """m: half-width of the uniform distribution of the point to the sides and up and down"""
-    speed: float = 11.5
-    """m/s at the start, along x"""
+    period: float = 0.05  # s between commands
+    system: FixedWing = WALDOCK  # whose level flight at `speed` flights start in
+    distance: float = 50.0  # m ahead
+    sideways: float = 5.0  # m: half-width of the uniform distribution of the point to the sides and up and down
+    speed: float = 11.5  # m/s at the start, along x
     along: float = 1.0
     across: float = 30.0
     rates: float = 0.1
     action: float = 0.01
     start_spread: tuple[float, float, float] = (0.5, 0.5, 0.1)
     """standard deviation in m, m/s and rad/s of the start around the straight line"""
-    divergence: float = 8.0
-    """m from the straight line at which a stream starts anew"""
+    divergence: float = 8.0  # m from the straight line at which a stream starts anew
 
     @property
     def steps(self) -> int:

@@ -1,7 +1,6 @@
 """References that a vehicle is to follow: positions and velocities on a steady clock, and their derivatives.
 
-A straight line to a target, the power loop, or one's own from a CSV file; `datasets.quadrotor_references` draws
-random ones.
+The power loop, or one's own from a CSV file; `datasets.quadrotor_references` draws random ones.
 """
 
 from __future__ import annotations
@@ -14,15 +13,15 @@ from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from visadapt.recordings import RecordingError
+from visadapt.recordings.checks import check_finite
+from visadapt.recordings.clock import RawEpisode, check_forward
 from visadapt.recordings.csv import Table
 from visadapt.systems import Quadrotor
-from visadapt.tasks.differential_flatness import commands, demanded
+from visadapt.tasks.differential_flatness import commands
 
-AXES = ("x", "y", "z")
 SPEEDS = ("x_dot", "y_dot", "z_dot")
 
 LOOP_RADIUS = 7.0
@@ -30,24 +29,18 @@ LOOP_RADIUS = 7.0
 5 m/s, leaves the controller a tenth of the range of commands (`smallest_loop`), rounded up to half a metre."""
 RAMP = 0.5
 """rad, by which a power loop turns while its curvature grows from none to the circle's, and again on the way out."""
-STRAIGHT = 1.0
-"""s of straight flight at least, before and after a power loop."""
+STRAIGHT = 1.0  # s of straight flight at least, before and after a power loop
 
 
 @dataclass(frozen=True)
 class Reference:
     """One reference, or many of one length: leading axes (...) number them, the next is time. World axes, z up."""
 
-    positions: Tensor
-    """(..., T, 3) m"""
-    velocities: Tensor
-    """(..., T, 3) m/s"""
-    accelerations: Tensor
-    """(..., T, 3) m/s2"""
-    jerks: Tensor
-    """(..., T, 3) m/s3"""
-    period: float
-    """s between rows"""
+    positions: Tensor  # (..., T, 3) m
+    velocities: Tensor  # (..., T, 3) m/s
+    accelerations: Tensor  # (..., T, 3) m/s2
+    jerks: Tensor  # (..., T, 3) m/s3
+    period: float  # s between rows
 
     @classmethod
     def of(cls, motion: Tensor, period: float) -> Self:
@@ -57,34 +50,8 @@ class Reference:
 
     def as_many(self) -> Self:
         """With a leading axis that numbers references, (1, T, 3), where this is a single one; else itself."""
-        if self.positions.dim() > 2:
-            return self
         motion = torch.stack((self.positions, self.velocities, self.accelerations, self.jerks))
-        return type(self).of(motion[:, None], self.period)
-
-    def states(self, gravity: float = 9.81) -> Tensor:
-        """The quadrotor's states (..., T, 13) on the reference; the first row is where an episode starts."""
-        return demanded(self.accelerations, self.jerks, gravity).state(self.positions, self.velocities)
-
-
-def line(start: Tensor, target: Tensor, speed: float, period: float = 0.1) -> Reference:
-    """From `start` (3,) straight to `target` (3,), in m, at a steady speed in m/s.
-
-    The speed is lowered a little where needed, so that the last row is the target.
-
-    Raises:
-        ValueError: a speed or period that is not positive, or a target nearer than one row.
-    """
-    _check_positive(speed=speed, period=period)
-    way = target - start
-    distance = float(way.norm())
-    if distance < speed * period:
-        raise ValueError(f"the target is {distance:g} m away, must be at least a row's {speed * period:g} m")
-    steps = ceil(distance / (speed * period) - 1e-6)
-    positions = start + way * torch.linspace(0, 1, steps + 1).to(way)[:, None]
-    velocities = (way / (steps * period)).expand_as(positions)
-    still = torch.zeros_like(positions)
-    return Reference(positions, velocities, still, still, period)
+        return self if motion.dim() > 3 else type(self).of(motion[:, None], self.period)
 
 
 def power_loop(speed: float, radius: float = LOOP_RADIUS, period: float = 0.1) -> Reference:
@@ -150,12 +117,19 @@ def read_reference(path: str | os.PathLike[str], period: float = 0.1, max_speed:
     _check_positive(period=period, max_speed=max_speed)
     path = Path(path)
     table = Table.open(path)
-    names = ["time", *AXES, *(SPEEDS if any(name in table.header for name in SPEEDS) else ())]
+    names = ["time", "x", "y", "z", *(SPEEDS if any(name in table.header for name in SPEEDS) else ())]
     for name in names:
         if name not in table.header:
             raise RecordingError(f"{path}: has no column {name!r}; its columns are {', '.join(table.header)}")
     values = table.numbers([table.header.index(name) for name in names])
-    _check_rows(table, names, values, period)
+    raw = RawEpisode(path, values[:, 0], values[:, :0], values[:, 1:], tuple(names[1:]), table.place)
+    check_finite(raw, ())
+    check_forward(raw)
+    lasts = values[-1, 0] - values[0, 0]
+    if len(values) < 3 or lasts < 2 * period * (1 - 1e-6):
+        raise RecordingError(
+            f"{path}: {len(values)} rows over {lasts:g} s; at least 3 rows over {2 * period:g} s are right"
+        )
     time, places = torch.from_numpy(values[:, 0] - values[0, 0]), values[:, 1:4]
     slopes = values[:, 4:] if len(names) > 4 else np.gradient(places, values[:, 0], axis=0, edge_order=2)
     at = torch.arange(int(float(time[-1]) / period + 1e-5) + 1, dtype=torch.float64) * period
@@ -187,28 +161,6 @@ def cubic(time: Tensor, values: Tensor, slopes: Tensor, at: Tensor) -> Tensor:
     rise, fall = slopes[..., row, :] * step, slopes[..., row + 1, :] * step
     level = before * (1 + 2 * s) * (1 - s) ** 2 + after * s**2 * (3 - 2 * s)
     return level + rise * s * (1 - s) ** 2 - fall * s**2 * (1 - s)
-
-
-def _check_rows(table: Table, names: list[str], values: NDArray[np.float64], period: float) -> None:
-    bad = np.argwhere(~np.isfinite(values))
-    if len(bad):
-        row, column = bad[0]
-        raise RecordingError(
-            f"{table.path}: {table.place(int(row))}, column {names[column]!r} is {values[row, column]}; "
-            "a finite number is right"
-        )
-    backwards = np.flatnonzero(np.diff(values[:, 0]) <= 0)
-    if len(backwards):
-        row = int(backwards[0]) + 1
-        raise RecordingError(
-            f"{table.path}: {table.place(row)} is at {values[row, 0]:g} s, the row before it at "
-            f"{values[row - 1, 0]:g} s; times must rise"
-        )
-    lasts = values[-1, 0] - values[0, 0]
-    if len(values) < 3 or lasts < 2 * period * (1 - 1e-6):
-        raise RecordingError(
-            f"{table.path}: {len(values)} rows over {lasts:g} s; at least 3 rows over {2 * period:g} s are right"
-        )
 
 
 def _check_positive(**values: float) -> None:

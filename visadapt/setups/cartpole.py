@@ -1,4 +1,4 @@
-"""The CartPole from pixels: encoder, policy and residual see through a learnt renderer (section 3.2.3)."""
+"""The cart-pole from states, and from pixels through a learnt renderer (the paper's sections 3.2.1 to 3.2.3)."""
 
 from __future__ import annotations
 
@@ -10,28 +10,51 @@ import torch
 from torch import Tensor
 
 from renderers import LayeredRenderer, RendererError, load_renderer
+from visadapt.learning.joint import SetupSettings
 from visadapt.learning.perception import PerceptionSettings, learn_to_see
 from visadapt.learning.policy import TuneSettings
 from visadapt.learning.tracking import Tracker
-from visadapt.policies import ImagePolicy, Policy
+from visadapt.learning.training_state import train_or_load
+from visadapt.policies import ImagePolicy, Policy, StatePolicy
 from visadapt.progress import Report, staged
 from visadapt.recordings import Episode
-from visadapt.setups.base import Setup, SetupSettings
-from visadapt.setups.residuals import residual_for
-from visadapt.storage.checkpoints import load_network, save_network
+from visadapt.setups.base import Setup
+from visadapt.setups.policy_file import residual_for
 from visadapt.systems import CartPole
-from visadapt.tasks.balance import Balance
-from visadapt.tasks.cost import CENTRED_CARTPOLE
+from visadapt.tasks.balance import CENTRED_CARTPOLE, PAPER_CARTPOLE, Balance
 from visadapt.weights import shipped
 from visadapt.world import World
 
-CONTRAST = 0.2
-"""Grey levels, of 1, that frames are divided by before the networks see them."""
+UNLIMITED = 1e9  # m, of the cart's position: nothing depends on it, and no camera loses the cart
 
-REACH = 1.45
-"""m to either side that a camera has to see for `SETTINGS`, of the drawn cart-pole, which sees 1.5 m."""
+FROM_STATES = SetupSettings(
+    source=TuneSettings(
+        Balance(PAPER_CARTPOLE, divergence=(UNLIMITED, 4.0, 0.5, 10.0)),
+        iterations=3000,
+        learning_rate=3e-3,
+        observation_noise=0.0,
+    ),
+    tuning=TuneSettings(
+        Balance(
+            PAPER_CARTPOLE,
+            start_spread=(0.3, 0.2, 0.1, 0.2),
+            kick=(0.0, 0.0, 0.0, 0.0),
+            divergence=(UNLIMITED, 2.0, 0.25, 3.0),
+            first_divergence=0.4,
+        ),
+        iterations=400,
+        learning_rate=2e-3,
+        longest=25,
+        recorded=0.8,
+        observation_noise=0.0,
+    ),
+)
 
-SETTINGS = SetupSettings(
+CONTRAST = 0.2  # Grey levels, of 1, that frames are divided by before the networks see them
+
+REACH = 1.45  # m to either side that a camera has to see for `FROM_FRAMES`, of the drawn cart-pole, which sees 1.5 m
+
+FROM_FRAMES = SetupSettings(
     source=TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500),
     tuning=TuneSettings(
         Balance(
@@ -53,6 +76,23 @@ SETTINGS = SetupSettings(
 )
 
 
+def cartpole_states(
+    source: World | None = None, with_history: bool = False, settings: SetupSettings = FROM_STATES
+) -> Setup:
+    """The cart-pole that is shown its states.
+
+    Args:
+        source: the physics known beforehand; without it, the paper's CartPole, 0.05 s between commands.
+        with_history: whether policy and residual read 5 states and actions, or the last alone.
+    """
+    return Setup(
+        source=source or World(CartPole()),
+        policy=partial(StatePolicy, 4, with_history=with_history),
+        residual=residual_for,
+        settings=settings,
+    )
+
+
 def cartpole_frames(
     source: World | None = None,
     renderer: LayeredRenderer | Path | str | None = None,
@@ -64,7 +104,7 @@ def cartpole_frames(
         source: the physics known beforehand, whose states begin with x, x_dot, theta, theta_dot; without it, the
             paper's CartPole, 0.05 s between commands.
         renderer: states to frames, trained, or the file of one; without it, that of the drawn cart-pole.
-        settings: how the policy learns; without it, `SETTINGS`, narrowed to what the renderer's camera sees.
+        settings: how the policy learns; without it, `FROM_FRAMES`, narrowed to what the renderer's camera sees.
 
     Raises:
         RendererError: the file holds no layered renderer.
@@ -73,7 +113,7 @@ def cartpole_frames(
     seen = renderer if isinstance(renderer, LayeredRenderer) else _load(Path(renderer or shipped("renderer")))
     seen.requires_grad_(False).eval()
     tracker = Tracker(seen, source)
-    settings = settings or _narrowed(SETTINGS, seen)
+    settings = settings or _narrowed(FROM_FRAMES, seen)
     perception = settings.perception or PerceptionSettings()
 
     def observe(state: Tensor) -> Tensor:
@@ -82,21 +122,23 @@ def cartpole_frames(
 
     def label(episodes: list[Episode]) -> list[Episode]:
         """The same episodes with states estimated from their frames; those of 1 or 2 rows are too short, and left."""
-        return [track.episode for track in tracker.track([episode for episode in episodes if len(episode.time) > 2])]
+        return tracker.track([episode for episode in episodes if len(episode.time) > 2])
 
     def prepare(policy: Policy, folder: Path, seed: int, report: Report | None) -> None:
         """Teach the policy's encoder to see, in `folder`, or take the one that is there."""
         assert isinstance(policy, ImagePolicy)
-        path, partial_path = folder / "encoder.safetensors", folder / "encoder.partial.safetensors"
-        if path.exists():
-            load_network(path, policy.perception)
-        else:
-            eyes = policy.perception.requires_grad_(True)
-            generator, progress = torch.Generator().manual_seed(seed), staged(report, "perception")
-            learn_to_see(eyes, seen, source.period, perception, generator, progress, partial_path)
-            save_network(path, eyes.requires_grad_(False), {"seed": seed, **asdict(perception)})
-            partial_path.unlink(missing_ok=True)
-        policy.encoder.load_state_dict(policy.perception.state_dict())
+        eyes = policy.perception.requires_grad_(True)
+        args = (
+            eyes,
+            seen,
+            source.period,
+            perception,
+            torch.Generator().manual_seed(seed),
+            staged(report, "perception"),
+        )
+        about = {"seed": seed, **asdict(perception)}
+        train_or_load(folder / "encoder.safetensors", eyes, about, lambda partial: learn_to_see(*args, partial))
+        policy.encoder.load_state_dict(eyes.requires_grad_(False).state_dict())
 
     return Setup(
         source=source,
