@@ -85,7 +85,7 @@ def main(settings: Settings) -> None:
         look("before", "Target, before", target)
         adapted = setup.adapt(policy, target, out, settings.budget, settings.round_samples, settings.seed, report)
         look("after", f"Target, after {adapted.ledger.used:,} samples", target)
-        film = CartPoleFilm([CartPolePanel.redrawn(title, shown, stream) for title, shown in films], target.period)
+        film = CartPoleFilm([CartPolePanel(title, shown, drawn=stream) for title, shown in films], target.period)
         film.write_still(out / "film.png", t=3.0)
         film.write(out / "film.mp4", staged(report, "film"))
     plot_losses(out / "losses.png", adapted.rounds)

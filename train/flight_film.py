@@ -66,36 +66,28 @@ def main(settings: Settings) -> None:
     hidden = experiment.effects(setup)
     with reporting() as report:
         adapted = experiment.adapt(setup, settings.work, adapting, settings.seed, report)
-        before = flown(setup, hidden, policy, settings.flight, "Target, before adaptation")
         after = f"Target, after {adapted.ledger.used:,} samples"
         panels = [
             flown(setup, no_effects, policy, settings.flight, "Source, 0 samples"),
-            before,
-            flown(setup, hidden, adapting, settings.flight, after, before),
+            flown(setup, hidden, policy, settings.flight, "Target, before adaptation"),
+            flown(setup, hidden, adapting, settings.flight, after),
         ]
         path = settings.out / f"{settings.vehicle}-{settings.experiment}.mp4"
         passed = max(panel.passed for panel in panels) + 0.3
         film = FlightFilm(panels)
-        film.write_still(path.with_suffix(".png"), settings.still if before.follows else passed)
+        film.write_still(path.with_suffix(".png"), settings.still if film.follows else passed)
         film.write(path, staged(report, "film"))
     for panel in panels:
-        print(f"{panel.title:30} {100 * float(panel.score[-1]):7.2f} cm {'mean' if before.follows else 'nearest'}")
+        print(f"{panel.title:30} {100 * float(panel.score[-1]):7.2f} cm {'mean' if film.follows else 'nearest'}")
     print(f"{path} and {path.with_suffix('.png').name} are written")
 
 
-def flown(
-    setup: Setup,
-    draw_effects: DrawEffects,
-    policy: Policy,
-    seed: int,
-    title: str,
-    earlier: FlightPanel | None = None,
-) -> FlightPanel:
+def flown(setup: Setup, draw_effects: DrawEffects, policy: Policy, seed: int, title: str) -> FlightPanel:
     """One flight under hidden effects; the seed alone decides what is to be flown, and the force."""
     policy.eval()
     target = flight_target(setup, draw_effects)
     flights = run(target, policy, 1, target.task.steps, torch.Generator().manual_seed(seed), strict=False)
-    return FlightPanel(title, flights[0], target.system, target.task, target.first[0], earlier)
+    return FlightPanel(title, flights[0], target.system, target.task, target.first[0])
 
 
 if __name__ == "__main__":

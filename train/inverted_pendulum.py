@@ -186,7 +186,7 @@ def _panels(films: Sequence[tuple[str, Run]]) -> list[CartPolePanel]:
     for title, shown in films:
         assert shown.episode.state is not None
         picture = large.show(shown.episode.state)
-        panels.append(CartPolePanel(title, shown, picture, angle_limit=ANGLE_LIMIT, force_known=False))
+        panels.append(CartPolePanel(title, shown, picture, angle_limit=ANGLE_LIMIT))
     return panels
 
 

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from visadapt.evaluation import SCORE_SEED
 from visadapt.evaluation.result_tables import Row, write_rows
-from visadapt.films.swing_up_film import SwingUpFilm, SwingUpPanel
+from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.learning.policy import TuneSettings, tune
 from visadapt.learning.training_state import train_or_load
 from visadapt.policies import StatePolicy
@@ -160,8 +160,8 @@ def make_film(settings: Settings) -> None:
     load_network(settings.work / "seed-0" / POLICY, policy)
     target = SyntheticTarget(start=Filmed(), angle_limit=math.inf)
     runs = run(target, policy.eval(), len(FILMED), STEPS, torch.Generator(), see=see)
-    panels = [SwingUpPanel(title, each) for title, each in zip(FILMED, runs, strict=True)]
-    film = SwingUpFilm(panels, SWING * target.period)
+    panels = [CartPolePanel(title, each, angle_limit=math.inf) for title, each in zip(FILMED, runs, strict=True)]
+    film = CartPoleFilm(panels, target.period, SWING * target.period)
     film.write_still(settings.still, STILL)
     path = settings.work / "film.mp4"
     with reporting() as report:

@@ -7,10 +7,11 @@ import imageio.v3 as imageio
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from PIL import Image
 
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
-from visadapt.films.colours import RED
+from visadapt.films.widgets import RED
 from visadapt.recordings import Episode
 from visadapt.targets.rollout import Run
 
@@ -27,11 +28,11 @@ def make_run(rows: int = 21, survived: bool = True, last_angle: float = 0.0, las
 
 
 def red_pixels(picture: np.ndarray) -> int:
-    return int((np.abs(picture.astype(int) - RED).max(-1) < 30).sum())
+    return int((np.abs(picture - 255 * np.array(to_rgb(RED))).max(-1) < 30).sum())
 
 
 def test_a_film_is_decoded_as_it_was_drawn(tmp_path: Path):
-    panels = [CartPolePanel.redrawn("source", make_run()), CartPolePanel.redrawn("target", make_run(9, False, 0.4))]
+    panels = [CartPolePanel("source", make_run()), CartPolePanel("target", make_run(9, False, 0.4))]
     path = tmp_path / "new folder" / "film.mp4"
     done: list[tuple[int, int]] = []
     CartPoleFilm(panels, PERIOD).write(path, lambda now, total, _: done.append((now, total)))
@@ -55,8 +56,8 @@ def test_a_film_is_decoded_as_it_was_drawn(tmp_path: Path):
 
 
 def test_the_end_of_an_episode_is_marked_and_the_scene_stands_still():
-    panel = CartPolePanel.redrawn("target", make_run(9, False, 0.4))
-    long = CartPolePanel.redrawn("source", make_run(21))
+    panel = CartPolePanel("target", make_run(9, False, 0.4))
+    long = CartPolePanel("source", make_run(21))
     assert red_pixels(CartPoleFilm([panel, long], PERIOD).still(0.3)) == 0
     after = CartPoleFilm([panel, long], PERIOD).still(0.5)
     assert red_pixels(after) > 2000
@@ -70,20 +71,20 @@ def test_the_end_of_an_episode_is_marked_and_the_scene_stands_still():
     [(True, 0.0, 0.1, ""), (False, -0.35, 0.1, "FELL"), (False, 0.1, 1.6, "LEFT THE FRAME")],
 )
 def test_the_panel_says_how_an_episode_ended(survived: bool, angle: float, place: float, failure: str):
-    assert CartPolePanel.redrawn("target", make_run(9, survived, angle, place)).failure == failure
+    panel = CartPolePanel("target", make_run(9, survived, angle, place))
+    assert panel.failure(8, due=5.0) == (f"{failure} at t = 0.40 s" if failure else "")
+    assert panel.failure(7, due=5.0) == ""
 
 
 def test_the_limit_of_the_angle_decides_what_a_fall_is():
     run = make_run(9, False, 0.25)
-    assert CartPolePanel.redrawn("target", run, angle_limit=0.2).failure == "FELL"
+    assert CartPolePanel("target", run, angle_limit=0.2).failure(8, 5.0).startswith("FELL")
 
 
 def test_the_force_is_drawn_at_the_cart_on_the_side_it_pushes_from():
     run = make_run()
     orange = [
-        CartPoleFilm([CartPolePanel.redrawn("t", Run(run.episode, True, sign * run.force))], PERIOD).still(0.5)[
-            340:420, 28:508
-        ]
+        CartPoleFilm([CartPolePanel("t", Run(run.episode, True, sign * run.force))], PERIOD).still(0.5)[340:420, 28:508]
         for sign in (1, -1)
     ]
     cart = 28 + 239.5 + 160 * run.episode.state[10, 0] - 28
@@ -96,30 +97,28 @@ def test_the_force_is_drawn_at_the_cart_on_the_side_it_pushes_from():
 @pytest.mark.parametrize("shape", [(100, 120), (100, 120, 3), (480, 480, 3), (37, 211)])
 def test_pictures_of_any_size_fill_the_same_panel(shape: tuple[int, ...]):
     picture = np.full((21, *shape), 90, np.uint8)
-    panels = [
-        CartPolePanel("a camera with a title too long for its panel " * 3, make_run(), picture, force_known=False)
-    ]
+    panels = [CartPolePanel("a camera with a title too long for its panel " * 3, make_run(), picture)]
     assert (
         CartPoleFilm(panels, PERIOD).still(0.2).shape
-        == CartPoleFilm([CartPolePanel.redrawn("drawn", make_run())], PERIOD).still(0.2).shape
+        == CartPoleFilm([CartPolePanel("drawn", make_run())], PERIOD).still(0.2).shape
     )
 
 
 def test_an_episode_of_one_row_is_a_film_of_one_frame(tmp_path: Path):
-    CartPoleFilm([CartPolePanel.redrawn("target", make_run(1))], PERIOD).write(tmp_path / "film.mp4")
+    CartPoleFilm([CartPolePanel("target", make_run(1))], PERIOD).write(tmp_path / "film.mp4")
     assert len(imageio.imread(tmp_path / "film.mp4", plugin="FFMPEG")) == 1
 
 
 def test_scales_are_shared_and_a_fall_does_not_squash_the_rest():
     run = make_run()
     run.episode.state[:, 1] *= 40
-    fallen = CartPolePanel.redrawn("fallen", Run(run.episode, False, run.force))
+    fallen = CartPolePanel("fallen", Run(run.episode, False, run.force))
     assert CartPoleFilm([fallen], PERIOD).full_speed >= 4
-    assert CartPoleFilm([fallen, CartPolePanel.redrawn("upright", make_run())], PERIOD).full_speed == 0.5
+    assert CartPoleFilm([fallen, CartPolePanel("upright", make_run())], PERIOD).full_speed == 0.5
 
 
 def test_a_still_is_a_picture(tmp_path: Path):
-    panels = [CartPolePanel.redrawn("source", make_run())]
+    panels = [CartPolePanel("source", make_run())]
     CartPoleFilm(panels, PERIOD).write_still(tmp_path / "still.png", 0.3)
     with Image.open(tmp_path / "still.png") as picture:
         assert np.array_equal(np.asarray(picture), CartPoleFilm(panels, PERIOD).still(0.3))
@@ -131,9 +130,8 @@ def test_a_still_is_a_picture(tmp_path: Path):
         (lambda run: CartPolePanel("a", run, np.zeros((20, 10, 10), np.uint8)), "21 rows, but there are 20 pictures"),
         (lambda run: CartPolePanel("a", run, np.zeros((21, 10, 10))), "must be uint8"),  # type: ignore[arg-type]
         (lambda run: CartPolePanel("a", run, np.zeros((21, 10, 10, 4), np.uint8)), "must be uint8"),
-        (lambda run: CartPolePanel("a", run, np.zeros((21, 10, 10), np.uint8), np.zeros((21, 2))), "cart's places"),
-        (lambda run: CartPoleFilm([], PERIOD).write("never.mp4"), "at least one panel"),
-        (lambda run: CartPoleFilm([CartPolePanel.redrawn("a", run)], 0.0).write("never.mp4"), "must be positive"),
+        (lambda run: CartPoleFilm([], PERIOD), "at least one panel"),
+        (lambda run: CartPoleFilm([CartPolePanel("a", run)], 0.0), "must be positive"),
     ],
 )
 def test_bad_input_is_one_clear_line(make, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -158,7 +156,7 @@ def test_a_disk_that_fills_up_leaves_the_old_film(tmp_path: Path):
     old.write_bytes(b"the film of yesterday")
     code = (
         "import resource, sys; from tests.films.test_cartpole_film import *\n"
-        "panels = [CartPolePanel.redrawn('a', make_run(10))]\n"
+        "panels = [CartPolePanel('a', make_run(10))]\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
         "try: CartPoleFilm(panels, PERIOD).write(sys.argv[1])\n"
         "except OSError as error: print(error); sys.exit(7)\n"
@@ -179,5 +177,5 @@ def test_an_ffmpeg_that_finds_the_disk_full_is_reported_as_a_full_disk(tmp_path:
     fake.chmod(0o755)
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(fake))
     with pytest.raises(OSError, match=r"film\.mp4 was not written: disk full"):
-        CartPoleFilm([CartPolePanel.redrawn("a", make_run(5))], PERIOD).write(tmp_path / "film.mp4")
+        CartPoleFilm([CartPolePanel("a", make_run(5))], PERIOD).write(tmp_path / "film.mp4")
     assert list(tmp_path.iterdir()) == [fake]

@@ -14,7 +14,6 @@ from visadapt.films import film
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.films.flight_film import FlightFilm
 from visadapt.films.flight_panel import FlightPanel
-from visadapt.films.swing_up_film import SwingUpFilm, SwingUpPanel
 from visadapt.policies import ImagePolicy, StatePolicy
 from visadapt.recordings import Episode
 from visadapt.setups.flight import flight_target
@@ -67,9 +66,7 @@ def test_policies_that_balance_are_drawn_side_by_side_from_the_same_start(tmp_pa
     target, policy = SyntheticTarget(sine_force), state_policy()
     film({"one": policy, "two": policy}, target, tmp_path / "film.mp4", seconds=0.4, seed=3)
     episode = run(target, policy, 1, 8, seeded())[0]
-    assert_shows(
-        tmp_path / "film.mp4", CartPoleFilm([CartPolePanel.redrawn(title, episode) for title in ("one", "two")], 0.05)
-    )
+    assert_shows(tmp_path / "film.mp4", CartPoleFilm([CartPolePanel(title, episode) for title in ("one", "two")], 0.05))
 
 
 def test_a_policy_on_frames_is_shown_them(tmp_path: Path):
@@ -78,7 +75,7 @@ def test_a_policy_on_frames_is_shown_them(tmp_path: Path):
     film(policy, target, tmp_path / "film.mp4", seconds=0.2, seed=3)
     episode = run(target, policy, 1, 4, seeded())[0]
     assert_shows(
-        tmp_path / "film.mp4", CartPoleFilm([CartPolePanel.redrawn("synthetic cart-pole", episode, camera)], 0.05)
+        tmp_path / "film.mp4", CartPoleFilm([CartPolePanel("synthetic cart-pole", episode, drawn=camera)], 0.05)
     )
 
 
@@ -94,7 +91,10 @@ def test_a_cart_pole_without_an_angle_limit_is_filmed_as_a_swing_up(tmp_path: Pa
     target, policy = SyntheticTarget(start=HANGING, angle_limit=math.inf), state_policy()
     film(policy, target, tmp_path / "film.mp4", seconds=0.4, seed=3, due=0.2)
     episode = run(target, policy, 1, 8, seeded(), see=lambda seen: within_a_turn(seen.state))[0]
-    assert_shows(tmp_path / "film.mp4", SwingUpFilm([SwingUpPanel("synthetic cart-pole", episode)], 0.2))
+    assert_shows(
+        tmp_path / "film.mp4",
+        CartPoleFilm([CartPolePanel("synthetic cart-pole", episode, angle_limit=math.inf)], 0.05, 0.2),
+    )
 
 
 def test_a_vehicle_is_filmed_with_its_course_to_its_end(tmp_path: Path):
@@ -103,7 +103,7 @@ def test_a_vehicle_is_filmed_with_its_course_to_its_end(tmp_path: Path):
     film(policy, target, tmp_path / "policy.mp4", seed=3)
     flown = run(target, policy, 1, 5, seeded())[0]
     expected = FlightFilm([FlightPanel("synthetic vehicle", flown, target.system, target.task, target.first[0])])
-    assert expected.scales.duration == pytest.approx(0.5)
+    assert expected.duration == pytest.approx(0.5)
     assert_shows(tmp_path / "policy.mp4", expected)
     film(flown, target, tmp_path / "run.mp4")
     assert_shows(tmp_path / "run.mp4", expected)

@@ -1,38 +1,41 @@
-"""Films of cart-poles that balance: the scene, numbers, command and disturbance, and the cart's speed so far.
+"""Films of cart-poles: the scene, numbers, command and disturbance, and the cart's speed so far.
 
-    film = CartPoleFilm([CartPolePanel.redrawn("before", run), CartPolePanel.redrawn("after", other)], period=0.05)
+    film = CartPoleFilm([CartPolePanel("before", run), CartPolePanel("after", other)], period=0.05)
     film.write("film.mp4")
 
-All panels share one clock; one whose episode has ended stays at its last frame.
+All panels share one clock; one whose episode has ended stays at its last frame. Where a pole is to swing up, a cone
+within 10 degrees of upright travels with the cart, and the pole's last poses stay behind it and fade.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
-import cv2
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgba_array
+from matplotlib.patches import Circle, FancyArrowPatch, Polygon, Rectangle, Wedge
 from numpy.typing import NDArray
 
-from renderers import Camera, DrawnCartPole
-from visadapt.films.canvas import Canvas, Floats, Picture
-from visadapt.films.colours import BLUE, INK, MUTED, ORANGE, TEAL, TROUGH
-from visadapt.films.film import Film, last_row
-from visadapt.films.widgets import Plot, banner, bar, ceiling, headline, reading, signed
+from renderers import DrawnCartPole
+from visadapt.films import widgets
+from visadapt.films.film import Film
+from visadapt.films.widgets import BLUE, INK, MINUS, MUTED, ORANGE, TEAL, TROUGH, Floats
 from visadapt.targets.rollout import Run
 
-PANEL_WIDTH, SCENE_HEIGHT = 480, 400
+PANEL_WIDTH, SCENE_TOP, SCENE_HEIGHT, NUMBERS_TOP, CHART_TOP = 480, 40, 400, 462, 594
 """px"""
-TITLE_HEIGHT, NUMBERS_HEIGHT, CHART_HEIGHT, PART_GAP = 40, 122, 128, 16
-"""px, of the other parts of a panel, and between parts"""
+UPRIGHT_RAD = math.radians(10)
+"""A pole that swings up counts as up to this angle to either side of upright."""
 
 
 @dataclass(frozen=True)
 class CartPolePanel:
-    """A run of a cart-pole and the pictures of it.
+    """A run of a cart-pole.
 
     Raises:
         ValueError: pictures that do not fit the run, or a run without states.
@@ -40,59 +43,32 @@ class CartPolePanel:
 
     title: str
     run: Run
-    pictures: NDArray[np.uint8]
-    """(T, H, W) grey or (T, H, W, 3) red, green, blue; scaled to fit the scene"""
-    cart: Floats | None = None
-    """(T, 3) px in the pictures: column and row of the cart's centre, and half its width; None draws no force"""
+    pictures: NDArray[np.uint8] | None = None
+    """(T, H, W) grey or (T, H, W, 3) red, green, blue, scaled to fit the scene; None draws the states"""
+    drawn: DrawnCartPole = field(default_factory=DrawnCartPole)
+    """sizes of what is drawn, and the part of the track that is shown"""
     angle_limit: float = 0.3
-    """rad; an episode that ended early fell if its last angle is beyond this, else the cart left the frame"""
-    force_known: bool = True
-    """whether the run's force is the target's true disturbance"""
+    """rad; an episode that ended early fell if its last angle is beyond this, else the cart left the frame; the pole
+    is to swing up where this is infinite, and the track is shown as far as the carts go"""
 
     def __post_init__(self) -> None:
-        rows, shape = len(self.run.episode.time), self.pictures.shape
-        if self.pictures.dtype != np.uint8 or len(shape) not in (3, 4) or (len(shape) == 4 and shape[3] != 3):
-            raise ValueError(
-                f"panel {self.title!r}: the pictures must be uint8 (T, H, W) or (T, H, W, 3), "
-                f"got {self.pictures.dtype} {shape}"
-            )
-        if len(self.pictures) != rows:
-            raise ValueError(
-                f"panel {self.title!r}: the run has {rows} rows, but there are {len(self.pictures)} pictures"
-            )
         if self.run.episode.state is None:
             raise ValueError(f"panel {self.title!r}: the run has no states to show")
-        if self.cart is not None and self.cart.shape != (rows, 3):
-            raise ValueError(f"panel {self.title!r}: the cart's places must be {(rows, 3)}, got {self.cart.shape}")
+        if self.pictures is not None:
+            rows, kind, shape = len(self.run.episode.time), self.pictures.dtype, self.pictures.shape
+            if kind != np.uint8 or len(shape) not in (3, 4) or shape[3:] not in ((), (3,)):
+                raise ValueError(
+                    f"panel {self.title!r}: the pictures must be uint8 (T, H, W) or (T, H, W, 3), got {kind} {shape}"
+                )
+            if len(self.pictures) != rows:
+                raise ValueError(f"panel {self.title!r}: the run has {rows} rows, but there are {shape[0]} pictures")
 
-    @classmethod
-    def redrawn(
-        cls, title: str, run: Run, scene: DrawnCartPole | None = None, angle_limit: float = 0.3
-    ) -> CartPolePanel:
-        """The run drawn from its true states, as `scene` draws it but as large as the panel."""
-        if run.episode.state is None:
-            raise ValueError(f"panel {title!r}: the run has no states to draw")
-        small = scene or DrawnCartPole()
-        zoom = min(PANEL_WIDTH / small.camera.width, SCENE_HEIGHT / small.camera.height)
-        view = Camera(
-            width=round(small.camera.width * zoom),
-            height=round(small.camera.height * zoom),
-            scale=small.camera.scale * zoom,
-            column=(small.camera.column + 0.5) * zoom - 0.5,
-            row=(small.camera.row + 0.5) * zoom - 0.5,
-        )
-        large = DrawnCartPole(view, small.pole_length, small.pole_width, small.cart_width, small.cart_height)
-        x, theta = run.episode.state[:, 0].clip(-10, 10), run.episode.state[:, 2]
-        column = view.column + view.scale * x
-        row = np.full_like(column, view.row + view.scale * (0.04 + small.cart_height / 2))
-        half = np.full_like(column, view.scale * small.cart_width / 2)
-        return cls(title, run, large(x, theta), np.stack([column, row, half], -1), angle_limit)
-
-    @property
+    @cached_property
     def state(self) -> Floats:
-        """(T, n_state), SI units"""
+        """(T, 4), SI units; the angle between -pi and pi"""
         assert self.run.episode.state is not None
-        return self.run.episode.state
+        x, x_dot, theta, theta_dot = self.run.episode.state.T
+        return np.stack([x, x_dot, np.arctan2(np.sin(theta), np.cos(theta)), theta_dot], -1)
 
     @property
     def speed(self) -> Floats:
@@ -105,139 +81,165 @@ class CartPolePanel:
         return float(self.run.episode.time[-1])
 
     @property
-    def failure(self) -> str:
-        """How the episode ended early; empty where it did not."""
-        if self.run.survived:
-            return ""
-        return "FELL" if abs(self.state[-1, 2]) > self.angle_limit else "LEFT THE FRAME"
+    def swings_up(self) -> bool:
+        """Whether the pole may start at any angle"""
+        return math.isinf(self.angle_limit)
+
+    @property
+    def up_from(self) -> int:
+        """The row from which the pole stays within UPRIGHT_RAD to the end; T where it is not up at the end."""
+        outside = np.flatnonzero(np.abs(self.state[:, 2]) >= UPRIGHT_RAD)
+        return int(outside[-1]) + 1 if len(outside) else 0
+
+    def failure(self, row: int, due: float) -> str:
+        """How the episode ended early, or that the pole is not up when it is due, s; empty up to that row."""
+        time = self.run.episode.time
+        if not self.run.survived and row == len(time) - 1:
+            fell = abs(self.state[-1, 2]) > self.angle_limit
+            return f"{'FELL' if fell else 'LEFT THE FRAME'} at t = {self.end:.2f} s"
+        late = self.swings_up and time[row] >= due and self.up_from > widgets.last_row(time, due)
+        return f"not up at {due:g} s" if late else ""
 
 
-@dataclass(frozen=True)
 class CartPoleFilm(Film):
     """Cart-poles side by side until the longest run has ended.
+
+    Args:
+        panels: at least one.
+        period: s between frames.
+        due: s, from when on poles that swing up are to be up.
 
     Raises:
         ValueError: no panels, or a period that is not positive.
     """
 
-    panels: Sequence[CartPolePanel]
-    period: float
+    panel_width, panel_height = PANEL_WIDTH, CHART_TOP + widgets.CHART_HEIGHT
 
-    panel_width = PANEL_WIDTH
-    panel_height = TITLE_HEIGHT + SCENE_HEIGHT + NUMBERS_HEIGHT + CHART_HEIGHT + 2 * PART_GAP
-
-    def __post_init__(self) -> None:
-        if not self.panels:
-            raise ValueError("a film needs at least one panel")
-        if not self.period > 0:
-            raise ValueError(f"the period of a film must be positive, got {self.period!r} s")
+    def __init__(self, panels: Sequence[CartPolePanel], period: float, due: float = 5.0) -> None:
+        super().__init__(panels, period)
+        self.due, self.duration = due, max(max(panel.end for panel in panels), 1e-3)
+        fastest = max(float(panel.speed.max()) for panel in panels)
+        upright = [float(panel.speed.max()) for panel in panels if panel.run.survived]
+        self.full_speed = max(widgets.ceiling(min(fastest, max(*upright, 0.5)) if upright else fastest), 0.1)
+        """m/s, at the top of all charts; the speed of a fall may exceed it, so that the other runs stay legible"""
+        self.full_force = max(widgets.ceiling(max(float(np.abs(panel.run.force).max()) for panel in panels)), 1.0)
+        """N, at the end of all force bars"""
+        x, _, theta, _ = np.concatenate([panel.state for panel in panels]).T
+        length = panels[0].drawn.pole_length
+        wide = float(np.abs([x, x + length * np.sin(theta)]).max()) + 0.4
+        self.reach = max(wide, 1.15 * length * PANEL_WIDTH / SCENE_HEIGHT)
+        """m to either side of the middle, such that neither carts nor poles that swing up leave the scene"""
 
     @property
     def times(self) -> list[float]:
-        return [i * self.period for i in range(round(max(panel.end for panel in self.panels) / self.period) + 1)]
+        return [i * self.period for i in range(round(self.duration / self.period) + 1)]
 
-    @cached_property
-    def duration(self) -> float:
-        """s, on the time axis of all panels"""
-        return max(max(panel.end for panel in self.panels), 1e-3)
+    def draw_panel(self, page: Axes, panel: CartPolePanel) -> Callable[[float], None]:
+        time, full = panel.run.episode.time, self.full_speed
+        set_clock, set_numbers = widgets.headline(page, panel.title), self._numbers(page, panel)
+        scene = widgets.framed(page, 0, SCENE_TOP, PANEL_WIDTH, SCENE_HEIGHT)
+        move_scene = self._states(scene, panel) if panel.pictures is None else _picture(scene, panel.pictures)
+        show_failure, words = widgets.banner(scene), widgets.note(scene, 15, TEAL)
+        axes = widgets.chart(page, CHART_TOP, "cart speed, m/s", self.duration)
+        axes.set(ylim=(-0.05 * full, 1.05 * full), yticks=np.linspace(0, full, 3))
+        draw_speed = widgets.trace(axes, time, panel.speed, widgets.running_mean(panel.speed), "mean {:.2f} m/s".format)
 
-    @cached_property
-    def full_speed(self) -> float:
-        """m/s, at the top of all charts; the speed of a fall may exceed it, so that the other runs stay legible"""
-        fastest = max(float(panel.speed.max()) for panel in self.panels)
-        upright = [float(panel.speed.max()) for panel in self.panels if panel.run.survived]
-        return max(ceiling(min(fastest, max(*upright, 0.5)) if upright else fastest), 0.1)
+        def move(t: float) -> None:
+            row = widgets.last_row(time, t)
+            failure, last = panel.failure(row, self.due), row == len(time) - 1
+            ended = last and not panel.run.survived
+            set_clock(panel.end if ended else t)
+            for part in (move_scene, set_numbers, draw_speed):
+                part(row, ended)
+            show_failure(failure, ended)
+            said = ""
+            if panel.swings_up and row >= panel.up_from and not failure:
+                said = f"up since {time[panel.up_from]:.2f} s"
+            elif last and not panel.swings_up and not failure and panel.end < self.duration - 1e-6:
+                said = f"ends upright at t = {panel.end:.1f} s"
+            words.set_text(said)
 
-    @cached_property
-    def full_force(self) -> float:
-        """N, at the end of all force bars"""
-        return max(ceiling(max(float(np.abs(panel.run.force).max()) for panel in self.panels)), 1.0)
+        return move
 
-    def draw_panel(self, canvas: Canvas, panel: CartPolePanel, t: float) -> None:
-        row = last_row(panel.run.episode.time, t)
-        last = row == len(panel.state) - 1
-        failed = last and bool(panel.failure)
-        headline(canvas, TITLE_HEIGHT - 14, PANEL_WIDTH, panel.title, f"t = {panel.end if failed else t:5.2f} s")
-        scene = canvas.part(0, TITLE_HEIGHT, PANEL_WIDTH, SCENE_HEIGHT)
-        _draw_scene(scene, panel, row, self.full_force, failed)
-        if panel.run.survived and last and panel.end < self.duration - 1e-6:
-            scene.text(PANEL_WIDTH / 2, 52, f"ends upright at t = {panel.end:.1f} s", 15, MUTED, align="centre")
-        scene.frame(0, 0, PANEL_WIDTH, SCENE_HEIGHT)
-        top = TITLE_HEIGHT + SCENE_HEIGHT + PART_GAP
-        _draw_numbers(canvas.part(0, top, PANEL_WIDTH, NUMBERS_HEIGHT), panel, row, self.full_force, failed)
-        top += NUMBERS_HEIGHT + PART_GAP
-        self._draw_chart(canvas.part(0, top, PANEL_WIDTH, CHART_HEIGHT), panel, row, failed)
+    def _states(self, scene: Axes, panel: CartPolePanel) -> Callable[[int, bool], None]:
+        """The track with its metres, cart and pole, and the disturbance as an arrow; or the cone and earlier poses."""
+        sizes, camera = panel.drawn, panel.drawn.camera
+        left, bottom, wide = -self.reach, -self.reach * SCENE_HEIGHT / PANEL_WIDTH, 2 * self.reach
+        if not panel.swings_up:
+            left, bottom = (-0.5 - camera.column) / camera.scale, (camera.row - camera.height + 0.5) / camera.scale
+            wide = camera.width / camera.scale
+        scene.set(xlim=(left, left + wide), ylim=(bottom, bottom + wide * SCENE_HEIGHT / PANEL_WIDTH))
+        scene.set_xticks(np.arange(math.ceil(left), left + wide))
+        scene.xaxis.set_major_formatter("{x:g} m")
+        scene.tick_params("x", length=0, labelsize=11, labelcolor=MUTED)
+        scene.grid(axis="x")
+        base = sizes.cart_height + 0.04
+        scene.axhspan(-base - 0.03, -base, color=MUTED)
+        cone = Wedge((0, 0), 1.08 * sizes.pole_length, 80, 100, alpha=0.3, visible=panel.swings_up)
+        earlier = PolyCollection([], facecolors=to_rgba_array([BLUE] * 16, np.linspace(0.28, 0.02, 16)))
+        cart = Rectangle((0, -base), sizes.cart_width, base, facecolor=INK)
+        pole = Polygon(_pole(sizes, 0.0, 0.0))
+        hinge = Circle((0, 0), 0.05, facecolor=TROUGH)
+        arrow = FancyArrowPatch((0, 0), (1, 0), color=ORANGE, shrinkA=0, shrinkB=0)
+        arrow.set_arrowstyle("simple,head_length=18,head_width=22,tail_width=8")
+        for artist in (cone, earlier, cart, pole, hinge, arrow):
+            scene.add_artist(artist)
+            artist.set(animated=True, zorder=2)
 
-    def _draw_chart(self, canvas: Canvas, panel: CartPolePanel, row: int, failed: bool) -> None:
-        """The cart's speed and its mean, up to a row."""
-        plot = Plot(canvas.width, canvas.height, self.duration)
-        canvas.text(0, 12, "cart speed |v|", 12, TEAL, bold=True)
-        plot.axes(canvas, {share: f"{self.full_speed * share:g}" for share in (0.0, 0.5, 1.0)})
-        time, speed = panel.run.episode.time[: row + 1], panel.speed[: row + 1]
-        mean = plot.value_and_mean(canvas, time, speed, self.full_speed, TEAL, failed)
-        canvas.text(canvas.width, 12, f"mean {mean:.2f} m/s", 12, INK, bold=True, align="right")
+        def move(row: int, ended: bool) -> None:
+            x, _, theta, _ = panel.state[row]
+            up = panel.swings_up and abs(theta) < UPRIGHT_RAD
+            cone.set(center=(x, 0), facecolor=TEAL if up else MUTED)
+            cart.set_x(x - sizes.cart_width / 2)
+            pole.set(xy=_pole(sizes, x, theta), facecolor=TEAL if up else BLUE)
+            hinge.set_center((x, 0))
+            if panel.swings_up:
+                rows = range(row - 2, max(row - 34, -1), -2)
+                earlier.set_verts([_pole(sizes, *panel.state[each, [0, 2]]) for each in rows])
+            force = float(panel.run.force[row]) / self.full_force
+            tip = x - math.copysign(sizes.cart_width / 2 + 0.03, force)
+            arrow.set_positions((tip - 0.19 * wide * force, -base / 2), (tip, -base / 2))
+            arrow.set_visible(abs(force) > 0.02 and not ended)
 
+        return move
 
-def _draw_scene(canvas: Canvas, panel: CartPolePanel, row: int, full_force: float, failed: bool) -> None:
-    """The picture, with the disturbance as an arrow at the cart; dimmed, with a banner, once the run has failed."""
-    picture = _colour(panel.pictures[row])
-    zoom = min(canvas.width / picture.shape[1], canvas.height / picture.shape[0])
-    size = (round(picture.shape[1] * zoom), round(picture.shape[0] * zoom))
-    # A frame enlarged by a whole number keeps its sharp pixels.
-    enlarge = cv2.INTER_NEAREST if zoom.is_integer() else cv2.INTER_CUBIC
-    if zoom != 1:
-        picture = np.asarray(cv2.resize(picture, size, interpolation=enlarge if zoom > 1 else cv2.INTER_AREA), np.uint8)
-    left, top = (canvas.width - size[0]) // 2, (canvas.height - size[1]) // 2
-    canvas.fade(1.0, TROUGH)
-    canvas.paste(left, top, picture)
-    force = float(panel.run.force[row])
-    length = 90 * abs(force) / full_force
-    if panel.cart is not None and length > 2 and not failed:
-        column, height, half = panel.cart[row] * zoom
-        sign = math.copysign(1, force)
-        tip = left + column - sign * (half + 4)
-        canvas.arrow((tip - sign * length, top + height), (tip, top + height), ORANGE, 8)
-    if failed:
-        canvas.fade(0.6)
-        banner(canvas, canvas.width / 2, 46, f"{panel.failure} at t = {panel.end:.2f} s")
+    def _numbers(self, page: Axes, panel: CartPolePanel) -> Callable[[int, bool], None]:
+        """State, command and disturbance; beside them the frame that the policy sees, unless it is the scene itself."""
+        episode, room, top = panel.run.episode, PANEL_WIDTH, NUMBERS_TOP
+        parts: list[Callable[[int, bool], None]] = []
+        if episode.frame is not None and episode.frame is not panel.pictures:
+            room -= 150
+            parts.append(_picture(widgets.framed(page, room + 30, top, 120, 100), episode.frame))
+            page.text(PANEL_WIDTH, top + 117, "the policy's view", fontsize=12, color=MUTED, ha="right")
+        names = ("position, m", "speed, m/s", "angle, \N{DEGREE SIGN}")
+        readings = [widgets.reading(page, k * room / 3, top, name) for k, name in enumerate(names)]
+        set_command = widgets.bar(page, 0, top + 66, room, "command", 1.0, "", BLUE)
+        set_force = widgets.bar(page, 0, top + 102, room, "force", self.full_force, " N", ORANGE)
 
+        def show(row: int, ended: bool) -> None:
+            x, x_dot, theta = panel.state[row, :3]
+            for text, value in zip(
+                readings, (f"{x:+.2f}", f"{x_dot:+.2f}", f"{math.degrees(theta):+.1f}"), strict=True
+            ):
+                text.set(text=value.replace("-", MINUS), color=MUTED if ended else INK)
+            set_command(None if row == len(episode.time) - 1 else float(episode.action[row, 0]))
+            known = not ended and panel.pictures is None  # cameras of real machines show no force
+            set_force(float(panel.run.force[row]) if known else None)
+            for part in parts:
+                part(row, ended)
 
-def _draw_numbers(canvas: Canvas, panel: CartPolePanel, row: int, full_force: float, failed: bool) -> None:
-    """State, command and disturbance; beside them the frame that the policy sees, unless it is the scene itself."""
-    frames = panel.run.episode.frame
-    room = canvas.width
-    if frames is not None and not np.array_equal(frames, panel.pictures):
-        room = _draw_frame(canvas, frames[row])
-    state = panel.state[row]
-    readings = (
-        ("position", signed(state[0], 2), "m"),
-        ("speed", signed(state[1], 2), "m/s"),
-        ("angle", signed(math.degrees(state[2]), 1), "\N{DEGREE SIGN}"),
-    )
-    for column, (name, value, unit) in enumerate(readings):
-        reading(canvas, column * room / 3, name, value, unit, MUTED if failed else INK)
-    last = row == len(panel.state) - 1
-    command = float(panel.run.episode.action[row, 0])
-    bar(canvas, 66, room, "command", None if last else command, 1.0, "", BLUE)
-    if panel.force_known:
-        force = float(panel.run.force[row])
-        bar(canvas, 102, room, "force", None if failed else force, full_force, " N", ORANGE)
-
-
-def _draw_frame(canvas: Canvas, frame: NDArray[np.uint8]) -> int:
-    """Draw a frame at the right edge; returns the px that are left beside it."""
-    height, width = canvas.height - 20, 160
-    size = (frame.shape[1], frame.shape[0])
-    if size[0] > width or size[1] > height:
-        size = (min(round(height * size[0] / size[1]), width), height)
-        frame = np.asarray(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), np.uint8)
-    left = canvas.width - size[0]
-    canvas.paste(left, 0, _colour(frame))
-    canvas.frame(left, 0, canvas.width, size[1])
-    canvas.text(canvas.width, size[1] + 17, "the policy's view", 12, MUTED, align="right")
-    return left - 28
+        return show
 
 
-def _colour(picture: NDArray[np.uint8]) -> Picture:
-    """(H, W, 3) of a grey (H, W) or coloured picture."""
-    return np.repeat(picture[..., None], 3, 2) if picture.ndim == 2 else picture
+def _picture(axes: Axes, pictures: NDArray[np.uint8]) -> Callable[[int, bool], None]:
+    """Fill axes with one of several pictures (T, H, W) or (T, H, W, 3); what is returned says with which."""
+    image = axes.imshow(pictures[0], "gray", vmin=0, vmax=255, animated=True)
+    return lambda row, ended: image.set_data(pictures[row])
+
+
+def _pole(sizes: DrawnCartPole, x: float, theta: float) -> Floats:
+    """Corners (4, 2) in m"""
+    along = np.array([math.sin(theta), math.cos(theta)])
+    across = sizes.pole_width / 2 * np.array([along[1], -along[0]])
+    hinge, tip = np.array([x, 0.0]), np.array([x, 0.0]) + sizes.pole_length * along
+    return np.stack([hinge - across, hinge + across, tip + across, tip - across])

@@ -8,12 +8,11 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from renderers import DrawnCartPole
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
-from visadapt.films.encoding import StrPath
-from visadapt.films.film import Film
+from visadapt.films.film import Film, StrPath
 from visadapt.films.flight_film import FlightFilm
 from visadapt.films.flight_panel import FlightPanel
-from visadapt.films.swing_up_film import SwingUpFilm, SwingUpPanel
 from visadapt.policies import Policy
 from visadapt.progress import Progress
 from visadapt.systems import CartPole
@@ -40,8 +39,8 @@ def film(
         film(policy, target, "film.mp4")
         film({"before": old_policy, "after": new_policy}, target, "film.mp4")
 
-    A vehicle is shown in three dimensions with its course; a cart-pole whose target has no angle limit as a swing-up;
-    any other cart-pole in the target's own frames, or drawn from its states where the target is synthetic.
+    A vehicle is shown in three dimensions with its course; a cart-pole in the target's own frames, or drawn from its
+    states where the target is synthetic or shows none; as a swing-up where the target has no angle limit.
 
     Args:
         shown: a policy, a run, or several of them by the title of their panel. All policies start alike.
@@ -77,7 +76,12 @@ def _run(policy: Policy, target: Target, seconds: float, seed: int, see: See | N
     steps = round(seconds / target.period)
     if isinstance(target, FlightTarget):
         steps = min(steps, target.task.steps)
-    if see is None and policy.shown == "state" and _swings_up(target):
+    if (
+        see is None
+        and policy.shown == "state"
+        and isinstance(target, SyntheticTarget)
+        and math.isinf(target.angle_limit)
+    ):
         see = _see_within_a_turn
     generator = torch.Generator().manual_seed(seed)
     return run(target, policy.eval(), 1, steps, generator, strict=False, see=see)[0]
@@ -87,20 +91,21 @@ def _see_within_a_turn(observation: Observation) -> Tensor:
     return within_a_turn(observation.state)
 
 
-def _swings_up(target: Target) -> bool:
-    return isinstance(target, SyntheticTarget) and math.isinf(target.angle_limit)
-
-
 def _film(runs: Mapping[str, Run], target: Target, due: float) -> Film:
     if isinstance(target, FlightTarget):
         return FlightFilm([_flight_panel(title, each, target) for title, each in runs.items()])
+    drawn = target.camera if isinstance(target, SyntheticTarget) and target.camera is not None else DrawnCartPole()
+    limit = target.angle_limit if isinstance(target, SyntheticTarget) else 0.3
+    if isinstance(target, GymnasiumTarget):
+        limit = target.mapping.limits.get("theta", limit)
+    panels = []
     for title, each in runs.items():
         state = each.episode.state
         if state is None or state.shape[1] != len(CartPole.states):
             raise ValueError(f"panel {title!r}: a cart-pole's states (rows, 4) are needed to film {target.name}")
-    if _swings_up(target):
-        return SwingUpFilm([SwingUpPanel(title, each) for title, each in runs.items()], due)
-    return CartPoleFilm([_cartpole_panel(title, each, target) for title, each in runs.items()], target.period)
+        pictures = None if isinstance(target, SyntheticTarget) else each.episode.frame
+        panels.append(CartPolePanel(title, each, pictures, drawn, limit))
+    return CartPoleFilm(panels, target.period, due)
 
 
 def _flight_panel(title: str, flown: Run, target: FlightTarget) -> FlightPanel:
@@ -110,12 +115,3 @@ def _flight_panel(title: str, flown: Run, target: FlightTarget) -> FlightPanel:
     # References are chosen by whole numbers, points are positions.
     task_state = task_state.long() if isinstance(target.task, Follow) else task_state
     return FlightPanel(title, flown, target.system, target.task, task_state)
-
-
-def _cartpole_panel(title: str, each: Run, target: Target) -> CartPolePanel:
-    if isinstance(target, SyntheticTarget):
-        return CartPolePanel.redrawn(title, each, target.camera, target.angle_limit)
-    if each.episode.frame is None:
-        return CartPolePanel.redrawn(title, each)
-    limit = target.mapping.limits.get("theta", 0.3) if isinstance(target, GymnasiumTarget) else 0.3
-    return CartPolePanel(title, each, each.episode.frame, angle_limit=limit, force_known=False)

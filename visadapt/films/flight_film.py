@@ -9,157 +9,356 @@ is marked from that moment on.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import LinearSegmentedColormap, to_rgba_array
+from matplotlib.lines import Line2D
+from matplotlib.patches import FancyArrowPatch, Polygon
 
-from visadapt.films.canvas import Canvas, Floats
-from visadapt.films.colours import BLUE, INK, MUTED, ROSE, TEAL, VIOLET
+from visadapt.evaluation.scoring import FAR
+from visadapt.films import widgets
 from visadapt.films.film import Film
-from visadapt.films.flight_panel import FlightPanel
-from visadapt.films.flight_views import FlightScales, draw_box, draw_close_up, draw_overview
-from visadapt.films.widgets import Plot, banner, bar, headline, reading
+from visadapt.films.flight_panel import INSTANT_PERIOD_S, FlightPanel, length
+from visadapt.films.vehicle_shapes import ROUND, drawn_parts, hull, vehicle_parts
+from visadapt.films.widgets import AMBER, BLUE, GROUND, HAIRLINE, INK, MUTED, PAPER, RED, SKY, TEAL, VIOLET, Floats
+from visadapt.systems import Quadrotor
 
-PANEL_WIDTH, TITLE_HEIGHT, SCENE_HEIGHT, BOX_SIDE = 480, 40, 360, 152
+PANEL_WIDTH, SCENE_TOP, SCENE_HEIGHT, BOX_TOP, BOX_SIDE = 480, 40, 360, 414, 152
 """px"""
-READINGS_HEIGHT, BARS_HEIGHT, CHART_HEIGHT, PART_GAP = 42, 68, 124, 14
-"""px, of the other parts of a panel, and between parts"""
+READINGS_TOP, BARS_TOP, CHART_TOP = 578, 640, 706
+"""px"""
 COMMAND_LABELS = {"rate_x": "roll rate", "rate_y": "pitch rate", "rate_z": "yaw rate"}
 """Labels of the commands whose names alone would not say what they are."""
+NEAREST_M, FARTHEST_PX = 0.2, 1e5
+"""Nothing nearer to the camera is drawn, and nothing further from the middle of the picture."""
+SECOND = round(1 / INSTANT_PERIOD_S)
+"""instants; so much of the reference ahead is highlighted"""
+OVERVIEW_DIRECTION = (0.55, 1.0, -0.6)
+"""in which the whole course is looked at"""
+ERROR_COLOURS = LinearSegmentedColormap.from_list("error", [TEAL, AMBER, RED])
 
 
 @dataclass(frozen=True)
+class ChaseCamera:
+    """A pinhole camera that moves with something, without turning."""
+
+    place: tuple[float, float, float]
+    """m, from what it moves with"""
+    looks_at: tuple[float, float, float]
+    """m, the point in the middle of the picture, from what it moves with"""
+    focal: float
+    """px"""
+
+    def project(self, points: Floats, moving: Floats) -> tuple[Floats, Floats]:
+        """Where points (..., 3) are seen (..., 2), px to the right and up from the middle, and how deep (...), m.
+
+        Both are nan where a point is nearer than NEAREST_M. What the camera moves with is at `moving` (3,).
+        """
+        seen = (points - moving - np.array(self.place)) @ _axes(np.subtract(self.looks_at, self.place)).T
+        depth = np.where(seen[..., 2] < NEAREST_M, np.nan, seen[..., 2])
+        return (self.focal * seen[..., :2] / depth[..., None]).clip(-FARTHEST_PX, FARTHEST_PX), depth
+
+
+FOLLOWING_CAMERA = ChaseCamera((-1.2, -2.6, 1.15), (0.0, 0.0, 0.0), 820.0)
+"""Of a flight along a reference; moves with the reference's point, so that a vehicle beside the middle is an error."""
+PASSING_CAMERA = ChaseCamera((-4.8, -2.7, 1.9), (4.0, 0.3, 0.1), 560.0)
+"""Of a flight through a point; moves with the vehicle, and stops 4 m before the point."""
+
+
 class FlightFilm(Film):
-    """Flights side by side.
+    """Flights side by side; the last instant is shown for another 1.5 s.
 
     Raises:
         ValueError: no panels, or flights along a reference beside flights through a point.
     """
 
-    panels: Sequence[FlightPanel]
-    period: float = 0.04
-    end_shown: float = 1.5
-    """s for which the last instant is shown"""
+    panel_width, panel_height = PANEL_WIDTH, CHART_TOP + widgets.CHART_HEIGHT
 
-    panel_width = PANEL_WIDTH
-    panel_height = TITLE_HEIGHT + SCENE_HEIGHT + BOX_SIDE + READINGS_HEIGHT + BARS_HEIGHT + CHART_HEIGHT + 4 * PART_GAP
-
-    def __post_init__(self) -> None:
-        if not self.panels:
-            raise ValueError("a film needs at least one panel")
-        if len({panel.follows for panel in self.panels}) > 1:
+    def __init__(self, panels: Sequence[FlightPanel]) -> None:
+        super().__init__(panels, 0.04)
+        if len({panel.follows for panel in panels}) > 1:
             raise ValueError("flights along a reference and through a point share no scales: film them apart")
+        self.follows = panels[0].follows
+        self.duration = max(max(panel.end for panel in panels), INSTANT_PERIOD_S)
+        # The other scales fit the flights that did not fail, so that these stay legible.
+        worst = max([panel.worst for panel in panels if panel.failed is None] or [FAR])
+        self.far = max(widgets.ceiling(worst), 0.05)
+        """m, distance at the top of the chart; from half of it on a path is drawn red"""
+        self.box = min(max(1.2 * worst, 0.1), FAR)
+        """m, half the width of the magnified view"""
+        self.most_force = max(*(float(np.linalg.norm(panel.force, axis=1).max()) for panel in panels), 0.1)
+        """N"""
+        low = min(float(panel.reference[:, 2].min()) for panel in panels)
+        self.ground = float(np.floor(2 * low - 1.4) / 2) if self.follows else float(np.floor(low - 6.0))
+        """m, height of the ground that is drawn"""
 
     @property
     def times(self) -> list[float]:
-        return [k * self.period for k in range(round((self.scales.duration + self.end_shown) / self.period) + 1)]
+        return [k * self.period for k in range(round((self.duration + 1.5) / self.period) + 1)]
 
-    @cached_property
-    def scales(self) -> FlightScales:
-        """Shared by all panels"""
-        return FlightScales.of(self.panels)
+    def draw_panel(self, page: Axes, panel: FlightPanel) -> Callable[[float], None]:
+        set_clock = widgets.headline(page, panel.title)
+        views = (self._close_up, self._overview, self._box, self._numbers, self._chart)
+        moves = [view(page, panel) for view in views]
 
-    def draw_panel(self, canvas: Canvas, panel: FlightPanel, t: float) -> None:
-        i, scales = panel.instant(t), self.scales
-        headline(canvas, TITLE_HEIGHT - 14, PANEL_WIDTH, panel.title, f"t = {panel.times[i]:5.2f} s")
-        top = TITLE_HEIGHT
-        scene = canvas.part(0, top, PANEL_WIDTH, SCENE_HEIGHT)
-        draw_close_up(scene, panel, i, scales)
-        _draw_distance(scene, panel, i, scales)
-        scene.frame(0, 0, PANEL_WIDTH, SCENE_HEIGHT)
-        top += SCENE_HEIGHT + PART_GAP
-        wide = PANEL_WIDTH - 2 * BOX_SIDE - 2 * 12
-        draw_overview(canvas.part(0, top, wide, BOX_SIDE), panel, i, scales)
-        boxes = (((0, 1), "from above"), ((0, 2), "from the side"))
-        if not panel.follows:
-            boxes = (((-1, 2), "target, from behind"), ((0, 2), "from the side"))
-        for k, (axes, name) in enumerate(boxes):
-            left = wide + 12 + k * (BOX_SIDE + 12)
-            draw_box(canvas.part(left, top, BOX_SIDE, BOX_SIDE), panel, i, scales, axes, name)
-        top += BOX_SIDE + PART_GAP
-        _draw_readings(canvas.part(0, top, PANEL_WIDTH, READINGS_HEIGHT), panel, i, scales)
-        top += READINGS_HEIGHT + PART_GAP
-        _draw_commands(canvas.part(0, top, PANEL_WIDTH, BARS_HEIGHT), panel, i)
-        top += BARS_HEIGHT + PART_GAP
-        _draw_chart(canvas.part(0, top, PANEL_WIDTH, CHART_HEIGHT), panel, i, scales)
+        def move(t: float) -> None:
+            i = min(max(int(t / INSTANT_PERIOD_S + 1e-6), 0), len(panel.times) - 1)
+            set_clock(float(panel.times[i]))
+            for each in moves:
+                each(i)
 
+        return move
 
-def _draw_distance(canvas: Canvas, panel: FlightPanel, i: int, scales: FlightScales) -> None:
-    """The flight's distance from its course; a banner instead once it has failed."""
-    t, failed = panel.times[i], panel.failed
-    if failed is not None and t >= failed - 1e-6:
-        if not panel.run.survived and i == len(panel.times) - 1:
-            canvas.fade(0.6)
-            text = f"LOST at t = {panel.end:.2f} s"
+    def _close_up(self, page: Axes, panel: FlightPanel) -> Callable[[int], None]:
+        """The vehicle in its true size and attitude with its thrust, the hidden force, and the course around it."""
+        camera, half = FOLLOWING_CAMERA if self.follows else PASSING_CAMERA, np.array([PANEL_WIDTH, SCENE_HEIGHT]) / 2
+        scene = widgets.framed(page, 0, SCENE_TOP, *(2 * half), xlim=(-half[0], half[0]), ylim=(-half[1], half[1]))
+        # The ground fades into the sky over the 150 px below the horizon.
+        ahead = np.subtract(camera.looks_at, camera.place)
+        horizon = camera.project(1e6 * ahead * (1, 1, 0), np.zeros(3))[0][1]
+        rows = ((horizon - np.linspace(half[1], -half[1], SCENE_HEIGHT)) / 150).clip(0, 1)[:, None]
+        shades = LinearSegmentedColormap.from_list("ground", [SKY, GROUND])
+        scene.imshow(rows, shades, vmin=0, vmax=1, extent=(-half[0], half[0], -half[1], half[1]), aspect="auto")
+        step, place, goal = 1.0 if self.follows else 5.0, panel.position, panel.goal
+        scene.text(half[0] - 10, 10 - half[1], f"grid {step:g} m", fontsize=11, color=MUTED, ha="right")
+        grid, colours = _grid(step)
+        tiles: Any = scene.add_collection(LineCollection([], animated=True), autolim=False)
+        shadow = Polygon(np.zeros((3, 2)), facecolor=MUTED, alpha=0.16, animated=True)
+        scene.add_patch(shadow)
+        lines: list[tuple[Line2D, Callable[[int], Floats]]] = [
+            (_line(scene, HAIRLINE, 1), lambda i: self._dropped(panel.reference)),
+            (_line(scene, MUTED, 1, alpha=0.5), lambda i: self._dropped(place[: i + 1])),
+            (_line(scene, MUTED, 1, linestyle="--"), lambda i: self._plumb(place[i])),
+            (_line(scene, MUTED, 1, linestyle="-" if self.follows else "--"), lambda i: panel.reference),
+        ]
+        if self.follows:
+            lines += [
+                (_line(scene, INK, 2), lambda i: panel.reference[i : i + SECOND + 1]),
+                (_line(scene, RED, 2, zorder=4), lambda i: np.stack([place[i], goal[i]])),
+                (_line(scene, INK, 0, marker="o", markersize=8, mec=PAPER, zorder=4), lambda i: goal[i : i + 1]),
+            ]
         else:
-            text = f"STRAYED at t = {failed:.2f} s" if panel.follows else f"MISSED by {_length(panel.worst)}"
-        banner(canvas, canvas.width / 2, 32, text)
-        return
-    if panel.follows:
-        text, away = f"{_length(panel.away[i])} off", panel.away[i]
-    elif t >= panel.passed:
-        text, away = f"passed {_length(panel.worst)} off", panel.worst
-    else:
-        return
-    canvas.text(14, 34, text, 22, scales.colour(float(away)), bold=True)
+            ring = np.column_stack([np.zeros(len(ROUND)), ROUND])
+            lines += [
+                (_line(scene, MUTED, 2), lambda i: self._plumb(goal[0] - (0, 0, FAR))),
+                (_line(scene, INK, 3), lambda i: goal[0] + FAR * ring),
+                (_line(scene, INK, 1), lambda i: goal[0] + 0.25 * FAR * ring),
+                (_line(scene, RED, 0, marker="o", markersize=5), lambda i: goal[:1]),
+            ]
+        draw_path, parts = self._path(scene, panel), vehicle_parts(panel.vehicle)
+        vehicle = scene.add_collection(PolyCollection([], animated=True, zorder=3), autolim=False)
+        show_thrust, show_force = _arrow(scene, BLUE), _arrow(scene, VIOLET)
+        distance, show_failure = widgets.note(scene, 22), widgets.banner(scene)
+
+        def move(i: int) -> None:
+            moving = goal[i]
+            if not self.follows:
+                arrived = np.flatnonzero(place[: i + 1, 0] > goal[0, 0] - 4.0)
+                moving = place[arrived[0] if len(arrived) else i]
+
+            def seen(points: Floats) -> Floats:
+                return camera.project(points, moving)[0]
+
+            pieces: Any = seen(grid + np.array([*np.round(moving[:2] / step) * step, self.ground]))
+            visible = np.isfinite(pieces).all((1, 2)) & (np.abs(pieces) < half).all(-1).any(-1)
+            tiles.set(segments=pieces[visible], colors=colours[visible])
+            for line, points in lines:
+                line.set_data(*seen(points(i)).T)
+            draw_path(seen, i)
+            corners, looks = drawn_parts(parts, place[i], panel.attitude[i], lambda p: camera.project(p, moving))
+            vehicle.set(**looks)
+            dropped = seen(self._dropped(corners))
+            shadow.set_visible(bool(np.isfinite(dropped).all()))
+            if shadow.get_visible():
+                shadow.set_xy(hull(dropped))
+            newtons, way = _thrust(panel, i)
+            show_thrust(seen(place[i] + np.outer([0, newtons], way)), f"thrust {newtons:.1f} N")
+            way = (0.45 if self.follows else 1.2) / self.most_force * panel.force[i]
+            show_force(seen(place[i] + np.outer([0, 1], way)), f"{np.linalg.norm(panel.force[i]):.2f} N")
+            failed = panel.failed is not None and panel.times[i] >= panel.failed - 1e-6
+            show_failure(panel.failure(i) if failed else "", panel.lost(i))
+            off = panel.away[i] if self.follows else panel.worst
+            words = f"{length(off)} off" if self.follows else f"passed {length(off)} off"
+            distance.set(text=words, color=self._colours(off))
+            distance.set_visible(not failed and (self.follows or panel.times[i] >= panel.passed))
+
+        return move
+
+    def _overview(self, page: Axes, panel: FlightPanel) -> Callable[[int], None]:
+        """The whole course from afar, above its shadow on the ground."""
+        course, place, size = panel.reference, panel.position, np.array([PANEL_WIDTH - BOX_SIDE - 12, BOX_SIDE])
+        across = _axes(OVERVIEW_DIRECTION)[:2].T
+        view = widgets.framed(page, 0, BOX_TOP, *size, facecolor=GROUND)
+        both = np.concatenate([course, self._dropped(course)]) @ across
+        low, high = both.min(0), both.max(0)
+        half = ((high - low) / (size - 36)).max() * size / 2
+        view.set(
+            xlim=(low + high)[0] / 2 + half[0] * np.array([-1, 1]),
+            ylim=(low + high)[1] / 2 + half[1] * np.array([-1, 1]),
+        )
+        step = max(widgets.ceiling(float(np.ptp(course, axis=0).max()) / 8), 0.5)
+        grid, colours = _grid(step)
+        view.add_collection(
+            LineCollection(list((grid + self._dropped(course.mean(0))) @ across), colors=colours), autolim=False
+        )
+        marks = course[::SECOND] if self.follows else np.linspace(course[0], course[-1], 9)
+        view.add_collection(LineCollection([self._plumb(mark) @ across for mark in marks], colors=HAIRLINE))
+        for points, colour in ((self._dropped(course), MUTED), (course, INK)):
+            view.plot(*(points @ across).T, color=colour, linewidth=1, alpha=0.6)
+        draw_path, plumb = self._path(view, panel), _line(view, MUTED, 1)
+        dot = _line(view, BLUE, 0, marker="o", markersize=8)
+        _name(view, f"whole course, grid {step:g} m")
+
+        def move(i: int) -> None:
+            draw_path(lambda points: points @ across, i)
+            plumb.set_data(*(self._plumb(place[i]) @ across).T)
+            dot.set_data(*(place[i : i + 1] @ across).T)
+
+        return move
+
+    def _box(self, page: Axes, panel: FlightPanel) -> Callable[[int], None]:
+        """The surroundings of the goal, magnified: seen from above, or from behind the point."""
+        side, limits = self.box, (-self.box, self.box)
+        view = widgets.framed(
+            page, PANEL_WIDTH - BOX_SIDE, BOX_TOP, BOX_SIDE, BOX_SIDE, xlim=limits, ylim=limits, facecolor=SKY
+        )
+        bar = widgets.ceiling(side / 2.5)
+        view.plot([-0.9 * side, -0.9 * side + bar], [-0.88 * side] * 2, color=MUTED, linewidth=2)
+        view.text(-0.82 * side + bar, -0.92 * side, length(bar, 0), fontsize=11, color=MUTED)
+        _name(view, "from above" if self.follows else "target, from behind")
+        course, draw_path, error = _line(view, MUTED, 1), self._path(view, panel), _line(view, RED, 2)
+        view.plot(0, 0, "o", color=INK, markersize=8, mec=PAPER)
+        dot = _line(view, INK, 0, marker="o", markersize=10, mec=PAPER)
+        columns, signs = ([0, 1], (1, 1)) if self.follows else ([1, 2], (-1, 1))
+
+        def move(i: int) -> None:
+            def seen(points: Floats) -> Floats:
+                return (points - panel.goal[i])[..., columns] * signs
+
+            course.set_data(*seen(panel.reference).T)
+            draw_path(seen, i)
+            over = self.follows or panel.times[i] >= panel.passed
+            x, y = seen(panel.position[i] if self.follows else panel.nearest).clip(-0.9 * side, 0.9 * side)
+            error.set(data=((0, x), (0, y)), visible=over)
+            dot.set(data=([x], [y]), mfc=self._colours(panel.away[i] if self.follows else panel.worst), visible=over)
+
+        return move
+
+    def _numbers(self, page: Axes, panel: FlightPanel) -> Callable[[int], None]:
+        """Speed, distance, score and hidden force; the commands."""
+        names = ("off the reference", "mean so far") if self.follows else ("to the target", "nearest so far")
+        places = ((0, "speed"), (106, names[0]), (240, names[1]), (362, "hidden force"))
+        readings = [widgets.reading(page, left, READINGS_TOP, name) for left, name in places]
+        readings[3].set_color(VIOLET)
+        half = PANEL_WIDTH / 2
+        bars = []
+        for k, variable in enumerate(panel.vehicle.actions):
+            label, left, middle = COMMAND_LABELS.get(variable.name, variable.name), k % 2 * (half + 7), k // 2 * 36
+            bars.append(widgets.bar(page, left, BARS_TOP + middle, half - 7, label, 1.0, "", BLUE))
+
+        def move(i: int) -> None:
+            words = (f"{panel.speed[i]:.2f} m/s", length(panel.away[i]), length(panel.score[i]))
+            for text, value in zip(readings, (*words, f"{np.linalg.norm(panel.force[i]):.2f} N"), strict=True):
+                text.set_text(value)
+            command = panel.command(i)
+            for k, set_bar in enumerate(bars):
+                set_bar(None if command is None else float(command[k]))
+
+        return move
+
+    def _chart(self, page: Axes, panel: FlightPanel) -> Callable[[int], None]:
+        """The distance up to an instant, and the score up to it: the mean distance, or the least."""
+        axes = widgets.chart(
+            page, CHART_TOP, "distance to the reference" if self.follows else "distance to the target", self.duration
+        )
+        levels = np.linspace(0, self.far, 3) if self.follows else 10.0 ** np.arange(-3, 3)
+        if self.follows:
+            axes.set_ylim(-0.05 * self.far, 1.05 * self.far)
+        else:
+            axes.set(yscale="log", ylim=(8e-4, 150))
+            axes.minorticks_off()
+        axes.set_yticks(levels, [length(level, None) for level in levels])
+        score = "mean {}" if self.follows else "nearest {}"
+        draw = widgets.trace(axes, panel.times, panel.away, panel.score, lambda metres: score.format(length(metres)))
+        return lambda i: draw(i, panel.lost(i))
+
+    def _path(self, axes: Axes, panel: FlightPanel) -> Callable[[Callable[[Floats], Floats], int], object]:
+        """The path, coloured by its distance from the reference, or by how far off it passes the point."""
+        colours = self._colours(panel.away if self.follows else np.full(len(panel.times), panel.worst))
+        pieces = np.stack([panel.position[:-1], panel.position[1:]], 1)
+        lines = LineCollection([], linewidths=3, capstyle="round", animated=True, zorder=2)
+        axes.add_collection(lines, autolim=False)
+        return lambda seen, i: lines.set(segments=seen(pieces[:i]), colors=colours[:i])
+
+    def _colours(self, away: Any) -> Any:
+        """Colours of a path at distances in m from its course."""
+        return ERROR_COLOURS(2 * away / self.far)
+
+    def _dropped(self, points: Floats) -> Floats:
+        """Points (..., 3) moved straight down, or up, to the ground."""
+        return np.where([True, True, False], points, self.ground)
+
+    def _plumb(self, point: Floats) -> Floats:
+        """(2, 3), from a point to the ground."""
+        return np.stack([point, self._dropped(point)])
 
 
-def _draw_readings(canvas: Canvas, panel: FlightPanel, i: int, scales: FlightScales) -> None:
-    force, width = float(np.linalg.norm(panel.force[i])), canvas.width
-    away, so_far = _split(panel.away[i]), _split(panel.scored(i))
-    names = ("off the reference", "mean so far") if panel.follows else ("to the target", "nearest so far")
-    reading(canvas, 0, "speed", f"{panel.speed[i]:.2f}", "m/s")
-    reading(canvas, 0.22 * width, names[0], *away)
-    undecided = not panel.follows and panel.times[i] < panel.passed
-    reading(canvas, 0.5 * width, names[1], *so_far, INK if undecided else scales.colour(panel.scored(i)))
-    reading(canvas, 0.755 * width, "hidden force", f"{force:.2f}", "N", VIOLET if force >= 0.005 else MUTED)
+def _thrust(panel: FlightPanel, i: int) -> tuple[float, Floats]:
+    """The commanded thrust in N, and the way (3,) in which it is drawn, m/N."""
+    vehicle, command = panel.vehicle, panel.command(i)
+    share = 0.0 if command is None else (float(command[0]) + 1) / 2
+    if isinstance(vehicle, Quadrotor):
+        low, high = (float(vehicle.mass) * float(limit) for limit in (vehicle.min_thrust, vehicle.max_thrust))
+        return low + (high - low) * share, 0.045 * panel.attitude[i][:, 2]
+    return float(getattr(vehicle, "max_thrust", 1.0)) * share, 0.3 * panel.attitude[i][:, 0]
 
 
-def _draw_commands(canvas: Canvas, panel: FlightPanel, i: int) -> None:
-    last, half = panel.row(i) == len(panel.run.episode.time) - 1, canvas.width // 2
-    for k, (variable, value) in enumerate(zip(panel.vehicle.actions, panel.command(i), strict=True)):
-        part = canvas.part(k % 2 * (half + 14), k // 2 * 36, half - 14, 36)
-        label = COMMAND_LABELS.get(variable.name, variable.name)
-        bar(part, 10, half - 14, label, None if last else float(value), 1.0, "", BLUE)
+def _arrow(scene: Axes, colour: str) -> Callable[[Floats, str], None]:
+    """An arrow with a label at its tip; what is returned sets tail and tip (2, 2) in px, and the label."""
+    arrow = FancyArrowPatch((0, 0), (1, 1), color=colour, shrinkA=0, shrinkB=0, zorder=5, animated=True)
+    arrow.set_arrowstyle("simple,head_length=13,head_width=12,tail_width=4")
+    scene.add_patch(arrow)
+    text = scene.text(0, 0, "", fontsize=12, color=colour, zorder=6, clip_on=True, animated=True)
+    text.set(fontweight="bold", bbox={"facecolor": PAPER, "alpha": 0.7, "pad": 2})
+
+    def show(ends: Floats, label: str) -> None:
+        (x, y), visible = ends[1] - ends[0], bool(8 < np.linalg.norm(ends[1] - ends[0]) < FARTHEST_PX)
+        arrow.set_visible(visible)
+        text.set_visible(visible)
+        if visible:
+            arrow.set_positions(*ends)
+            text.set(text=label, position=ends[1] + np.copysign(8, (x, y)))
+            text.set(ha="left" if x > 0 else "right", va="bottom" if y > 0 else "top")
+
+    return show
 
 
-def _draw_chart(canvas: Canvas, panel: FlightPanel, i: int, scales: FlightScales) -> None:
-    """The distance up to an instant, and the score up to it: the mean distance, or the least."""
-    plot = Plot(canvas.width, canvas.height, scales.duration, left=34.0 if panel.follows else 48.0)
-    if panel.follows:
-        name, text = "distance to the reference, cm", f"mean {_length(panel.scored(i))}"
-        levels = {share: f"{100 * share * scales.far:g}" for share in (0.0, 0.5, 1.0)}
-    else:
-        name, text = "distance to the target", f"nearest {_length(panel.scored(i))}"
-        levels = {k / 5: label for k, label in enumerate(("1 mm", "1 cm", "10 cm", "1 m", "10 m", "100 m"))}
-
-    def height(away: Floats) -> Floats:
-        if panel.follows:
-            return away / scales.far
-        return np.asarray((np.log10(away.clip(1e-3, 1e4)) + 3) / 5)
-
-    canvas.text(0, 12, name, 12, TEAL, bold=True)
-    canvas.text(canvas.width, 12, text, 12, INK, bold=True, align="right")
-    plot.axes(canvas, levels)
-    if panel.earlier is not None:
-        other = panel.earlier
-        plot.line(canvas, plot.place(other.times, height(other.distances))[: i + 1], ROSE, 2)
-    line = plot.place(panel.times, height(panel.distances))[: i + 1]
-    plot.line(canvas, line, TEAL, 2)
-    rows = panel.row(i) + 1
-    times = np.arange(rows) * panel.task.period
-    plot.line(canvas, plot.place(times, height(panel.score[:rows])), INK, 1)
-    plot.cursor(canvas, line[-1], TEAL, failed=not panel.run.survived and i == len(panel.times) - 1)
+def _line(axes: Axes, colour: str, width: float, **properties: Any) -> Line2D:
+    return axes.plot([], [], color=colour, linewidth=width, animated=True, **properties)[0]
 
 
-def _length(metres: float) -> str:
-    return " ".join(_split(metres))
+def _name(view: Axes, name: str) -> None:
+    box = {"facecolor": PAPER, "pad": 4}
+    view.annotate(name, (0, 1), (6, -6), "axes fraction", "offset points", fontsize=11, color=MUTED, va="top", bbox=box)
 
 
-def _split(metres: float) -> tuple[str, str]:
-    """A length and its unit, cm below one metre."""
-    if metres < 0.995:
-        return f"{100 * metres:.1f}", "cm"
-    return f"{metres:.2f}" if metres < 99.5 else f"{metres:.0f}", "m"
+def _axes(ahead: Any) -> Floats:
+    """(3, 3), rows: unit vectors to the right, up, and ahead of a camera that does not roll."""
+    ahead = np.asarray(ahead) / np.linalg.norm(ahead)
+    right = np.cross(ahead, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(right, ahead), ahead])
+
+
+def _grid(step: float) -> tuple[Floats, Floats]:
+    """Pieces (n, 2, 3) in m of a grid around the origin, `step` m wide; their colours (n, 4), which fade outwards."""
+    along, across = step * np.array(np.meshgrid(np.arange(-14, 14), np.arange(-14, 15), indexing="ij"))
+    pieces = np.stack([np.stack([along + shift, across, 0 * along], -1).reshape(-1, 3) for shift in (0.0, step)], 1)
+    pieces = np.concatenate([pieces, pieces[..., [1, 0, 2]]])
+    far = np.linalg.norm(pieces.mean(1), axis=1) / (14 * step)
+    return pieces[far < 1], to_rgba_array(HAIRLINE, 1 - far[far < 1] ** 2)

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from visadapt.evaluation.scoring import FAR
-from visadapt.films.canvas import Floats
+from visadapt.films.widgets import Floats, running_mean
 from visadapt.systems import RigidBody
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, VELOCITY, rotation
 from visadapt.targets.rollout import Run
@@ -25,201 +22,131 @@ LARGEST_DRAWN = 1e4
 """m, m/s and N: positions, velocities and forces are clipped to +- this before they are drawn"""
 
 
-@dataclass(frozen=True)
 class FlightPanel:
     """A flight and its task.
 
     Between rows, positions are cubic Hermite splines of the rows' positions and velocities, attitudes and forces are
-    linear, and commands are held. Arrays are over instants (N, ...), INSTANT_PERIOD_S apart, unless stated otherwise.
+    linear, and commands are held. A flight through a point is shown until 0.5 s after it passed the point.
+
+    Args:
+        title: of the panel.
+        run: of the vehicle.
+        vehicle: whose sizes are drawn.
+        task: `Follow`, or `Reach`.
+        task_state: in which the flight began, in the task's own numbers: the first of the episode's `task_state`.
+
+    Attributes:
+        follows: True where the task is a reference to follow, False where it is a point to fly through.
+        states: (rows, 13) that are shown.
+        times: (N,) s, the instants, INSTANT_PERIOD_S apart.
+        rows: (N,) the last row at or before each instant.
+        position, speed, attitude, force: (N, 3) m, (N,) m/s, (N, 3, 3) from body to world axes, (N, 3) N.
+        reference: (M, 3) m, the whole reference at instants; or (2, 3), start and end of the line to the point.
+        goal: (N, 3) m, where the reference is, or the point.
+        away: (N,) m, to the goal; at the instant nearest to a point, the distance by which it was missed.
+        score: (N,) m, of the rows so far: the mean distance to the reference, or the least to the point.
+        nearest: (3,) m, where the path, straight between rows, came nearest to the point.
+        worst: m, the greatest distance from the reference, or the distance by which the point was missed.
+        passed: s at which the flight came nearest to its point.
+        failed: s at which the flight was first more than FAR off, or passed its point so, or was lost; or None.
 
     Raises:
         ValueError: a run without states of a rigid body, or longer than its reference; a task of another kind.
     """
 
-    title: str
-    run: Run
-    vehicle: RigidBody
-    task: FlightTask
-    """`Follow`, or `Reach`"""
-    task_state: Tensor
-    """in which the flight began, in the task's own numbers: the first row of the episode's `task_state`"""
-    earlier: FlightPanel | None = None
-    """another flight, drawn faintly for comparison"""
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.task, Follow | Reach):
-            raise ValueError(
-                f"panel {self.title!r}: no picture is known of a task {type(self.task).__name__}; "
-                "Follow and Reach can be filmed"
-            )
-        state = self.run.episode.state
-        if state is None or state.shape[1] != len(self.vehicle.states):
-            raise ValueError(f"panel {self.title!r}: the run has no states of a {self.vehicle.name} to show")
-        if isinstance(self.task, Follow) and len(state) > self.task.steps + 1:
-            raise ValueError(
-                f"panel {self.title!r}: the run has {len(state)} rows, its reference only {self.task.steps + 1}"
-            )
-
-    @property
-    def follows(self) -> bool:
-        """True where the task is a reference to follow, False where it is a point to fly through."""
-        return isinstance(self.task, Follow)
-
-    @cached_property
-    def states(self) -> Floats:
-        """(rows, 13) that are shown: a flight through a point is shown until 0.5 s after it passed the point."""
-        state = self.run.episode.state
-        assert state is not None
-        clipped = np.array(state, float)
-        clipped[:, : VELOCITY.stop] = clipped[:, : VELOCITY.stop].clip(-LARGEST_DRAWN, LARGEST_DRAWN)
-        if self.follows:
-            return clipped
-        nearest = int(self._misses(clipped).argmin()) if len(clipped) > 1 else 0
-        return clipped[: nearest + 2 + round(0.5 / self.task.period)]
-
-    @property
-    def end(self) -> float:
-        """s, of the last row that is shown"""
-        return (len(self.states) - 1) * self.task.period
-
-    @cached_property
-    def times(self) -> Floats:
-        """(N,) s"""
-        return np.arange(round(self.end / INSTANT_PERIOD_S) + 1) * INSTANT_PERIOD_S
-
-    def instant(self, t: float) -> int:
-        """The last instant at or before t s."""
-        return min(max(int(t / INSTANT_PERIOD_S + 1e-6), 0), len(self.times) - 1)
-
-    def row(self, instant: int) -> int:
-        """The last row at or before an instant."""
-        return min(int(self.times[instant] / self.task.period + 1e-6), len(self.states) - 1)
-
-    @cached_property
-    def position(self) -> Floats:
-        """(N, 3) m"""
-        return self._smooth(self.states[:, POSITION], self.states[:, VELOCITY], self.times)
-
-    @cached_property
-    def speed(self) -> Floats:
-        """(N,) m/s"""
-        velocity = self.states[:, VELOCITY]
-        return self._between(np.linalg.norm(velocity, axis=1))
-
-    @cached_property
-    def attitude(self) -> Floats:
-        """(N, 3, 3) from body to world axes"""
-        turns = self.states[:, ATTITUDE]
+    def __init__(self, title: str, run: Run, vehicle: RigidBody, task: FlightTask, task_state: Tensor) -> None:
+        if not isinstance(task, Follow | Reach):
+            kind = type(task).__name__
+            raise ValueError(f"panel {title!r}: no picture is known of a task {kind}; Follow and Reach can be filmed")
+        state = run.episode.state
+        if state is None or state.shape[1] != len(vehicle.states):
+            raise ValueError(f"panel {title!r}: the run has no states of a {vehicle.name} to show")
+        if isinstance(task, Follow) and len(state) > task.steps + 1:
+            raise ValueError(f"panel {title!r}: the run has {len(state)} rows, its reference only {task.steps + 1}")
+        self.title, self.run, self.vehicle, self.period = title, run, vehicle, task.period
+        self.follows = isinstance(task, Follow)
+        states = np.array(state, float)
+        states[:, : VELOCITY.stop] = states[:, : VELOCITY.stop].clip(-LARGEST_DRAWN, LARGEST_DRAWN)
+        if isinstance(task, Reach):
+            steps = torch.from_numpy(np.stack([states[:-1], states[1:]], 1))
+            misses = np.asarray(task.misses(steps, task_state.double().expand(len(steps), 3))[:, 0])
+            first = int(misses.argmin()) + 1 if len(misses) else 0
+            states = states[: first + 1 + round(0.5 / task.period)]
+        self.states = states
+        self.end = (len(states) - 1) * task.period
+        self.times: Floats = np.arange(round(self.end / INSTANT_PERIOD_S) + 1) * INSTANT_PERIOD_S
+        self.rows = np.minimum((self.times / task.period + 1e-6).astype(int), len(states) - 1)
+        self.position = self._smooth(states[:, POSITION], states[:, VELOCITY], self.times)
+        self.speed = self._between(np.linalg.norm(states[:, VELOCITY], axis=1))
+        turns = states[:, ATTITUDE]
         # A quaternion and its negative are the same attitude: choose signs so that neighbouring rows are close.
         flips = np.where((turns[1:] * turns[:-1]).sum(1) < 0, -1.0, 1.0)
         turns = turns * np.concatenate([[1.0], flips.cumprod()])[:, None]
-        return rotation(torch.from_numpy(self._between(turns))).numpy()
-
-    @cached_property
-    def force(self) -> Floats:
-        """(N, 3) N, zeros where the target does not know its disturbance"""
-        force = self.run.force[: len(self.states)]
-        if force.ndim == 1:
-            force = np.zeros((len(force), 3))
-        return self._between(force.clip(-LARGEST_DRAWN, LARGEST_DRAWN))
-
-    def command(self, instant: int) -> Floats:
-        """(4,) in [-1, 1], held from a row to the next"""
-        return np.asarray(self.run.episode.action[self.row(instant)])
-
-    @cached_property
-    def reference(self) -> Floats:
-        """(M, 3) m, the whole reference, INSTANT_PERIOD_S apart; or (2, 3), start and end of the line to the point."""
-        if isinstance(self.task, Reach):
-            return np.stack([self.states[0, POSITION], self.task_state.double().numpy()])
-        whole, which = self._along.references, int(self.task_state[0])
-        rows = slice(int(self.task_state[1]), None)
-        positions, velocities = (part[which, rows].double().numpy() for part in (whole.positions, whole.velocities))
-        count = round((len(positions) - 1) * whole.period / INSTANT_PERIOD_S) + 1
-        return self._smooth(positions, velocities, np.arange(count) * INSTANT_PERIOD_S)
-
-    @cached_property
-    def goal(self) -> Floats:
-        """(N, 3) m: where the reference is, or the point to fly through"""
-        if self.follows:
-            return self.reference[: len(self.times)]
-        return np.repeat(self.reference[-1:], len(self.times), 0)
-
-    @cached_property
-    def away(self) -> Floats:
-        """(N,) m, to the goal"""
-        return np.asarray(np.linalg.norm(self.position - self.goal, axis=1))
-
-    @cached_property
-    def score(self) -> Floats:
-        """(rows,) m, the score up to each row: the mean distance to the reference, or the least to the point."""
-        if self.follows:
-            every = round(self.task.period / INSTANT_PERIOD_S)
-            away = self.away[::every]
-            mean: Floats = away[1:].cumsum() / np.arange(1, len(away))
-            return np.concatenate([away[:1], mean])
-        return np.concatenate([self.away[:1], np.minimum.accumulate(self._misses(self.states))])
-
-    def scored(self, instant: int) -> float:
-        """m, the score up to the last row at or before an instant"""
-        return float(self.score[self.row(instant)])
-
-    @cached_property
-    def distances(self) -> Floats:
-        """(N,) m, to the goal; at the instant that is nearest to a point, the distance by which it was missed"""
-        out = self.away.copy()
-        if not self.follows:
-            out[out.argmin()] = self.worst
-        return out
-
-    @cached_property
-    def nearest(self) -> Floats:
-        """(3,) m: where the path, straight between rows, came nearest to the point"""
-        row = int(self.score.argmin())
-        start, end = self.states[max(row - 1, 0), POSITION], self.states[row, POSITION]
-        way = end - start
-        share = float((self.reference[-1] - start) @ way / max(float(way @ way), 1e-12))
-        return np.asarray(start + min(max(share, 0.0), 1.0) * way)
-
-    @cached_property
-    def passed(self) -> float:
-        """s at which the flight came nearest to its point"""
-        return float(self.score.argmin() * self.task.period)
-
-    @cached_property
-    def failed(self) -> float | None:
-        """s at which the flight failed, more than FAR off or lost; None where it did not."""
-        lost = None if self.run.survived else self.end
-        if self.follows:
+        self.attitude: Floats = rotation(torch.from_numpy(self._between(turns))).numpy()
+        force = run.force[: len(states)].clip(-LARGEST_DRAWN, LARGEST_DRAWN)
+        self.force = self._between(force if force.ndim == 2 else np.zeros((len(states), 3)))
+        lost = None if run.survived else self.end
+        if isinstance(task, Follow):
+            course, which, start = task.references, int(task_state[0]), int(task_state[1])
+            places, slopes = (part[which, start:].double().numpy() for part in (course.positions, course.velocities))
+            count = round((len(places) - 1) * course.period / INSTANT_PERIOD_S) + 1
+            self.reference = self._smooth(places, slopes, np.arange(count) * INSTANT_PERIOD_S)
+            self.goal = self.reference[: len(self.times)]
+            self.away: Floats = np.linalg.norm(self.position - self.goal, axis=1)
+            at_rows = self.away[:: round(task.period / INSTANT_PERIOD_S)]
+            self.score: Floats = np.concatenate([at_rows[:1], running_mean(at_rows[1:])])[self.rows]
+            self.worst, self.passed = float(self.away.max()), self.end
             far = np.flatnonzero(self.away > FAR)
-            return float(self.times[far[0]]) if len(far) else lost
-        return self.passed if self.score[-1] > FAR else lost
+            self.failed = float(self.times[far[0]]) if len(far) else lost
+        else:
+            point = task_state.double().numpy()
+            self.reference = np.stack([states[0, POSITION], point])
+            self.goal = np.tile(point, (len(self.times), 1))
+            self.away = np.linalg.norm(self.position - self.goal, axis=1)
+            least = np.minimum.accumulate(np.concatenate([self.away[:1], misses[: len(states) - 1]]))
+            self.score, self.worst, row = least[self.rows], float(least[-1]), int(least.argmin())
+            self.away[self.away.argmin()] = self.worst
+            self.passed = row * task.period
+            self.failed = self.passed if self.worst > FAR else lost
+            before, way = states[max(row - 1, 0), POSITION], states[row, POSITION] - states[max(row - 1, 0), POSITION]
+            share = float((point - before) @ way / max(float(way @ way), 1e-12))
+            self.nearest: Floats = before + min(max(share, 0.0), 1.0) * way
 
-    @cached_property
-    def worst(self) -> float:
-        """m: the greatest distance from the reference, or the distance by which the point was missed"""
-        return float(self.away.max() if self.follows else self.score[-1])
+    def command(self, instant: int) -> Floats | None:
+        """(4,) in [-1, 1], held from a row to the next; None in the episode's last row"""
+        row = self.rows[instant]
+        return self.run.episode.action[row] if row < len(self.run.episode.time) - 1 else None
 
-    @property
-    def _along(self) -> Follow:
-        assert isinstance(self.task, Follow)
-        return self.task
+    def lost(self, instant: int) -> bool:
+        """Whether the flight has ended early by an instant."""
+        return not self.run.survived and instant == len(self.times) - 1
 
-    def _misses(self, states: Floats) -> Floats:
-        """(rows - 1,) m: the least distance to the point over each step."""
-        steps = torch.from_numpy(np.stack([states[:-1], states[1:]], 1))
-        return np.asarray(self.task.misses(steps, self.task_state.double().expand(len(steps), 3))[:, 0])
+    def failure(self, instant: int) -> str:
+        """In words, how a flight that has failed by an instant did so."""
+        if self.lost(instant):
+            return f"LOST at t = {self.end:.2f} s"
+        return f"STRAYED at t = {self.failed:.2f} s" if self.follows else f"MISSED by {length(self.worst)}"
 
     def _smooth(self, values: Floats, slopes: Floats, times: Floats) -> Floats:
         """Values (M, n) at times (M,) of the cubic Hermite splines of values and slopes (rows, n)."""
         if len(values) == 1:
             return values
-        rows = torch.arange(len(values)).double() * self.task.period
+        rows = torch.arange(len(values)).double() * self.period
         return cubic(rows, torch.from_numpy(values), torch.from_numpy(slopes), torch.from_numpy(times)).numpy()
 
     def _between(self, values: Floats) -> Floats:
         """Values (N, ...) at the instants, linear between rows (rows, ...)."""
-        at = self.times / self.task.period
-        row = np.minimum(at.astype(int), max(len(values) - 2, 0))
-        share = (at - row).reshape(-1, *[1] * (values.ndim - 1))
+        row = np.minimum(self.rows, max(len(values) - 2, 0))
+        share = (self.times / self.period - row).reshape(-1, *[1] * (values.ndim - 1))
         return np.asarray(values[row] * (1 - share) + values[np.minimum(row + 1, len(values) - 1)] * share)
+
+
+def length(metres: float, digits: int | None = 1) -> str:
+    """A length with its unit; without `digits`, as short as it goes, from mm on."""
+    if digits is None:
+        return (
+            f"{1000 * metres:g} mm" if 0 < metres < 0.01 else f"{100 * metres:g} cm" if metres < 1 else f"{metres:g} m"
+        )
+    if metres < 0.995:
+        return f"{100 * metres:.{digits}f} cm"
+    return f"{metres:.2f} m" if metres < 99.5 else f"{metres:.0f} m"

@@ -1,138 +1,180 @@
-"""Parts of the panels of all films: headline, readings, bars, a plot against time, a banner that marks failure."""
+"""The parts of films and plots that matplotlib draws: their colours and style, and what all panels are made of.
+
+Each part of a panel draws itself once and returns what moves it; artists that move are `animated`.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle
+from matplotlib.text import Text
+from numpy.typing import NDArray
 
-from visadapt.films.canvas import Canvas, Floats, text_width
-from visadapt.films.colours import HAIRLINE, INK, MUTED, PAPER, RED, TROUGH, Colour
+INK, MUTED, HAIRLINE, TROUGH, PAPER = "#1f2933", "#6e7a88", "#d8dde3", "#eceff3", "#ffffff"
+BLUE, ORANGE, TEAL, RED, AMBER = "#2f67c9", "#de7416", "#0e7a70", "#be2a2a", "#e8a830"
+VIOLET = "#7a3ea8"
+"""The hidden force on a vehicle."""
+SKY, GROUND, AIRFRAME = "#fafcfe", "#eef1f0", "#e2e7ee"
 
+STYLE: Any = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib; its digits are equally wide: numbers do not jitter
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": MUTED,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "axes.axisbelow": True,
+    "axes.titlesize": 10,
+    "axes.unicode_minus": True,
+    "grid.color": HAIRLINE,
+    "grid.linewidth": 0.6,
+    "patch.linewidth": 0,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.labelsize": 9,
+    "ytick.labelsize": 9,
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+}
+"""For `matplotlib.rc_context`"""
+
+Floats = NDArray[np.floating]
 MINUS = "\N{MINUS SIGN}"
+CHART_HEIGHT = 128
+"""px, with title and ticks"""
 
 
-def headline(canvas: Canvas, baseline: float, width: float, title: str, clock: str) -> None:
-    """A title on the left, in the largest size from 20 px down to 11 px that fits, and the time on the right."""
-    room = width - text_width(clock, 15) - 20
-    size = next((size for size in range(20, 11, -1) if text_width(title, size, True) <= room), 11)
-    canvas.text(0, baseline, title, size, bold=True)
-    canvas.text(width, baseline, clock, 15, MUTED, align="right")
+def inset(page: Axes, left: float, top: float, width: float, height: float, **properties: Any) -> Axes:
+    """Axes on a part of a page, in px."""
+    whole = page.bbox
+    place = np.array([left, whole.height - top - height, width, height]) / np.tile(whole.size, 2)
+    return page.inset_axes(tuple(place), **properties)
 
 
-def banner(canvas: Canvas, x: float, y: float, text: str) -> None:
-    """White text on red, centred at (x, y) px."""
-    half = text_width(text, 18, True) / 2 + 18
-    canvas.box(x - half, y - 18, x + half, y + 18, RED)
-    canvas.text(x, y + 6, text, 18, PAPER, bold=True, align="centre")
+def framed(page: Axes, left: float, top: float, width: float, height: float, **properties: Any) -> Axes:
+    """Axes in a thin frame on a part of a page, in px, without ticks."""
+    axes = inset(page, left, top, width, height, xticks=[], yticks=[], **properties)
+    axes.spines[:].set(visible=True, color=HAIRLINE)
+    return axes
 
 
-def reading(canvas: Canvas, x: float, name: str, value: str, unit: str, colour: Colour = INK) -> None:
-    """A value under its name, 35 px tall; the unit stands beside it."""
-    canvas.text(x, 12, name, 12, MUTED)
-    canvas.text(x, 35, value, 18, colour)
-    gap = 0 if unit == "\N{DEGREE SIGN}" else 5
-    canvas.text(x + text_width(value, 18) + gap, 35, unit, 13 if gap else 18, MUTED)
+def headline(page: Axes, title: str) -> Callable[[float], None]:
+    """A title, as large as fits between 11 px and 20 px, and a clock; what is returned sets the clock, in s."""
+    width = page.get_xlim()[1]
+    for size in range(20, 10, -1):
+        text = page.text(0, 26, title, fontsize=size, fontweight="bold", clip_on=True)
+        if text.get_window_extent().width < width - 110 or size == 11:
+            break
+        text.remove()
+    clock = page.text(width, 26, "", fontsize=15, color=MUTED, ha="right", animated=True)
+    return lambda t: clock.set_text(f"t = {t:5.2f} s")
+
+
+def note(axes: Axes, size: float, colour: str = INK) -> Text:
+    """A line of text, `size` px tall, in the upper left corner; it moves."""
+    text = axes.annotate("", (0, 1), (12, -12), "axes fraction", "offset points", va="top", fontsize=size, color=colour)
+    text.set(fontweight="bold", zorder=9, animated=True)
+    return text
+
+
+def banner(scene: Axes) -> Callable[[str, bool], None]:
+    """White text on red; what is returned sets the text, which may be empty, and whether the scene is dimmed."""
+    box = {"facecolor": RED, "linewidth": 0, "boxstyle": "square,pad=0.6"}
+    text = scene.annotate("", (0.5, 1), (0, -32), "axes fraction", "offset points", ha="center", va="center", bbox=box)
+    text.set(fontsize=18, fontweight="bold", color=PAPER, zorder=9, animated=True)
+    veil = Rectangle((0, 0), 1, 1, transform=scene.transAxes, facecolor=PAPER, alpha=0.6, zorder=8, animated=True)
+    scene.add_patch(veil)
+
+    def show(failure: str, dimmed: bool) -> None:
+        text.set(text=failure, visible=bool(failure))
+        veil.set_visible(dimmed)
+
+    return show
+
+
+def reading(page: Axes, left: float, top: float, name: str, **properties: Any) -> Text:
+    """The text of a value under its name, 35 px tall."""
+    page.text(left, top + 12, name, fontsize=12, color=MUTED)
+    return page.text(left, top + 35, "", fontsize=18, animated=True, **properties)
 
 
 def bar(
-    canvas: Canvas, y: float, room: float, name: str, value: float | None, end: float, unit: str, colour: Colour
-) -> None:
-    """A bar from 0 in the middle to `value`, on a scale from -end to +end; a value of None is shown as a dash."""
-    left, right = 74.0, room - 66.0
-    middle, half = (left + right) / 2, (right - left) / 2
-    canvas.text(0, y + 5, name, 13, MUTED)
-    canvas.box(left, y - 6, right, y + 6, TROUGH)
-    if value is not None:
-        edge = middle + half * min(max(value / end, -1.0), 1.0)
-        canvas.box(min(middle, edge), y - 6, max(middle, edge), y + 6, colour)
-    canvas.box(middle - 0.5, y - 9, middle + 0.5, y + 9, MUTED)
-    canvas.text(left, y + 19, f"{MINUS}{end:g}", 10, MUTED)
-    canvas.text(right, y + 19, f"{end:g}{unit}", 10, MUTED, align="right")
-    shown = "\N{EN DASH}" if value is None else signed(value, 2 if end <= 1 else 1) + unit
-    nonzero = any(digit in shown for digit in "123456789")
-    canvas.text(room, y + 5, shown, 14, colour if nonzero else MUTED, bold=nonzero, align="right")
+    page: Axes, left: float, middle: float, width: float, name: str, end: float, unit: str, colour: str
+) -> Callable[[float | None], None]:
+    """A bar from 0 in the middle, on a scale from -end to +end; what is returned sets its value, None for a dash."""
+    start, room = left + 74, width - 140
+    page.text(left, middle + 5, name, fontsize=13, color=MUTED)
+    page.add_patch(Rectangle((start, middle - 6), room, 12, facecolor=TROUGH))
+    page.plot([start + room / 2] * 2, [middle - 9, middle + 9], color=MUTED, linewidth=1)
+    page.text(start, middle + 19, f"{MINUS}{end:g}", fontsize=10, color=MUTED)
+    page.text(start + room, middle + 19, f"{end:g}{unit}", fontsize=10, color=MUTED, ha="right")
+    filled = Rectangle((start + room / 2, middle - 6), 0, 12, facecolor=colour, animated=True)
+    page.add_patch(filled)
+    number = page.text(left + width, middle + 5, "", fontsize=14, color=colour, ha="right", animated=True)
+
+    def show(value: float | None) -> None:
+        filled.set_width(0.0 if value is None else room / 2 * min(max(value / end, -1.0), 1.0))
+        number.set_text("\N{EN DASH}" if value is None else signed(value, 2 if end <= 1 else 1) + unit)
+
+    return show
 
 
-@dataclass(frozen=True)
-class Plot:
-    """A plot against time: its axes lie in an area of width x height px, below a line of text."""
+def chart(page: Axes, top: float, title: str, duration: float) -> Axes:
+    """Axes for a plot against time in s, as wide as the page."""
+    axes = inset(page, 40, top + 24, page.bbox.width - 45, CHART_HEIGHT - 44, xlim=(-0.01 * duration, 1.01 * duration))
+    axes.set_title(title, loc="left", fontsize=12, color=TEAL, fontweight="bold")
+    axes.xaxis.set_major_formatter(lambda t, _: f"{t:g}" if t else "0 s")
+    axes.spines[:].set_visible(False)
+    axes.tick_params(color=HAIRLINE, labelcolor=MUTED, labelsize=11)
+    axes.tick_params("y", length=0)
+    return axes
 
-    width: float
-    height: float
-    duration: float
-    """s, from the left edge to the right"""
-    left: float = 34.0
-    """px, room for the labels of the levels"""
-    top: float = 26.0
-    """px, room for the line of text"""
 
-    @property
-    def right(self) -> float:
-        """px"""
-        return self.width - 5.0
+def trace(
+    axes: Axes, time: Floats, values: Floats, score: Floats, words: Callable[[float], str]
+) -> Callable[[int, bool], None]:
+    """Values (T,) and a score of those so far (T,), told in words; what is returned draws them up to a row.
 
-    @property
-    def bottom(self) -> float:
-        """px"""
-        return self.height - 22.0
+    A cursor is at the row, or where the run has failed a red line over the chart's height.
+    """
+    (line,) = axes.plot([], [], color=TEAL, linewidth=3, animated=True)
+    (thin,) = axes.plot([], [], color=INK, linewidth=1.2, animated=True)
+    (dot,) = axes.plot([], [], "o", color=TEAL, markersize=8, animated=True)
+    mark = axes.axvline(0, color=RED, linewidth=2, animated=True)
+    told = axes.set_title("", loc="right", fontsize=12, fontweight="bold", animated=True)
 
-    def place(self, time: Floats, share: Floats) -> Floats:
-        """Points (n, 2) in px of times (n,) in s and shares (n,) of the plot's height, measured from the bottom."""
-        x = self.left + (self.right - self.left) * time / self.duration
-        return np.stack([x, self.bottom - (self.bottom - self.top) * share], -1)
+    def draw(row: int, failed: bool) -> None:
+        line.set_data(time[: row + 1], values[: row + 1])
+        thin.set_data(time[: row + 1], score[: row + 1])
+        told.set_text(words(float(score[row])))
+        dot.set(data=([time[row]], [values[row]]), visible=not failed)
+        mark.set(xdata=[time[row]] * 2, visible=failed)
 
-    def axes(self, canvas: Canvas, levels: Mapping[float, str]) -> None:
-        """Level lines at shares of the height, each with its label, and about seven ticks in s."""
-        for share, label in levels.items():
-            y = round(self.bottom - (self.bottom - self.top) * share)
-            canvas.box(self.left, y, self.right, y + 1, HAIRLINE)
-            canvas.text(self.left - 7, y + 4, label, 11, MUTED, align="right")
-        for tick in np.arange(0, self.duration * 1.0001, ceiling(self.duration / 7)):
-            x = round(self.left + (self.right - self.left) * tick / self.duration)
-            canvas.box(x, self.bottom, x + 1, self.bottom + 5, HAIRLINE)
-            label = f"{tick:g}" if tick else "0 s"
-            canvas.text(x, self.bottom + 18, label, 11, MUTED, align="right" if x > self.right - 12 else "centre")
+    return draw
 
-    def line(self, canvas: Canvas, points: Floats, colour: Colour, thickness: int) -> None:
-        """A line through points of `place`, clipped at the plot's top."""
-        top, inside = self._inside(canvas)
-        inside.line(points - (0, top), colour, thickness)
 
-    def value_and_mean(
-        self, canvas: Canvas, time: Floats, values: Floats, full: float, colour: Colour, failed: bool = False
-    ) -> float:
-        """Values (n,) so far as a thick line with a cursor, their mean so far as a thin one; returns the latest mean.
+def last_row(times: Floats, t: float) -> int:
+    """Index of the last of rising times (T,) in s at or before t s; 0 where there is none."""
+    return max(int(np.searchsorted(times, t + 1e-6, side="right")) - 1, 0)
 
-        `full` is the value at the plot's top.
-        """
-        mean = np.cumsum(values) / np.arange(1, len(values) + 1)
-        line = self.place(time, values / full)
-        self.line(canvas, line, colour, 2)
-        self.line(canvas, self.place(time, mean / full), INK, 1)
-        self.cursor(canvas, line[-1], colour, failed)
-        return float(mean[-1])
 
-    def cursor(self, canvas: Canvas, point: Floats, colour: Colour, failed: bool = False) -> None:
-        """A dot at a point of `place`, or, where the run has failed there, a red mark over the plot's height."""
-        if failed:
-            canvas.box(point[0] - 1, self.top, point[0] + 1, self.bottom, RED)
-            return
-        top, inside = self._inside(canvas)
-        inside.disc(point - (0, top), 4, colour, corners=16)
-
-    def _inside(self, canvas: Canvas) -> tuple[int, Canvas]:
-        """The first row in px below the line of text, and the area from there on."""
-        top = round(self.top) - 4
-        return top, canvas.part(0, top, round(self.width), round(self.height) - top)
+def running_mean(values: Floats) -> Floats:
+    """(T,) means of the values (T,) so far."""
+    return np.asarray(values.cumsum() / np.arange(1, len(values) + 1))
 
 
 def signed(value: float, digits: int) -> str:
     """A number with its sign, + also where it rounds to zero."""
-    rounded = round(float(value), digits) + 0.0
-    return f"{MINUS if rounded < 0 else '+'}{abs(rounded):.{digits}f}"
+    return f"{round(float(value), digits) + 0.0:+.{digits}f}".replace("-", MINUS)
 
 
 def ceiling(value: float) -> float:
