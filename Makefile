@@ -8,7 +8,7 @@ PIP_ARGS ?=
 VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
-TYPED := $(foreach room,visadapt renderers datasets train benchmarks tests,$(if $(wildcard $(room)/*.py),$(room)))
+TYPED := $(foreach room,visadapt renderers datasets experiments train benchmarks tests,$(if $(wildcard $(room)/*.py),$(room)))
 
 .DELETE_ON_ERROR:
 .PHONY: demo demo-from-scratch test lint types format clean

@@ -28,7 +28,16 @@ import tyro
 
 from visadapt.storage.atomic_files import replacing
 
-CODE = ("visadapt", "renderers", "datasets", "train", "benchmarks/*.py", "benchmarks/blind", "assets/*.safetensors")
+CODE = (
+    "visadapt",
+    "renderers",
+    "datasets",
+    "experiments",
+    "train",
+    "benchmarks/*.py",
+    "benchmarks/blind",
+    "assets/*.safetensors",
+)
 """What tables depend on, as git's path patterns."""
 RUNS = Path("results/runs.json")
 """The `Stamp` of each command that has succeeded, by its name."""

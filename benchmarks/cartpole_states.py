@@ -22,9 +22,9 @@ from pathlib import Path
 import torch
 import tyro
 
+from experiments.curves import plot_curve
+from experiments.result_tables import print_speed, read_rows, speed_row, write_rows
 from visadapt.evaluation import CartPoleScore, kept_score
-from visadapt.evaluation.result_tables import print_speed, read_rows, speed_row, write_rows
-from visadapt.films.plots import plot_curve
 from visadapt.policies import Policy
 from visadapt.setups.cartpole import cartpole_states
 from visadapt.storage.run_folder import open_run

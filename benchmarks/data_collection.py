@@ -26,15 +26,15 @@ import torch
 import tyro
 
 from datasets import quadrotor_references
+from experiments.curves import Chart, plot_charts
+from experiments.flights import EXPERIMENTS, flight_target
+from experiments.result_tables import Row, miss_row, read_rows, write_rows
 from visadapt.effects import Residual
 from visadapt.evaluation import SCORE_SEED, FlightScore, kept_score
-from visadapt.evaluation.result_tables import Row, miss_row, read_rows, write_rows
-from visadapt.films.plots import Chart, plot_charts
 from visadapt.learning.grounding import gap, left_over
 from visadapt.learning.windows import Windows
 from visadapt.policies import AutoregressivePolicy, Policy
 from visadapt.setups.base import Setup
-from visadapt.setups.flight import EXPERIMENTS, flight_target
 from visadapt.storage.run_folder import once
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import VELOCITY

@@ -26,12 +26,12 @@ import torch
 import tyro
 
 from datasets import quadrotor_references
+from experiments.curves import Chart, plot_charts, plot_losses
+from experiments.flights import EXPERIMENTS, flight_target
+from experiments.result_tables import miss_row, read_rows, write_rows
 from visadapt.evaluation import FlightScore, kept_score
-from visadapt.evaluation.result_tables import miss_row, read_rows, write_rows
-from visadapt.films.plots import Chart, plot_charts, plot_losses
 from visadapt.policies import Policy
 from visadapt.setups.base import Setup
-from visadapt.setups.flight import EXPERIMENTS, flight_target
 from visadapt.targets.synthetic import DrawEffects, no_effects
 from visadapt.weights import shipped
 

@@ -22,12 +22,12 @@ from pathlib import Path
 import torch
 import tyro
 
+from experiments.result_tables import print_speed, speed_row, write_rows
 from visadapt.effects import ActuatorDelay, Effect, PeriodicForce, Spring, ViscousFriction
 from visadapt.estimation.fit_states import neutral
 from visadapt.evaluation import CartPoleScore, kept_score
-from visadapt.evaluation.result_tables import print_speed, speed_row, write_rows
 from visadapt.learning.grounding import fit_named
-from visadapt.learning.joint import Ledger
+from visadapt.learning.ledger import Ledger
 from visadapt.learning.policy import TuneSettings, tune
 from visadapt.learning.windows import Windows
 from visadapt.policies import Policy

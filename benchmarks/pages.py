@@ -14,8 +14,8 @@ from pathlib import Path
 
 from benchmarks import tables_adaptation as adaptation, tables_diagnosis as diagnosis
 from benchmarks.all import COMMANDS, stamps
+from experiments.result_tables import read_rows
 from visadapt.effects.catalogue import catalogue_markdown
-from visadapt.evaluation.result_tables import read_rows
 from visadapt.storage.atomic_files import replacing
 from visadapt.systems import SYSTEMS
 

@@ -17,9 +17,10 @@ from pathlib import Path
 
 import tyro
 
+from experiments.flights import flight_target
+from experiments.result_tables import Row, write_rows
 from visadapt.evaluation import score
-from visadapt.evaluation.result_tables import Row, write_rows
-from visadapt.setups.flight import flight_target, quadrotor
+from visadapt.setups.flight import quadrotor
 from visadapt.systems import Quadrotor
 from visadapt.tasks.references import Reference, power_loop, smallest_loop
 from visadapt.weights import shipped

@@ -3,8 +3,8 @@
 python -m benchmarks.renderers --help
 
 Held-out states: pole within `angle` of upright, cart within the camera's reach less half a cart, so that the cart is
-whole. The estimator (renderers/measure.py) reads the drawn frames too: its own error is the floor of the other rows.
-Writes results/renderers.csv and prints it as a table.
+whole. The estimator (benchmarks/pose_estimator.py) reads the drawn frames too: its own error is the floor of the other
+rows. Writes results/renderers.csv and prints it as a table.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.pose_estimator import measure
+from experiments.result_tables import Row, write_rows
 from renderers import DrawnCartPole, LayeredRenderer, MLPRenderer, RendererError, load_renderer
-from renderers.measure import measure
-from visadapt.evaluation.result_tables import Row, write_rows
 from visadapt.weights import shipped
 
 Floats = NDArray[np.floating]

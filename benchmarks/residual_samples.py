@@ -22,15 +22,15 @@ import tyro
 from torch import Tensor
 
 from datasets import quadrotor_references
+from experiments.curves import Chart, plot_charts
+from experiments.flights import EXPERIMENTS, flight_target
+from experiments.result_tables import Row, read_rows, write_rows
 from visadapt.effects import Residual
-from visadapt.evaluation.result_tables import Row, read_rows, write_rows
-from visadapt.films.plots import Chart, plot_charts
 from visadapt.learning.grounding import gap, ground, left_over, rescale
 from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
 from visadapt.policies.networks import FlightResidualNetwork, ResidualNetwork, StateResidualNetwork
 from visadapt.setups.base import Setup
-from visadapt.setups.flight import EXPERIMENTS, flight_target
 from visadapt.systems import RigidBody
 from visadapt.systems.rigid_body import VELOCITY
 from visadapt.targets.rollout import run

@@ -1,6 +1,6 @@
 """The pages' tables of policies and renderers: each function takes the rows of its CSVs and gives the lines of a table.
 
-The first line is the header. Rows are those of `visadapt.evaluation.result_tables`, as read from the file.
+The first line is the header. Rows are those of `experiments.result_tables`, as read from the file.
 """
 
 from __future__ import annotations

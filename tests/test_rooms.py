@@ -1,4 +1,4 @@
-"""Arrows between rooms go one way: renderers <- visadapt <- datasets, train, benchmarks."""
+"""Arrows between rooms go one way: renderers <- visadapt <- datasets, experiments <- train, benchmarks."""
 
 import ast
 from pathlib import Path
@@ -10,8 +10,9 @@ MAY_IMPORT = {
     "renderers": set(),
     "visadapt": {"renderers"},
     "datasets": {"renderers", "visadapt"},
-    "train": {"renderers", "visadapt", "datasets"},
-    "benchmarks": {"renderers", "visadapt", "datasets"},
+    "experiments": {"visadapt"},
+    "train": {"renderers", "visadapt", "datasets", "experiments"},
+    "benchmarks": {"renderers", "visadapt", "datasets", "experiments"},
 }
 
 

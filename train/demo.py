@@ -21,11 +21,11 @@ from pathlib import Path
 
 import tyro
 
+from experiments.curves import plot_losses
 from renderers import DrawnCartPole
 from train import renderer as renderer_training
 from visadapt.evaluation import CartPoleScore, kept_score
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
-from visadapt.films.plots import plot_losses
 from visadapt.progress import reporting, staged
 from visadapt.setups.cartpole import cartpole_frames
 from visadapt.storage.run_folder import open_run, write_json

@@ -24,12 +24,12 @@ import torch
 import tyro
 
 from datasets import quadrotor_references
+from experiments.flights import EXPERIMENTS, flight_target
 from visadapt.films.flight_film import FlightFilm
 from visadapt.films.flight_panel import FlightPanel
 from visadapt.policies import Policy
 from visadapt.progress import reporting, staged
 from visadapt.setups.base import Setup
-from visadapt.setups.flight import EXPERIMENTS, flight_target
 from visadapt.targets import TargetError
 from visadapt.targets.rollout import run
 from visadapt.targets.synthetic import DrawEffects, no_effects

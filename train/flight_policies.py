@@ -16,10 +16,11 @@ import torch
 import tyro
 
 from datasets import quadrotor_references
+from experiments.flights import flight_target
 from visadapt.evaluation import score
 from visadapt.progress import reporting
 from visadapt.setups.base import Setup
-from visadapt.setups.flight import fixed_wing, flight_target, quadrotor
+from visadapt.setups.flight import fixed_wing, quadrotor
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.parameter_file import ParameterFileError, load_parameters
 from visadapt.world import World

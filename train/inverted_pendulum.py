@@ -29,12 +29,12 @@ import tyro
 from PIL import Image
 from torch import Tensor
 
+from experiments.curves import plot_losses
+from experiments.result_tables import Row, speed_row, write_rows
 from renderers import LayeredRenderer, load_renderer, save_renderer
 from renderers.training import fit
 from visadapt.evaluation import CartPoleScore, kept_score
-from visadapt.evaluation.result_tables import Row, speed_row, write_rows
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
-from visadapt.films.plots import plot_losses
 from visadapt.learning.grounding import gap
 from visadapt.learning.joint import SetupSettings
 from visadapt.learning.perception import Paths, PerceptionSettings

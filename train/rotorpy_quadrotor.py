@@ -31,12 +31,13 @@ import tyro
 from torch import Tensor
 
 from datasets import quadrotor_references
+from experiments.flights import flight_target
+from experiments.result_tables import Row, miss_row, write_rows
 from visadapt.evaluation import FlightScore, kept_score
-from visadapt.evaluation.result_tables import Row, miss_row, write_rows
 from visadapt.policies import Policy
 from visadapt.progress import reporting
 from visadapt.recordings import Episode
-from visadapt.setups.flight import flight_target, quadrotor
+from visadapt.setups.flight import quadrotor
 from visadapt.storage.run_folder import once, open_run, write_json
 from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, rotation, times
 from visadapt.targets import TargetError

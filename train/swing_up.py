@@ -28,8 +28,8 @@ import torch
 import tyro
 from torch import Tensor
 
+from experiments.result_tables import Row, write_rows
 from visadapt.evaluation import SCORE_SEED
-from visadapt.evaluation.result_tables import Row, write_rows
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.learning.policy import TuneSettings, tune
 from visadapt.learning.training_state import train_or_load

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from experiments.flights import flight_target
 from renderers import DrawnCartPole
 from tests.flying import push, small_quadrotor
 from visadapt.films import film
@@ -16,7 +17,6 @@ from visadapt.films.flight_film import FlightFilm
 from visadapt.films.flight_panel import FlightPanel
 from visadapt.policies import ImagePolicy, StatePolicy
 from visadapt.recordings import Episode
-from visadapt.setups.flight import flight_target
 from visadapt.targets import Observation, Start, SyntheticTarget, Target, TargetError, sine_force
 from visadapt.targets.rollout import Run, run
 from visadapt.tasks.balance import within_a_turn

@@ -6,9 +6,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from benchmarks.pose_estimator import measure
 from datasets import cartpole_frames
 from renderers import Camera, DrawnCartPole, LayeredRenderer, MLPRenderer, RendererError, load_renderer, save_renderer
-from renderers.measure import measure
 from renderers.training import fit
 from visadapt.weights import shipped
 

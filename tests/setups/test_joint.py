@@ -6,7 +6,8 @@ import torch
 from tests.scenes import state_residual_network
 from visadapt.effects import AngleOffset, Residual
 from visadapt.learning.grounding import GroundSettings
-from visadapt.learning.joint import BudgetExceeded, Ledger, SetupSettings, adapt
+from visadapt.learning.joint import SetupSettings, adapt
+from visadapt.learning.ledger import BudgetExceeded, Ledger
 from visadapt.learning.policy import TuneSettings
 from visadapt.policies import StatePolicy
 from visadapt.policies.networks import StateResidualNetwork

@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from datasets import quadrotor_references
+from experiments.flights import flight_target
 from tests.flying import drag, trained_as
 from visadapt.effects import PeriodicForce
 from visadapt.evaluation import score
-from visadapt.setups.flight import fixed_wing, flight_target, quadrotor
+from visadapt.setups.flight import fixed_wing, quadrotor
 from visadapt.tasks.references import Reference
 from visadapt.weights import shipped
 

@@ -1,8 +1,9 @@
 import pytest
 
 from benchmarks.data_collection import REACH, random_policy
+from experiments.flights import flight_target
 from tests.flying import drag, seeded, small_quadrotor
-from visadapt.setups.flight import fixed_wing, flight_target
+from visadapt.setups.flight import fixed_wing
 from visadapt.targets.rollout import run
 
 

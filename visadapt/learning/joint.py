@@ -18,6 +18,7 @@ from torch import Tensor
 
 from visadapt.effects import Residual
 from visadapt.learning.grounding import GroundLoss, GroundSettings, fit_named, ground, rescale
+from visadapt.learning.ledger import Ledger
 from visadapt.learning.perception import PerceptionSettings
 from visadapt.learning.policy import TuneSettings, initialise_feedforward, tune
 from visadapt.learning.windows import Observe, Windows
@@ -34,34 +35,6 @@ EXPLORATION = 0.05  # Standard deviation of white noise on the commands while da
 FILES = ("recording.h5", "residual.safetensors", "policy.safetensors")  # What the stages of a round leave in its folder
 
 Label = Callable[[list[Episode]], list[Episode]]  # Gives the episodes of a round the states that grounding learns from
-
-
-class BudgetExceeded(RuntimeError):
-    """A step of the target was asked for that the budget does not hold."""
-
-
-@dataclass
-class Ledger:
-    """Counts the steps of a target. Only the final evaluation is free, and is not entered."""
-
-    budget: int  # steps of the target allowed in all
-    entries: list[tuple[str, int]] = field(default_factory=list)  # (purpose, steps), in order
-
-    @property
-    def used(self) -> int:
-        """Steps counted so far."""
-        return sum(steps for _, steps in self.entries)
-
-    @property
-    def left(self) -> int:
-        """Steps that may still be taken."""
-        return self.budget - self.used
-
-    def count(self, purpose: str, steps: int) -> None:
-        """Enter steps before they are taken; raises BudgetExceeded where they would overdraw the budget."""
-        if steps > self.left:
-            raise BudgetExceeded(f"{purpose}: {steps} target steps asked for, {self.left} of {self.budget} are left")
-        self.entries.append((purpose, steps))
 
 
 @dataclass(frozen=True)

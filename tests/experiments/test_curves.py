@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from visadapt.films.plots import Chart, plot_charts, plot_curve, plot_losses
+from experiments.curves import Chart, plot_charts, plot_curve, plot_losses
 from visadapt.learning.joint import Round
 
 
@@ -74,5 +74,5 @@ def test_nothing_to_plot_is_said(tmp_path: Path):
 
 
 def test_no_global_state_of_pyplot_is_touched():
-    code = "import sys, visadapt.films.plots; sys.exit('matplotlib.pyplot' in sys.modules)"
+    code = "import sys, experiments.curves; sys.exit('matplotlib.pyplot' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2]).returncode == 0
