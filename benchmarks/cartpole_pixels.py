@@ -21,9 +21,10 @@ import torch
 import tyro
 
 from experiments.curves import plot_curve
+from experiments.kept_scores import kept_score
 from experiments.result_tables import print_speed, read_rows, speed_row, write_rows
 from renderers import DrawnCartPole
-from visadapt.evaluation import CartPoleScore, kept_score
+from visadapt.evaluation import CartPoleScore
 from visadapt.setups.cartpole import cartpole_frames
 from visadapt.storage.run_folder import open_run
 from visadapt.targets import SyntheticTarget, no_effects, sine_force

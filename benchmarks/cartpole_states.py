@@ -23,8 +23,9 @@ import torch
 import tyro
 
 from experiments.curves import plot_curve
+from experiments.kept_scores import kept_score
 from experiments.result_tables import print_speed, read_rows, speed_row, write_rows
-from visadapt.evaluation import CartPoleScore, kept_score
+from visadapt.evaluation import CartPoleScore
 from visadapt.policies import Policy
 from visadapt.setups.cartpole import cartpole_states
 from visadapt.storage.run_folder import open_run

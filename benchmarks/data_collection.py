@@ -28,9 +28,10 @@ import tyro
 from datasets import quadrotor_references
 from experiments.curves import Chart, plot_charts
 from experiments.flights import EXPERIMENTS, flight_target
+from experiments.kept_scores import kept_score
 from experiments.result_tables import Row, miss_row, read_rows, write_rows
 from visadapt.effects import Residual
-from visadapt.evaluation import SCORE_SEED, FlightScore, kept_score
+from visadapt.evaluation import SCORE_SEED, FlightScore
 from visadapt.learning.grounding import gap, left_over
 from visadapt.learning.windows import Windows
 from visadapt.policies import AutoregressivePolicy, Policy

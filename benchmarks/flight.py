@@ -28,8 +28,9 @@ import tyro
 from datasets import quadrotor_references
 from experiments.curves import Chart, plot_charts, plot_losses
 from experiments.flights import EXPERIMENTS, flight_target
+from experiments.kept_scores import kept_score
 from experiments.result_tables import miss_row, read_rows, write_rows
-from visadapt.evaluation import FlightScore, kept_score
+from visadapt.evaluation import FlightScore
 from visadapt.policies import Policy
 from visadapt.setups.base import Setup
 from visadapt.targets.synthetic import DrawEffects, no_effects

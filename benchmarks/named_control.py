@@ -22,10 +22,11 @@ from pathlib import Path
 import torch
 import tyro
 
+from experiments.kept_scores import kept_score
 from experiments.result_tables import print_speed, speed_row, write_rows
 from visadapt.effects import ActuatorDelay, Effect, PeriodicForce, Spring, ViscousFriction
 from visadapt.estimation.fit_states import neutral
-from visadapt.evaluation import CartPoleScore, kept_score
+from visadapt.evaluation import CartPoleScore
 from visadapt.learning.grounding import fit_named
 from visadapt.learning.ledger import Ledger
 from visadapt.learning.policy import TuneSettings, tune

@@ -22,9 +22,10 @@ import tyro
 
 from datasets import quadrotor_references
 from experiments.flights import EXPERIMENTS, flight_target
+from experiments.kept_scores import kept_score
 from experiments.result_tables import miss_row, write_rows
 from visadapt.effects import ConstantForce, Effect, LinearDrag, ThrustGain
-from visadapt.evaluation import FlightScore, kept_score
+from visadapt.evaluation import FlightScore
 from visadapt.setups.flight import quadrotor
 from visadapt.storage.run_folder import open_run
 from visadapt.systems import Quadrotor

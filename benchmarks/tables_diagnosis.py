@@ -18,7 +18,7 @@ MEASURES = {
     "coverage of 90 % intervals": "coverage of the 90 % intervals",
     "closed where identified, median": "gap closed where identified, median",
     "region overlap, median": "region of a patch, gust or frozen zone: overlap, median",
-    "seconds": "time for one recording, median",
+    "seconds": "CPU time for one recording, median",
 }
 """Measures of the sealed check, and their names in the tables."""
 

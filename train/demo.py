@@ -22,9 +22,10 @@ from pathlib import Path
 import tyro
 
 from experiments.curves import plot_losses
+from experiments.kept_scores import kept_score
 from renderers import DrawnCartPole
 from train import renderer as renderer_training
-from visadapt.evaluation import CartPoleScore, kept_score
+from visadapt.evaluation import CartPoleScore
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.progress import reporting, staged
 from visadapt.setups.cartpole import cartpole_frames

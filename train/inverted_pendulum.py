@@ -30,10 +30,11 @@ from PIL import Image
 from torch import Tensor
 
 from experiments.curves import plot_losses
+from experiments.kept_scores import kept_score
 from experiments.result_tables import Row, speed_row, write_rows
 from renderers import LayeredRenderer, load_renderer, save_renderer
 from renderers.training import fit
-from visadapt.evaluation import CartPoleScore, kept_score
+from visadapt.evaluation import CartPoleScore
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.learning.grounding import gap
 from visadapt.learning.joint import SetupSettings

@@ -32,8 +32,9 @@ from torch import Tensor
 
 from datasets import quadrotor_references
 from experiments.flights import flight_target
+from experiments.kept_scores import kept_score
 from experiments.result_tables import Row, miss_row, write_rows
-from visadapt.evaluation import FlightScore, kept_score
+from visadapt.evaluation import FlightScore
 from visadapt.policies import Policy
 from visadapt.progress import reporting
 from visadapt.recordings import Episode

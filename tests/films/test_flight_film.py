@@ -12,7 +12,8 @@ import torch
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from visadapt.films.flight_film import FOLLOWING_CAMERA, NEAREST_M, ChaseCamera, FlightFilm
+from visadapt.films.camera import FOLLOWING_CAMERA, NEAREST_M, ChaseCamera
+from visadapt.films.flight_film import FlightFilm
 from visadapt.films.flight_panel import FlightPanel
 from visadapt.films.vehicle_shapes import drawn_parts, vehicle_parts
 from visadapt.films.widgets import RED, VIOLET

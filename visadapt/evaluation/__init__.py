@@ -1,5 +1,5 @@
 """Scores, and the tables that hold them."""
 
-from visadapt.evaluation.scoring import SCORE_SEED, CartPoleScore, FlightScore, kept_score, score
+from visadapt.evaluation.scoring import SCORE_SEED, CartPoleScore, FlightScore, score
 
-__all__ = ["SCORE_SEED", "CartPoleScore", "FlightScore", "kept_score", "score"]
+__all__ = ["SCORE_SEED", "CartPoleScore", "FlightScore", "score"]

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any, overload
+from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 import torch
 
 from visadapt.policies import Policy
-from visadapt.storage.run_folder import once
 from visadapt.targets import FlightTarget, Target
 from visadapt.targets.rollout import Run, run
 
@@ -91,22 +89,6 @@ def score(
         runs = run(target, policy, episodes, steps or target.task.steps, generator, strict=False)
         return _score_flights(runs, target)
     return score_runs(run(target, policy, episodes, steps or EPISODE_STEPS, generator))
-
-
-@overload
-def kept_score(  # type: ignore[overload-overlap]
-    path: Path, policy: Policy, target: FlightTarget, episodes: int = ...
-) -> FlightScore: ...
-@overload
-def kept_score(path: Path, policy: Policy, target: Target, episodes: int = ...) -> CartPoleScore: ...
-def kept_score(path: Path, policy: Policy, target: Target, episodes: int = 100) -> CartPoleScore | FlightScore:
-    """`score`, run only where it is not kept in the JSON file `path` yet."""
-    found: dict[str, Any] = once(path, lambda: asdict(score(policy, target, episodes)))
-    if not isinstance(target, FlightTarget):
-        return CartPoleScore(**found)
-    # JSON has no infinity: that of a flight that was not finite is null there.
-    missing: dict[str, Any] = {key: math.inf for key, value in found.items() if value is None}
-    return FlightScore(**(found | missing))
 
 
 def score_runs(runs: Sequence[Run]) -> CartPoleScore:

@@ -10,18 +10,18 @@ is marked from that moment on.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import LinearSegmentedColormap, to_rgba_array
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch, Polygon
 
 from visadapt.evaluation.scoring import FAR
 from visadapt.films import widgets
+from visadapt.films.camera import FARTHEST_PX, FOLLOWING_CAMERA, PASSING_CAMERA, axes_towards, ground_grid
 from visadapt.films.film import Film
 from visadapt.films.flight_panel import INSTANT_PERIOD_S, FlightPanel, length
 from visadapt.films.vehicle_shapes import ROUND, drawn_parts, hull, vehicle_parts
@@ -34,40 +34,11 @@ READINGS_TOP, BARS_TOP, CHART_TOP = 578, 640, 706
 """px"""
 COMMAND_LABELS = {"rate_x": "roll rate", "rate_y": "pitch rate", "rate_z": "yaw rate"}
 """Labels of the commands whose names alone would not say what they are."""
-NEAREST_M, FARTHEST_PX = 0.2, 1e5
-"""Nothing nearer to the camera is drawn, and nothing further from the middle of the picture."""
 SECOND = round(1 / INSTANT_PERIOD_S)
 """instants; so much of the reference ahead is highlighted"""
 OVERVIEW_DIRECTION = (0.55, 1.0, -0.6)
 """in which the whole course is looked at"""
 ERROR_COLOURS = LinearSegmentedColormap.from_list("error", [TEAL, AMBER, RED])
-
-
-@dataclass(frozen=True)
-class ChaseCamera:
-    """A pinhole camera that moves with something, without turning."""
-
-    place: tuple[float, float, float]
-    """m, from what it moves with"""
-    looks_at: tuple[float, float, float]
-    """m, the point in the middle of the picture, from what it moves with"""
-    focal: float
-    """px"""
-
-    def project(self, points: Floats, moving: Floats) -> tuple[Floats, Floats]:
-        """Where points (..., 3) are seen (..., 2), px to the right and up from the middle, and how deep (...), m.
-
-        Both are nan where a point is nearer than NEAREST_M. What the camera moves with is at `moving` (3,).
-        """
-        seen = (points - moving - np.array(self.place)) @ _axes(np.subtract(self.looks_at, self.place)).T
-        depth = np.where(seen[..., 2] < NEAREST_M, np.nan, seen[..., 2])
-        return (self.focal * seen[..., :2] / depth[..., None]).clip(-FARTHEST_PX, FARTHEST_PX), depth
-
-
-FOLLOWING_CAMERA = ChaseCamera((-1.2, -2.6, 1.15), (0.0, 0.0, 0.0), 820.0)
-"""Of a flight along a reference; moves with the reference's point, so that a vehicle beside the middle is an error."""
-PASSING_CAMERA = ChaseCamera((-4.8, -2.7, 1.9), (4.0, 0.3, 0.1), 560.0)
-"""Of a flight through a point; moves with the vehicle, and stops 4 m before the point."""
 
 
 class FlightFilm(Film):
@@ -126,7 +97,7 @@ class FlightFilm(Film):
         scene.imshow(rows, shades, vmin=0, vmax=1, extent=(-half[0], half[0], -half[1], half[1]), aspect="auto")
         step, place, goal = 1.0 if self.follows else 5.0, panel.position, panel.goal
         scene.text(half[0] - 10, 10 - half[1], f"grid {step:g} m", fontsize=11, color=MUTED, ha="right")
-        grid, colours = _grid(step)
+        grid, colours = ground_grid(step)
         tiles: Any = scene.add_collection(LineCollection([], animated=True), autolim=False)
         shadow = Polygon(np.zeros((3, 2)), facecolor=MUTED, alpha=0.16, animated=True)
         scene.add_patch(shadow)
@@ -192,7 +163,7 @@ class FlightFilm(Film):
     def _overview(self, page: Axes, panel: FlightPanel) -> Callable[[int], None]:
         """The whole course from afar, above its shadow on the ground."""
         course, place, size = panel.reference, panel.position, np.array([PANEL_WIDTH - BOX_SIDE - 12, BOX_SIDE])
-        across = _axes(OVERVIEW_DIRECTION)[:2].T
+        across = axes_towards(OVERVIEW_DIRECTION)[:2].T
         view = widgets.framed(page, 0, BOX_TOP, *size, facecolor=GROUND)
         both = np.concatenate([course, self._dropped(course)]) @ across
         low, high = both.min(0), both.max(0)
@@ -202,7 +173,7 @@ class FlightFilm(Film):
             ylim=(low + high)[1] / 2 + half[1] * np.array([-1, 1]),
         )
         step = max(widgets.ceiling(float(np.ptp(course, axis=0).max()) / 8), 0.5)
-        grid, colours = _grid(step)
+        grid, colours = ground_grid(step)
         view.add_collection(
             LineCollection(list((grid + self._dropped(course.mean(0))) @ across), colors=colours), autolim=False
         )
@@ -345,20 +316,3 @@ def _line(axes: Axes, colour: str, width: float, **properties: Any) -> Line2D:
 def _name(view: Axes, name: str) -> None:
     box = {"facecolor": PAPER, "pad": 4}
     view.annotate(name, (0, 1), (6, -6), "axes fraction", "offset points", fontsize=11, color=MUTED, va="top", bbox=box)
-
-
-def _axes(ahead: Any) -> Floats:
-    """(3, 3), rows: unit vectors to the right, up, and ahead of a camera that does not roll."""
-    ahead = np.asarray(ahead) / np.linalg.norm(ahead)
-    right = np.cross(ahead, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(right, ahead), ahead])
-
-
-def _grid(step: float) -> tuple[Floats, Floats]:
-    """Pieces (n, 2, 3) in m of a grid around the origin, `step` m wide; their colours (n, 4), which fade outwards."""
-    along, across = step * np.array(np.meshgrid(np.arange(-14, 14), np.arange(-14, 15), indexing="ij"))
-    pieces = np.stack([np.stack([along + shift, across, 0 * along], -1).reshape(-1, 3) for shift in (0.0, step)], 1)
-    pieces = np.concatenate([pieces, pieces[..., [1, 0, 2]]])
-    far = np.linalg.norm(pieces.mean(1), axis=1) / (14 * step)
-    return pieces[far < 1], to_rgba_array(HAIRLINE, 1 - far[far < 1] ** 2)
