@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from visadapt.estimation.kalman import Linear, backward, forward, log_likelihood, respond, smoothed_covariance
+from visadapt.estimation.kalman import Linear, backward, forward, log_likelihood, respond
 
 N, T, STATES, CHANNELS, COLUMNS = 3, 7, 4, 2, 3
 
@@ -72,18 +72,6 @@ def test_smoothed_states_are_the_conditional_mean_for_every_column(problem):
             error = problem.reading[n, :, :, column].flatten() - h @ mean
             expected = mean + covariance @ h.T @ torch.linalg.solve(s, error)
             torch.testing.assert_close(smoothed[n, :, :, column].flatten(), expected)
-
-
-def test_the_covariance_of_smoothed_states_is_the_conditional_one(problem):
-    found = smoothed_covariance(problem, forward(problem, torch.diag_embed(PROCESS), MEASUREMENT))
-    for n in range(N):
-        _, covariance = dense(problem, n, 0)
-        h = torch.block_diag(*problem.sensing[n])
-        s = h @ covariance @ h.T + torch.diag(MEASUREMENT[n].repeat(T))
-        expected = covariance - covariance @ h.T @ torch.linalg.solve(s, h @ covariance)
-        for t in range(T):
-            rows = slice(t * STATES, (t + 1) * STATES)
-            torch.testing.assert_close(found[n, t], expected[rows, rows])
 
 
 def test_smoothed_states_follow_the_model_with_the_smoothed_disturbances(problem):

@@ -121,23 +121,6 @@ def backward(problem: Linear, filtered: Filtered) -> tuple[Tensor, Tensor]:
     return torch.stack(states[::-1], 1), torch.stack(adjoints[::-1], 1)
 
 
-def smoothed_covariance(problem: Linear, filtered: Filtered) -> Tensor:
-    """(N, T, n, n) of the smoothed states: P - P L P, with L the covariance of the adjoints (Bryson and Frazier)."""
-    spread = torch.zeros_like(filtered.covariance[0])
-    identity = torch.eye(spread.shape[-1], dtype=spread.dtype)
-    out = []
-    for t in reversed(range(len(filtered.covariance))):
-        white = torch.linalg.solve_triangular(filtered.root[t], problem.sensing[:, t], upper=False)
-        kept = identity - torch.bmm(filtered.cross[t].mT, white)
-        spread = torch.bmm(white.mT, white) + kept.mT @ spread @ kept
-        covariance = filtered.covariance[t]
-        out.append(covariance - covariance @ spread @ covariance)
-        if t:
-            step = problem.transition[:, t - 1]
-            spread = step.mT @ spread @ step
-    return torch.stack(out[::-1], 1)
-
-
 def log_likelihood(filtered: Filtered, used: Tensor) -> Tensor:
     """(N,) of the first column; `used` (N, T, m) is 1 where something was measured."""
     square = filtered.innovation[..., 0].square() / filtered.variance
