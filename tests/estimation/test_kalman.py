@@ -98,3 +98,25 @@ def test_inputs_pass_through_the_gains_like_columns(problem):
     )
     expected = forward(quiet, torch.diag_embed(PROCESS), MEASUREMENT).innovation
     torch.testing.assert_close(respond(problem, filtered, problem.drive, problem.reading), expected)
+
+
+def test_states_of_an_unstable_system_are_found_over_many_precise_readings():
+    """Rounding errors of the covariance that are not symmetric would grow as fast as the system does."""
+    # Cart and pole near upright, each pushed by a load that drifts; held at rest, as a policy holds them.
+    rate = torch.zeros(6, 6, dtype=torch.float64)
+    rate[0, 1] = rate[2, 3] = rate[1, 4] = rate[3, 5] = 1.0
+    rate[1, 2], rate[3, 2], rate[3, 4] = -0.7, 15.8, -1.5
+    step, rows, precision = torch.linalg.matrix_exp(0.05 * rate), 1000, 5e4
+    sensing = torch.zeros(2, 6, dtype=torch.float64)
+    sensing[0, 0] = sensing[1, 0] = sensing[1, 2] = precision
+    problem = Linear(
+        step.expand(1, rows - 1, 6, 6),
+        torch.zeros(1, rows - 1, 6, 1, dtype=torch.float64),
+        sensing.expand(1, rows, 2, 6),
+        torch.zeros(1, rows, 2, 1, dtype=torch.float64),
+        torch.tensor([0.1, 0.0, 0.1, 0.0, 0.0, 0.0], dtype=torch.float64)[None, :, None],
+        torch.tensor([2.25, 25.0, 0.1, 100.0, 100.0, 0.1], dtype=torch.float64),
+    )
+    process = torch.diag(torch.tensor([0.0, 0, 0, 0, 1e-2, 1e-5], dtype=torch.float64))
+    smoothed, _ = backward(problem, forward(problem, process[None], torch.full((1, 2), 10.0).double()))
+    assert smoothed[0, :, [0, 2]].abs().max() < 10 / precision

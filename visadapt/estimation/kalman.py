@@ -69,6 +69,8 @@ def forward(problem: Linear, process: Tensor, noise: Tensor) -> Filtered:
             a = problem.transition[:, t - 1]
             mean = torch.baddbmm(problem.drive[:, t - 1], a, mean)
             covariance = torch.baddbmm(process, torch.bmm(a, covariance), a.mT)
+            # No reading damps rounding errors that are not symmetric: in an unstable system they would grow.
+            covariance = (covariance + covariance.mT) / 2
         predicted.append(mean)
         covariances.append(covariance)
         sensing = problem.sensing[:, t]
