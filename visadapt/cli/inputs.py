@@ -18,6 +18,7 @@ from typing import Any
 
 from visadapt.diagnosis.saved import load_effects
 from visadapt.effects import EFFECTS, Effect
+from visadapt.effects.base import expect
 from visadapt.effects.catalogue import catalogue
 from visadapt.progress import Report, reporting
 from visadapt.storage.run_folder import open_run
@@ -92,9 +93,10 @@ def _effect(text: str, system: System) -> Effect:
         near = difflib.get_close_matches(name, [effect.name for effect in catalogue()], 1)
         hint = f"did you mean {near[0]}? " if near else ""
         raise InputError(f"--effect {text}: there is no effect {name!r}; {hint}`visadapt effects` lists them")
-    if not isinstance(system, EFFECTS[name].systems):
-        kinds = " or a ".join(kind.name for kind in EFFECTS[name].systems)
-        raise InputError(f"--effect {text}: {name} acts on a {kinds}, not on a {system.name}")
+    try:
+        expect(system, EFFECTS[name])
+    except TypeError as error:
+        raise InputError(f"--effect {text}: {error}") from error
     values: dict[str, float] = {}
     for part in rest.split(",") if rest else ():
         parameter, _, number = part.partition("=")

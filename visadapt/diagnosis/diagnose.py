@@ -21,18 +21,11 @@ from visadapt.diagnosis.result import (
     Where,
 )
 from visadapt.diagnosis.search import heldout
-from visadapt.diagnosis.search.causes import (
-    Alternative,
-    alternatives,
-    causes,
-    errors_with_repeats,
-    ranking,
-    repeated_reading_causes,
-    stage_shares,
-)
+from visadapt.diagnosis.search.causes import Alternative, alternatives, causes, ranking, stage_shares
 from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
 from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
 from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
 from visadapt.effects import EFFECTS, Effect
 from visadapt.effects.catalogue import catalogue as all_effects, twins

@@ -248,7 +248,7 @@ class SensingEffect(Effect):
         raise NotImplementedError
 
 
-def expect(system: System, effect: Effect) -> Any:
+def expect(system: System, effect: Effect | type[Effect]) -> Any:
     """The system, which has the parameters of those that the effect acts on.
 
     Raises:

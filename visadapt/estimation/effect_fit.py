@@ -31,8 +31,9 @@ from visadapt.estimation.fit_states import (
 )
 from visadapt.estimation.likelihood import FitState, fit
 from visadapt.estimation.profiles import profile_of
+from visadapt.estimation.repeated_readings import SMOOTHING_RATIO, RepeatedReadings, find_repeats, zone
 from visadapt.estimation.screening import screen
-from visadapt.estimation.segments import SMOOTHING_RATIO, RepeatedReadings, Segments, cut, find_repeats, zone
+from visadapt.estimation.segments import Segments, cut
 from visadapt.systems import System
 from visadapt.world import World
 

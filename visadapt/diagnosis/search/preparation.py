@@ -13,7 +13,8 @@ from visadapt.diagnosis.search import sensor_checks
 from visadapt.diagnosis.search.search import Search
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
-from visadapt.estimation.segments import RepeatedReadings, Segments, cut, find_repeats
+from visadapt.estimation.repeated_readings import RepeatedReadings, find_repeats
+from visadapt.estimation.segments import Segments, cut
 from visadapt.recordings import Recording
 from visadapt.systems import System
 
