@@ -107,15 +107,16 @@ def test_without_air_and_with_fast_motors_it_flies_as_the_source(monkeypatch):
         expected.append(at.state)
 
     def away(h):
-        """How far off positions, velocities, and rates are at most, where tick and motors' lag are both `h` s."""
-        monkeypatch.setattr(ours, "TICK", h)
+        """Largest errors of position, velocity and rates; the rate loop's period and the motors' lag are both `h` s."""
+        monkeypatch.setattr(ours, "RATE_LOOP_PERIOD_S", h)
         states = fly(RotorpyTarget(level(), aero=False, changes={"tau_m": h}), commands)
         off = (states - torch.stack(expected)).abs()
         return [float(off[..., part].max()) for part in (POSITION, VELOCITY, RATES)]
 
     coarse, fine = away(0.01), away(0.005)
     # Thrusts come h late: at h = 5 ms a velocity lacks h times what the thrust now has over a hover's, here 3.8 m/s2 at
-    # most. Rates come 1.5 h late, the half tick included: a jump by 0.5 rad/s, which turns at 2.6 rad/s2 at first.
+    # most. Rates come 1.5 h late, half a period of the rate loop included: a jump by 0.5 rad/s, which turns at
+    # 2.6 rad/s2 at first.
     assert fine[1] < 0.02
     assert fine[2] < 0.02
     assert fine[0] < 0.02 * 1.2
