@@ -196,6 +196,20 @@ class TestMeasuring:
         torch.testing.assert_close(world.step(world.start(state), 0.3 * actions[0]).state, alone.state)
 
 
+def test_rows_of_unequal_duration_are_those_of_worlds_with_these_periods():
+    effects = [ConstantForce(force=2.0), ActuatorLag(time_constant=0.1)]
+    commands = torch.tensor([[0.6], [-0.3], [0.9]], dtype=torch.float64)
+    held = torch.tensor([0.04, 0.05, 0.07], dtype=torch.float64)
+    state = torch.tensor([[0.1, -0.4, 0.05, 0.3]], dtype=torch.float64).repeat(3, 1)
+    world = World(CartPole(), effects, period=0.05, substeps=2).double()
+    acting = world.actuate(commands[:, None], held[:, None])[:, 0]
+    together = world.integrate(torch.zeros(3).double(), state, acting, held)
+    for k in range(3):
+        alone = World(CartPole(), effects, period=float(held[k]), substeps=2).double()
+        expected = alone.step(alone.start(state[:1]), commands[k, None]).state
+        torch.testing.assert_close(together[k, None], expected, rtol=0, atol=1e-12)
+
+
 def test_the_load_of_an_instant_is_that_of_all_effects_on_the_altered_system():
     effects = [ConstantForce(force=2.0), ViscousFriction(coefficient=3.0), CartMass(scale=2.0)]
     world = World(CartPole(), effects)

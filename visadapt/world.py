@@ -13,7 +13,7 @@ from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, Parameter,
 from visadapt.effects.base import expect
 from visadapt.history import History
 from visadapt.systems import SYSTEMS, System
-from visadapt.systems.integrators import INTEGRATORS
+from visadapt.systems.integrators import INTEGRATORS, Duration
 
 
 @dataclass(frozen=True)
@@ -121,10 +121,13 @@ class World(nn.Module):
         rows = torch.arange(len(state), device=state.device), (clock / self.period).round().long()
         return WorldState(clock, state, tuple(memory[rows] for memory in self.memories(state, commands, states)))
 
-    def memories(self, state: Tensor, commands: Tensor, states: Tensor | None = None) -> tuple[Tensor, ...]:
+    def memories(
+        self, state: Tensor, commands: Tensor, states: Tensor | None = None, held: Tensor | None = None
+    ) -> tuple[Tensor, ...]:
         """What effects remember at every row of B episodes, before that row is read: (B, T + 1, any, any) each.
 
-        Args: as those of `start`; `commands` and `states` begin where the episodes do.
+        Args: as those of `start`, where `commands` and `states` begin where the episodes do; `held` (B, T) s is how
+        long each command was, where the clock is unsteady.
         """
         first = state if states is None else states[:, 0]
         acting, sensing = self._split(self._at_rest(first))
@@ -134,17 +137,20 @@ class World(nn.Module):
         generator = torch.Generator(first.device).manual_seed(0)  # which readings were lost is not known
         system = self.altered(first)
         for t in range(commands.shape[1]):
-            _, acting = self._act(commands[:, t, None], acting, system)
+            _, acting = self._act(commands[:, t, None], acting, system, None if held is None else held[:, t, None])
             if states is not None:
                 _, sensing = self._read(states[:, min(t, states.shape[1] - 1)], sensing, generator)
             rows.append((*acting, *sensing))
         return tuple(torch.stack(memory, 1) for memory in zip(*rows, strict=True))
 
-    def actuate(self, commands: Tensor) -> Tensor:
-        """What acts (B, T, substeps, n_action) of the commands (B, T, n_action) of episodes, from their beginning."""
+    def actuate(self, commands: Tensor, held: Tensor | None = None) -> Tensor:
+        """What acts (B, T, substeps, n_action) of the commands (B, T, n_action) of episodes, from their beginning.
+
+        `held` (B, T) s is how long each command is, where the clock is unsteady; one period without it.
+        """
         episodes, length, width = commands.shape
         like = commands.new_zeros(episodes, len(self.system.states))
-        acting, _ = self._act(commands, self._split(self._at_rest(like))[0], self.altered(like))
+        acting, _ = self._act(commands, self._split(self._at_rest(like))[0], self.altered(like), held)
         return acting.reshape(episodes, length, self.substeps, width)
 
     def step(self, at: WorldState, action: Tensor, history: History | None = None) -> WorldState:
@@ -162,12 +168,12 @@ class World(nn.Module):
             state = state + residual.delta(history.acting(action)).to(state)
         return WorldState(at.time + self.period, state, (*acting, *sensing))
 
-    def integrate(self, time: Tensor, state: Tensor, commands: Tensor) -> Tensor:
-        """The state (B, n_state) a period after `time` (B,) where `commands` (B, substeps, n_action) act.
+    def integrate(self, time: Tensor, state: Tensor, commands: Tensor, duration: Tensor | None = None) -> Tensor:
+        """The state (B, n_state) a period, or `duration` (B,) s, after `time` (B,) where `commands` act.
 
-        The physics alone: `actuate` says what acts of the commands that were given.
+        `commands` (B, substeps, n_action) are what `actuate` makes of those that were given: this is the physics alone.
         """
-        return self._integrate(self.altered(state), time, state, commands)
+        return self._integrate(self.altered(state), time, state, commands, duration)
 
     def measure(self, at: WorldState, generator: torch.Generator | None = None) -> tuple[Tensor, WorldState]:
         """What sensors read (B, n_state) of the row `at`, and the world with that row read.
@@ -219,17 +225,24 @@ class World(nn.Module):
         """What the actuation effects remember, and what the sensing effects do."""
         return memory[: len(self._actuation)], memory[len(self._actuation) :]
 
-    def _act(self, commands: Tensor, memory: tuple[Tensor, ...], system: System) -> tuple[Tensor, tuple[Tensor, ...]]:
+    def _act(
+        self, commands: Tensor, memory: tuple[Tensor, ...], system: System, held: Tensor | None = None
+    ) -> tuple[Tensor, tuple[Tensor, ...]]:
         """What acts (B, T substeps, n_action) of commands (B, T, n_action), and the new memory."""
         acting = commands.clamp(-1, 1).repeat_interleave(self.substeps, 1)
+        substep: Duration = self.period / self.substeps
+        if held is not None:
+            substep = (held / self.substeps).repeat_interleave(self.substeps, 1)
         remembered = []
         for effect, own in zip(self._actuation, memory, strict=True):
-            acting, own = effect.acting_on(system).apply_to(acting, own, self.period / self.substeps)
+            acting, own = effect.acting_on(system).apply_to(acting, own, substep)
             remembered.append(own)
         return acting, tuple(remembered)
 
-    def _integrate(self, system: System, time: Tensor, state: Tensor, commands: Tensor) -> Tensor:
-        h = self.period / self.substeps
+    def _integrate(
+        self, system: System, time: Tensor, state: Tensor, commands: Tensor, duration: Tensor | None = None
+    ) -> Tensor:
+        h: Duration = (self.period if duration is None else duration) / self.substeps
         integrate = INTEGRATORS[self.integrator]
         for k in range(self.substeps):
             command = commands[:, k]

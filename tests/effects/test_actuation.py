@@ -51,6 +51,22 @@ def test_an_episode_at_once_is_the_same_as_step_by_step(name, data):
 
 
 @pytest.mark.parametrize("name", CHAIN)
+def test_on_an_unsteady_clock_it_is_what_fine_equal_substeps_give(name):
+    fine = 0.001
+    effect = build(name, {p.name: p.low + 0.3 * (p.high - p.low) for p in EFFECTS[name].table})
+    # Each of 12 commands is held for 40 to 60 ms, in two substeps.
+    half = torch.randint(20, 31, (12,), generator=torch.Generator().manual_seed(4))
+    held = half.repeat_interleave(2)
+    commands = 2 * torch.rand(1, 12, 1, generator=torch.Generator().manual_seed(5), dtype=torch.float64) - 1
+    memory = effect.memory(commands, 0.025)
+    unsteady, _ = effect.apply_to(commands.repeat_interleave(2, 1), memory, fine * held[None].double())
+    every = commands.repeat_interleave(2 * half, 1)
+    steady, _ = effect.apply_to(every, effect.memory(every, fine), fine)
+    means = torch.stack([part.mean(1) for part in steady.split(held.tolist(), 1)], 1)
+    torch.testing.assert_close(unsteady, means, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", CHAIN)
 def test_signals_of_several_motors_do_not_mix(name):
     effect = build(name, {p.name: p.low + 0.3 * (p.high - p.low) for p in EFFECTS[name].table})
     generator = torch.Generator().manual_seed(3)

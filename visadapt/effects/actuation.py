@@ -8,6 +8,7 @@ which are continuous in command and parameter, with one-sided derivatives at the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import ClassVar
 
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor
 
 from visadapt.effects.base import ActuationEffect, Parameter
+from visadapt.systems.integrators import Duration
 
 
 class ActuatorDelay(ActuationEffect):
@@ -43,29 +45,30 @@ class ActuatorDelay(ActuationEffect):
     }
 
     def memory(self, commands: Tensor, substep: float) -> Tensor:
-        return torch.zeros_like(commands[:, :1]).expand(-1, self._reach(commands, substep), -1)
+        # Past commands, and how long each was held. Twice what the delay reaches, for substeps down to half as long.
+        delay = self.value("delay", commands).detach()
+        if not bool((delay >= 0).all()):
+            raise ValueError(f"actuator_delay: delay must not be negative, got {float(delay.min()):g} s")
+        reach = 2 * math.ceil(float(delay.max()) / substep) + 1
+        held = torch.full_like(commands[:, :1, :1], substep)
+        return torch.cat((torch.zeros_like(commands[:, :1]), held), -1).expand(-1, reach, -1)
 
-    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
         batch, count, width = commands.shape
-        shift = self._shift(commands, substep).expand(batch)
-        past = torch.cat((memory, commands), 1)
-        whole = shift.detach().floor()
-        part = (shift - whole)[:, None, None]
-        now = torch.arange(count, device=commands.device) + memory.shape[1]
-        index = (now - whole.long()[:, None])[..., None].expand(batch, count, width)
-        delayed = (1 - part) * past.gather(1, index) + part * past.gather(1, index - 1)
-        return delayed, past[:, count:]
-
-    def _shift(self, commands: Tensor, substep: float) -> Tensor:
-        """The delay in substeps, one for each row or one for all, in the precision of the commands."""
-        return self.value("delay", commands) / substep
-
-    def _reach(self, commands: Tensor, substep: float) -> int:
-        """Number of past substeps that the delay can reach."""
-        shift = self._shift(commands, substep).detach()
-        if not bool((shift >= 0).all()):
-            raise ValueError(f"actuator_delay: delay must not be negative, got {float(shift.min()) * substep:g} s")
-        return int(shift.max().floor()) + 1
+        held = torch.as_tensor(substep, dtype=commands.dtype, device=commands.device).expand(batch, count)
+        past = torch.cat((memory, torch.cat((commands, held[..., None]), -1)), 1)
+        # The command's integral up to each edge between substeps, from the first that is remembered.
+        lasting = past[..., -1]
+        edge = torch.cat((torch.zeros_like(lasting[:, :1]), lasting.cumsum(1)), 1)
+        whole = (past[..., :-1] * lasting[..., None]).cumsum(1)
+        whole = torch.cat((torch.zeros_like(whole[:, :1]), whole), 1)
+        # ... and up to a delay before each edge of the present substeps: its differences are the delayed impulses.
+        wanted = (edge[:, -count - 1 :] - self.value("delay", commands).expand(batch)[:, None]).clamp_min(0)
+        left = (torch.searchsorted(edge.detach(), wanted.detach(), right=True) - 1).clamp(0, past.shape[1] - 1)
+        columns = left[..., None].expand(-1, -1, width)
+        inside = (wanted - edge.gather(1, left))[..., None]
+        impulse = whole.gather(1, columns) + inside * past[..., :-1].gather(1, columns)
+        return impulse.diff(dim=1) / held[..., None], past[:, count:]
 
 
 class ActuatorBacklash(ActuationEffect):
@@ -83,7 +86,7 @@ class ActuatorBacklash(ActuationEffect):
     def memory(self, commands: Tensor, substep: float) -> Tensor:
         return torch.zeros_like(commands[:, :1])
 
-    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
         half = self.column("width", commands) / 2
         follows, output = memory[:, 0], []
         for low, high in zip((commands - half).unbind(1), (commands + half).unbind(1), strict=True):
@@ -102,7 +105,7 @@ class ActuatorDeadzone(ActuationEffect):
     source = "Tao and Kokotovic (1996), Adaptive Control of Systems with Actuator and Sensor Nonlinearities, chapter 2"
     table = (Parameter("width", "1", 0.0, 0.6, 0.0),)
 
-    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
         # The sign stays outside: a clamp between equal limits would have no gradient in a width of 0.
         return commands.sign() * (commands.abs() - self.column("width", commands)).clamp_min(0), memory
 
@@ -116,7 +119,7 @@ class ActuatorSaturation(ActuationEffect):
     source = "Khalil (2002), Nonlinear Systems, section 1.2.7"
     table = (Parameter("limit", "1", 0.02, 1.0, 1.0),)
 
-    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
         limit = self.column("limit", commands)
         return torch.minimum(torch.maximum(commands, -limit), limit), memory
 
@@ -139,7 +142,7 @@ class ActuatorGain(ActuationEffect):
         )
     }
 
-    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
         return self.column("scale", commands) * commands, memory
 
 
@@ -159,7 +162,7 @@ class ActuatorBias(ActuationEffect):
         )
     }
 
-    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
         return commands + self.column("offset", commands), memory
 
 
@@ -175,8 +178,9 @@ class ActuatorLag(ActuationEffect):
     def memory(self, commands: Tensor, substep: float) -> Tensor:
         return torch.zeros_like(commands[:, :1])
 
-    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
-        ratio = self.column("time_constant", commands) / substep
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
+        substeps = substep[..., None] if isinstance(substep, Tensor) else substep
+        ratio = (self.column("time_constant", commands) / substeps).expand(commands.shape[0], commands.shape[1], 1)
         # exp(-1000) is 0 in every precision, and so are its derivatives: the limit is exact, and nothing divides by 0.
         rate = ratio.clamp_min(1e-3).reciprocal()
         left = (-rate).exp()  # share of the old value that remains after a substep
@@ -184,11 +188,10 @@ class ActuatorLag(ActuationEffect):
         after = -(-rate).expm1() * commands
         reach, weight = 1, left
         while reach < commands.shape[1]:
-            after = torch.cat((after[:, :reach], after[:, reach:] + weight * after[:, :-reach]), 1)
-            weight = weight.square()
+            after = torch.cat((after[:, :reach], after[:, reach:] + weight[:, reach:] * after[:, :-reach]), 1)
+            weight = torch.cat((weight[:, :reach], weight[:, reach:] * weight[:, :-reach]), 1)
             reach *= 2
-        count = torch.arange(1, commands.shape[1] + 1, device=commands.device, dtype=commands.dtype)[None, :, None]
-        after = after + (-rate * count).exp() * memory
+        after = after + weight * memory
         before = torch.cat((memory, after[:, :-1]), 1)
         # The mean of command + (before - command) exp(-t / time_constant) over the substep.
         return commands + (before - commands) * ratio * -(-rate).expm1(), after[:, -1:]

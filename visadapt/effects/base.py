@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from visadapt.systems import System
+from visadapt.systems.integrators import Duration
 
 
 class Stage(StrEnum):
@@ -170,10 +171,11 @@ class ActuationEffect(Effect):
         """
         return commands[:, :0]
 
-    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
-        """The changed commands (B, S, n_action) over S substeps, each `substep` s long, and the new memory.
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
+        """The changed commands (B, S, n_action) over S substeps, and the new memory.
 
-        S may cover one period or a whole episode: the result is the same.
+        A substep lasts `substep` s, or (B, S) s where the clock is unsteady. S may cover one period or a whole episode:
+        the result is the same.
         """
         raise NotImplementedError
 

@@ -18,6 +18,7 @@ from visadapt.effects.aerial import VEHICLES, Vehicle
 from visadapt.effects.base import ActuationEffect, DynamicsEffect, Parameter, expect
 from visadapt.effects.parameters import ParameterScale, ParameterShift
 from visadapt.systems import Quadrotor, System
+from visadapt.systems.integrators import Duration
 from visadapt.systems.rigid_body import beside
 
 
@@ -86,34 +87,38 @@ class MotorLag(ActuationEffect):
         """w and d (B, 2, n_action); of a thrust, w is 0."""
         return torch.zeros_like(commands[:, :1]).repeat(1, 2, 1)
 
-    def apply_to(self, commands: Tensor, memory: Tensor, substep: float) -> tuple[Tensor, Tensor]:
-        ratio = self.value("time_constant", commands) / substep
-        kept, brought = self._of_a_substep(ratio, substep, commands)
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
+        count = commands.shape[1]
+        length = substep if isinstance(substep, Tensor) else commands.new_full((1, 1), substep)
+        ratio = self.value("time_constant", commands).reshape(-1, 1) / length
+        kept, brought = self._of_a_substep(ratio, length, commands)
+        kept = kept.expand(-1, count, -1, -1, -1)
         after = commands[..., None] * brought
-        start = after[:, :1] + (kept @ memory.movedim(1, 2)[:, None, ..., None])[..., 0]
-        after = torch.cat((start, after[:, 1:]), 1)
         # All prefixes of a linear recurrence in log2(S) rounds.
         reach = 1
-        while reach < commands.shape[1]:
-            late = (kept @ after[:, :-reach, ..., None])[..., 0]
+        while reach < count:
+            late = (kept[:, reach:] @ after[:, :-reach, ..., None])[..., 0]
             after = torch.cat((after[:, :reach], after[:, reach:] + late), 1)
-            kept = kept @ kept
+            kept = torch.cat((kept[:, :reach], kept[:, reach:] @ kept[:, :-reach]), 1)
             reach *= 2
+        after = after + (kept @ memory.movedim(1, 2)[:, None, ..., None])[..., 0]
         before = torch.cat((memory[:, 1:], after[:, :-1, :, 1]), 1)
-        ratio = ratio if ratio.dim() == 0 else ratio[:, None, None]
         # The mean of w + d over a substep, since time_constant dd/dt = command - (w + d).
-        return commands + ratio * (before - after[..., 1]), after[:, -1].movedim(2, 1)
+        return commands + ratio[..., None] * (before - after[..., 1]), after[:, -1].movedim(2, 1)
 
-    def _of_a_substep(self, ratio: Tensor, substep: float, commands: Tensor) -> tuple[Tensor, Tensor]:
-        """Over a substep: the transition of (w, d), (B or 1, 1, n_action, 2, 2), and the response to 1, (..., 2)."""
+    def _of_a_substep(self, ratio: Tensor, length: Tensor, commands: Tensor) -> tuple[Tensor, Tensor]:
+        """Over substeps (B or 1, S or 1) s long: the transitions of (w, d), (..., n_action, 2, 2), and the responses to
+        1, (..., n_action, 2)."""
         none = (0.0,) * commands.shape[2]
-        gain, damping = (substep * beside(values, commands) for values in self.loops or (none, none))
+        gain, damping = (
+            length[..., None] * beside(values, commands).unsqueeze(-2) for values in self.loops or (none, none)
+        )
         # As in actuator_lag: with exp(-1000) the limit is exact, and nothing divides by 0.
         rate = ratio.clamp_min(1e-3).reciprocal()[..., None]
         rate, gain, damping = torch.broadcast_tensors(rate, gain, damping)
         zero = torch.zeros_like(gain)
         flow = torch.stack((-damping, gain, zero, -rate, -rate, rate, zero, zero, zero), -1)
-        whole = flow.unflatten(-1, (3, 3)).matrix_exp().reshape(-1, 1, commands.shape[2], 3, 3)
+        whole = flow.unflatten(-1, (3, 3)).matrix_exp()
         return whole[..., :2, :2], whole[..., :2, 2]
 
 

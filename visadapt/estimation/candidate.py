@@ -33,7 +33,8 @@ class CandidateModel:
         self.effects = tuple(effects)
         self.rows = rows
         abrupt = any(effect.abrupt for effect in effects)
-        smooth = 1 if accuracy == COARSEST else math.ceil(rows.period / self.profile.longest_step)
+        longest = float(rows.held.max())
+        smooth = 1 if accuracy == COARSEST else math.ceil(longest / self.profile.longest_step - 1e-9)
         substeps = max(smooth, self.profile.substeps[accuracy] if abrupt else 1)
         placeholders = [effect(**{parameter.name: 0.0 for parameter in effect.table}) for effect in effects]
         self._world = World(system, placeholders, rows.period, substeps=substeps)
@@ -58,8 +59,9 @@ class CandidateModel:
         """Inputs after the actuation effects, (R, W, T, substeps, n_action), for R parameter vectors (R, P)."""
         rows = self.rows
         episodes = len(rows.command)
-        given = rows.command.repeat(len(theta), 1, 1)
-        acting = self.at(theta.repeat_interleave(episodes, 0)).actuate(given).unflatten(0, (len(theta), episodes))
+        given, held = rows.command.repeat(len(theta), 1, 1), rows.held.repeat(len(theta), 1)
+        acting = self.at(theta.repeat_interleave(episodes, 0)).actuate(given, held)
+        acting = acting.unflatten(0, (len(theta), episodes))
         return acting[:, rows.episode[:, None], rows.index]
 
     def started(self, theta: Tensor, state: Tensor) -> WorldState:
@@ -68,7 +70,7 @@ class CandidateModel:
         rows, length = self.rows, state.shape[1]
         episode, index = rows.episode.repeat_interleave(length), rows.index[:, :length].flatten()
         first = rows.command.new_zeros(len(rows.command), state.shape[-1])
-        memory = self.at(theta).memories(first, rows.command)
+        memory = self.at(theta).memories(first, rows.command, held=rows.held)
         time = rows.time[:, :length].flatten()
         return WorldState(time, state.flatten(0, 1), tuple(m[episode, index] for m in memory))
 
@@ -99,8 +101,10 @@ def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised
     acting = model.commands(shifted[variants])[:, :, :-1].flatten(1, 2)
     commands = acting[[variants.index(k) if k in variants else 0 for k in range(len(shifted))]]
     world = model.at(theta)
-    time = model.rows.time[:, :-1].flatten()
-    step = linearise_step(world, theta, time, state[:, :-1].flatten(0, 1), commands, by_state=known is None)
+    time, duration = model.rows.time[:, :-1].flatten(), model.rows.duration[:, :-1].flatten()
+    step = linearise_step(
+        world, theta, time, state[:, :-1].flatten(0, 1), commands, by_state=known is None, duration=duration
+    )
     reading = linearise_reading(world, theta, state.flatten(0, 1), by_state=known is None)
     channels = list(model.rows.channels)
     steps, rows = (windows, length - 1), (windows, length)

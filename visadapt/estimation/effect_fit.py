@@ -80,7 +80,8 @@ def fit_effects(
     profile = profile_of(system)
     channels = tuple(range(len(system.states)))
     holds = find_repeats(measured, channels, profile.angle_sensor)
-    rows = cut(measured, holds.used, commands, channels, period, profile.window_rows)
+    stamps = [period * torch.arange(len(values)).double() for values in measured]
+    rows = cut(measured, holds.used, commands, stamps, channels, period, profile.window_rows)
     present = [float(getattr(effect, p.name)) for effect in effects if type(effect) in fitted_as for p in effect.table]
     found = _fitted(system, fitted, rows, present)
     if MeasurementDelay in fitted_as:

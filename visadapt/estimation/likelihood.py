@@ -67,8 +67,8 @@ def initial_states(rows: Segments, system: System) -> Tensor:
         if channel not in rows.channels:
             position = out[..., position_column]
             change = torch.zeros_like(position)
-            change[:, 1:-1] = (position[:, 2:] - position[:, :-2]) / (2 * rows.period)
-            change[:, 0] = (position[:, 1] - position[:, 0]) / rows.period
+            change[:, 1:-1] = (position[:, 2:] - position[:, :-2]) / (rows.time[:, 2:] - rows.time[:, :-2])
+            change[:, 0] = (position[:, 1] - position[:, 0]) / rows.duration[:, 0]
             out[..., channel] = change
     return out * rows.inside[..., None]
 

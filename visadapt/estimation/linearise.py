@@ -73,8 +73,9 @@ def linearise_step(
     acting: Tensor,
     by_state: bool = True,
     by_command: bool = False,
+    duration: Tensor | None = None,
 ) -> Tangent:
-    """The state one period after each of N states, with derivatives.
+    """The state one period, or `duration` (N,) s, after each of N states, with derivatives.
 
     Args:
         world: the effects' present parameter values are not used.
@@ -93,7 +94,8 @@ def linearise_step(
         commands = given[list(moved)]
         if by_command:
             commands = commands + STATE_STEP * pushed[:, None, None]
-        return world.with_values(rows).integrate(time.repeat(len(moved)), states, commands.flatten(0, 1))
+        lasting = None if duration is None else duration.repeat(len(moved))
+        return world.with_values(rows).integrate(time.repeat(len(moved)), states, commands.flatten(0, 1), lasting)
 
     return _tangent(step, world, values, state, by_state, width if by_command else 0, width)
 

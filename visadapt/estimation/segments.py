@@ -22,10 +22,11 @@ class Segments:
     inside: Tensor  # (W, T) 1 within the window, 0 in its padding
     time: Tensor  # (W, T) s since the start of the episode
     command: Tensor  # (E, L, n_action) of whole episodes, from their start
+    held: Tensor  # (E, L) s for which each command was held: until the next row; `period` after the last
     first: Tensor  # (W,) row of the episode at which the window starts
     episode: Tensor  # (W,) index of the window's episode
     channels: tuple[int, ...]  # the m columns of the state that were measured
-    period: float  # s between rows
+    period: float  # s between rows, the median where the clock is unsteady
     step: tuple[float, ...]  # resolution of each channel: the smallest difference between two different readings
 
     @property
@@ -37,6 +38,11 @@ class Segments:
     def index(self) -> Tensor:
         """(W, T) row of the episode; it continues in the padding."""
         return self.first[:, None] + torch.arange(self.shape[1])
+
+    @property
+    def duration(self) -> Tensor:
+        """(W, T) s from each row to the next; it continues in the padding."""
+        return self.held[self.episode[:, None], self.index]
 
     def select(self, windows: Tensor) -> Segments:
         """These windows, by index."""
@@ -58,16 +64,19 @@ def cut(
     measured: Sequence[Tensor],
     valid: Sequence[Tensor],
     commands: Sequence[Tensor],
+    stamps: Sequence[Tensor],
     channels: tuple[int, ...],
     period: float,
     longest: int,
     stretches: Sequence[tuple[int, int, int]] | None = None,
 ) -> Segments:
-    """Cut each episode into windows of nearly equal length, at most `longest` rows of `period` s.
+    """Cut each episode into windows of nearly equal length, at most `longest` rows.
 
     Args:
         measured, valid: (T, m) of each episode; `valid` is 1 where a measurement of these `channels` may be used.
         commands: (T, n_action).
+        stamps: (T,) s since the start of the episode.
+        period: s between rows, the median of all.
         stretches: the parts to use, as (episode index, first row, row past the last); whole episodes by default.
     """
     pieces = []
@@ -87,13 +96,18 @@ def cut(
     command = torch.zeros(
         len(commands), max(len(c) for c in commands) + rows, commands[0].shape[1], dtype=torch.float64
     )
-    for index, values in enumerate(commands):
+    held = torch.full(command.shape[:2], period, dtype=torch.float64)
+    for index, (values, stamp) in enumerate(zip(commands, stamps, strict=True)):
         command[index, : len(values)] = values
+        held[index, : len(values) - 1] = stamp.diff()
     first = torch.tensor([a for _, a, _ in pieces])
-    time = period * (first[:, None] + torch.arange(rows)).double()
+    time = torch.zeros(shape, dtype=torch.float64)
+    for w, (index, a, b) in enumerate(pieces):
+        time[w] = stamps[index][a] + period * torch.arange(rows)
+        time[w, : b - a] = stamps[index][a:b]
     episode = torch.tensor([index for index, _, _ in pieces])
     step = tuple(smallest_step(torch.cat([values[:, k] for values in measured])) for k in range(len(channels)))
-    return Segments(out, used, inside, time, command, first, episode, channels, period, step)
+    return Segments(out, used, inside, time, command, held, first, episode, channels, period, step)
 
 
 def smallest_step(readings: Tensor) -> float:

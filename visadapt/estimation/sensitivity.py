@@ -120,7 +120,9 @@ class Sensitivity:
             return theta[:, None].expand(-1, windows * used, -1).flatten(0, 1)
 
         state = fits.state[0]
-        after = model.at(per_row(length - 1)).integrate(spread(rows.time[:, :-1]), spread(state[:, :-1]), commands)
+        after = model.at(per_row(length - 1)).integrate(
+            spread(rows.time[:, :-1]), spread(state[:, :-1]), commands, spread(rows.duration[:, :-1])
+        )
         read = model.measure(per_row(length), spread(state))
         after = after.reshape(count, windows, length - 1, n)
         read = read.reshape(count, windows, length, -1)

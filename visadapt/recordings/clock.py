@@ -1,4 +1,4 @@
-"""An episode as it was read, and its clock: without jitter, irregular rows resampled, split where rows are missing."""
+"""An episode as it was read, and its clock: steady, or every row at its own stamp; split where rows are missing."""
 
 from __future__ import annotations
 
@@ -19,12 +19,14 @@ GAP_PERIODS = 1.5
 """Two rows further apart than this have a missing row between them."""
 MOST_GAPS = 0.05
 """Share of gaps among the steps above which a clock is irregular; below it, rows are missing."""
-MOST_JITTER_PERIODS = 0.1
-"""Root mean square by which the rows of a steady clock may deviate from it; a real rig's deviate by about 0.01."""
-PERIOD_TOLERANCE = 0.02
-"""Relative difference that the periods of two episodes of one recording may have."""
-INTERPOLATED_PERIODS = 3.0
-"""Longest step of an irregular clock that is interpolated; at longer ones the episode is split."""
+MOST_ROUNDING_PERIODS = 0.02
+"""Root mean square by which the stamps of a steady clock may deviate from it: their rounding, and a real rig's 0.01."""
+UNSTEADY_PERIODS = 0.1
+"""Difference between the longest and the shortest step above which the clock is reported as unsteady."""
+LONGEST_STEP_PERIODS = 3.0
+"""Longest step of an irregular clock; at longer ones the episode is split."""
+PERIOD_RATIO = 1.5
+"""Ratio that the periods of two episodes of one recording may have."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class RawEpisode:
 
     path: Path
     time: NDArray[np.float64]
-    """(T,) s, as in the file; `steadied` makes it start at 0"""
+    """(T,) s, as in the file; `uninterrupted` makes it start at 0"""
     action: NDArray[np.float64]
     """(T, n_action)"""
     state: NDArray[np.float64]
@@ -86,8 +88,8 @@ def check_forward(raw: RawEpisode) -> None:
         )
 
 
-def steadied(raw: RawEpisode, note: Note) -> list[RawEpisode]:
-    """The episode in parts whose rows are one period apart; `time` counts from the start of the whole episode."""
+def uninterrupted(raw: RawEpisode, note: Note) -> list[RawEpisode]:
+    """The episode in parts without missing rows; `time` counts from the start of the whole episode."""
     raw = replace(raw, time=raw.time - raw.time[0])
     steps = np.diff(raw.time)
     if len(steps) == 0:
@@ -95,40 +97,42 @@ def steadied(raw: RawEpisode, note: Note) -> list[RawEpisode]:
     period = float(np.median(steps))
     gaps = steps > GAP_PERIODS * period
     irregular = gaps.mean() > MOST_GAPS and gaps.sum() > 1
-    cuts = np.flatnonzero(steps > (INTERPOLATED_PERIODS if irregular else GAP_PERIODS) * period)
+    cuts = np.flatnonzero(steps > (LONGEST_STEP_PERIODS if irregular else GAP_PERIODS) * period)
     for cut in cuts:
         note("rows are missing here; the episode was split", f"{raw.source}, {raw.place(int(cut) + 1)}")
     edges = [0, *(int(cut) + 1 for cut in cuts), len(raw.time)]
     parts = [raw.part(start, end) for start, end in pairwise(edges)]
-    return [_one_clock(part, period, note) for part in parts]
+    return [_clocked(part, note) for part in parts]
 
 
-def _one_clock(part: RawEpisode, nominal: float, note: Note) -> RawEpisode:
-    """The part on a steady clock: its own if it jitters little, else resampled with the period `nominal`."""
+def _clocked(part: RawEpisode, note: Note) -> RawEpisode:
+    """The part on a steady clock where its stamps deviate by no more than their rounding; else with its own stamps."""
     index = np.arange(len(part.time))
     if len(index) < 3:
         return part
     period, start = np.polyfit(index, part.time, 1)
     off = part.time - (start + period * index)
-    if np.sqrt(np.mean(off**2)) <= MOST_JITTER_PERIODS * period:
+    if np.sqrt(np.mean(off**2)) <= MOST_ROUNDING_PERIODS * period:
         return replace(part, time=part.time[0] + period * index)
-    note(f"an irregular clock; resampled to one row every {nominal:.4g} s", part.source)
-    time = np.arange(part.time[0], part.time[-1] + 1e-9, nominal)
-    state = np.column_stack([np.interp(time, part.time, column) for column in part.state.T])
-    # A command holds until the next one.
-    held = np.searchsorted(part.time, time + 1e-9, side="right") - 1
-    return replace(part, time=time, action=part.action[held], state=state)
+    steps = np.diff(part.time)
+    if np.ptp(steps) > UNSTEADY_PERIODS * period:
+        note(
+            f"an unsteady clock: its steps last {steps.min():.3g} to {steps.max():.3g} s; every row and command counts "
+            "at its own time",
+            part.source,
+        )
+    return part
 
 
 def alike(parts: list[RawEpisode], note: Note) -> tuple[list[RawEpisode], float]:
-    """The parts that have the period of most rows, and that period in s; every part needs at least two rows."""
-    periods = np.array([np.diff(part.time).mean() for part in parts])
+    """The parts with about the period of most rows, and the median step in s; every part needs at least two rows."""
+    periods = np.array([np.median(np.diff(part.time)) for part in parts])
     order = np.argsort(periods)
     rows = np.cumsum([len(parts[index].time) for index in order])
     period = float(periods[order][np.searchsorted(rows, rows[-1] / 2)])
     kept = []
     for part, own in zip(parts, periods, strict=True):
-        if abs(own / period - 1) <= PERIOD_TOLERANCE:
+        if 1 / PERIOD_RATIO <= own / period <= PERIOD_RATIO:
             kept.append(part)
         else:
             note(f"left out, since its rows are not {period:.4g} s apart as most are", part.source)

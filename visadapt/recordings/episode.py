@@ -73,7 +73,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class Recording:
-    """Episodes of states and actions. Every episode's clock is steady: its rows are one period apart.
+    """Episodes of states and actions, whose clocks may be unsteady: what counts is each row's `time`.
 
     >>> import numpy as np, visadapt as va
     >>> episode = va.Episode(time=0.05 * np.arange(3), action=np.zeros((3, 1)), state=np.zeros((3, 2)))
@@ -86,7 +86,7 @@ class Recording:
     measured: tuple[str, ...]
     """names of the measured states, in the system's order"""
     period: float
-    """s between rows: the median of the episodes'"""
+    """s between rows, the median"""
     sources: tuple[str, ...]
     """where each episode comes from, for messages: "run3.csv, episode 2" """
     warnings: tuple[str, ...] = ()

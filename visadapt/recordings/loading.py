@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from visadapt.recordings.checks import check_commands, check_finite, check_units
-from visadapt.recordings.clock import Note, RawEpisode, alike, check_forward, steadied
+from visadapt.recordings.clock import Note, RawEpisode, alike, check_forward, uninterrupted
 from visadapt.recordings.csv import needed, read_rows
 from visadapt.recordings.episode import Episode, Recording, RecordingError
 from visadapt.recordings.hdf5 import read_names, read_recording
@@ -31,10 +31,10 @@ def load_recording(
 ) -> Recording:
     """Read states and actions from CSV and HDF5 files.
 
-    Names are matched by `csv.py`, clocks made steady by `clock.py`. Angles are unwrapped within an episode so
-    that upright is 0 (if the pole turns over, in the turn in which it is upright most often). A command in N (a column
-    `force` that exceeds 1) is divided by the system's `max_force`. The recording's warnings say what was changed or
-    left out.
+    Names are matched by `csv.py`. Clocks are checked by `clock.py`; rows of an unsteady one keep their stamps. Angles
+    are unwrapped within an episode so that upright is 0 (if the pole turns over, in the turn in which it is upright
+    most often). A command in N (a column `force` that exceeds 1) is divided by the system's `max_force`. The
+    recording's warnings say what was changed or left out.
 
     Args:
         paths: one or several: files, or folders whose CSV and HDF5 files are taken in the order of their names.
@@ -68,7 +68,7 @@ def load_recording(
     check_commands(whole, system.actions, note)
     for raw in whole:
         check_units(raw, system)
-    parts = [part for raw in whole for part in steadied(_unwrapped(raw, system), note)]
+    parts = [part for raw in whole for part in uninterrupted(_unwrapped(raw, system), note)]
     parts, period = alike(_long_enough(parts, note), note)
     if period * FEWEST_ROWS > SHORTEST_EPISODE_S:
         raise RecordingError(

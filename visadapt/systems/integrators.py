@@ -1,4 +1,7 @@
-"""Fixed-step integrators of dy/dt = f(t, y). Hairer, Norsett and Wanner (1993), Solving ODEs I, section II.1."""
+"""One step of dy/dt = f(t, y) for B rows: y (B, n) from the time t (B,), by h s: one number, or (B,) a row's own.
+
+Hairer, Norsett and Wanner (1993), Solving ODEs I, section II.1.
+"""
 
 from __future__ import annotations
 
@@ -7,28 +10,35 @@ from collections.abc import Callable
 from torch import Tensor
 
 Derivative = Callable[[Tensor, Tensor], Tensor]
+Duration = float | Tensor
 
 
-def euler(f: Derivative, t: Tensor, y: Tensor, h: float) -> Tensor:
+def euler(f: Derivative, t: Tensor, y: Tensor, h: Duration) -> Tensor:
     """Explicit Euler, first order."""
-    return y + h * f(t, y)
+    return y + _column(h) * f(t, y)
 
 
-def midpoint(f: Derivative, t: Tensor, y: Tensor, h: float) -> Tensor:
+def midpoint(f: Derivative, t: Tensor, y: Tensor, h: Duration) -> Tensor:
     """Explicit midpoint rule (Runge 1895), second order."""
-    return y + h * f(t + h / 2, y + h / 2 * f(t, y))
+    step = _column(h)
+    return y + step * f(t + h / 2, y + step / 2 * f(t, y))
 
 
-def rk4(f: Derivative, t: Tensor, y: Tensor, h: float) -> Tensor:
+def rk4(f: Derivative, t: Tensor, y: Tensor, h: Duration) -> Tensor:
     """The classical Runge-Kutta method (Kutta 1901), fourth order."""
+    step = _column(h)
     k1 = f(t, y)
-    k2 = f(t + h / 2, y + h / 2 * k1)
-    k3 = f(t + h / 2, y + h / 2 * k2)
-    k4 = f(t + h, y + h * k3)
-    return y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    k2 = f(t + h / 2, y + step / 2 * k1)
+    k3 = f(t + h / 2, y + step / 2 * k2)
+    k4 = f(t + h, y + step * k3)
+    return y + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
-INTEGRATORS: dict[str, Callable[[Derivative, Tensor, Tensor, float], Tensor]] = {
+def _column(h: Duration) -> Duration:
+    return h[:, None] if isinstance(h, Tensor) else h
+
+
+INTEGRATORS: dict[str, Callable[[Derivative, Tensor, Tensor, Duration], Tensor]] = {
     "euler": euler,
     "midpoint": midpoint,
     "rk4": rk4,

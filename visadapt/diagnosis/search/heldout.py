@@ -117,12 +117,16 @@ def _rollouts(model: CandidateModel, theta: Tensor, state: Tensor, horizon: int,
     extra = torch.cat((extra, padding), 1)
     commands = model.commands(theta[None])[0]
     commands = torch.cat((commands, commands[:, -1:].expand(-1, horizon, -1, -1)), 1)
+    duration = torch.cat((rows.duration, rows.duration[:, -1:].expand(-1, horizon)), 1)
     world = model.at(theta)
-    out = [state]
+    time, out = rows.time, [state]
     for h in range(horizon):
-        time = (rows.time + h * rows.period).flatten()
-        acting = commands[:, h : h + length].flatten(0, 1)
-        after = world.integrate(time, out[-1].flatten(0, 1), acting).reshape(state.shape) + extra[:, h : h + length]
+        now = slice(h, h + length)
+        lasting = duration[:, now]
+        after = world.integrate(
+            time.flatten(), out[-1].flatten(0, 1), commands[:, now].flatten(0, 1), lasting.flatten()
+        )
+        time, after = time + lasting, after.reshape(state.shape) + extra[:, now]
         out.append(after.nan_to_num(STATE_LIMIT, STATE_LIMIT, -STATE_LIMIT).clamp(-STATE_LIMIT, STATE_LIMIT))
     return torch.stack(out, 2)
 

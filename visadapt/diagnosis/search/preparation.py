@@ -39,6 +39,7 @@ def prepare(recording: Recording, system: System) -> PreparedRecording:
     states = [torch.tensor(np.asarray(e.state, dtype=np.float64)) for e in recording.episodes]
     states = [sensor_checks.continuous_quaternion(values, quaternion) for values in states]
     commands = [torch.tensor(np.asarray(e.action, dtype=np.float64)) for e in recording.episodes]
+    stamps = [torch.tensor(np.asarray(e.time, dtype=np.float64)) for e in recording.episodes]
     repeats = find_repeats(states, channels, profile.angle_sensor)
 
     def windows(
@@ -47,7 +48,7 @@ def prepare(recording: Recording, system: System) -> PreparedRecording:
         """`rows` and `raw` of episodes or stretches of these, and a warning if not all windows are used."""
         all_used = [torch.ones_like(m) for m in measured]
         rows, raw = (
-            cut(measured, valid, commands, channels, recording.period, profile.window_rows, stretches)
+            cut(measured, valid, commands, stamps, channels, recording.period, profile.window_rows, stretches)
             for valid in (repeats.used, all_used)
         )
         count, length = rows.shape

@@ -82,7 +82,7 @@ def derived_velocities(system: System, rows: Segments) -> dict[str, float]:
     out = {}
     for k in velocities:
         velocity = state[..., rows.channels[k]]
-        acceleration = (velocity[:, 2:] - velocity[:, :-2]) / (2 * rows.period)
+        acceleration = (velocity[:, 2:] - velocity[:, :-2]) / (rows.time[:, 2:] - rows.time[:, :-2])
         used = inside * rows.used[:, 1:-1, k]
         error = rows.measured[:, 1:-1, k] - velocity[:, 1:-1]
         # Least squares of error = -lag acceleration.
