@@ -1,7 +1,10 @@
 """Repeated readings: rows that were lost, and angles at which a sensor stood still.
 
-Because of noise, a sensor in motion never gives the same number twice; where it does, the previous reading was
-repeated. Such readings do not measure the state: they are excluded from fits, and counted here.
+Because of noise, a sensor in motion hardly gives the same number twice; where it does, the previous reading was
+repeated. Such readings do not measure the state: they are excluded from fits, and counted here. An encoder gives the
+same number twice where the quantity moves by less than one of its steps: at turning points, and at rest. Equal readings
+therefore count as repeated only in runs that readings enter and leave at speed, and only where there are more of them
+than the encoder's steps explain.
 """
 
 from __future__ import annotations
@@ -14,9 +17,16 @@ from torch import Tensor
 
 from visadapt.estimation.segments import smallest_step
 
-MIN_JUMP_STEPS = 8
-"""Jump into or out of a run of equal readings, in steps of the sensor's resolution, above which the run counts as
-repeated; below, the quantity may have stood still."""
+MIN_JUMP_STEPS, MIN_OTHER_STEPS = 8, 1.5
+"""Changes into and out of a run of equal readings, in steps of the sensor's resolution, that the larger and the smaller
+must exceed for the run to be repeated; below, the quantity may have stood still."""
+
+MAX_CHANCE = 1e-3
+"""Probability that an encoder's steps give as many equal readings, below which they count as repeated."""
+
+NEAR_STEPS, NEAR_SHARE = 4.0, 0.2
+"""Changes up to this many steps, or up to this share of the median change, from which the frequency of changes of less
+than one step is estimated."""
 
 ZONE_EDGE_POINTS = 120  # Angles tried for either edge of the zone in which the angle sensor stands still
 
@@ -39,35 +49,60 @@ def find_repeats(
 
     `angle_sensor` are the columns of the angle, which may stand still on its own, and of its rate; empty without one.
     """
-    together = torch.cat(list(measured))
-    steps = [smallest_step(together[:, k]) for k in range(len(channels))]
+    changes = torch.cat([values.diff(dim=0) for values in measured])
+    steps = [smallest_step(torch.cat([values[:, k] for values in measured])) for k in range(len(channels))]
+    by_chance = [_equal_by_chance(changes[:, k], step) for k, step in enumerate(steps)]
     pole = torch.tensor([c in angle_sensor for c in channels], dtype=torch.bool)
     angle = channels.index(angle_sensor[0]) if angle_sensor and angle_sensor[0] in channels else None
-    used, lost, frozen = [], [], []
-    for values in measured:
-        same = torch.stack([_repeats(values[:, k], MIN_JUMP_STEPS * steps[k]) for k in range(len(channels))], 1)
-        whole = same.all(1)
-        # A rate from a separate sensor may go on while the angle stands still.
-        partial = same & pole & ~whole[:, None]
-        still = partial[:, angle] if angle is not None else torch.zeros_like(whole)
+    same = [torch.stack([_repeats(values[:, k], steps[k]) for k in range(len(channels))], 1) for values in measured]
+    lost = _unless_by_chance([each.all(1) for each in same], min(by_chance))
+    # A rate from a separate sensor may go on while the angle stands still.
+    frozen = [torch.zeros_like(whole) for whole in lost]
+    if angle is not None:
+        alone = [each[:, angle] & ~whole for each, whole in zip(same, lost, strict=True)]
+        frozen = _unless_by_chance(alone, by_chance[angle])
+    used = []
+    for each, whole, still in zip(same, lost, frozen, strict=True):
+        partial = each & pole & still[:, None]
         # The first reading after a standstill may still be mixed with the repeated value.
         waking = torch.zeros_like(partial)
         waking[1:] = partial[:-1] & ~partial[1:]
-        used.append(1.0 - (whole[:, None] | (still[:, None] & partial) | waking).double())
-        lost.append(whole)
-        frozen.append(still)
+        used.append(1.0 - (whole[:, None] | partial | waking).double())
     return RepeatedReadings(used, lost, frozen)
 
 
-def _repeats(readings: Tensor, jump: float) -> Tensor:
-    """(T,) rows that repeat the row before, in runs preceded or followed by a change of more than `jump`."""
+def _repeats(readings: Tensor, step: float) -> Tensor:
+    """(T,) rows that repeat the row before, in runs that readings of resolution `step` enter and leave at speed.
+
+    A run from the first row on may be a machine at rest; one up to the last row has no change that leaves it.
+    """
     change = readings.diff(prepend=readings[:1])
     same = change == 0
     same[0] = False
     # Rows of a run share a number; the jump into a run is the change at its first row, the jump out that of the next.
     run = (~same).cumsum(0) - 1
-    jumps = torch.cat((change[~same].abs(), torch.zeros(1, dtype=readings.dtype)))
-    return same & ((jumps[run] > jump) | (jumps[run + 1] > jump))
+    jumps = torch.cat((change[~same].abs(), readings.new_full((1,), torch.inf)))
+    smaller, larger = torch.minimum(jumps[run], jumps[run + 1]), torch.maximum(jumps[run], jumps[run + 1])
+    return same & (larger > MIN_JUMP_STEPS * step) & (smaller > MIN_OTHER_STEPS * step)
+
+
+def _equal_by_chance(change: Tensor, step: float) -> float:
+    """How many of the changes (N,) of a moving quantity are expected to be 0 by a resolution of `step`."""
+    size = change[change != 0].abs()
+    if not len(size) or step == 0:
+        return 0.0
+    near = max(NEAR_STEPS * step, NEAR_SHARE * float(size.median()))
+    return float((size <= near * (1 + 1e-6)).sum()) * step / (2 * near)
+
+
+def _unless_by_chance(equal: list[Tensor], expected: float) -> list[Tensor]:
+    """The marks (T,) of episodes; none where `expected` of them by chance explain their number (Poisson)."""
+    count = sum(int(marks.sum()) for marks in equal)
+    # Probability of at least `count`: the regularised lower incomplete gamma function.
+    explained = (
+        count == 0 or float(torch.special.gammainc(torch.tensor(float(count)), torch.tensor(expected))) > MAX_CHANCE
+    )
+    return [torch.zeros_like(marks) for marks in equal] if explained else equal
 
 
 def zone(repeated: Tensor, angle: Tensor, deviation: float) -> tuple[float, float, float]:

@@ -1,0 +1,59 @@
+"""Readings that a sensor repeats, told from those that an encoder's steps make equal."""
+
+import math
+
+import pytest
+import torch
+
+from visadapt.estimation.repeated_readings import find_repeats
+
+COUNTS = torch.tensor([1e-4, 2 * math.pi / 4096], dtype=torch.float64)  # m and rad
+ANGLE = (2, 3)  # columns of the state
+
+
+def moving(rows=600, period=0.05, noise=0.0):
+    """Position and angle (T, 2) of a cart-pole that swings, seen through encoders."""
+    time = period * torch.arange(rows).double()
+    motion = torch.stack((0.3 * (2.1 * time).sin(), 0.1 * (5.3 * time).sin() + 0.02 * (11.0 * time).sin()), 1)
+    motion = motion + noise * torch.randn(motion.shape, generator=torch.Generator().manual_seed(0)).double()
+    return (motion / COUNTS).round() * COUNTS
+
+
+def with_repeats(values, repeated, columns):
+    out = values.clone()
+    for row in repeated.nonzero()[:, 0].tolist():
+        out[row, columns] = out[row - 1, columns]
+    return out
+
+
+@pytest.mark.parametrize("period", [0.02, 0.05])
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_turning_points_of_an_encoder_are_measurements(period, noise):
+    values = moving(period=period, noise=noise)
+    assert bool((values.diff(dim=0)[:, 1] == 0).any())  # equal readings, which the steps explain
+    found = find_repeats([values], (0, 2), ANGLE)
+    assert not bool(found.lost[0].any() | found.frozen[0].any())
+    assert bool((found.used[0] == 1).all())
+
+
+def test_a_machine_at_rest_that_then_starts_has_lost_no_rows():
+    values = torch.cat((moving()[:1].expand(40, -1), moving()[5:]))
+    assert not bool(find_repeats([values], (0, 2), ANGLE).lost[0].any())
+
+
+def test_lost_rows_of_an_encoder_are_found():
+    values = moving()
+    lost = torch.rand(len(values), generator=torch.Generator().manual_seed(1)) < 0.1
+    lost[0] = lost[-1] = False
+    found = find_repeats([with_repeats(values, lost, [0, 1])], (0, 2), ANGLE).lost[0]
+    assert int((found & ~lost).sum()) <= 2
+    assert int((lost & ~found).sum()) <= 0.1 * int(lost.sum())
+
+
+def test_an_angle_that_stands_still_in_a_zone_of_an_encoder_is_found():
+    values = moving()
+    frozen = (values[:, 1] > 0.02) & (values[:, 1] < 0.05)
+    frozen[0] = False
+    found = find_repeats([with_repeats(values, frozen, [1])], (0, 2), ANGLE).frozen[0]
+    assert int((found & ~frozen).sum()) <= 2
+    assert int((frozen & ~found).sum()) <= 0.1 * int(frozen.sum())
