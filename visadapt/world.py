@@ -13,6 +13,7 @@ from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, Parameter,
 from visadapt.effects.base import expect
 from visadapt.history import History
 from visadapt.systems import SYSTEMS, System
+from visadapt.systems.dry_friction import sliding, stopped
 from visadapt.systems.integrators import INTEGRATORS, Duration
 
 
@@ -190,8 +191,10 @@ class World(nn.Module):
         return self._read(state, self._split(self._at_rest(state))[1], None)[0]
 
     def load(self, at: WorldState) -> Tensor:
-        """Sum of the loads (B, n_load) of all effects at an instant."""
-        return self._load(at.time, at.state, self.system_at(at))
+        """Sum of the loads (B, n_load) of all effects at an instant, with dry friction on what moves."""
+        system = self.system_at(at)
+        load, limits = self._load(at.time, at.state, system), self._dry_friction(at.time, at.state, system)
+        return load if limits is None else load + sliding(limits, at.state[:, self._velocities])
 
     def system_at(self, at: WorldState) -> System:
         """The system with the parameters that effects give it at an instant."""
@@ -245,13 +248,16 @@ class World(nn.Module):
         h: Duration = (self.period if duration is None else duration) / self.substeps
         integrate = INTEGRATORS[self.integrator]
         for k in range(self.substeps):
-            command = commands[:, k]
+            command, here = commands[:, k], self._varied(system, time, state)
+            limits = self._dry_friction(time, state, here)
+            friction = 0.0 if limits is None else sliding(limits, state[:, self._velocities])
 
-            def derivative(t: Tensor, s: Tensor, u: Tensor = command) -> Tensor:
+            def derivative(t: Tensor, s: Tensor, u: Tensor = command, rub: float | Tensor = friction) -> Tensor:
                 now = self._varied(system, t, s)
-                return now.derivative(s, u, self._load(t, s, now))
+                return now.derivative(s, u, self._load(t, s, now) + rub)
 
-            state = integrate(derivative, time, state, h)
+            after = integrate(derivative, time, state, h)
+            state = after if limits is None else stopped(here, state, after, command, limits, h)
             time = time + h
         return state
 
@@ -269,6 +275,16 @@ class World(nn.Module):
         for effect in self._dynamics:
             system = effect.vary(system, time, state)
         return system
+
+    @property
+    def _velocities(self) -> list[int]:
+        return [velocity for _, velocity in self.system.coordinates]
+
+    def _dry_friction(self, time: Tensor, state: Tensor, system: System) -> Tensor | None:
+        """Sum over all effects of the largest dry friction; None without any."""
+        found = [effect.dry_friction(time, state, system) for effect in self._dynamics]
+        limits = [each for each in found if each is not None]
+        return sum(limits[1:], limits[0]) if limits else None
 
     def _load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         load = torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)

@@ -249,8 +249,8 @@ def stick_slip(y, push, friction):
 
 
 class TestCoulombFriction:
-    @pytest.mark.parametrize(("friction", "millimetres"), [(0.5, 0.8), (2.0, 2.5), (6.0, 9.0)])
-    def test_half_a_second_ahead_it_is_close_to_exact_stick_and_slip(self, friction, millimetres):
+    @pytest.mark.parametrize("friction", [0.5, 2.0, 6.0])
+    def test_half_a_second_ahead_it_is_exact_stick_and_slip(self, friction):
         generator, ahead = np.random.default_rng(0), 10
         states, actions, stuck, excitation = [np.array([0.1, 0.0, 0.03, 0.0])], [], 0, 0.0
         for k in range(120):
@@ -270,28 +270,37 @@ class TestCoulombFriction:
             reached = run(world, true[:count], plan)[-1]
             return 1e3 * float((reached - true[ahead : ahead + count])[:, 0].square().mean().sqrt())
 
-        class Textbook(CoulombFriction):
-            def push(self, time, state, system):
-                return -self.value("force", state) * state[:, 1].sign()
+        # A fifth of the noise of good sensors, 1 mm and 1 mrad.
+        assert error(CoulombFriction(force=friction).double(), 4) < 0.2
 
-        assert error(Textbook(force=friction).double(), 50) < 0.1 * friction
-        smooth = CoulombFriction(force=friction).double()
-        assert error(smooth, 4) < millimetres
-        assert error(smooth, 4) < 0.02 * error(CoulombFriction(force=0.0).double(), 4)
-
-    def test_beyond_one_and_a_half_widths_it_is_the_textbook_force(self):
-        speed = torch.tensor([0.05, -0.06, 0.0, 5.0], dtype=torch.float64)
+    def test_it_is_the_textbook_force_on_a_cart_that_moves(self):
         state = torch.zeros(4, 4, dtype=torch.float64)
-        state[:, 1] = speed
-        load = CoulombFriction(force=6.0).double().load(torch.zeros(4), state, CartPole())
-        assert load[:, 0].tolist() == pytest.approx([-6.0, 6.0, 0.0, -6.0])
+        state[:, 1] = torch.tensor([0.05, -0.06, 0.0, 5.0])
+        world = World(CartPole(), [CoulombFriction(force=6.0).double()])
+        load = world.load(world.start(state))
+        assert load[:, 0].tolist() == [-6.0, 6.0, 0.0, -6.0]
         assert not load[:, 1].any()
 
-    def test_steps_of_12_5_ms_bring_a_cart_to_rest_without_swinging_about_it(self):
-        world = World(CartPole(), [CoulombFriction(force=torch.tensor([0.1, 1.0, 6.0]))], PERIOD, "rk4", 4)
-        seen = run(
-            world.requires_grad_(False), torch.tensor([[0.0, 0.3, math.pi, 0.0]]).repeat(3, 1), [columns(0.0)] * 8
-        )
+    def test_a_cart_comes_to_rest_and_sticks_while_the_pole_pulls_at_it(self):
+        world = World(CartPole(), [CoulombFriction(force=torch.tensor([1.0, 6.0]))], PERIOD, "rk4", 4)
         # The pole, hanging, swings and pulls at the cart: less than 1 N.
-        assert bool((seen[-1, 1:, 1].abs() < 0.006).all())
-        assert bool((seen[..., 1] > -0.01).all())
+        start = torch.tensor([[0.0, 0.3, math.pi, 0.0]]).repeat(2, 1)
+        seen = run(world.requires_grad_(False), start, [columns(0.0)] * 12)
+        assert not bool(seen[-4:, :, 1].any())
+        torch.testing.assert_close(seen[-4:, :, 0], seen[-1:, :, 0].expand(4, -1), rtol=0, atol=1e-6)
+        assert bool((seen[..., 1] >= 0).all())
+
+    @pytest.mark.parametrize("speed", [0.02, -0.02, 0.3, 0.0])
+    def test_gradients_agree_with_finite_differences_in_sliding_stopping_and_sticking(self, speed):
+        world = World(CartPole(), [CoulombFriction(force=2.0).double()], PERIOD, "rk4", 4)
+        state = torch.tensor([[0.1, speed, 0.02, 0.1]], dtype=torch.float64)
+
+        def after(force, velocity):
+            moved = state.clone()
+            moved[:, 1] = velocity
+            return world.with_values(force).step(world.start(moved), columns(0.12).double()).state
+
+        force, velocity = torch.tensor([2.0]).double(), torch.tensor(speed).double()
+        assert torch.autograd.gradcheck(
+            after, (force.requires_grad_(), velocity.requires_grad_(speed != 0)), eps=1e-7, atol=1e-5
+        )

@@ -16,6 +16,7 @@ from visadapt.diagnosis.result import (
     UNEXPLAINED,
     Cause,
     Diagnosis,
+    Gap,
     RecordingSummary,
     Region,
     Where,
@@ -27,8 +28,10 @@ from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
+from visadapt.diagnosis.search.unexplained import black_box_functions
 from visadapt.effects import EFFECTS, Effect
 from visadapt.effects.catalogue import catalogue as all_effects, twins
+from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.effect_fit import remembers
 from visadapt.estimation.profiles import profile_of
 from visadapt.progress import Report, staged
@@ -41,6 +44,12 @@ MIN_GAP_CLOSED = 0.95
 
 CLEAR_OF_NOISE = 3.0
 """Error of the corrected predictions over the noise, above which the share of the gap closed decides the verdict."""
+
+AT_BOUND = 1e-3  # Distance from an end of its range, as a share of it, within which a strength is at that end
+
+MIN_CLOSED_TO_EXPLAIN = 0.5
+"""Share of the gap that the best set must close for what it leaves to be the next thing to look into; else it is what
+the source leaves."""
 
 RUNNERS_UP = 2  # Sets after the best for which the share of the gap that they close is computed
 
@@ -90,9 +99,10 @@ def diagnose(
     effects = list(all_effects(system) if catalogue is None else catalogue)
     if policy is not None:
         policy_bound.check(policy, system)
-    prepared = prepare(recording, system)
+    candidates = searched(effects, system)
+    prepared = prepare(recording, system, candidates)
     rows = prepared.rows
-    search = Search(system, rows, searched(effects, system), prepared.source)
+    search = Search(system, rows, candidates, prepared.source)
     search.run(staged(progress, "search"))
     comparison = compare(search)
     best = comparison.best
@@ -133,8 +143,8 @@ def diagnose(
         causes=found,
         ranking=ranking(comparison, effects, system, gap_closed, repeat_causes),
         gap=errors.gap(),
-        next_experiment=_next(comparison, verdict, groups, system),
-        warnings=(*recording.warnings, *prepared.warnings, *_warnings(comparison, verdict)),
+        next_experiment=_next(search, comparison, verdict, groups, errors.gap()),
+        warnings=(*recording.warnings, *prepared.warnings, *_warnings(comparison, verdict), *_at_bounds(comparison)),
         figures=figure_data(search, source, corrected, errors, before, after, regions),
         policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, best),
     )
@@ -185,13 +195,31 @@ def _regions(
     return (*fitted, *(one for one in regions_of(disturbance, seed) if one.variable not in taken))
 
 
-def _next(comparison: ModelComparison, verdict: str, groups: Sequence[Sequence[Alternative]], system: System) -> str:
+def _next(
+    search: Search, comparison: ModelComparison, verdict: str, groups: Sequence[Sequence[Alternative]], gap: Gap
+) -> str:
     if verdict == NO_GAP:
-        return next_experiment.more(profile_of(system))
+        return next_experiment.more(search.profile)
     if verdict == UNEXPLAINED:
         first = comparison.functions[0]
+        if not gap.closed >= MIN_CLOSED_TO_EXPLAIN:
+            source = CandidateModel(search.system, (), search.rows)
+            first = black_box_functions(source, search.source.fits)[0]
         return next_experiment.explain(first.port, first.variable)
-    return next_experiment.separate([[one.effect for one in group] for group in groups], system)
+    return next_experiment.separate([[one.effect for one in group] for group in groups], search.system)
+
+
+def _at_bounds(comparison: ModelComparison) -> list[str]:
+    """A warning for each strength that the best set has at an end of the range searched."""
+    table = [(effect, parameter) for effect in comparison.best.effects for parameter in effect.table]
+    return [
+        f"{effect.name}: {parameter.name} is at {end:g} {parameter.unit}, the end of the range searched; the truth may "
+        "lie beyond it, and the other causes are then wrong as well"
+        for (effect, parameter), value in zip(table, comparison.best.fits.theta[0].tolist(), strict=True)
+        for end in (parameter.low, parameter.high)
+        if parameter.is_strength and end != parameter.neutral
+        if abs(value - end) < AT_BOUND * (parameter.high - parameter.low)
+    ]
 
 
 def _warnings(comparison: ModelComparison, verdict: str) -> list[str]:

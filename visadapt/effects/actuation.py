@@ -64,7 +64,7 @@ class ActuatorDelay(ActuationEffect):
         whole = torch.cat((torch.zeros_like(whole[:, :1]), whole), 1)
         # ... and up to a delay before each edge of the present substeps: its differences are the delayed impulses.
         wanted = (edge[:, -count - 1 :] - self.value("delay", commands).expand(batch)[:, None]).clamp_min(0)
-        left = (torch.searchsorted(edge.detach(), wanted.detach(), right=True) - 1).clamp(0, past.shape[1] - 1)
+        left = (torch.searchsorted(edge.detach(), wanted.detach()) - 1).clamp(0, past.shape[1] - 1)
         columns = left[..., None].expand(-1, -1, width)
         inside = (wanted - edge.gather(1, left))[..., None]
         impulse = whole.gather(1, columns) + inside * past[..., :-1].gather(1, columns)

@@ -120,7 +120,7 @@ class Effect(nn.Module):
                 f"got {', '.join(sorted(values)) or 'none'}"
             )
         for key, value in values.items():
-            self.register_parameter(key, nn.Parameter(torch.as_tensor(value, dtype=torch.get_default_dtype())))
+            self._parameters[key] = nn.Parameter(torch.as_tensor(value, dtype=torch.get_default_dtype()))
 
     def with_values(self, values: Tensor) -> Self:
         """The same effect with other parameters: (P,) in the order of `table`, or (B, P), a row for each batch row."""
@@ -215,9 +215,16 @@ class DynamicsEffect(Effect):
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         """Load (B, n_load) at the time (B,) since the start of the episode, in a state (B, n_state).
 
-        `system` has been altered and varied by all effects.
+        `system` has been altered and varied by all effects. Dry friction is no load: see `dry_friction`.
         """
         return torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)
+
+    def dry_friction(self, time: Tensor, state: Tensor, system: System) -> Tensor | None:
+        """The largest dry friction (B, n_load, 2) against positive and against negative motion; None without any.
+
+        Constant over an integration step; arguments as those of `load`.
+        """
+        return None
 
 
 Reading: TypeAlias = tuple[Tensor, Tensor]  # what a sensor reads of a row (B, n_state), and its new memory

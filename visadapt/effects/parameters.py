@@ -37,7 +37,7 @@ class CartMass(ParameterScale):
     name = "cart_mass"
     equation = "M = scale M_source"
     source = "Barto, Sutton and Anderson (1983), appendix, the cart's mass"
-    table = (Parameter("scale", "1", 0.3, 8.0, 1.0),)
+    table = (Parameter("scale", "1", 0.05, 20.0, 1.0),)
     systems = (CartPole,)
     scaled: ClassVar[dict[str, str]] = {"scale": "cart_mass"}
 
@@ -48,7 +48,7 @@ class PoleMass(ParameterScale):
     name = "pole_mass"
     equation = "m = scale m_source"
     source = "Barto, Sutton and Anderson (1983), appendix, the pole's mass"
-    table = (Parameter("scale", "1", 0.05, 5.0, 1.0),)
+    table = (Parameter("scale", "1", 0.02, 20.0, 1.0),)
     systems = (CartPole,)
     scaled: ClassVar[dict[str, str]] = {"scale": "pole_mass"}
 
@@ -59,6 +59,6 @@ class PoleLength(ParameterScale):
     name = "pole_length"
     equation = "l = scale l_source"
     source = "Barto, Sutton and Anderson (1983), appendix, the pole's half-length"
-    table = (Parameter("scale", "1", 0.4, 2.5, 1.0),)
+    table = (Parameter("scale", "1", 0.2, 5.0, 1.0),)
     systems = (CartPole,)
     scaled: ClassVar[dict[str, str]] = {"scale": "pole_half_length"}

@@ -18,7 +18,7 @@ from visadapt.systems import System
 
 Effects = tuple[type[Effect], ...]
 
-QUICK, CAREFUL = (8, COARSE), (20, FINE)
+QUICK, CAREFUL = (12, COARSE), (20, FINE)
 """Iterations and integration accuracy of a fit in the search, and of one whose result is reported."""
 
 

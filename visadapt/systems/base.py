@@ -54,6 +54,8 @@ class System(ABC):
     actions: ClassVar[tuple[Variable, ...]]
     loads: ClassVar[tuple[Variable, ...]]
     """Generalised forces that a dynamics effect may add, one entry per degree of freedom."""
+    coordinates: ClassVar[tuple[tuple[int, int], ...]] = ()
+    """For each load the columns of the position and the velocity that it acts on; dry friction needs them."""
 
     @abstractmethod
     def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:

@@ -45,6 +45,7 @@ class CartPole(System):
         Variable("cart_force", "N", -100.0, 100.0),
         Variable("pivot_torque", "N m", -100.0, 100.0),
     )
+    coordinates: ClassVar[tuple[tuple[int, int], ...]] = ((0, 1), (2, 3))
 
     def __post_init__(self) -> None:
         self.check_parameters()

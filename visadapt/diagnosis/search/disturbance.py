@@ -42,10 +42,9 @@ def disturbance(model: CandidateModel, fits: FitState, log_process: Tensor) -> D
     _, adjoint = backward(problem, forward(problem, process, noise))
     added = -(adjoint[..., 0] @ process)[:, 1:, driven]
     by_load = loads_of(model, fits)[:, :, driven]
-    # The padding has no response to a load; any invertible matrix serves there.
+    # A coordinate that sticks has no response to a load, nor has the padding: the least load that acts is 0 there.
     valid = rows.inside[:, 1:]
-    by_load = torch.where(valid[..., None, None] > 0, by_load, torch.eye(len(driven), dtype=by_load.dtype))
-    load = torch.linalg.solve(by_load, added[..., None])[..., 0] * valid[..., None]
+    load = (torch.linalg.pinv(by_load, rtol=1e-6) @ added[..., None])[..., 0] * valid[..., None]
     variables = {name: values[:, :-1] for name, values in variables_of(model, fits.state[0]).items()}
     variables["episode"] = rows.episode[:, None].double().expand_as(valid)
     return Disturbance(load, valid, variables)

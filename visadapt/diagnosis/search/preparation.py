@@ -11,6 +11,7 @@ from torch import Tensor
 
 from visadapt.diagnosis.search import sensor_checks
 from visadapt.diagnosis.search.search import Search
+from visadapt.effects import Effect
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.repeated_readings import RepeatedReadings, find_repeats
@@ -31,8 +32,8 @@ class PreparedRecording:
     source: FitState | None = None  # the fit of the source to `rows`, if a check needed it
 
 
-def prepare(recording: Recording, system: System) -> PreparedRecording:
-    """Prepare a recording of some or all states, and the commands, of a system."""
+def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effect]] = ()) -> PreparedRecording:
+    """Prepare a recording of some or all states, and the commands; `catalogue` are the effects that may be there."""
     profile = profile_of(system)
     channels = tuple(system.index(name) for name in recording.measured)
     quaternion = [k for k, channel in enumerate(channels) if channel in profile.quaternion]
@@ -92,7 +93,7 @@ def prepare(recording: Recording, system: System) -> PreparedRecording:
         rows, raw = rows.with_channels(kept), raw.with_channels(kept)
     # After the velocities, since those that lag make the wrong sign likelier.
     fitted = source if rows is unchecked else None
-    convention = sensor_checks.opposite_signs(system, rows, source, fitted)
+    convention = sensor_checks.opposite_signs(system, rows, catalogue, source, fitted)
     if convention is not None:
         rows, raw = (sensor_checks.to_source(each, convention, profile.angle_sensor) for each in (rows, raw))
         fitted = None

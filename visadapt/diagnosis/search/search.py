@@ -1,10 +1,16 @@
-"""The search over sets of effects: add, remove and exchange effects while that raises the posterior odds."""
+"""The search over sets of effects: add, remove and exchange effects while that raises the posterior odds.
+
+Every effect is fitted alone. Sets then grow, and those near the best are tried: with one effect fewer, with one
+exchanged, and with two exchanged for one, since two effects often imitate a third (a weaker motor and a lighter pole, a
+heavier cart).
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import torch
 from torch import Tensor
@@ -32,16 +38,21 @@ from visadapt.systems import System
 MAX_EFFECTS = 6  # Effects in a set at most
 
 MAX_CANDIDATES, MAX_EXCHANGES = 8, 5
-"""Effects that are fitted in addition to each set when sets grow, and when one effect is exchanged."""
+"""Effects that are fitted in addition to each set when sets grow, and when effects are exchanged."""
+
+EXCHANGE_LOG_PROCESS = math.log(0.003**2)
+"""Least log variance of the velocities' process noise, (m/s)^2 and (rad/s)^2, with which a fit starts after an
+exchange: room for what the new effect does not yet explain, and little to shed where it explains all."""
 
 WIDEN_ABOVE = 5.0
 WIDEN_MODELS = 6
 """Log likelihood that process noise adds to the best set, above which the search is widened, and to how many of the
 best sets of one and of two effects."""
 
-POLISH_WITHIN = 8.0
+POLISH_WITHIN, POLISH_SIMPLER_WITHIN = 8.0, 60.0
 POLISH_MODELS = 8
-"""Log posterior odds behind the best within which sets are fitted carefully, and the most of them."""
+"""Log posterior odds behind the best within which sets are fitted carefully, sets with fewer parameters within more,
+since a quick fit of a set that is right may not have shed all its process noise; and the most of them."""
 
 
 @dataclass(frozen=True)
@@ -74,14 +85,19 @@ class Search:
         self.fitted: dict[frozenset[str], ScoredModel] = {}
         self._slopes: tuple[Tensor, Tensor] | None = None
         self._screened: dict[tuple[str, ...], tuple[FitState, list[Candidate]]] = {}
+        self._exchanged: set[tuple[tuple[str, ...], frozenset[str]]] = set()
         if source is None:
             self.fit([((), initial_fit(system, rows))], CAREFUL)
         else:
             self.fitted[frozenset()] = ScoredModel((), source, float(source.likelihood[0]))
 
     def run(self, progress: Progress | None = None) -> None:
-        """Grow sets while that raises the posterior odds; then try sets that differ in one effect."""
+        """Fit every effect alone, grow sets while that raises the posterior odds, then try sets near the best."""
         beam = [self.source]
+        if self.profile.fit_all_alone:
+            leads = {one.effect: one.values for one in self._screening(self.source)}
+            every = [((e,), with_effect(self.source.fits, leads.get(e, neutral(e)))) for e in self.catalogue]
+            self.fit(every, QUICK)
         for size in range(MAX_EFFECTS):
             if progress is not None:
                 progress(size, MAX_EFFECTS, -self.best.log_odds)
@@ -141,38 +157,51 @@ class Search:
 
     def _candidates(self, base: ScoredModel) -> list[Candidate]:
         """Effects whose screening promises enough to fit them in addition to a set, the largest gain first."""
-        fits, candidates = self._screened.get(base.names, (None, []))
+        return self._promising(self._screening(base))
+
+    def _screening(self, base: ScoredModel) -> list[Candidate]:
+        """All other effects that raise the likelihood of a fitted set."""
+        fits, screened = self._screened.get(base.names, (None, []))
         if fits is not base.fits:
             rest = [e for e in self.catalogue if e not in base.effects]
             screened = screen(self.system, base.effects, base.fits, self.rows, rest)
-            profile = self.profile
-            relative = profile.min_gain_share * max((one.gain for one in screened), default=0.0)
+            self._screened[base.names] = base.fits, screened
+        return screened
 
-            def required(one: Candidate) -> float:
-                return max(relative, profile.min_gain + profile.min_gain_per_parameter * len(one.values))
+    def _promising(self, screened: Sequence[Candidate]) -> list[Candidate]:
+        profile = self.profile
+        relative = profile.min_gain_share * max((one.gain for one in screened), default=0.0)
 
-            candidates = [one for one in screened if one.gain >= required(one)]
-            self._screened[base.names] = base.fits, candidates
-        return candidates
+        def required(one: Candidate) -> float:
+            return max(relative, profile.min_gain + profile.min_gain_per_parameter * len(one.values))
+
+        return [one for one in screened if one.gain >= required(one)]
 
     def neighbours(self, centre: ScoredModel) -> None:
-        """Fit the sets with one effect removed, and with one exchanged for another."""
-        smaller = []
-        starts = []
-        for removed in centre.effects:
-            effects = tuple(e for e in centre.effects if e is not removed)
-            key = frozenset(e.name for e in effects)
-            if key in self.fitted and not self.profile.refit_subsets:
-                smaller.append(self.fitted[key])
-            else:
-                starts.append((effects, _without(centre, removed)))
-        smaller += self.fit(starts, QUICK)
-        self.extend(smaller, MAX_EXCHANGES)
+        """Fit the sets with one effect removed, with one exchanged for another, and with two exchanged for one."""
+        smaller = [_without(centre, [removed]) for removed in centre.effects]
+        known = set() if self.profile.refit_subsets else self.fitted.keys()
+        self.fit([each for each in smaller if frozenset(e.name for e in each[0]) not in known], QUICK)
+        exchanges = []
+        for removed in (*combinations(centre.effects, 1), *combinations(centre.effects, 2)):
+            # Along the states of the whole set what is removed shows as a disturbance, without a fit of what is left.
+            kept, fits = _without(centre, removed)
+            rest = [e for e in self.catalogue if e not in centre.effects]
+            for candidate in self._promising(screen(self.system, kept, fits, self.rows, rest))[:MAX_EXCHANGES]:
+                effects, names = (*kept, candidate.effect), frozenset(e.name for e in (*kept, candidate.effect))
+                if (centre.names, names) not in self._exchanged:
+                    self._exchanged.add((centre.names, names))
+                    process = centre.fits.log_process.clamp(min=EXCHANGE_LOG_PROCESS)
+                    exchanges.append((effects, replace(with_effect(fits, candidate.values), log_process=process)))
+        self.fit(exchanges, QUICK)
 
     def polish(self) -> None:
         """Fit carefully the sets close to the best, and the best set less each effect, with which it is compared."""
         best = self.best
-        close = [f for f in self.ranked if f.log_odds > best.log_odds - POLISH_WITHIN][:POLISH_MODELS]
+        fewer = [f.fits.theta.shape[1] < best.fits.theta.shape[1] for f in self.ranked]
+        within = [POLISH_SIMPLER_WITHIN if simpler else POLISH_WITHIN for simpler in fewer]
+        close = [f for f, most in zip(self.ranked, within, strict=True) if f.log_odds > best.log_odds - most]
+        close = close[:POLISH_MODELS]
         smaller = [self.fitted.get(frozenset(best.names) - {name}) for name in best.names]
         close += [f for f in smaller if f is not None and all(f is not other for other in close)]
         self.fit([(f.effects, f.fits) for f in close], CAREFUL)
@@ -187,9 +216,7 @@ class Search:
     def exchange(self, whole: ScoredModel, removed: type[Effect], new: type[Effect]) -> ScoredModel:
         """A set with one of its effects exchanged for another."""
         kept = tuple(e for e in whole.effects if e is not removed)
-        base = (
-            self.fitted.get(frozenset(e.name for e in kept)) or self.fit([(kept, _without(whole, removed))], QUICK)[0]
-        )
+        base = self.fitted.get(frozenset(e.name for e in kept)) or self.fit([_without(whole, [removed])], QUICK)[0]
         return self.fit([((*base.effects, new), self._start(base, new))], CAREFUL)[0]
 
     def _start(self, base: ScoredModel, effect: type[Effect]) -> FitState:
@@ -229,11 +256,11 @@ class Search:
         return torch.ones(count, self.rows.shape[0], dtype=torch.float64)
 
 
-def _without(whole: ScoredModel, removed: type[Effect]) -> FitState:
-    """A start for a set less one of its effects."""
-    kept = [e is not removed for e in whole.effects for _ in e.table]
+def _without(whole: ScoredModel, removed: Sequence[type[Effect]]) -> tuple[Effects, FitState]:
+    """A set less some of its effects, and a start for its fit."""
+    kept = [e not in removed for e in whole.effects for _ in e.table]
     base = whole.fits
     theta = base.theta[:, torch.tensor(kept, dtype=torch.bool)]
     # The removed effect then acts as a disturbance; a fit that starts with too little process noise would not find it.
     process = base.log_process.clamp(min=math.log(0.02**2))
-    return replace(base, theta=theta, log_process=process)
+    return tuple(e for e in whole.effects if e not in removed), replace(base, theta=theta, log_process=process)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from visadapt.diagnosis.search.disturbance import disturbance
 from visadapt.diagnosis.search.search import Search
+from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import Convention, profile_of
@@ -25,6 +26,10 @@ and sensors are checked."""
 MIN_GAIN_PER_READING = 0.1
 """Log likelihood per reading that another convention must gain to be taken for that of the recording."""
 
+EFFECTS_WITH_SIGNS, LEADS_WITH_SIGNS = 2, 3
+"""Effects that are added one by one to the source in either convention before that is decided, since a large effect can
+look like a wrong sign; and how many are tried for each."""
+
 
 def continuous_quaternion(measured: Tensor, quaternion: Sequence[int]) -> Tensor:
     """An episode (T, m) whose quaternion, in these columns, does not jump to the opposite sign."""
@@ -37,22 +42,31 @@ def continuous_quaternion(measured: Tensor, quaternion: Sequence[int]) -> Tensor
     return out
 
 
-def opposite_signs(system: System, rows: Segments, source: FitState, fitted: FitState | None) -> Convention | None:
+def opposite_signs(
+    system: System, rows: Segments, catalogue: Sequence[type[Effect]], source: FitState, fitted: FitState | None
+) -> Convention | None:
     """The convention in which the recording is far likelier than in the source's, if there is one.
 
-    `source` is a fit of the source before bad readings were excluded, `fitted` that to `rows`, if known.
+    `catalogue` are the effects that may be present, `source` is a fit of the source before bad readings were excluded,
+    `fitted` that to `rows`, if known.
     """
     profile = profile_of(system)
     if not profile.sign_conventions or float(source.log_process.max()) < SUSPICIOUS_LOG_PROCESS:
         return None
-    fitted = fitted or Search(system, rows, ()).source.fits
-    likelihoods = [
-        float(Search(system, to_source(rows, other, profile.angle_sensor), ()).source.fits.likelihood[0])
-        for other in profile.sign_conventions
-    ]
-    best = max(range(len(likelihoods)), key=likelihoods.__getitem__)
-    gained = likelihoods[best] - float(fitted.likelihood[0])
-    return profile.sign_conventions[best] if gained > MIN_GAIN_PER_READING * float(rows.used.sum()) else None
+    required = MIN_GAIN_PER_READING * float(rows.used.sum())
+    own = Search(system, rows, catalogue, fitted)
+    others = [Search(system, to_source(rows, c, profile.angle_sensor), catalogue) for c in profile.sign_conventions]
+    best = max(range(len(others)), key=lambda k: _likelihood(others[k]))
+    if _likelihood(others[best]) - _likelihood(own) <= required:
+        return None
+    for search in (own, others[best]):
+        for _ in range(EFFECTS_WITH_SIGNS):
+            search.extend([search.best], LEADS_WITH_SIGNS)
+    return profile.sign_conventions[best] if _likelihood(others[best]) - _likelihood(own) > required else None
+
+
+def _likelihood(search: Search) -> float:
+    return float(search.best.fits.likelihood[0])
 
 
 def to_source(rows: Segments, convention: Convention, angle_sensor: Sequence[int]) -> Segments:
@@ -69,26 +83,24 @@ MAX_LAG = 0.2
 def derived_velocities(system: System, rows: Segments) -> dict[str, float]:
     """Names of velocities that lag behind the slope of their position, with the lag in s.
 
-    Differences of past positions lag, and filtered ones do more. Position and slope are those of the states that the
-    source fits to the positions alone.
+    Differences of past positions lag, and filtered ones do more. Readings alone decide, so that no model has to be
+    right: the slope between the rows before and after a row does not lag.
     """
     position_of = profile_of(system).position_of
-    positions = [k for k, channel in enumerate(rows.channels) if channel not in position_of]
-    velocities = [k for k, channel in enumerate(rows.channels) if position_of.get(channel) in rows.channels]
-    if not velocities:
-        return {}
-    state = Search(system, rows.with_channels(positions), ()).source.fits.state[0]
+    span = rows.time[:, 2:] - rows.time[:, :-2]
     inside = rows.inside[:, 2:] * rows.inside[:, :-2]
     out = {}
-    for k in velocities:
-        velocity = state[..., rows.channels[k]]
-        acceleration = (velocity[:, 2:] - velocity[:, :-2]) / (rows.time[:, 2:] - rows.time[:, :-2])
-        used = inside * rows.used[:, 1:-1, k]
-        error = rows.measured[:, 1:-1, k] - velocity[:, 1:-1]
+    for k, channel in enumerate(rows.channels):
+        if position_of.get(channel) not in rows.channels:
+            continue
+        position, velocity = rows.measured[..., rows.channels.index(position_of[channel])], rows.measured[..., k]
+        acceleration = (velocity[:, 2:] - velocity[:, :-2]) / span
+        error = velocity[:, 1:-1] - (position[:, 2:] - position[:, :-2]) / span
+        used = inside * rows.used[..., k].unfold(1, 3, 1).amin(-1)
         # Least squares of error = -lag acceleration.
         lag = float(-(error * acceleration * used).sum() / (acceleration.square() * used).sum())
         if lag > MAX_LAG * rows.period:
-            out[system.states[rows.channels[k]].name] = lag
+            out[system.states[channel].name] = lag
     return out
 
 
