@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from itertools import permutations
 from typing import Any
 
+from datasets.blind.kinds import STRIBECK
 from visadapt.effects import EFFECTS, Role
 from visadapt.estimation.profiles import PROFILES
 
@@ -34,8 +35,10 @@ class Truth:
     @classmethod
     def of(cls, recording: dict[str, Any]) -> Truth:
         """From the key's JSON."""
-        effects = {e["effect"]: e["parameters"] for e in recording["effects"]}
-        return cls(recording["kind"], effects, {e["effect"]: e["strength"] for e in recording["effects"]})
+        effects = {e["effect"]: _as_in_the_catalogue(e["effect"], e["parameters"]) for e in recording["effects"]}
+        # An effect that was foreign when the set was made, and has joined the catalogue since, is to be found.
+        kind = "single" if recording["kind"] == "foreign" and effects.keys() <= EFFECTS.keys() else recording["kind"]
+        return cls(kind, effects, {e["effect"]: e["strength"] for e in recording["effects"]})
 
 
 @dataclass
@@ -68,6 +71,14 @@ class Score:
     """whether a 90 % interval contains the truth, for every parameter of correctly named causes"""
     overlaps: list[float] = field(default_factory=list)
     """intersection over union of the region of a patch, gust or frozen zone with the answer's; 0 if it has none"""
+
+
+def _as_in_the_catalogue(effect: str, parameters: dict[str, float]) -> dict[str, float]:
+    """Parameters under the catalogue's names."""
+    if effect == STRIBECK:
+        force = parameters["force"]
+        return {"force": 0.1 * force, "breakaway": force, "velocity": parameters["speed"]}
+    return parameters
 
 
 def classes(answer: Answer) -> list[set[str]]:

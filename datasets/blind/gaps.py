@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 
 from datasets.blind.control import draw_driver
-from datasets.blind.kinds import FOREIGN, INSEPARABLE, KINDS, NAMED, REST, Effects, Shape
+from datasets.blind.kinds import INSEPARABLE, KINDS, REST, Effects, Shape, drawn
 from datasets.blind.plant import PERIOD, Array
 from datasets.blind.sealing import key_path, names, seal
 from datasets.blind.simulation import Case, Run, simulate
@@ -178,7 +178,7 @@ def _stayed(run: Run) -> bool:
 def _draw_kinds(rng: np.random.Generator, mixture: str, effects: Effects) -> list[str]:
     if mixture == "none" and (effects == "rest" or (effects == "all" and rng.random() < 0.5)):
         return [REST[int(rng.integers(len(REST)))].name]
-    kinds = FOREIGN if mixture == "foreign" else NAMED
+    kinds = drawn(mixture, effects)
     while True:
         chosen = [kinds[i].name for i in rng.choice(len(kinds), EFFECTS_IN[mixture], replace=False)]
         if not any(together <= set(chosen) for together in INSEPARABLE):

@@ -155,8 +155,22 @@ NAMED: tuple[Kind, ...] = (
 REST: tuple[Kind, ...] = (Kind("position_offset", "sensing", 0.001, 0.4, _signed("offset"), _sign),)
 """the rest of the catalogue: a cart-pole moves alike at every place, so that no recording shows where x is 0"""
 
+LATER: tuple[Kind, ...] = (
+    Kind(
+        "directional_friction",
+        "dynamics",
+        0.02,
+        12.0,
+        lambda size, shape: {"forward": size * shape["forward"], "backward": size * (1 - shape["forward"])},
+        lambda rng, _: {"forward": float(rng.uniform(0.1, 0.9))},
+    ),
+    Kind("pole_friction", "dynamics", 0.0002, 0.3, _plain("torque")),
+    Kind("pole_spring", "dynamics", 0.001, 1.0, _plain("stiffness")),
+)
+"""effects that joined the catalogue after the sets 2028 and 2029 were made"""
+
 Effects = Literal["core", "rest", "all"]
-"""what a set is drawn from: the core of the catalogue, the effects beside it, or both"""
+"""what a set is drawn from: the core of the catalogue, the effects that no recording shows, or the whole catalogue"""
 
 
 def _seeded(rng: np.random.Generator, **more: float) -> Shape:
@@ -237,7 +251,20 @@ FOREIGN: tuple[Kind, ...] = (
     Kind("angle_drift", "sensing", 0.0003, 0.05, _signed("rate"), _sign),
     Kind("angle_quantisation", "sensing", 0.002, 0.15, _plain("step")),
 )
-"""kinds that no effect of the catalogue describes"""
+"""kinds that no effect of the catalogue described when the sets 2028 and 2029 were made"""
+
+STRIBECK = "stribeck_friction"
+"""foreign when the sets 2028 and 2029 were made; in the catalogue since"""
+
+
+def drawn(mixture: str, effects: Effects) -> tuple[Kind, ...]:
+    """The kinds that recordings of a mixture are drawn from."""
+    if mixture == "foreign":
+        return FOREIGN if effects == "core" else tuple(kind for kind in FOREIGN if kind.name != STRIBECK)
+    if effects == "core":
+        return NAMED
+    return (*NAMED, *LATER, *(kind for kind in FOREIGN if kind.name == STRIBECK))
+
 
 INSEPARABLE: tuple[frozenset[str], ...] = (
     frozenset({"actuator_bias", "constant_force"}),
@@ -245,8 +272,13 @@ INSEPARABLE: tuple[frozenset[str], ...] = (
     frozenset({"actuator_gain", "cart_mass", "pole_mass"}),
     frozenset({"track_tilt", "angle_offset", "constant_force"}),
     frozenset({"track_tilt", "angle_offset", "actuator_bias"}),
+    frozenset({"directional_friction", "constant_force"}),
+    frozenset({"directional_friction", "actuator_bias"}),
+    frozenset({"directional_friction", "coulomb_friction"}),
+    frozenset({"directional_friction", STRIBECK}),
+    frozenset({"coulomb_friction", STRIBECK}),
 )
 """never together in one recording, since other sizes of some or all of them give the same data"""
 
-KINDS: dict[str, Kind] = {kind.name: kind for kind in NAMED + REST + FOREIGN}
+KINDS: dict[str, Kind] = {kind.name: kind for kind in NAMED + REST + LATER + FOREIGN}
 """by name"""

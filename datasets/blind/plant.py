@@ -54,6 +54,8 @@ CART_FORCES: dict[str, Load] = {
     "quadratic_drag": lambda p, t, s: -p["coefficient"] * s[1] * np.abs(s[1]),
     "friction_patch": lambda p, t, s: -p["coefficient"] * s[1] * _inside(s[0], p["start"], p["end"]),
     "spring": lambda p, t, s: -p["stiffness"] * (s[0] - p["rest"]),
+    # Dry friction of unequal directions is that of their mean (below) and this constant force, also at rest.
+    "directional_friction": lambda p, t, s: 0.5 * (p["backward"] - p["forward"]),
     # From here on: foreign to the catalogue.
     "cogging": lambda p, t, s: p["amplitude"] * np.sin(2 * np.pi * s[0] / p["wavelength"] + p["phase"]),
     "hardening_spring": lambda p, t, s: -p["stiffness"] * (s[0] - p["rest"]) ** 3,
@@ -72,6 +74,7 @@ CART_FORCES: dict[str, Load] = {
 
 PIVOT_TORQUES: dict[str, Load] = {
     "pole_damping": lambda p, t, s: -p["coefficient"] * s[3],
+    "pole_spring": lambda p, t, s: -p["stiffness"] * s[2],
     "pivot_detent": lambda p, t, s: p["torque"] * np.sin(p["teeth"] * s[2] + p["phase"]),
     "pivot_cable": lambda p, t, s: p["torque"] * (s[2] / 0.1) ** 2,
 }
@@ -79,11 +82,13 @@ PIVOT_TORQUES: dict[str, Load] = {
 
 CART_DRY: dict[str, Load] = {
     "coulomb_friction": lambda p, t, s: p["force"],
+    "directional_friction": lambda p, t, s: 0.5 * (p["backward"] + p["forward"]),
     "stribeck_friction": lambda p, t, s: p["force"] * (0.1 + 0.9 * np.exp(-((s[1] / p["speed"]) ** 2))),
 }
 """largest dry friction on the cart in N"""
 
 PIVOT_DRY: dict[str, Load] = {
+    "pole_friction": lambda p, t, s: p["torque"],
     "sticky_bearing": lambda p, t, s: p["torque"] * _inside(s[2], p["start"], p["end"]),
 }
 """largest dry friction at the pivot in N m"""

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from datasets.blind.chain import NEUTRAL, Actuation, Sensing
 from datasets.blind.gaps import CART_REACH, POLE_REACH, Settings, key_text, lines, main, make
-from datasets.blind.kinds import FOREIGN, KINDS, NAMED, REST
+from datasets.blind.kinds import FOREIGN, KINDS, LATER, NAMED, REST, drawn
 from datasets.blind.plant import MAX_FORCE, PERIOD, nominal, predict
 from datasets.blind.simulation import Case, simulate
 from visadapt.effects.catalogue import catalogue
@@ -209,11 +209,11 @@ def test_recordings_stay_up_and_strengths_are_in_range(drafts):
 
 
 def test_kinds_are_named_once_and_shared_by_no_side():
-    assert len(KINDS) == len(NAMED) + len(REST) + len(FOREIGN)
+    assert len(KINDS) == len(NAMED) + len(REST) + len(LATER) + len(FOREIGN)
     assert len(FOREIGN) >= 10
 
 
-@pytest.mark.parametrize("kind", [k.name for k in NAMED + REST + FOREIGN])
+@pytest.mark.parametrize("kind", [k.name for k in NAMED + REST + LATER + FOREIGN])
 def test_every_kind_acts(bare, kind):
     rng = np.random.default_rng(0)
     quiet = simulate([bare], False, 10)[0]
@@ -226,7 +226,7 @@ def test_every_kind_acts(bare, kind):
 
 
 def test_every_effect_of_the_catalogue_is_drawn_once():
-    assert sorted(k.name for k in NAMED + REST) == sorted(
+    assert sorted(k.name for k in drawn("single", "all") + REST) == sorted(
         # Tests register effects of their own.
         effect.name
         for effect in catalogue(CartPole())
