@@ -90,7 +90,7 @@ def test_of_effects_that_fit_alike_the_first_is_taken():
     from visadapt.diagnosis.result import Cause, Estimate, Gap, RecordingSummary, Where
 
     def cause(name, parameter, *alike):
-        return Cause(name, {parameter: Estimate(1.0, "", (0.5, 1.5))}, 0.5, 0.9, alike)
+        return Cause(name, {parameter: Estimate(1.0, "", (0.5, 1.5))}, 0.5, 0.9, indistinguishable_from=alike)
 
     causes = (
         cause("viscous_friction", "coefficient", "quadratic_drag"),

@@ -32,7 +32,7 @@ def answer_of(data: Data, fits: Sequence[Fit], verdict: str) -> Answer:
         if any(cause["indistinguishable_from"] for cause in causes):
             verdict = "ambiguous"
     return {
-        "schema": 1,
+        "schema": 2,
         "system": data.system,
         "verdict": verdict,
         "where": {"regions": [region for cause in causes for region in _region(cause)]},

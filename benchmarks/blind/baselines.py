@@ -193,7 +193,7 @@ def chance(path: Path) -> Answer:
     rest = [[str(n)] for n in rng.choice(effects, 2, replace=False)]
     verdict = "unexplained" if guess == 4 else "identified" if named else "no_gap"
     return {
-        "schema": 1,
+        "schema": 2,
         "system": system,
         "verdict": verdict,
         "where": {"regions": []},

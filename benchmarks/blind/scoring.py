@@ -52,7 +52,7 @@ class Score:
     found: bool | None = None
     """whether every true effect has a class (named kinds only)"""
     exact: bool | None = None
-    """whether, besides, there is no other class"""
+    """whether, besides, there is no other class but slight ones"""
     top3: bool | None = None
     """whether the true set is among the first three of the ranking"""
     strength: float | None = None
@@ -141,7 +141,8 @@ def score(truth: Truth, answer: Answer) -> Score:
     if truth.kind in ("none", "foreign"):
         return result
     result.found = matches(effects, groups)
-    result.exact = result.found and len(groups) == len(effects)
+    slight = {cause["effect"] for cause in answer["causes"] if cause.get("slight")}
+    result.exact = result.found and all(group & effects or group <= slight for group in groups)
     result.top3 = any(set(entry["effects"]) == effects for entry in ranking[:3])
     if truth.kind == "single":
         result.strength = next(iter(truth.strengths.values()))

@@ -27,7 +27,7 @@ def cause(effect, alike=(), **parameters):
 def answer(verdict, *causes, regions=(), ranking=None, closed=0.9):
     first = [c["effect"] for c in causes]
     return {
-        "schema": 1,
+        "schema": 2,
         "verdict": verdict,
         "where": {"regions": list(regions)},
         "causes": list(causes),

@@ -43,12 +43,14 @@ def diagnosis(tmp_path):
                 },
                 "probability": 0.9,
                 "gap_closed": 0.9,
+                "gap_reopened": 0.9,
+                "slight": False,
                 "indistinguishable_from": [],
             }
             for effect, values in causes
         ]
         recording = {"episodes": 1, "samples": 100, "period": 0.05}
-        content = {"schema": 1, "system": system, "recording": recording, "verdict": verdict, "causes": listed}
+        content = {"schema": 2, "system": system, "recording": recording, "verdict": verdict, "causes": listed}
         path.write_text(json.dumps({**content, "next_experiment": ""}))
         return path
 

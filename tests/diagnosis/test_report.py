@@ -82,10 +82,20 @@ PATCH = Cause(
     },
     probability=0.982,
     gap_closed=0.61,
+    gap_reopened=0.58,
 )
-DELAY = Cause("actuator_delay", {"delay": Estimate(0.0312, "s", (0.0281, 0.0343))}, 0.94, 0.33)
-GAIN = Cause("actuator_gain", {"scale": Estimate(0.8, "1", (0.77, 0.83))}, 0.52, 0.93, ("cart_mass",))
-MASS = Cause("cart_mass", {"scale": Estimate(1.27, "1", (1.2, math.nan))}, 0.46, 0.93, ("actuator_gain",))
+DELAY = Cause("actuator_delay", {"delay": Estimate(0.0312, "s", (0.0281, 0.0343))}, 0.94, 0.33, 0.31)
+GAIN = Cause(
+    "actuator_gain", {"scale": Estimate(0.8, "1", (0.77, 0.83))}, 0.52, 0.93, 0.9, indistinguishable_from=("cart_mass",)
+)
+MASS = Cause(
+    "cart_mass",
+    {"scale": Estimate(1.27, "1", (1.2, math.nan))},
+    0.46,
+    0.93,
+    0.9,
+    indistinguishable_from=("actuator_gain",),
+)
 REGION = Region("x", 0.1, 0.4, 0.8, 0.0004)
 
 
@@ -166,6 +176,8 @@ class TestResult:
             "parameters": {"delay": {"value": 0.0312, "unit": "s", "ci90": [0.0281, 0.0343]}},
             "probability": 0.94,
             "gap_closed": 0.33,
+            "gap_reopened": 0.31,
+            "slight": False,
             "indistinguishable_from": [],
         }
         assert list(content["gap"]) == ["measure", "before", "after", "floor", "black_box", "closed"]
@@ -214,8 +226,8 @@ class TestWords:
             ),
             (
                 "unexplained",
-                "Something acts that no known effect explains: the best of them close 38 % of the gap, a black box "
-                "91 %; it shows most at x from 0.10 to 0.40 m.",
+                "Something acts that no known effect explains: the best of them close 38 % of the gap, with a black "
+                "box 91 %; it shows most at x from 0.10 to 0.40 m.",
             ),
             (
                 "no_gap",

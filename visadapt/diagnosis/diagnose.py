@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 
 import torch
@@ -113,22 +114,21 @@ def diagnose(
     # Predictions of the source, the best set, each cause alone and the runners-up, on held-out episodes.
     alone = [search.single(effect) for effect in dict.fromkeys(one.canonical for group in groups for one in group)]
     runners_up = [compared.model for compared in comparison.models[1 : 1 + RUNNERS_UP]]
-    sets = {frozenset(f.names): f for f in [search.source, best, *alone, *runners_up]}
+    without = [search.without(best, effect) for effect in best.effects]
+    sets = {frozenset(f.names): f for f in [search.source, best, *alone, *without, *runners_up]}
     rollouts = heldout.held_out(system, rows, [(f.effects, f.fits) for f in sets.values()])
     predicted = dict(zip(sets, rollouts, strict=True))
     source = errors_with_repeats(prepared, search) if repeats else predicted[frozenset()]
     corrected = predicted[frozenset(best.names)]
-    black_box = heldout.held_out(system, rows, [((), search.source.fits)], black_box=True)[0]
+    black_box = heldout.held_out(system, rows, [(best.effects, best.fits)], black_box=True)[0]
     noise = (best.fits.log_noise[0] / 2).exp()
-    errors = Errors(source.rms(noise), corrected.rms(noise), corrected.floor(noise), black_box.rms(noise), noise)
+    reached = torch.minimum(corrected.rms(noise), black_box.rms(noise))
+    errors = Errors(source.rms(noise), corrected.rms(noise), corrected.floor(noise), reached, noise)
     gap_closed = {names: errors.closed_by(each) for names, each in predicted.items()}
 
-    verdict = _verdict(comparison, errors, bool(repeats))
-    found: tuple[Cause, ...] = ()
-    if verdict == IDENTIFIED:
-        found = (*repeat_causes, *causes(search, comparison, groups, gap_closed))
-        if any(cause.indistinguishable_from for cause in found):
-            verdict = AMBIGUOUS
+    explaining = (*repeat_causes, *causes(search, comparison, groups, gap_closed))
+    verdict = _verdict(comparison, errors, explaining, bool(repeats))
+    found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
     before, after = disturbances(search, comparison)
     regions = _regions(found, before if found else after, effects, profile.region_variables, seed)
     return Diagnosis(
@@ -160,16 +160,22 @@ def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effec
     return out
 
 
-def _verdict(comparison: ModelComparison, errors: Errors, repeats: bool) -> str:
-    """The verdict, before it is known whether causes can be told apart; `repeats`: readings are repeated."""
+def _verdict(comparison: ModelComparison, errors: Errors, explaining: Sequence[Cause], repeats: bool) -> str:
+    """The verdict where these causes are what explains the gap best; `repeats`: readings are repeated."""
+    gap = errors.gap()
     if comparison.unexplained:
-        gap = errors.gap()
         # Where the noise is low, any model of a real machine leaves something significant: then the share of the gap
         # that is closed decides, otherwise whether what is unexplained is negligible.
         clear = gap.after > CLEAR_OF_NOISE * gap.floor
         enough = gap.closed >= MIN_GAP_CLOSED if clear else comparison.negligible
-        return IDENTIFIED if comparison.best.effects and enough else UNEXPLAINED
-    return IDENTIFIED if comparison.best.effects or repeats else NO_GAP
+        if not (comparison.best.effects and enough):
+            return UNEXPLAINED
+    elif math.isnan(gap.closed) and not repeats:
+        return NO_GAP  # the source predicts as well as the noise allows
+    carrying = [cause for cause in explaining if not cause.slight]
+    if not carrying:
+        return UNEXPLAINED if comparison.unexplained else NO_GAP
+    return AMBIGUOUS if any(cause.indistinguishable_from for cause in carrying) else IDENTIFIED
 
 
 def _regions(

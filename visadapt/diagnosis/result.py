@@ -20,7 +20,7 @@ from visadapt.effects import EFFECTS, Effect
 IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP = "identified", "ambiguous", "unexplained", "no_gap"
 VERDICTS = (IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP)
 
-SCHEMA_VERSION = 1  # Version of `schema.json`
+SCHEMA_VERSION = 2  # Version of `schema.json`
 
 KEYS = {"start": "from", "end": "to"}
 NOT_IN_JSON = ("figures", "policy")
@@ -66,6 +66,8 @@ class Cause:
     parameters: Mapping[str, Estimate]
     probability: float
     gap_closed: float  # by this cause alone, on held-out episodes
+    gap_reopened: float = math.nan  # share of the gap that opens again without it, on held-out episodes
+    slight: bool = False  # whether that is too little for the verdict to rest on it
     indistinguishable_from: tuple[str, ...] = ()  # effects that fit this recording equally well
 
 
@@ -86,8 +88,8 @@ class Gap:
     before: float  # of the source
     after: float  # of the source with the causes
     floor: float  # of the measurement noise alone
-    black_box: float  # of the source with a black box of smooth functions
-    closed: float  # (before - after) / (before - floor)
+    black_box: float  # the best that a black box of smooth functions reaches beside the causes; at most `after`
+    closed: float  # (before - after) / (before - floor); NaN where there is no gap to close
 
 
 @dataclass(frozen=True)
@@ -261,6 +263,8 @@ def _plain(value: Any, is_share: bool = False) -> Any:
     if isinstance(value, tuple):
         return [_plain(each) for each in value]
     if isinstance(value, str):
+        return value
+    if isinstance(value, bool):
         return value
     if isinstance(value, Integral):
         return int(value)

@@ -12,6 +12,8 @@ from typing import Any
 from visadapt.diagnosis.result import SCHEMA_VERSION, Cause, Estimate, named_effects
 from visadapt.effects import EFFECTS, Effect
 
+READABLE = (1, SCHEMA_VERSION)  # Versions of the file in which the causes have the same meaning
+
 
 class DiagnosisFileError(ValueError):
     """A file of a diagnosis that gives no effects; the message is one line that says which and why."""
@@ -30,7 +32,7 @@ def load_effects(path: str | os.PathLike[str]) -> tuple[str, list[Effect]]:
         raise DiagnosisFileError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:
         raise DiagnosisFileError(f"{path}: not JSON: {error}") from error
-    if not isinstance(content, dict) or content.get("schema") != SCHEMA_VERSION:
+    if not isinstance(content, dict) or content.get("schema") not in READABLE:
         raise DiagnosisFileError(
             f"{path}: no diagnosis of version {SCHEMA_VERSION}, such as `visadapt diagnose --json` writes"
         )
@@ -51,4 +53,6 @@ def _cause(content: Mapping[str, Any]) -> Cause:
         name: Estimate(math.nan if one["value"] is None else float(one["value"]), one["unit"], (math.nan, math.nan))
         for name, one in content["parameters"].items()
     }
-    return Cause(content["effect"], values, math.nan, math.nan, tuple(content["indistinguishable_from"]))
+    return Cause(
+        content["effect"], values, math.nan, math.nan, indistinguishable_from=tuple(content["indistinguishable_from"])
+    )

@@ -177,14 +177,15 @@ def _lost(holds: RepeatedReadings) -> tuple[Tensor, Tensor]:
 
 def _frozen(holds: RepeatedReadings, states: Sequence[Tensor], found: FitState, angle: int) -> tuple[Tensor, Tensor]:
     """Start and end (2,) of the angles at which the sensor stands still, and their covariance (2, 2)."""
-    # A first reading has none before it to repeat.
-    held = torch.cat([frozen[1:] for frozen in holds.frozen])
+    # A first reading has none before it to repeat, and a lost row says nothing of the sensor.
+    seen = torch.cat([~lost[1:] for lost in holds.lost])
+    held = torch.cat([frozen[1:] for frozen in holds.frozen])[seen]
     if not bool(held.any()):
         width = torch.tensor([p.high - p.low for p in FrozenZone.table], dtype=torch.float64)
         return torch.tensor(neutral(FrozenZone), dtype=torch.float64), torch.diag(width.square() / 12)
     noise = SMOOTHING_RATIO * float((found.log_noise[0, angle] / 2).exp())
-    start, end, deviation = zone(held, torch.cat([state[1:, angle] for state in states]), noise)
-    return torch.tensor([start, end], dtype=torch.float64), deviation**2 * torch.eye(2, dtype=torch.float64)
+    edges, deviations = zone(held, torch.cat([state[1:, angle] for state in states])[seen], noise)
+    return edges, torch.diag(deviations.square())
 
 
 def _on_time(world: World, delay: float, late: Tensor, commands: Tensor) -> Tensor:

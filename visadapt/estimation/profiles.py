@@ -59,7 +59,6 @@ class SystemProfile:
     min_gain: float = 1.0  # log likelihood that an effect must gain in the screening to be fitted
     min_gain_per_parameter: float = 0.0  # log likelihood required in addition for each of the effect's parameters
     min_gain_share: float = 0.0  # share of the best candidate's gain that a candidate must reach to be fitted
-    fit_all_alone: bool = True  # whether every effect is fitted alone, whatever its screening promises
     refit_subsets: bool = False
     """whether a subset that was fitted before is fitted again, starting from the larger set's parameters"""
     black_box_threshold: float = 4.0  # log odds above which a black-box function counts as something unexplained
@@ -117,7 +116,6 @@ _VEHICLE = SystemProfile(
     check_sensors=False,
     min_gain_per_parameter=3.0,
     min_gain_share=0.3,
-    fit_all_alone=False,
     refit_subsets=True,
     # With more functions to choose from, the largest log odds by chance are higher.
     black_box_threshold=6.0,

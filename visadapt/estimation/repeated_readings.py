@@ -21,6 +21,8 @@ MIN_JUMP_STEPS, MIN_OTHER_STEPS = 8, 1.5
 """Changes into and out of a run of equal readings, in steps of the sensor's resolution, that the larger and the smaller
 must exceed for the run to be repeated; below, the quantity may have stood still."""
 
+MIN_REST_ROWS = 4  # Equal rows at the start of an episode, above which the machine rests
+
 MAX_CHANCE = 1e-3
 """Probability that an encoder's steps give as many equal readings, below which they count as repeated."""
 
@@ -55,11 +57,13 @@ def find_repeats(
     pole = torch.tensor([c in angle_sensor for c in channels], dtype=torch.bool)
     angle = channels.index(angle_sensor[0]) if angle_sensor and angle_sensor[0] in channels else None
     same = [torch.stack([_repeats(values[:, k], steps[k]) for k in range(len(channels))], 1) for values in measured]
-    lost = _unless_by_chance([each.all(1) for each in same], min(by_chance))
+    resting = [_resting(values) for values in measured]
+    whole_rows = [each.all(1) & ~rest for each, rest in zip(same, resting, strict=True)]
+    lost = _unless_by_chance(whole_rows, min(by_chance))
     # A rate from a separate sensor may go on while the angle stands still.
     frozen = [torch.zeros_like(whole) for whole in lost]
     if angle is not None:
-        alone = [each[:, angle] & ~whole for each, whole in zip(same, lost, strict=True)]
+        alone = [each[:, angle] & ~whole & ~rest for each, whole, rest in zip(same, whole_rows, resting, strict=True)]
         frozen = _unless_by_chance(alone, by_chance[angle])
     used = []
     for each, whole, still in zip(same, lost, frozen, strict=True):
@@ -71,16 +75,23 @@ def find_repeats(
     return RepeatedReadings(used, lost, frozen)
 
 
+def _resting(values: Tensor) -> Tensor:
+    """Which rows (T, m) repeat the first one of an episode, where these are too many to have been lost: it rests."""
+    still = (values == values[:1]).all(1).cumprod(0) > 0
+    return still if int(still.sum()) > MIN_REST_ROWS else torch.zeros_like(still)
+
+
 def _repeats(readings: Tensor, step: float) -> Tensor:
     """(T,) rows that repeat the row before, in runs that readings of resolution `step` enter and leave at speed.
 
-    A run from the first row on may be a machine at rest; one up to the last row has no change that leaves it.
+    A run from the first row on has no change that enters it, one up to the last row none that leaves it.
     """
     change = readings.diff(prepend=readings[:1])
     same = change == 0
     same[0] = False
     # Rows of a run share a number; the jump into a run is the change at its first row, the jump out that of the next.
     run = (~same).cumsum(0) - 1
+    change[0] = torch.inf
     jumps = torch.cat((change[~same].abs(), readings.new_full((1,), torch.inf)))
     smaller, larger = torch.minimum(jumps[run], jumps[run + 1]), torch.maximum(jumps[run], jumps[run + 1])
     return same & (larger > MIN_JUMP_STEPS * step) & (smaller > MIN_OTHER_STEPS * step)
@@ -105,8 +116,8 @@ def _unless_by_chance(equal: list[Tensor], expected: float) -> list[Tensor]:
     return [torch.zeros_like(marks) for marks in equal] if explained else equal
 
 
-def zone(repeated: Tensor, angle: Tensor, deviation: float) -> tuple[float, float, float]:
-    """Start and end in rad of the zone of angles in which a sensor stands still, and their standard deviation.
+def zone(repeated: Tensor, angle: Tensor, deviation: float) -> tuple[Tensor, Tensor]:
+    """Start and end (2,) in rad of the zone of angles in which a sensor stands still, and their standard deviations.
 
     Given whether each of N readings is `repeated`, and their estimated angles with a normal error of `deviation` rad.
     Posterior mean over a grid of both edges, with a uniform prior.
@@ -125,5 +136,5 @@ def zone(repeated: Tensor, angle: Tensor, deviation: float) -> tuple[float, floa
     weight = (score - score.max()).exp()
     weight = weight / weight.sum()
     start, end = (weight.sum(1) * low).sum(), (weight.sum(0) * high).sum()
-    spread = (weight.sum(1) * (low - start).square()).sum() + (weight.sum(0) * (high - end).square()).sum()
-    return float(start), float(end), float((spread / 2).sqrt())
+    spread = (weight.sum(1) * (low - start).square()).sum(), (weight.sum(0) * (high - end).square()).sum()
+    return torch.stack((start, end)), torch.stack(spread).sqrt()

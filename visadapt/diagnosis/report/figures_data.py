@@ -33,7 +33,7 @@ class Errors:
     before: Tensor  # of the source
     after: Tensor  # of the source with the causes
     floor: Tensor  # of the states that the smoother estimates: noise
-    black_box: Tensor  # of the source with a black box
+    black_box: Tensor  # the best that a black box reaches beside the causes
     deviation: Tensor  # (m,) standard deviations of the measurement noise, in the states' units
 
     def closed_by(self, rollouts: RolloutErrors) -> float:

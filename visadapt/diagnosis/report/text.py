@@ -93,10 +93,11 @@ def sentence(diagnosis: Diagnosis) -> str:
             f"No gap: the simulator predicts this recording as well as its noise allows "
             f"(error {number(gap.before)}, noise {number(gap.floor)})."
         )
+    carrying = [cause for cause in diagnosis.causes if not cause.slight]
     if diagnosis.verdict == IDENTIFIED:
-        return f"{_capitalised(listed([_described(cause) for cause in diagnosis.causes]))} {_closes(diagnosis)}."
+        return f"{_capitalised(listed([_described(cause) for cause in carrying]))} {_closes(diagnosis)}."
     if diagnosis.verdict == AMBIGUOUS:
-        groups = [listed([_described(cause) for cause in group], "or") for group in _alternatives(diagnosis.causes)]
+        groups = [listed([_described(cause) for cause in group], "or") for group in _alternatives(carrying)]
         whole = listed([f"either {group}" if " or " in group else group for group in groups])
         return f"{_capitalised(whole)} {_closes(diagnosis)}; this recording cannot tell which."
     return _unexplained(diagnosis)
@@ -119,7 +120,7 @@ def _unexplained(diagnosis: Diagnosis) -> str:
     if best <= 0:
         text += "none of them closes any of the gap"
     elif black_box > best:
-        text += f"the best of them close {percent(best)} of the gap, a black box {percent(min(1.0, black_box))}"
+        text += f"the best of them close {percent(best)} of the gap, with a black box {percent(min(1.0, black_box))}"
     else:
         text += f"the best of them close {percent(best)} of the gap, and what is left is not noise"
     if diagnosis.where.regions:
@@ -133,7 +134,7 @@ def _described(cause: Cause) -> str:
 
 
 def _closes(diagnosis: Diagnosis) -> str:
-    many = len(_alternatives(diagnosis.causes)) > 1
+    many = len(_alternatives([cause for cause in diagnosis.causes if not cause.slight])) > 1
     return f"{'close' if many else 'closes'} {percent(diagnosis.gap.closed)} of the gap to the simulator"
 
 

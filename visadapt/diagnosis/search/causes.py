@@ -19,6 +19,9 @@ from visadapt.systems import System
 
 Z_90 = 1.6449  # Half-width of a normal distribution's 90 % interval, in standard deviations
 
+SLIGHT = 0.01
+"""Share of the gap that must open again without a cause for the verdict to rest on it."""
+
 GapClosed = Mapping[frozenset[str], float]
 """Share of the gap that a set closes on held-out episodes, by the names of its effects."""
 
@@ -50,9 +53,11 @@ def alternatives(
 def causes(
     search: Search, comparison: ModelComparison, groups: Sequence[Sequence[Alternative]], gap_closed: GapClosed
 ) -> list[Cause]:
-    """Every alternative as a cause."""
+    """Every alternative as a cause; `gap_closed` holds each effect alone, the best set, and it less each effect."""
     out = []
-    for group in groups:
+    best = frozenset(comparison.best.names)
+    for effect, group in zip(comparison.best.effects, groups, strict=True):
+        reopened = gap_closed[best] - gap_closed[best - {effect.name}]
         names = [one.effect.name for one in group]
         for one in group:
             fitted = estimates(search, one.compared.model, one.canonical)
@@ -62,6 +67,8 @@ def causes(
                     fitted if one.effect is one.canonical else _twin(search, one, fitted),
                     _probability(comparison, one, group),
                     gap_closed.get(frozenset({one.canonical.name}), math.nan),
+                    reopened,
+                    reopened < SLIGHT,
                     tuple(name for name in names if name != one.effect.name),
                 )
             )

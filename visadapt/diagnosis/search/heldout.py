@@ -58,9 +58,12 @@ def overall(errors: Tensor) -> Tensor:
     return errors.square().mean(-1).sqrt()
 
 
+MIN_GAP = 1.02  # Error of the source over the noise floor, below which there is no gap to close
+
+
 def closed(before: float, after: float, floor: float) -> float:
     """(before - after) / (before - floor); NaN where there is no gap to close."""
-    return (before - after) / (before - floor) if before > floor * 1.001 else math.nan
+    return (before - after) / (before - floor) if before > floor * MIN_GAP else math.nan
 
 
 def folds(rows: Segments, most: int) -> Tensor:

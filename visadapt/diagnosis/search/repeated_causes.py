@@ -42,11 +42,11 @@ def repeated_reading_causes(
     frozen = sum(int(x.sum()) for x in repeats.frozen)
     in_windows = int(_in_windows(recording.rows, repeats.frozen).sum())
     if frozen >= MIN_REPEATS and (recording.defect is not None or in_windows >= MIN_REPEATS):
-        start, end, deviation = _zone(recording, search, comparison)
-        unit = FrozenZone.table[0].unit
+        edges, deviations = _zone(recording, search, comparison)
+        low, high = (edges - Z_90 * deviations).tolist(), (edges + Z_90 * deviations).tolist()
         parameters = {
-            name: Estimate(edge, unit, (edge - Z_90 * deviation, edge + Z_90 * deviation))
-            for name, edge in (("start", start), ("end", end))
+            parameter.name: Estimate(edge, parameter.unit, (low[k], high[k]))
+            for k, (parameter, edge) in enumerate(zip(FrozenZone.table, edges.tolist(), strict=True))
         }
         cost = _cost(recording, search, comparison, repeats.frozen)
         out.append((Cause(FrozenZone.name, parameters, 1.0, math.nan), cost))
@@ -81,13 +81,14 @@ def _cost(
     return float(0.5 * square[_in_windows(recording.rows, repeated)].sum())
 
 
-def _zone(recording: PreparedRecording, search: Search, comparison: ModelComparison) -> tuple[float, float, float]:
-    """Start and end of the angles at which the sensor stands still, and their standard deviation."""
+def _zone(recording: PreparedRecording, search: Search, comparison: ModelComparison) -> tuple[Tensor, Tensor]:
+    """Start and end (2,) of the angles at which the sensor stands still, and their standard deviations."""
     rows = recording.rows
     fits = comparison.best.fits
-    inside = rows.inside > 0
+    inside = (rows.inside > 0) & ~_in_windows(rows, recording.repeats.lost)  # a lost row says nothing of the sensor
     if recording.defect is not None:
-        return *recording.defect, BAND
+        edges = torch.tensor(recording.defect, dtype=torch.float64)
+        return edges, torch.full_like(edges, BAND)
     channel = rows.channels.index(search.profile.angle_sensor[0])
     deviation = SMOOTHING_RATIO * float((fits.log_noise[0, channel] / 2).exp())
     angle = fits.state[0, ..., search.profile.angle_sensor[0]][inside]

@@ -1,8 +1,8 @@
 """The search over sets of effects: add, remove and exchange effects while that raises the posterior odds.
 
-Every effect is fitted alone. Sets then grow, and those near the best are tried: with one effect fewer, with one
-exchanged, and with two exchanged for one, since two effects often imitate a third (a weaker motor and a lighter pole, a
-heavier cart).
+Sets grow from the source and from every effect alone. Those near the best are then tried: with one effect fewer, with
+one exchanged, and with two exchanged for one, since two effects often imitate a third (a weaker motor and a lighter
+pole, a heavier cart).
 """
 
 from __future__ import annotations
@@ -39,6 +39,8 @@ MAX_EFFECTS = 6  # Effects in a set at most
 
 MAX_CANDIDATES, MAX_EXCHANGES = 8, 5
 """Effects that are fitted in addition to each set when sets grow, and when effects are exchanged."""
+
+FIT_ALL_ABOVE = 100.0  # Log likelihood that the best effect promises, above which every effect is fitted alone
 
 EXCHANGE_LOG_PROCESS = math.log(0.003**2)
 """Least log variance of the velocities' process noise, (m/s)^2 and (rad/s)^2, with which a fit starts after an
@@ -92,12 +94,9 @@ class Search:
             self.fitted[frozenset()] = ScoredModel((), source, float(source.likelihood[0]))
 
     def run(self, progress: Progress | None = None) -> None:
-        """Fit every effect alone, grow sets while that raises the posterior odds, then try sets near the best."""
+        """Grow sets while that raises the posterior odds, then try sets near the best."""
         beam = [self.source]
-        if self.profile.fit_all_alone:
-            leads = {one.effect: one.values for one in self._screening(self.source)}
-            every = [((e,), with_effect(self.source.fits, leads.get(e, neutral(e)))) for e in self.catalogue]
-            self.fit(every, QUICK)
+        self._alone()
         for size in range(MAX_EFFECTS):
             if progress is not None:
                 progress(size, MAX_EFFECTS, -self.best.log_odds)
@@ -117,6 +116,14 @@ class Search:
             self._settle()
         if progress is not None:
             progress(MAX_EFFECTS, MAX_EFFECTS, -self.best.log_odds)
+
+    def _alone(self) -> None:
+        """Fit every effect alone where effects are so large that the screening, a linear response, may mislead."""
+        leads = self._screening(self.source)
+        if leads and leads[0].gain > FIT_ALL_ABOVE:
+            values = {one.effect: one.values for one in leads}
+            every = [((e,), with_effect(self.source.fits, values.get(e, neutral(e)))) for e in self.catalogue]
+            self.fit(every, QUICK)
 
     def _settle(self) -> None:
         """Exchange, remove and fit carefully until the best set stays the best."""
@@ -213,10 +220,14 @@ class Search:
             self.fit([((effect,), self._start(self.source, effect))], QUICK)
         return self.fitted[key]
 
+    def without(self, whole: ScoredModel, removed: type[Effect]) -> ScoredModel:
+        """A set less one of its effects."""
+        start = _without(whole, [removed])
+        return self.fitted.get(frozenset(e.name for e in start[0])) or self.fit([start], QUICK)[0]
+
     def exchange(self, whole: ScoredModel, removed: type[Effect], new: type[Effect]) -> ScoredModel:
         """A set with one of its effects exchanged for another."""
-        kept = tuple(e for e in whole.effects if e is not removed)
-        base = self.fitted.get(frozenset(e.name for e in kept)) or self.fit([_without(whole, [removed])], QUICK)[0]
+        base = self.without(whole, removed)
         return self.fit([((*base.effects, new), self._start(base, new))], CAREFUL)[0]
 
     def _start(self, base: ScoredModel, effect: type[Effect]) -> FitState:
