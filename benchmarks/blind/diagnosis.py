@@ -36,8 +36,8 @@ from benchmarks.blind.tables import Row, confusion, label, read_table, tabulate,
 from datasets.blind import flights as blind_flights, gaps as blind_gaps
 from datasets.blind.kinds import Effects
 
-Kind = Literal["easy", "hard", "quadrotor", "fixed_wing"]
-"""One of the two sets of the cart-pole, or the set of a vehicle."""
+Kind = Literal["easy", "hard", "large", "quadrotor", "fixed_wing"]
+"""One of the sets of the cart-pole, or the set of a vehicle."""
 System = Literal["cartpole", "quadrotor", "fixed_wing"]
 
 
@@ -185,7 +185,7 @@ def recordings_of(settings: Settings, kind: Kind) -> Path:
         return settings.data
     folder = Path("data/blind") / f"{settings.label(kind)}-{settings.count}-{settings.seed}"
     if len(list(folder.glob("*.csv"))) != settings.count or not key_of(folder).exists():
-        if kind == "easy" or kind == "hard":
+        if kind == "easy" or kind == "hard" or kind == "large":
             blind_gaps.main(blind_gaps.Settings(folder, kind, settings.count, settings.seed, effects=settings.effects))
         else:
             blind_flights.main(

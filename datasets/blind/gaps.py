@@ -28,6 +28,8 @@ from datasets.blind.plant import PERIOD, Array
 from datasets.blind.sealing import key_path, names, seal
 from datasets.blind.simulation import Case, Run, simulate
 
+CartPoleKind = Literal["easy", "hard", "large"]
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -35,14 +37,15 @@ class Settings:
 
     out: Path
     """folder for the recordings"""
-    kind: Literal["easy", "hard"] = "hard"
-    """easy: about 1,000 rows, little noise, all states; hard: about 400 rows, much noise, no velocities"""
+    kind: CartPoleKind = "hard"
+    """easy: about 1,000 rows, little noise, all states; hard: about 400 rows, much noise, no velocities; large: as
+    easy, with effects up to ten times as strong"""
     count: int = 200
     """how many recordings"""
     seed: int = 0
     """seed of all random numbers"""
     strengths: tuple[float, float] | None = None
-    """weakest and strongest effect, in units of the noise; by default 2 to 30 (easy) or 0.7 to 6 (hard)"""
+    """weakest and strongest effect, in units of the noise; by default 2 to 30 (easy), 0.7 to 6 (hard), 10 to 300"""
     key: Path | None = None
     """file for the answers; by default beside the folder, <out>.key.json"""
     effects: Effects = "core"
@@ -85,8 +88,16 @@ DIFFICULTIES = {
         (0.7, 6.0),
         {"single": 0.3, "pair": 0.2, "triple": 0.1, "none": 0.2, "foreign": 0.2},
     ),
+    "large": Difficulty(
+        1000,
+        (5, 12),
+        (0.001, 0.005, 0.001, 0.005),
+        True,
+        (10.0, 300.0),
+        {"single": 0.5, "pair": 0.25, "none": 0.25},
+    ),
 }
-"""the two sets"""
+"""the sets; a new one goes to the end, since a set's place seeds it"""
 
 EFFECTS_IN = {"none": 0, "single": 1, "pair": 2, "triple": 3, "foreign": 1}
 """number of effects in a recording"""
