@@ -88,7 +88,7 @@ def classes(answer: Answer) -> list[set[str]]:
     merged: list[set[str]] = []
     for cause in answer["causes"]:
         own = {cause["effect"]}
-        if answer["verdict"] == "ambiguous":
+        if answer["verdict"] == "ambiguous" or cause.get("slight"):
             own |= set(cause.get("indistinguishable_from") or ())
         for other in [other for other in merged if other & own]:
             merged.remove(other)
@@ -141,8 +141,8 @@ def score(truth: Truth, answer: Answer) -> Score:
     if truth.kind in ("none", "foreign"):
         return result
     result.found = matches(effects, groups)
-    slight = {cause["effect"] for cause in answer["causes"] if cause.get("slight")}
-    result.exact = result.found and all(group & effects or group <= slight for group in groups)
+    carrying = {cause["effect"] for cause in answer["causes"] if not cause.get("slight")}
+    result.exact = result.found and all(group & effects or not group & carrying for group in groups)
     result.top3 = any(set(entry["effects"]) == effects for entry in ranking[:3])
     if truth.kind == "single":
         result.strength = next(iter(truth.strengths.values()))

@@ -71,6 +71,23 @@ def test_classes_count_up_to_three_and_only_where_ambiguous():
     assert not score(FRICTION, answer("ambiguous", large)).found
 
 
+def test_a_slight_cause_is_not_one_too_many_and_counts_where_it_is_true():
+    slight = cause("actuator_delay", ["measurement_delay"]) | {"slight": True}
+    s = score(FRICTION, answer("identified", cause("viscous_friction"), slight))
+    assert (s.found, s.exact) == (True, True)
+    assert not score(FRICTION, answer("identified", cause("viscous_friction"), cause("actuator_delay"))).exact
+    both = truth("pair", viscous_friction={"coefficient": 1.0}, measurement_delay={"delay": 0.01})
+    assert score(both, answer("identified", cause("viscous_friction"), slight)).exact
+
+
+def test_what_was_foreign_and_has_joined_the_catalogue_is_to_be_found():
+    effect = {"effect": "stribeck_friction", "parameters": {"force": 2.0, "speed": 0.1}, "strength": 3.0}
+    known = Truth.of({"kind": "foreign", "effects": [effect]})
+    assert (known.kind, known.effects["stribeck_friction"]["breakaway"]) == ("single", 2.0)
+    cable = {"effect": "pivot_cable", "parameters": {"torque": 0.1}, "strength": 3.0}
+    assert Truth.of({"kind": "foreign", "effects": [cable]}).kind == "foreign"
+
+
 def test_alternatives_that_are_listed_as_causes_are_one_class():
     said = answer("ambiguous", cause("actuator_bias", ["constant_force"]), cause("constant_force", ["actuator_bias"]))
     assert classes(said) == [{"actuator_bias", "constant_force"}]

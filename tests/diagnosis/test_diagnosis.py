@@ -12,7 +12,9 @@ from visadapt.effects import (
     ActuatorBacklash,
     ActuatorGain,
     AngleOffset,
+    CartMass,
     ConstantForce,
+    CoulombFriction,
     DynamicsEffect,
     FrictionPatch,
     Parameter,
@@ -85,6 +87,21 @@ def test_two_simultaneous_effects_are_both_named():
     assert "viscous_friction" in names(result)
     assert names(result) & {"actuator_gain", "cart_mass"}
     assert sum(result.where.stages.values()) == pytest.approx(1)
+
+
+def test_a_heavier_cart_is_not_a_weaker_motor_with_a_lighter_pole():
+    result = diagnose(record([CartMass(scale=1.8)], measured=("x", "x_dot", "theta", "theta_dot")), SOURCE)
+    assert names(result) == {"cart_mass"}
+    assert result.causes[0].parameters["scale"].value == pytest.approx(1.8, rel=0.02)
+    assert result.causes[0].gap_reopened > 0.9
+
+
+def test_two_large_effects_are_both_named():
+    effects = [CoulombFriction(force=3.0), ActuatorGain(scale=0.7)]
+    result = diagnose(record(effects, measured=("x", "x_dot", "theta", "theta_dot"), episodes=6), SOURCE)
+    carrying = {cause.effect: cause for cause in result.causes if not cause.slight}
+    assert carrying.keys() == {"coulomb_friction", "actuator_gain"}
+    assert carrying["coulomb_friction"].parameters["force"].value == pytest.approx(3.0, rel=0.02)
 
 
 def test_the_region_of_a_friction_patch_is_found():

@@ -96,12 +96,11 @@ class Search:
     def run(self, progress: Progress | None = None) -> None:
         """Grow sets while that raises the posterior odds, then try sets near the best."""
         beam = [self.source]
-        self._alone()
         for size in range(MAX_EFFECTS):
             if progress is not None:
                 progress(size, MAX_EFFECTS, -self.best.log_odds)
             before = self.best
-            children = self.extend(beam)
+            children = (size == 0 and self._alone()) or self.extend(beam)
             if not children:
                 break
             beam = sorted(children, key=lambda f: -f.log_odds)[: self.profile.beam_width]
@@ -117,13 +116,14 @@ class Search:
         if progress is not None:
             progress(MAX_EFFECTS, MAX_EFFECTS, -self.best.log_odds)
 
-    def _alone(self) -> None:
-        """Fit every effect alone where effects are so large that the screening, a linear response, may mislead."""
+    def _alone(self) -> list[ScoredModel]:
+        """Every effect alone, where effects are so large that the screening, a linear response, may mislead."""
         leads = self._screening(self.source)
-        if leads and leads[0].gain > FIT_ALL_ABOVE:
-            values = {one.effect: one.values for one in leads}
-            every = [((e,), with_effect(self.source.fits, values.get(e, neutral(e)))) for e in self.catalogue]
-            self.fit(every, QUICK)
+        if not leads or leads[0].gain < FIT_ALL_ABOVE:
+            return []
+        values = {one.effect: one.values for one in leads}
+        every = [((e,), with_effect(self.source.fits, values.get(e, neutral(e)))) for e in self.catalogue]
+        return self.fit(every, QUICK)
 
     def _settle(self) -> None:
         """Exchange, remove and fit carefully until the best set stays the best."""
@@ -150,17 +150,17 @@ class Search:
         return self.ranked[0]
 
     def extend(self, bases: Sequence[ScoredModel], most: int = MAX_CANDIDATES) -> list[ScoredModel]:
-        """Fit every base with one more effect, for the `most` best candidates of its screening."""
-        starts = []
-        keys = set()
+        """Every base with one more effect, fitted unless it was, for the `most` best candidates of its screening."""
+        known, starts = [], {}
         for base in bases:
             for candidate in self._candidates(base)[:most]:
                 effects = (*base.effects, candidate.effect)
                 key = frozenset(e.name for e in effects)
-                if key not in self.fitted and key not in keys:
-                    keys.add(key)
-                    starts.append((effects, with_effect(base.fits, candidate.values)))
-        return self.fit(starts, QUICK)
+                if key in self.fitted:
+                    known.append(self.fitted[key])
+                elif key not in starts:
+                    starts[key] = effects, with_effect(base.fits, candidate.values)
+        return known + self.fit(list(starts.values()), QUICK)
 
     def _candidates(self, base: ScoredModel) -> list[Candidate]:
         """Effects whose screening promises enough to fit them in addition to a set, the largest gain first."""
