@@ -21,6 +21,7 @@ from visadapt.diagnosis.result import (
     RecordingSummary,
     Region,
     Where,
+    without_slight,
 )
 from visadapt.diagnosis.search import heldout
 from visadapt.diagnosis.search.causes import Alternative, alternatives, causes, ranking, stage_shares
@@ -172,7 +173,7 @@ def _verdict(comparison: ModelComparison, errors: Errors, explaining: Sequence[C
             return UNEXPLAINED
     elif math.isnan(gap.closed) and not repeats:
         return NO_GAP  # the source predicts as well as the noise allows
-    carrying = [cause for cause in explaining if not cause.slight]
+    carrying = without_slight(explaining)
     if not carrying:
         return UNEXPLAINED if comparison.unexplained else NO_GAP
     return AMBIGUOUS if any(cause.indistinguishable_from for cause in carrying) else IDENTIFIED

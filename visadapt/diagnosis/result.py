@@ -7,7 +7,7 @@ determined is NaN, null in the JSON.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from numbers import Integral
 from typing import Any
@@ -69,6 +69,11 @@ class Cause:
     gap_reopened: float = math.nan  # share of the gap that opens again without it, on held-out episodes
     slight: bool = False  # whether that is too little for the verdict to rest on it
     indistinguishable_from: tuple[str, ...] = ()  # effects that fit this recording equally well
+
+
+def without_slight(causes: Iterable[Cause]) -> list[Cause]:
+    """The causes on which the verdict rests."""
+    return [cause for cause in causes if not cause.slight]
 
 
 @dataclass(frozen=True)

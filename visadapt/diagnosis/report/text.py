@@ -8,7 +8,16 @@ from typing import Any
 
 import jinja2
 
-from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, Cause, Diagnosis, Estimate, Region
+from visadapt.diagnosis.result import (
+    AMBIGUOUS,
+    IDENTIFIED,
+    NO_GAP,
+    Cause,
+    Diagnosis,
+    Estimate,
+    Region,
+    without_slight,
+)
 from visadapt.systems import SYSTEMS
 
 UNKNOWN = "unknown"
@@ -93,7 +102,7 @@ def sentence(diagnosis: Diagnosis) -> str:
             f"No gap: the simulator predicts this recording as well as its noise allows "
             f"(error {number(gap.before)}, noise {number(gap.floor)})."
         )
-    carrying = [cause for cause in diagnosis.causes if not cause.slight]
+    carrying = without_slight(diagnosis.causes)
     if diagnosis.verdict == IDENTIFIED:
         return f"{_capitalised(listed([_described(cause) for cause in carrying]))} {_closes(diagnosis)}."
     if diagnosis.verdict == AMBIGUOUS:
@@ -134,7 +143,7 @@ def _described(cause: Cause) -> str:
 
 
 def _closes(diagnosis: Diagnosis) -> str:
-    many = len(_alternatives([cause for cause in diagnosis.causes if not cause.slight])) > 1
+    many = len(_alternatives(without_slight(diagnosis.causes))) > 1
     return f"{'close' if many else 'closes'} {percent(diagnosis.gap.closed)} of the gap to the simulator"
 
 

@@ -155,7 +155,7 @@ class Search:
         for base in bases:
             for candidate in self._candidates(base)[:most]:
                 effects = (*base.effects, candidate.effect)
-                key = frozenset(e.name for e in effects)
+                key = _key(effects)
                 if key in self.fitted:
                     known.append(self.fitted[key])
                 elif key not in starts:
@@ -188,16 +188,17 @@ class Search:
         """Fit the sets with one effect removed, with one exchanged for another, and with two exchanged for one."""
         smaller = [_without(centre, [removed]) for removed in centre.effects]
         known = set() if self.profile.refit_subsets else self.fitted.keys()
-        self.fit([each for each in smaller if frozenset(e.name for e in each[0]) not in known], QUICK)
+        self.fit([each for each in smaller if _key(each[0]) not in known], QUICK)
         exchanges = []
         for removed in (*combinations(centre.effects, 1), *combinations(centre.effects, 2)):
             # Along the states of the whole set what is removed shows as a disturbance, without a fit of what is left.
             kept, fits = _without(centre, removed)
             rest = [e for e in self.catalogue if e not in centre.effects]
             for candidate in self._promising(screen(self.system, kept, fits, self.rows, rest))[:MAX_EXCHANGES]:
-                effects, names = (*kept, candidate.effect), frozenset(e.name for e in (*kept, candidate.effect))
-                if (centre.names, names) not in self._exchanged:
-                    self._exchanged.add((centre.names, names))
+                effects = (*kept, candidate.effect)
+                exchange = centre.names, _key(effects)
+                if exchange not in self._exchanged:
+                    self._exchanged.add(exchange)
                     process = centre.fits.log_process.clamp(min=EXCHANGE_LOG_PROCESS)
                     exchanges.append((effects, replace(with_effect(fits, candidate.values), log_process=process)))
         self.fit(exchanges, QUICK)
@@ -223,7 +224,7 @@ class Search:
     def without(self, whole: ScoredModel, removed: type[Effect]) -> ScoredModel:
         """A set less one of its effects."""
         start = _without(whole, [removed])
-        return self.fitted.get(frozenset(e.name for e in start[0])) or self.fit([start], QUICK)[0]
+        return self.fitted.get(_key(start[0])) or self.fit([start], QUICK)[0]
 
     def exchange(self, whole: ScoredModel, removed: type[Effect], new: type[Effect]) -> ScoredModel:
         """A set with one of its effects exchanged for another."""
@@ -257,7 +258,7 @@ class Search:
         for k, (effects, _) in enumerate(starts):
             fits = single_fit(out, k, len(models[k].table))
             fitted = ScoredModel(effects, fits, log_posterior_odds(effects, fits, len(self.catalogue)))
-            key = frozenset(fitted.names)
+            key = _key(effects)
             if key not in self.fitted or self.fitted[key].log_odds < fitted.log_odds:
                 self.fitted[key] = fitted
             results.append(self.fitted[key])
@@ -265,6 +266,11 @@ class Search:
 
     def _all_windows(self, count: int) -> Tensor:
         return torch.ones(count, self.rows.shape[0], dtype=torch.float64)
+
+
+def _key(effects: Effects) -> frozenset[str]:
+    """A set of effects, whatever their order."""
+    return frozenset(effect.name for effect in effects)
 
 
 def _without(whole: ScoredModel, removed: Sequence[type[Effect]]) -> tuple[Effects, FitState]:
