@@ -42,12 +42,21 @@ class TestClock:
         table["time"] = table["time"] * 1000
         refuses("column 'time': rows are 50 s apart.*milliseconds", write(file, table))
 
-    def test_an_episode_of_another_period_is_left_out(self, tmp_path):
-        for number, period in enumerate((0.05, 0.02, 0.05)):
-            write(tmp_path / f"{number}.csv", a_table(period=period))
-        recording = load(tmp_path)
-        assert [source[-5:] for source in recording.sources] == ["0.csv", "2.csv"]
+    def test_an_episode_of_another_period_is_left_out(self, file):
+        tables = [a_table(period=period) for period in (0.05, 0.02, 0.05)]
+        numbers = np.repeat([0, 1, 2], [len(table["time"]) for table in tables])
+        table = {"episode": numbers, **{name: np.concatenate([one[name] for one in tables]) for name in HEADER}}
+        recording = load(write(file, table))
+        assert [source[-9:] for source in recording.sources] == ["episode 0", "episode 2"]
         assert "left out, since its rows are not 0.05 s apart" in " ".join(recording.warnings)
+
+    def test_a_file_of_another_period(self, tmp_path):
+        for number, scale in enumerate((1, 1000, 1)):
+            table = a_table()
+            write(tmp_path / f"{number}.csv", {**table, "time": scale * table["time"]})
+        refuses(
+            "1.csv: column 'time': rows are 50 s apart, those of .*0.csv 0.05 s; .* in seconds, are right", tmp_path
+        )
 
 
 class TestEpisodes:

@@ -125,15 +125,24 @@ def _clocked(part: RawEpisode, note: Note) -> RawEpisode:
 
 
 def alike(parts: list[RawEpisode], note: Note) -> tuple[list[RawEpisode], float]:
-    """The parts with about the period of most rows, and the median step in s; every part needs at least two rows."""
+    """The parts with about the period of most rows, and the median step in s; every part needs at least two rows.
+
+    Raises:
+        RecordingError: a file has no such part.
+    """
     periods = np.array([np.median(np.diff(part.time)) for part in parts])
     order = np.argsort(periods)
     rows = np.cumsum([len(parts[index].time) for index in order])
     period = float(periods[order][np.searchsorted(rows, rows[-1] / 2)])
-    kept = []
-    for part, own in zip(parts, periods, strict=True):
-        if 1 / PERIOD_RATIO <= own / period <= PERIOD_RATIO:
-            kept.append(part)
-        else:
+    fits = (periods / period < PERIOD_RATIO) & (periods * PERIOD_RATIO > period)
+    kept = [part for part, fit in zip(parts, fits, strict=True) if fit]
+    usual = {part.path for part in kept}
+    for part, own, fit in zip(parts, periods, fits, strict=True):
+        if part.path not in usual:
+            raise RecordingError(
+                f"{part.source}: column 'time': rows are {own:.4g} s apart, those of {kept[0].path} {period:.4g} s; "
+                "recordings with one period, in seconds, are right"
+            )
+        if not fit:
             note(f"left out, since its rows are not {period:.4g} s apart as most are", part.source)
     return kept, period

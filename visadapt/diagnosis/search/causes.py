@@ -6,14 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import torch
-
 from visadapt.diagnosis.result import Cause, Estimate, Ranked
 from visadapt.diagnosis.search.model_comparison import ComparedModel, ModelComparison
 from visadapt.diagnosis.search.search import ScoredModel, Search
 from visadapt.effects import Effect, Parameter, Role
 from visadapt.effects.catalogue import twins
-from visadapt.estimation.fit_states import posterior
+from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.covariance import deviations
 from visadapt.estimation.screening import spans
 from visadapt.systems import System
 
@@ -89,9 +88,8 @@ def _twin(search: Search, one: Alternative, fitted: Mapping[str, Estimate]) -> M
 
 
 def estimates(search: Search, model: ScoredModel, effect: type[Effect]) -> dict[str, Estimate]:
-    """Maximum likelihood estimates of one effect's parameters, with 90 % intervals from Fisher's information."""
-    _, whole = posterior(model.effects, model.fits)
-    deviation = torch.linalg.inv(whole).diagonal().sqrt()
+    """Maximum likelihood estimates of one effect's parameters, with 90 % intervals that hold under misfit as well."""
+    deviation = deviations(CandidateModel(search.system, model.effects, search.rows), model.fits)
     first = sum(len(e.table) for e in model.effects[: model.effects.index(effect)])
     covered = spans(search.system, search.rows, model.fits.state[0])
     out = {}

@@ -1,0 +1,39 @@
+"""The covariance of a fit's parameters, also where no model is right.
+
+If the model is right its innovations are white, and the covariance is the inverse of Fisher's information I. What a
+wrong model leaves unexplained lasts for several rows, so that these do not inform independently. The covariance is then
+I^-1 J I^-1 with the long-run covariance J of the scores (Huber 1967, Proc. 5th Berkeley Symposium 1), here with the
+weights of Newey and West (1987, Econometrica 55(3)).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.fit_states import posterior
+from visadapt.estimation.kalman import forward
+from visadapt.estimation.likelihood import FitState, linear_problem, variances
+
+CORRELATION_TIME = 0.5  # s; scores further apart are taken as independent
+
+
+def deviations(model: CandidateModel, fits: FitState) -> Tensor:
+    """Standard deviations (K,) of the parameters of a fit (C = 1): the larger of both covariances' for each.
+
+    The long-run covariance is estimated from the recording, and too small where that is short.
+    """
+    rows = model.rows
+    covariance = torch.linalg.inv(posterior(model.effects, fits)[1])
+    filtered = forward(linear_problem([model], fits), *variances(model, fits.log_process, fits.log_noise))
+    white = filtered.white * rows.used[..., None]
+    score = (white[..., :1] * white[..., 1:]).sum(2)
+    length = score.shape[1]
+    last = min(length - 1, round(CORRELATION_TIME / rows.period))
+    scores = torch.einsum("wtk,wtl->kl", score, score)
+    for lag in range(1, last + 1):
+        product = torch.einsum("wtk,wtl->kl", score[:, lag:], score[:, : length - lag])
+        scores = scores + (1 - lag / (last + 1)) * (product + product.T)
+    robust = covariance @ scores @ covariance
+    return torch.maximum(covariance.diagonal(), robust.diagonal()).sqrt()
