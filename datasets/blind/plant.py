@@ -190,13 +190,14 @@ def nominal(n: int) -> Plant:
     return Plant(np.full(n, CART_MASS), np.full(n, POLE_MASS), np.full(n, HALF_LENGTH), np.zeros(n))
 
 
-def predict(start: Array, commands: Array, lengths: Array | None = None, substeps: int = 8) -> Array:
+def predict(start: Array, commands: Array, lengths: Array | None = None) -> Array:
     """States that the source predicts from `start` (4, n) under commands (steps, n): (4, n) at the end.
 
-    Each command acts for its length in s (steps, n), or for 50 ms.
+    Each command acts for its length in s (steps, n), or for 50 ms, in 8 substeps in 50 ms and at least 2.
     """
     plant, state = nominal(start.shape[1]), start
     for command, length in zip(commands, np.full(commands.shape, PERIOD) if lengths is None else lengths, strict=True):
+        substeps = max(2, round(8 * float(length.mean()) / PERIOD))
         for _ in range(substeps):
             state = plant.step(0.0, state, MAX_FORCE * command, length / substeps)
     return state

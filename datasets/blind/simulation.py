@@ -76,14 +76,15 @@ class Run:
         """Largest |x| (m) and |theta| (rad)."""
         return float(np.abs(self.true[:, 0]).max()), float(np.abs(self.true[:, 2]).max())
 
-    def predicted_gap(self, deviations: Array, every: int = 2) -> float:
+    def predicted_gap(self, deviations: Array) -> float:
         """Strength of an effect on commands or states.
 
-        Root mean square, over rows and over x and theta, of the error of the source's prediction of the true states
+        Root mean square, over a row in every 0.1 s and over x and theta, of the error of the source's prediction of the true states
         half a second ahead, in units of the measurement noise (`deviations`, m and rad).
         """
-        ahead = round(HORIZON / float(self.lengths.mean()))
-        rows = np.arange(0, len(self.true) - ahead, every)
+        period = float(self.lengths.mean())
+        ahead = round(HORIZON / period)
+        rows = np.arange(0, len(self.true) - ahead, round(0.1 / period))
         start = self.true[rows].transpose(1, 0, 2).reshape(4, -1)
         commands, lengths = (
             np.stack([values[rows + k].reshape(-1) for k in range(ahead)]) for values in (self.commands, self.lengths)
@@ -107,9 +108,9 @@ def simulate(cases: list[Case], substeps: int) -> list[Run]:
     A pole beyond 1 rad or a cart beyond 5 m is stopped there, and `Run.reach` shows it.
     """
     runs: dict[int, Run] = {}
-    for period, longest in dict.fromkeys((case.rig.period, case.rig.longest) for case in cases):
-        own = [i for i, case in enumerate(cases) if (case.rig.period, case.rig.longest) == (period, longest)]
-        steps = math.ceil(substeps * longest / PERIOD - 1e-9)
+    for period in dict.fromkeys(case.rig.period for case in cases):
+        own = [i for i, case in enumerate(cases) if case.rig.period == period]
+        steps = math.ceil(substeps * max(cases[i].rig.longest for i in own) / PERIOD - 1e-9)
         runs |= zip(own, _simulate([cases[i] for i in own], period, steps), strict=True)
     return [runs[i] for i in range(len(cases))]
 
@@ -128,7 +129,7 @@ def _simulate(cases: list[Case], period: float, substeps: int) -> list[Run]:
         times[own:, span] += times[own - 1, span] + lengths[own - 1, span] - own * period
     drive = Controllers([case.driver for case in cases], period)
     chain = _chain(cases, spans, n)
-    plant = _plant(cases, spans, n, rows * cases[0].rig.longest)
+    plant = _plant(cases, spans, n, rows * max(case.rig.longest for case in cases))
     start = drive.start if plant.slosh is None else np.concatenate((drive.start, drive.start[:2]))
     actuation, sensing = Actuation(chain, n), Sensing(chain, drive.start, float(lengths.min()) / substeps)
     true, measured, clean = (np.empty((rows, 4, n)) for _ in range(3))

@@ -14,7 +14,7 @@ from datasets.blind.drafts import RECORDING_SUBSTEPS, Draft, draw_case, stayed
 from datasets.blind.kinds import Shape
 from datasets.blind.plant import PERIOD, Array
 from datasets.blind.rigs import Rig, Velocities, late_rows, late_steps
-from datasets.blind.simulation import Case, simulate
+from datasets.blind.simulation import Case, Run, simulate
 from datasets.blind.sizing import SEARCH_SUBSTEPS, strength_of
 
 CLEAN = (0.001, 0.005, 0.001, 0.005)
@@ -101,6 +101,8 @@ ROWS = (
 )
 """in the order of the files"""
 
+EXCITATIONS = (0.3, 0.45, 0.65, 0.85, 1.0)
+"""that are tried at once, as shares of the usual strength"""
 MIXTURES = ("none", "single", "pair")
 """by the number of effects"""
 
@@ -112,19 +114,18 @@ def make_table(seed: int) -> list[Draft]:
         Draft(np.random.default_rng(own), MIXTURES[len(row.effects)], row=row.name)
         for own, row in zip(seeds, ROWS, strict=True)
     ]
-    for attempt in range(80):
+    for _ in range(20):
         pending = [(draft, row) for draft, row in zip(drafts, ROWS, strict=True) if draft.run is None]
         if not pending:
             return drafts
-        cases = [_draw(draft.rng, row, 0.95 ** (attempt // 2)) for draft, row in pending]
-        for (draft, _), case, run in zip(pending, cases, simulate(cases, SEARCH_SUBSTEPS), strict=True):
+        trials = [(draft, _draw(draft.rng, row, level)) for draft, row in pending for level in EXCITATIONS]
+        bare = simulate([case for _, case in trials], SEARCH_SUBSTEPS)
+        # Of each row, the most excited that stayed.
+        kept = {id(draft): (draft, case) for (draft, case), run in zip(trials, bare, strict=True) if stayed(run)}
+        runs = simulate([case for _, case in kept.values()], RECORDING_SUBSTEPS)
+        for (draft, case), run in zip(kept.values(), runs, strict=True):
             if stayed(run):
-                draft.case = case
-        drawn = [draft for draft, _ in pending if draft.case is not None]
-        for draft, run in zip(drawn, simulate([d.case for d in drawn if d.case], RECORDING_SUBSTEPS), strict=True):
-            draft.run = run if stayed(run) else None
-            draft.case = draft.case if stayed(run) else None
-            draft.strengths = _strengths(draft)
+                draft.case, draft.run, draft.strengths = case, run, _strengths(case, run)
     raise RuntimeError("some recordings could not be kept on the track; try another seed")
 
 
@@ -135,13 +136,10 @@ def _draw(rng: np.random.Generator, row: Row, excitation: float) -> Case:
     return replace(case, effects=row.effects)
 
 
-def _strengths(draft: Draft) -> dict[str, float]:
+def _strengths(case: Case, run: Run) -> dict[str, float]:
     """By effect, each alone, in units of 1 mm and 1 mrad."""
-    if draft.case is None:
-        return {}
-    alone = [replace(draft.case, effects={name: values}) for name, values in draft.case.effects.items()]
-    runs = simulate(alone, SEARCH_SUBSTEPS)
+    alone = [replace(case, effects={name: values}) for name, values in case.effects.items()]
+    runs = [run] if len(alone) == 1 else simulate(alone, SEARCH_SUBSTEPS)
     return {
-        name: strength_of(name, run, np.array([0.001, 0.001]))
-        for name, run in zip(draft.case.effects, runs, strict=True)
+        name: strength_of(name, own, np.array([0.001, 0.001])) for name, own in zip(case.effects, runs, strict=True)
     }
