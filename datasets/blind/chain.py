@@ -1,9 +1,9 @@
 """Actuation and sensing of the blind recordings: from a command to the motor's input, from a state to its reading.
 
 The actuation chain runs delay, backlash, dead zone, saturation, gain, bias, lag; the sensing chain runs delay, scale,
-offset, noise, encoder, velocities derived from its positions, and last the effects that hold a reading. Widths, limits and offsets of the actuation chain are in units
-of the command. Before an episode commands are zero, the lag has settled on the bias, and the machine rests in its
-first state.
+offset, noise, encoder, velocities derived from its positions, and last the effects that hold a reading. Widths, limits
+and offsets of the actuation chain are in units of the command. Before an episode commands are zero, the lag has settled
+on the bias, and the machine rests in its first state.
 """
 
 from __future__ import annotations

@@ -67,4 +67,11 @@ def lines(draft: Draft) -> Iterator[str]:
     for episode in range(episodes):
         for row in range(rows):
             values = [f"{draft.run.measured[row, c, episode]:.7f}" for c in channels]
-            yield ",".join((str(episode), f"{draft.run.times[row, episode]:.{digits}f}", *values, f"{draft.run.commands[row, episode]:.7f}"))
+            yield ",".join(
+                (
+                    str(episode),
+                    f"{draft.run.times[row, episode]:.{digits}f}",
+                    *values,
+                    f"{draft.run.commands[row, episode]:.7f}",
+                )
+            )

@@ -41,15 +41,15 @@ class Settings:
     """folder for the recordings"""
     kind: CartPoleKind = "hard"
     """easy: about 1,000 rows, little noise, all states; hard: about 400 rows, much noise, no velocities; large: as
-    easy, with effects up to ten times as strong; rig: about 20 s as a lab's machine gives them; table: the recordings of
-    datasets.blind.table"""
+    easy, with effects up to ten times as strong; rig: about 20 s as a lab's machine gives them; table: the recordings
+    of datasets.blind.table"""
     count: int = 200
     """how many recordings; the table has its own count"""
     seed: int = 0
     """seed of all random numbers"""
     strengths: tuple[float, float] | None = None
     """weakest and strongest effect, in units of the noise; by default 2 to 30 (easy), 0.7 to 6 (hard), 10 to 300
-    (large), and for rig 5 to 60 times 1 mm and 1 mrad"""
+    (large), and for rig 10 to 300 times 1 mm and 1 mrad"""
     key: Path | None = None
     """file for the answers; by default beside the folder, <out>.key.json"""
     effects: Effects = "core"
@@ -114,7 +114,7 @@ DIFFICULTIES = {
         (3, 6),
         (2e-5, 0.005, 1e-4, 0.005),
         False,
-        (5.0, 60.0),
+        (10.0, 300.0),
         {"single": 0.5, "pair": 0.25, "none": 0.25},
         lab=True,
         in_pairs=("coulomb_friction",),
@@ -195,7 +195,8 @@ def _draw_case(rng: np.random.Generator, difficulty: Difficulty, excitation: flo
     rows, rig = round(difficulty.rows / episodes), Rig(velocities="measured" if difficulty.velocities else "absent")
     if difficulty.lab:
         rig, rows = draw_rig(rng, difficulty.rows * PERIOD, episodes)
-    return draw_case(rng, rows, episodes, np.array(difficulty.noise), rig, difficulty.velocities, excitation)
+    case = draw_case(rng, rows, episodes, np.array(difficulty.noise), rig, difficulty.velocities, excitation)
+    return replace(case, turns_exactly=difficulty.lab)
 
 
 def key_text(settings: Settings, drafts: list[Draft]) -> str:
@@ -213,7 +214,7 @@ def key_text(settings: Settings, drafts: list[Draft]) -> str:
             answer |= {"row": draft.row} if draft.row else {}
             answer["rig"] = draft.case.rig.description
         answers.append(answer)
-    head = {"kind": settings.kind, "seed": settings.seed}
+    head: dict[str, object] = {"kind": settings.kind, "seed": settings.seed}
     if settings.kind != "table":
         head["noise"] = DIFFICULTIES[settings.kind].noise
     return json.dumps({**head, "recordings": answers}, indent=1) + "\n"

@@ -119,6 +119,8 @@ class Plant:
     """dry friction on the cart"""
     dry_torques: Table = field(default_factory=list)
     """dry friction at the pivot"""
+    turns_exactly: bool = False
+    """whether dry friction turns round within a substep, where a velocity passes 0; the older sets do without"""
     slosh: tuple[Array, Array, Array] | None = None
     """mass (kg, zero where there is none), angular frequency (rad/s) and damping ratio of a mass hidden in the cart"""
 
@@ -171,10 +173,20 @@ class Plant:
             per_impulse = self._solve(before[2], *unit)  # m/s and rad/s for each N s or N m s
             own = per_impulse[0] if axis == 1 else per_impulse[1]
             impulse = -np.clip(after[axis] / own, -most * h, most * h)
+            if self.turns_exactly:
+                impulse = self._turn(before[axis], after[axis], own, most, h, impulse)
             for velocity, gain in zip((1, 3), per_impulse, strict=True):
                 after[velocity] += gain * impulse
                 after[velocity - 1] += 0.5 * h * gain * impulse
         return after
+
+    @staticmethod
+    def _turn(before: Array, after: Array, own: Array, most: Array, h: Time, impulse: Array) -> Array:
+        """The impulse where a velocity passes 0 and slides on: friction turns round at that instant."""
+        drive, against = np.abs(after - before) / h, np.abs(after - before) / h + own * most
+        passes = (before * (after - before) < 0) & (np.abs(before) < against * h) & (drive > own * most)
+        left = h - np.abs(before) / np.where(against > 0, against, 1.0)
+        return np.where(passes, np.sign(before) * most * (2 * left - h), impulse)
 
 
 def _total(table: Table, t: Time, state: Array) -> Array:

@@ -57,8 +57,9 @@ class Rig:
 
 def late_steps(rng: np.random.Generator, rows: int, episodes: int, most: float) -> Array:
     """Every step lasts up to `most` seconds longer than the period, and the next begins later by that."""
-    longer = rng.uniform(0.0, most, (rows, episodes))
-    return np.round(np.concatenate((np.zeros((1, episodes)), np.cumsum(longer, 0))), 6)
+    late = np.zeros((rows + 1, episodes))
+    late[1:] = np.cumsum(rng.uniform(0.0, most, (rows, episodes)), 0)
+    return np.round(late, 6)
 
 
 def late_rows(rng: np.random.Generator, rows: int, episodes: int, most: float) -> Array:

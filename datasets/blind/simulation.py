@@ -46,6 +46,8 @@ class Case:
     """(rows, episodes), uniform: which rows a dropout loses"""
     rig: Rig = field(default_factory=Rig)
     """sensors and clock"""
+    turns_exactly: bool = False
+    """of its dry friction (`Plant`); alike for all cases of a set"""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -79,8 +81,8 @@ class Run:
     def predicted_gap(self, deviations: Array) -> float:
         """Strength of an effect on commands or states.
 
-        Root mean square, over a row in every 0.1 s and over x and theta, of the error of the source's prediction of the true states
-        half a second ahead, in units of the measurement noise (`deviations`, m and rad).
+        Root mean square, over a row in every 0.1 s and over x and theta, of the error of the source's prediction of the
+        true states half a second ahead, in units of the measurement noise (`deviations`, m and rad).
         """
         period = float(self.lengths.mean())
         ahead = round(HORIZON / period)
@@ -130,6 +132,7 @@ def _simulate(cases: list[Case], period: float, substeps: int) -> list[Run]:
     drive = Controllers([case.driver for case in cases], period)
     chain = _chain(cases, spans, n)
     plant = _plant(cases, spans, n, rows * max(case.rig.longest for case in cases))
+    plant.turns_exactly = cases[0].turns_exactly
     start = drive.start if plant.slosh is None else np.concatenate((drive.start, drive.start[:2]))
     actuation, sensing = Actuation(chain, n), Sensing(chain, drive.start, float(lengths.min()) / substeps)
     true, measured, clean = (np.empty((rows, 4, n)) for _ in range(3))
@@ -209,7 +212,9 @@ MASSES = {"cart_mass": "cart_mass", "pole_mass": "pole_mass", "pole_length": "ha
 NDArrayInt = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 
 
-def _together(effect: str, members: list[tuple[NDArrayInt, Shape, int]], seconds: float) -> tuple[NDArrayInt, Parameters]:
+def _together(
+    effect: str, members: list[tuple[NDArrayInt, Shape, int]], seconds: float
+) -> tuple[NDArrayInt, Parameters]:
     """Columns and parameters, one value a column, of all cases that have this effect."""
     index = np.concatenate([columns for columns, _, _ in members])
     counts = [count for _, _, count in members]

@@ -133,7 +133,7 @@ def _draw(rng: np.random.Generator, row: Row, excitation: float) -> Case:
     # The controller of the hard set and of lab's machines has no velocities.
     velocities = row.noise == CLEAN and row.velocities == "measured"
     case = draw_case(rng, row.rows, row.episodes, np.array(row.noise), row.rig(rng), velocities, excitation)
-    return replace(case, effects=row.effects)
+    return replace(case, effects=row.effects, turns_exactly=True)
 
 
 def _strengths(case: Case, run: Run) -> dict[str, float]:
