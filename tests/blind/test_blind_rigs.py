@@ -133,12 +133,12 @@ def test_dry_friction_turns_round_where_the_velocity_does():
         plant, state, h = nominal(1), np.array([[0.0], [0.3], [0.02], [0.1]]), 0.05 / steps
         plant.turns_exactly = True
         plant.dry_forces.append((np.array([0]), {}, lambda p, t, s: np.array([1.3])))
-        for force in 6.0 * np.cos(0.2 * np.pi * np.arange(20)):
+        for force in 6.0 * np.sin(0.2 * np.pi * np.arange(10)):
             for _ in range(steps):
                 state = plant.step(0.0, state, np.array([-force]), h)
         ends.append(state[:, 0])
-    # To a hundredth of a count of 0.1 mm, which 1 ms would miss by more than a count without it.
-    assert abs(ends[0][0] - ends[1][0]) < 1e-6
+    # A tenth of a count of 0.1 mm, after half a second at 1 ms; turning at the next substep misses by more than a count.
+    assert abs(ends[0][0] - ends[1][0]) < 1e-5
 
 
 def test_lab_machines_differ_and_last_as_long_as_asked():
