@@ -137,7 +137,7 @@ def test_dry_friction_turns_round_where_the_velocity_does():
             for _ in range(steps):
                 state = plant.step(0.0, state, np.array([-force]), h)
         ends.append(state[:, 0])
-    # A tenth of a count of 0.1 mm, after half a second at 1 ms; turning at the next substep misses by more than a count.
+    # A tenth of a count of 0.1 mm, after half a second at 1 ms; turning a substep late misses by more than one.
     assert abs(ends[0][0] - ends[1][0]) < 1e-5
 
 
