@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 
 from datasets.blind.drafts import RECORDING_SUBSTEPS, Draft, draw_case, lines, stayed
-from datasets.blind.kinds import INSEPARABLE, REST, Effects, drawn
+from datasets.blind.kinds import AS_ONE, INSEPARABLE, REST, Effects, drawn
 from datasets.blind.plant import PERIOD, Array
 from datasets.blind.rigs import Rig, draw_rig
 from datasets.blind.sealing import key_path, names, seal
@@ -164,7 +164,7 @@ def _attempt(drafts: list[Draft], difficulty: Difficulty, effects: Effects, exci
     kept = [(draft, case) for draft, case, run in zip(drafts, cases, bare, strict=True) if stayed(run)]
     parts: list[list[Job]] = []
     for draft, case in kept:
-        chosen = _draw_kinds(draft.rng, draft.mixture, effects, difficulty.in_pairs)
+        chosen = draw_kinds(draft.rng, draft.mixture, effects, difficulty.in_pairs)
         parts.append([draw_job(draft.rng, name, case, difficulty.strengths) for name in chosen])
     seek([job for own in parts for job in own], difficulty.unit)
     weakest, strongest = difficulty.strengths
@@ -179,14 +179,16 @@ def _attempt(drafts: list[Draft], difficulty: Difficulty, effects: Effects, exci
             draft.case, draft.run, draft.strengths = case, run, {job.name: job.strength for job in own}
 
 
-def _draw_kinds(rng: np.random.Generator, mixture: str, effects: Effects, in_pairs: tuple[str, ...]) -> list[str]:
+def draw_kinds(rng: np.random.Generator, mixture: str, effects: Effects, in_pairs: tuple[str, ...]) -> list[str]:
+    """Names of the effects of a recording, which data can tell apart."""
     if mixture == "none" and (effects == "rest" or (effects == "all" and rng.random() < 0.5)):
         return [REST[int(rng.integers(len(REST)))].name]
     fixed = list(in_pairs) if mixture == "pair" else []
     kinds = [kind.name for kind in drawn(mixture, effects) if kind.name not in fixed]
+    apart = INSEPARABLE if effects == "core" else INSEPARABLE + AS_ONE
     while True:
         chosen = fixed + [kinds[i] for i in rng.choice(len(kinds), EFFECTS_IN[mixture] - len(fixed), replace=False)]
-        if not any(together <= set(chosen) for together in INSEPARABLE):
+        if not any(together <= set(chosen) for together in apart):
             return chosen
 
 

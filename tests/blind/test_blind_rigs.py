@@ -1,7 +1,6 @@
 """Recordings of lab machines: clock, encoders and derived velocities, as the file shows them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 from datasets.blind.chain import NEUTRAL, Actuation
 from datasets.blind.drafts import Draft, draw_case, lines
-from datasets.blind.gaps import Settings, make
+from datasets.blind.gaps import DIFFICULTIES, draw_kinds
 from datasets.blind.kinds import INSEPARABLE, KINDS
 from datasets.blind.plant import MAX_FORCE, nominal
 from datasets.blind.rigs import Rig, draw_rig, late_rows, late_steps
@@ -154,10 +153,15 @@ def test_lab_machines_differ_and_last_as_long_as_asked():
         np.testing.assert_allclose(np.diff(times, axis=0), lengths[:-1], atol=1e-12)
 
 
-def test_every_pair_of_a_lab_set_has_dry_friction():
-    drafts = make(Settings(Path("unused"), "rig", 2, seed=4, strengths=(2.0, 60.0), effects="all"))
-    for draft in drafts:
-        assert draft.mixture != "pair" or "coulomb_friction" in draft.case.effects
+def test_pairs_of_a_lab_set_are_dry_friction_and_another_that_is_not_one_effect_with_it():
+    rng = np.random.default_rng(0)
+    others = set()
+    for _ in range(300):
+        first, second = draw_kinds(rng, "pair", "all", DIFFICULTIES["rig"].in_pairs)
+        assert first == "coulomb_friction"
+        others.add(second)
+    assert not others & {"constant_force", "actuator_bias", "directional_friction", "stribeck_friction"}
+    assert len(others) > 15
 
 
 def test_the_table_shows_every_effect_that_two_others_imitate():
