@@ -133,6 +133,18 @@ COMMANDS = (
     _blind("blind_hard", "--seed 2028 --kinds hard --count 100 --jobs 2", 20),
     _blind("blind_easy", "--seed 2028 --kinds easy --count 24 --jobs 2", 10),
     _blind(
+        "blind_rig",
+        "--seed 2042 --kinds rig --effects all --count 24 --jobs 2 --diagnosers ours --out results/blind_rigs.csv",
+        30,
+        "blind_rigs.csv",
+    ),
+    _blind(
+        "blind_table",
+        "--seed 2042 --kinds table --jobs 2 --diagnosers ours --out results/blind_rigs.csv",
+        30,
+        "blind_rigs.csv",
+    ),
+    _blind(
         "blind_quadrotor",
         "--system quadrotor --count 24 --seed 2032 --jobs 2 --diagnosers ours refit chance",
         10,

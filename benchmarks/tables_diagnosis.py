@@ -42,6 +42,12 @@ def blind(first: Rows, second: Rows) -> Lines:
     return [[*header, "hard, second draw: ours"], *([*line, _cell(again.get(key))] for key, *line in lines)]
 
 
+def blind_rigs(rows: Rows) -> Lines:
+    """Lab's machines, and the rows of `datasets.blind.table`, without the measures that neither set has."""
+    header, *lines = _check(rows, ("rig-all", "table"))
+    return [header, *(line for _, *line in lines if any(line[1:]))]
+
+
 def blind_flights(rows: Rows) -> Lines:
     """Vehicles: every diagnoser, without the measures that no vehicle has."""
     header, *lines = _check(rows, ("quadrotor", "fixed_wing"))

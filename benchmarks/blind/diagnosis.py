@@ -35,8 +35,9 @@ from benchmarks.blind.scoring import Answer, Score, Truth, score
 from benchmarks.blind.tables import Row, confusion, label, read_table, tabulate, write_csv, write_table
 from datasets.blind import flights as blind_flights, gaps as blind_gaps
 from datasets.blind.kinds import Effects
+from datasets.blind.table import ROWS
 
-Kind = Literal["easy", "hard", "large", "quadrotor", "fixed_wing"]
+Kind = Literal["easy", "hard", "large", "rig", "table", "quadrotor", "fixed_wing"]
 """One of the sets of the cart-pole, or the set of a vehicle."""
 System = Literal["cartpole", "quadrotor", "fixed_wing"]
 
@@ -48,7 +49,7 @@ class Settings:
     system: System = "cartpole"
     """the system that is recorded; a vehicle has one set"""
     count: int = 200
-    """recordings of each set"""
+    """recordings of each set; the table has its own count"""
     seed: int = 7
     """seed of the recordings"""
     kinds: tuple[Kind, ...] = ("easy", "hard")
@@ -183,14 +184,13 @@ def recordings_of(settings: Settings, kind: Kind) -> Path:
     """The folder of a set, made unless it exists and is complete."""
     if settings.data is not None:
         return settings.data
-    folder = Path("data/blind") / f"{settings.label(kind)}-{settings.count}-{settings.seed}"
-    if len(list(folder.glob("*.csv"))) != settings.count or not key_of(folder).exists():
-        if kind == "easy" or kind == "hard" or kind == "large":
-            blind_gaps.main(blind_gaps.Settings(folder, kind, settings.count, settings.seed, effects=settings.effects))
+    count = len(ROWS) if kind == "table" else settings.count
+    folder = Path("data/blind") / f"{settings.label(kind)}-{count}-{settings.seed}"
+    if len(list(folder.glob("*.csv"))) != count or not key_of(folder).exists():
+        if kind == "quadrotor" or kind == "fixed_wing":
+            blind_flights.main(blind_flights.Settings(folder, kind, count, settings.seed, effects=settings.effects))
         else:
-            blind_flights.main(
-                blind_flights.Settings(folder, kind, settings.count, settings.seed, effects=settings.effects)
-            )
+            blind_gaps.main(blind_gaps.Settings(folder, kind, count, settings.seed, effects=settings.effects))
     return folder
 
 

@@ -30,7 +30,7 @@ class Row:
     """One measure of one diagnoser on one set."""
 
     kind: str
-    """easy or hard, of the cart-pole, or a vehicle"""
+    """a set of the cart-pole, or a vehicle"""
     diagnoser: str
     measure: str
     """what is measured; docs/results.md explains it"""

@@ -14,12 +14,12 @@ import numpy as np
 from datasets.blind.plant import PERIOD, Array, predict
 
 
-def linearised() -> tuple[Array, Array]:
-    """A (4, 4) and B (4, 1) of the source over one period, by central differences about upright."""
+def linearised(period: float) -> tuple[Array, Array]:
+    """A (4, 4) and B (4, 1) of the source over one period in s, by central differences about upright."""
     small = 1e-5
     probes = np.concatenate((np.eye(4), -np.eye(4)), 1) * small
-    ends = predict(probes, np.zeros((1, 8)))
-    pushed = predict(np.zeros((4, 2)), np.array([[small, -small]]))
+    ends = predict(probes, np.zeros((1, 8)), np.full((1, 8), period))
+    pushed = predict(np.zeros((4, 2)), np.array([[small, -small]]), np.full((1, 2), period))
     return (ends[:, :4] - ends[:, 4:]) / (2 * small), (pushed[:, :1] - pushed[:, 1:]) / (2 * small)
 
 
@@ -39,7 +39,7 @@ class Driver:
     gain: Array
     """(4,)"""
     observer: Array | None
-    """(4, measured channels); None: the controller is given the true state"""
+    """(4, 4), without weight on what is not measured; None: the controller is given the true state"""
     start: Array
     """(4, episodes): first states"""
     excitation: Array
@@ -51,10 +51,16 @@ class Driver:
 
 
 def draw_driver(
-    rng: np.random.Generator, episodes: int, rows: int, noise: Array, velocities: bool, strength: float
+    rng: np.random.Generator,
+    episodes: int,
+    rows: int,
+    noise: Array,
+    velocities: bool,
+    strength: float,
+    period: float = PERIOD,
 ) -> Driver:
     """Draw a controller; `strength` < 1 scales the excitation down after earlier draws left the track or fell."""
-    a, b = linearised()
+    a, b = linearised(period)
     weights = np.array([3.0, 0.5, 20.0, 0.5]) * np.exp(rng.normal(0, 0.5, 4))
     gain = riccati(a, b, np.diag(weights), np.array([[np.exp(rng.uniform(np.log(20.0), np.log(200.0)))]]))[0]
     observer, seen = None, "true state"
@@ -62,11 +68,11 @@ def draw_driver(
         channels = np.eye(4) if velocities else np.eye(4)[[0, 2]]
         variance = (channels @ noise) ** 2
         unknown = b @ b.T * 0.05**2 + np.diag([1e-4, 1e-2, 1e-4, 1e-2]) ** 2
-        observer, seen = riccati(a.T, channels.T, unknown, np.diag(variance)).T, "measurement"
+        observer, seen = riccati(a.T, channels.T, unknown, np.diag(variance)).T @ channels, "measurement"
     kind = str(rng.choice(["sines", "steps", "chirp"]))
     level = strength * float(rng.uniform(0.06, 0.2))
-    excitation = np.stack([_excite(rng, kind, rows) for _ in range(episodes)], 1) * level
-    time = np.arange(rows)[:, None] * PERIOD
+    excitation = np.stack([_excite(rng, kind, rows, period) for _ in range(episodes)], 1) * level
+    time = np.arange(rows)[:, None] * period
     wander = strength * float(rng.uniform(0.0, 0.5))
     reference = wander * np.sin(
         2 * np.pi * rng.uniform(0.05, 0.25, episodes) * time + rng.uniform(-np.pi, np.pi, episodes)
@@ -77,24 +83,24 @@ def draw_driver(
     return Driver(gain, observer, start, excitation, reference, described)
 
 
-def _excite(rng: np.random.Generator, kind: str, rows: int) -> Array:
+def _excite(rng: np.random.Generator, kind: str, rows: int, period: float) -> Array:
     """A signal (rows,) of about unit root mean square."""
-    time = np.arange(rows) * PERIOD
+    time = np.arange(rows) * period
     if kind == "sines":
         frequencies = np.exp(rng.uniform(np.log(0.2), np.log(3.0), 4))[:, None]
         phases = rng.uniform(-np.pi, np.pi, 4)[:, None]
         return np.asarray(np.sin(2 * np.pi * frequencies * time + phases).sum(0) / np.sqrt(2))
     if kind == "steps":
-        lengths = rng.integers(2, 12, rows)
+        lengths = rng.integers(2, 12, rows) * round(PERIOD / period)
         return np.repeat(rng.uniform(-1.7, 1.7, rows), lengths)[:rows]
-    rate = (3.0 - 0.2) / max(time[-1], PERIOD)
+    rate = (3.0 - 0.2) / max(time[-1], period)
     return np.asarray(1.3 * np.sin(2 * np.pi * (0.2 + 0.5 * rate * time) * time + rng.uniform(-np.pi, np.pi)))
 
 
 class Controllers:
-    """The controllers of several recordings, whose episodes are the columns of one batch."""
+    """The controllers of several recordings of one period, whose episodes are the columns of one batch."""
 
-    def __init__(self, drivers: list[Driver], velocities: bool) -> None:
+    def __init__(self, drivers: list[Driver], period: float) -> None:
         counts = [driver.start.shape[1] for driver in drivers]
         rows = max(len(driver.excitation) for driver in drivers)
 
@@ -102,10 +108,9 @@ class Controllers:
             padded = [np.pad(v, ((0, rows - len(v)), (0, 0))) for v in (getattr(driver, name) for driver in drivers)]
             return np.concatenate(padded, 1)
 
-        self.a, self.b = linearised()
-        self.channels = [0, 1, 2, 3] if velocities else [0, 2]
+        self.a, self.b = linearised(period)
         self.gain = np.repeat([driver.gain for driver in drivers], counts, 0).T
-        none = np.zeros((4, len(self.channels)))
+        none = np.zeros((4, 4))
         observers = [none if driver.observer is None else driver.observer for driver in drivers]
         self.observer = np.repeat(observers, counts, 0)
         self.sees_state = np.repeat([driver.observer is None for driver in drivers], counts)
@@ -121,7 +126,7 @@ class Controllers:
         seen = np.where(self.sees_state, state, self.estimate)
         error = seen - np.array([1.0, 0.0, 0.0, 0.0])[:, None] * self.reference[row]
         command = np.clip(self.excitation[row] - (self.gain * error).sum(0), -1.0, 1.0)
-        innovation = (reading - self.estimate)[self.channels]
+        innovation = reading - self.estimate
         self.estimate = self.a @ self.estimate + self.b * command + np.einsum("nij,jn->in", self.observer, innovation)
         self.estimate = np.clip(self.estimate, -20.0, 20.0)
         return np.asarray(command)

@@ -280,5 +280,11 @@ INSEPARABLE: tuple[frozenset[str], ...] = (
 )
 """never together in one recording, since other sizes of some or all of them give the same data"""
 
+AS_ONE: tuple[frozenset[str], ...] = (
+    frozenset({"coulomb_friction", "constant_force"}),
+    frozenset({"coulomb_friction", "actuator_bias"}),
+)
+"""never together where the whole catalogue is drawn: a friction by direction is the same, and one effect less"""
+
 KINDS: dict[str, Kind] = {kind.name: kind for kind in NAMED + REST + LATER + FOREIGN}
 """by name"""

@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Parameters = dict[str, Array]
+Time = float | Array
+"""s, one for all machines or one for each (n,)"""
 
 PERIOD = 0.05
 """s between commands"""
@@ -31,17 +33,18 @@ MAX_FORCE = 30.0
 CART_MASS, POLE_MASS, HALF_LENGTH = 1.0, 0.1, 0.5
 """kg, kg and m of the source"""
 
-Load = Callable[[Parameters, float, Array], Array]
-"""(parameters, time in s, states (4, n)) -> N on the cart or N m at the pivot, (n,)"""
+Load = Callable[[Parameters, Array, Array], Array]
+"""(parameters, times in s (n,), states (4, n)) -> N on the cart or N m at the pivot, (n,)"""
 
 
 def _inside(value: Array, start: Array, end: Array) -> Array:
     return ((value >= start) & (value < end)).astype(np.float64)
 
 
-def _path(p: Parameters, t: float) -> Array:
+def _path(p: Parameters, t: Array) -> Array:
     """Value at time t of a force path that is sampled every 10 ms."""
-    return p["path"][:, min(int(t / 0.01 + 1e-6), p["path"].shape[1] - 1)]
+    sample = np.minimum((t / 0.01 + 1e-6).astype(int), p["path"].shape[1] - 1)
+    return p["path"][np.arange(len(sample)), sample]
 
 
 CART_FORCES: dict[str, Load] = {
@@ -116,10 +119,12 @@ class Plant:
     """dry friction on the cart"""
     dry_torques: Table = field(default_factory=list)
     """dry friction at the pivot"""
+    turns_exactly: bool = False
+    """whether dry friction turns round within a substep, where a velocity passes 0; the older sets do without"""
     slosh: tuple[Array, Array, Array] | None = None
     """mass (kg, zero where there is none), angular frequency (rad/s) and damping ratio of a mass hidden in the cart"""
 
-    def acceleration(self, t: float, state: Array, force: Array) -> tuple[Array, Array]:
+    def acceleration(self, t: Time, state: Array, force: Array) -> tuple[Array, Array]:
         """Smooth part of (x'' in m/s2, theta'' in rad/s2) under the motor's `force` (N)."""
         _, _, angle, rate = state[:4]
         push = force + _total(self.forces, t, state)
@@ -139,7 +144,7 @@ class Plant:
         determinant = m11 * m22 - m12**2
         return (m22 * push - m12 * torque) / determinant, (m11 * torque - m12 * push) / determinant
 
-    def _rates(self, t: float, state: Array, force: Array) -> Array:
+    def _rates(self, t: Time, state: Array, force: Array) -> Array:
         rates = np.zeros_like(state)
         rates[0], rates[2] = state[1], state[3]
         rates[1], rates[3] = self.acceleration(t, state, force)
@@ -149,7 +154,7 @@ class Plant:
             rates[5] = -(omega**2) * (state[4] - state[0]) - 2 * ratio * omega * (state[5] - state[1])
         return rates
 
-    def step(self, t: float, state: Array, force: Array, h: float) -> Array:
+    def step(self, t: Time, state: Array, force: Array, h: Time) -> Array:
         """States (4 or 6, n) after h seconds under a motor force (N) held constant; rows 4 and 5 are the slosh's."""
         middle = state + 0.5 * h * self._rates(t, state, force)
         after = state + h * self._rates(t + 0.5 * h, middle, force)
@@ -157,7 +162,7 @@ class Plant:
             after = self._rub(t, state, after, h)
         return after
 
-    def _rub(self, t: float, before: Array, after: Array, h: float) -> Array:
+    def _rub(self, t: Time, before: Array, after: Array, h: Time) -> Array:
         """Apply the impulse of dry friction, at most to a standstill, to velocities and positions."""
         zero = np.zeros_like(after[0])
         for axis, table in ((1, self.dry_forces), (3, self.dry_torques)):
@@ -168,16 +173,27 @@ class Plant:
             per_impulse = self._solve(before[2], *unit)  # m/s and rad/s for each N s or N m s
             own = per_impulse[0] if axis == 1 else per_impulse[1]
             impulse = -np.clip(after[axis] / own, -most * h, most * h)
+            if self.turns_exactly:
+                impulse = self._turn(before[axis], after[axis], own, most, h, impulse)
             for velocity, gain in zip((1, 3), per_impulse, strict=True):
                 after[velocity] += gain * impulse
                 after[velocity - 1] += 0.5 * h * gain * impulse
         return after
 
+    @staticmethod
+    def _turn(before: Array, after: Array, own: Array, most: Array, h: Time, impulse: Array) -> Array:
+        """The impulse where a velocity passes 0 and slides on: friction turns round at that instant."""
+        drive, against = np.abs(after - before) / h, np.abs(after - before) / h + own * most
+        passes = (before * (after - before) < 0) & (np.abs(before) < against * h) & (drive > own * most)
+        left = h - np.abs(before) / np.where(against > 0, against, 1.0)
+        return np.where(passes, np.sign(before) * most * (2 * left - h), impulse)
 
-def _total(table: Table, t: float, state: Array) -> Array:
+
+def _total(table: Table, t: Time, state: Array) -> Array:
     total = np.zeros(state.shape[1])
+    times = np.broadcast_to(t, total.shape)
     for rows, parameters, law in table:
-        total[rows] += law(parameters, t, state[:, rows])
+        total[rows] += law(parameters, times[rows], state[:, rows])
     return total
 
 
@@ -186,10 +202,14 @@ def nominal(n: int) -> Plant:
     return Plant(np.full(n, CART_MASS), np.full(n, POLE_MASS), np.full(n, HALF_LENGTH), np.zeros(n))
 
 
-def predict(start: Array, commands: Array, substeps: int = 8) -> Array:
-    """States that the source predicts from `start` (4, n) under commands (steps, n): (4, n) at the end."""
+def predict(start: Array, commands: Array, lengths: Array | None = None) -> Array:
+    """States that the source predicts from `start` (4, n) under commands (steps, n): (4, n) at the end.
+
+    Each command acts for its length in s (steps, n), or for 50 ms, in 8 substeps in 50 ms and at least 2.
+    """
     plant, state = nominal(start.shape[1]), start
-    for command in commands:
+    for command, length in zip(commands, np.full(commands.shape, PERIOD) if lengths is None else lengths, strict=True):
+        substeps = max(2, round(8 * float(length.mean()) / PERIOD))
         for _ in range(substeps):
-            state = plant.step(0.0, state, MAX_FORCE * command, PERIOD / substeps)
+            state = plant.step(0.0, state, MAX_FORCE * command, length / substeps)
     return state

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -25,9 +26,10 @@ from datasets.blind.plant import (
     nominal,
     predict,
 )
+from datasets.blind.rigs import Rig
 
-HORIZON = 10
-"""periods of prediction over which an effect's strength is measured (half a second)"""
+HORIZON = 0.5
+"""s of prediction over which an effect's strength is measured, in whole periods"""
 
 
 @dataclass
@@ -42,6 +44,10 @@ class Case:
     """(rows, 4, episodes): m, m/s, rad, rad/s"""
     loss_draws: Array
     """(rows, episodes), uniform: which rows a dropout loses"""
+    rig: Rig = field(default_factory=Rig)
+    """sensors and clock"""
+    turns_exactly: bool = False
+    """of its dry friction (`Plant`); alike for all cases of a set"""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -62,23 +68,31 @@ class Run:
     """readings without it"""
     commands: Array
     """of the controller"""
+    times: Array
+    """s, (rows, episodes): when a row is measured and its command begins to act"""
+    lengths: Array
+    """s, (rows, episodes): for how long the command acts"""
 
     @property
     def reach(self) -> tuple[float, float]:
         """Largest |x| (m) and |theta| (rad)."""
         return float(np.abs(self.true[:, 0]).max()), float(np.abs(self.true[:, 2]).max())
 
-    def predicted_gap(self, deviations: Array, every: int = 2) -> float:
+    def predicted_gap(self, deviations: Array) -> float:
         """Strength of an effect on commands or states.
 
-        Root mean square, over rows and over x and theta, of the error of the source's prediction of the true states
-        half a second ahead, in units of the measurement noise (`deviations`, m and rad).
+        Root mean square, over a row in every 0.1 s and over x and theta, of the error of the source's prediction of the
+        true states half a second ahead, in units of the measurement noise (`deviations`, m and rad).
         """
-        rows = np.arange(0, len(self.true) - HORIZON, every)
+        period = float(self.lengths.mean())
+        ahead = round(HORIZON / period)
+        rows = np.arange(0, len(self.true) - ahead, round(0.1 / period))
         start = self.true[rows].transpose(1, 0, 2).reshape(4, -1)
-        commands = np.stack([self.commands[rows + k].reshape(-1) for k in range(HORIZON)])
-        end = self.true[rows + HORIZON].transpose(1, 0, 2).reshape(4, -1)
-        return _strength((end - predict(start, commands))[[0, 2]], deviations)
+        commands, lengths = (
+            np.stack([values[rows + k].reshape(-1) for k in range(ahead)]) for values in (self.commands, self.lengths)
+        )
+        end = self.true[rows + ahead].transpose(1, 0, 2).reshape(4, -1)
+        return _strength((end - predict(start, commands, lengths))[[0, 2]], deviations)
 
     def sensed_gap(self, deviations: Array) -> float:
         """Strength of an effect on readings: the change in x and theta (rms), in units of the noise."""
@@ -90,40 +104,62 @@ def _strength(difference: Array, deviations: Array) -> float:
         return float(np.sqrt(np.mean((difference / deviations[:, None]) ** 2)))
 
 
-def simulate(cases: list[Case], velocities: bool, substeps: int) -> list[Run]:
-    """Run the cases in closed loop, `substeps` of the plant between commands.
+def simulate(cases: list[Case], substeps: int) -> list[Run]:
+    """Run the cases in closed loop, `substeps` of the plant in 50 ms, those of one period side by side.
 
     A pole beyond 1 rad or a cart beyond 5 m is stopped there, and `Run.reach` shows it.
     """
+    runs: dict[int, Run] = {}
+    for period in dict.fromkeys(case.rig.period for case in cases):
+        own = [i for i, case in enumerate(cases) if case.rig.period == period]
+        steps = math.ceil(substeps * max(cases[i].rig.longest for i in own) / PERIOD - 1e-9)
+        runs |= zip(own, _simulate([cases[i] for i in own], period, steps), strict=True)
+    return [runs[i] for i in range(len(cases))]
+
+
+def _simulate(cases: list[Case], period: float, substeps: int) -> list[Run]:
+    """Cases of one nominal period (s), with so many substeps of the plant in each row."""
     columns = np.cumsum([0, *(case.shape[1] for case in cases)])
     spans = [slice(int(a), int(b)) for a, b in pairwise(columns)]
-    n, rows, h = int(columns[-1]), max(case.shape[0] for case in cases), PERIOD / substeps
+    n, rows = int(columns[-1]), max(case.shape[0] for case in cases)
     noise, loss_draws = np.zeros((rows, 4, n)), np.ones((rows, n))
+    times, lengths = np.repeat(period * np.arange(rows)[:, None], n, 1), np.full((rows, n), period)
     for case, span in zip(cases, spans, strict=True):
-        noise[: case.shape[0], :, span], loss_draws[: case.shape[0], span] = case.noise, case.loss_draws
-    drive = Controllers([case.driver for case in cases], velocities)
+        own = case.shape[0]
+        noise[:own, :, span], loss_draws[:own, span] = case.noise, case.loss_draws
+        times[:own, span], lengths[:own, span] = case.rig.clock(*case.shape)
+        times[own:, span] += times[own - 1, span] + lengths[own - 1, span] - own * period
+    drive = Controllers([case.driver for case in cases], period)
     chain = _chain(cases, spans, n)
-    plant = _plant(cases, spans, n, rows)
+    plant = _plant(cases, spans, n, rows * max(case.rig.longest for case in cases))
+    plant.turns_exactly = cases[0].turns_exactly
     start = drive.start if plant.slosh is None else np.concatenate((drive.start, drive.start[:2]))
-    actuation, sensing = Actuation(chain, n), Sensing(chain, drive.start, h)
+    actuation, sensing = Actuation(chain, n), Sensing(chain, drive.start, float(lengths.min()) / substeps)
     true, measured, clean = (np.empty((rows, 4, n)) for _ in range(3))
     commands = np.empty((rows, n))
     state = start
     for row in range(rows):
-        time = row * PERIOD
+        time, h = times[row], lengths[row] / substeps
         true[row] = state[:4]
         measured[row], clean[row] = sensing.read(time, state, noise[row], loss_draws[row])
         commands[row] = drive(row, state[:4], measured[row])
-        actuation.push(commands[row])
+        actuation.push(time, commands[row])
         for k in range(substeps):
             t = time + k * h
             after = plant.step(t, state, MAX_FORCE * actuation(t, h), h)
             lost = (np.abs(after[2]) > 1.0) | (np.abs(after[0]) > 5.0)
             state = np.where(lost, state * np.array([1.0, 0.0, 1.0, 0.0, 1.0, 0.0])[: len(state), None], after)
-            sensing.pass_by(state)
+            sensing.pass_by(t + h, state)
     return [
-        Run(true[:rows, :, span], measured[:rows, :, span], clean[:rows, :, span], commands[:rows, span])
-        for rows, span in zip((case.shape[0] for case in cases), spans, strict=True)
+        Run(
+            true[:own, :, span],
+            measured[:own, :, span],
+            clean[:own, :, span],
+            commands[:own, span],
+            times[:own, span],
+            lengths[:own, span],
+        )
+        for own, span in zip((case.shape[0] for case in cases), spans, strict=True)
     ]
 
 
@@ -134,10 +170,14 @@ def _chain(cases: list[Case], spans: list[slice], n: int) -> Parameters:
             for name, value in parameters.items():
                 if f"{effect}.{name}" in chain:
                     chain[f"{effect}.{name}"][span] = value
+        rig = case.rig
+        chain["encoder.position"][span], chain["encoder.angle"][span] = rig.counts
+        chain["velocity.derived"][span] = rig.velocities in ("differences", "filtered")
+        chain["velocity.time_constant"][span] = rig.time_constant
     return chain
 
 
-def _plant(cases: list[Case], spans: list[slice], n: int, rows: int) -> Plant:
+def _plant(cases: list[Case], spans: list[slice], n: int, seconds: float) -> Plant:
     plant = nominal(n)
     slosh = (np.zeros(n), np.ones(n), np.zeros(n))
     members: dict[str, list[tuple[NDArrayInt, Shape, int]]] = {}
@@ -162,7 +202,7 @@ def _plant(cases: list[Case], spans: list[slice], n: int, rows: int) -> Plant:
     )
     for laws, table in tables:
         for effect in sorted(members.keys() & laws.keys()):
-            table.append((*_together(effect, members[effect], rows), laws[effect]))
+            table.append((*_together(effect, members[effect], seconds), laws[effect]))
     return plant
 
 
@@ -172,13 +212,15 @@ MASSES = {"cart_mass": "cart_mass", "pole_mass": "pole_mass", "pole_length": "ha
 NDArrayInt = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 
 
-def _together(effect: str, members: list[tuple[NDArrayInt, Shape, int]], rows: int) -> tuple[NDArrayInt, Parameters]:
+def _together(
+    effect: str, members: list[tuple[NDArrayInt, Shape, int]], seconds: float
+) -> tuple[NDArrayInt, Parameters]:
     """Columns and parameters, one value a column, of all cases that have this effect."""
     index = np.concatenate([columns for columns, _, _ in members])
     counts = [count for _, _, count in members]
     parameters = {name: np.repeat([p[name] for _, p, _ in members], counts) for name in members[0][1]}
     if "path_seed" in parameters:
-        paths = [_paths(effect, p, count, int(rows * PERIOD / 0.01)) for _, p, count in members]
+        paths = [_paths(effect, p, count, int(seconds / 0.01)) for _, p, count in members]
         parameters["path"] = np.concatenate(paths)
     return index, parameters
 

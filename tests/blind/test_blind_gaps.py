@@ -10,7 +10,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from datasets.blind.chain import NEUTRAL, Actuation, Sensing
-from datasets.blind.gaps import CART_REACH, POLE_REACH, Settings, key_text, lines, main, make
+from datasets.blind.drafts import CART_REACH, POLE_REACH, lines
+from datasets.blind.gaps import Settings, key_text, main, make
 from datasets.blind.kinds import FOREIGN, KINDS, LATER, NAMED, REST, drawn
 from datasets.blind.plant import MAX_FORCE, PERIOD, nominal, predict
 from datasets.blind.simulation import Case, simulate
@@ -98,7 +99,7 @@ def law(effects):
 )
 def test_trajectories_are_those_of_an_independent_solver(bare, effects):
     bare.effects = effects
-    run = simulate([bare], False, 50)[0]
+    run = simulate([bare], 50)[0]
     force, torque = law(effects)
     u = run.commands[:, 0]
     # Anew every half second, since the pole's instability multiplies any error by 3,000 in 2 s.
@@ -149,7 +150,7 @@ def chain(**values):
 
 def test_a_delay_may_be_any_fraction():
     actuation = Actuation(chain(actuator_delay__delay=0.0123), 1)
-    actuation.push(np.array([1.0]))
+    actuation.push(0.0, np.array([1.0]))
     heard = [actuation(k * 1e-3, 1e-3)[0] for k in range(50)]
     np.testing.assert_allclose(heard, [0.0] * 12 + [0.7] + [1.0] * 37, atol=1e-8)
 
@@ -165,7 +166,7 @@ def test_the_actuation_chain_has_its_order():
     actuation = Actuation(chain(**values), 1)
     heard = []
     for row, command in enumerate((0.5, 0.45, 1.0, -1.0)):
-        actuation.push(np.array([command]))
+        actuation.push(row * PERIOD, np.array([command]))
         heard.append(float(actuation(row * PERIOD, 1e-3)[0]))
     # 0.5 -> 0.45 behind the play -> 0.25 -> 0.5 -> 0.8; then the play holds; then the limit, both ways.
     np.testing.assert_allclose(heard, [0.8, 0.8, 1.3, -0.7], atol=1e-8)
@@ -173,7 +174,7 @@ def test_the_actuation_chain_has_its_order():
 
 def test_a_lag_answers_a_step_exponentially_from_the_bias():
     actuation = Actuation(chain(actuator_lag__time_constant=0.02, actuator_bias__offset=0.1), 1)
-    actuation.push(np.array([1.0]))
+    actuation.push(0.0, np.array([1.0]))
     heard = [actuation(k * 1e-3, 1e-3)[0] for k in range(20)]
     assert actuation.lagged[0] == pytest.approx(0.1 + 1 - np.exp(-1))
     assert heard[0] == pytest.approx(0.1 + 1 - 20 * (1 - np.exp(-0.05)))
@@ -216,10 +217,10 @@ def test_kinds_are_named_once_and_shared_by_no_side():
 @pytest.mark.parametrize("kind", [k.name for k in NAMED + REST + LATER + FOREIGN])
 def test_every_kind_acts(bare, kind):
     rng = np.random.default_rng(0)
-    quiet = simulate([bare], False, 10)[0]
+    quiet = simulate([bare], 10)[0]
     effect = KINDS[kind]
     bare.effects = {kind: effect.build(effect.high, effect.draw(rng, 2.0))}
-    run = simulate([bare], False, 10)[0]
+    run = simulate([bare], 10)[0]
     changed = run.clean if effect.stage == "sensing" else run.true
     against = run.true if effect.stage == "sensing" else quiet.true
     assert np.abs(changed - against)[:, [0, 2]].max() > 1e-4
@@ -252,7 +253,7 @@ def test_the_key_is_sealed_and_everything_repeats(tmp_path, capsys, drafts):
     assert files == ["0000.csv", "0001.csv"]
     assert [answer["file"] for answer in json.loads(key)["recordings"]] == files
     for file, draft in zip(files, drafts["hard"], strict=True):
-        assert (settings.out / file).read_text().splitlines() == list(lines(draft, velocities=False))
+        assert (settings.out / file).read_text().splitlines() == list(lines(draft))
     header, first = (settings.out / "0000.csv").read_text().splitlines()[:2]
     assert header == "episode,time,x,theta,command"
     assert first.startswith("0,0.00,")
