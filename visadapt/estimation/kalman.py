@@ -99,9 +99,10 @@ def forward(problem: Linear, process: Tensor, noise: Tensor) -> Filtered:
 
 def respond(filtered: Filtered, drive: Tensor, reading: Tensor) -> Tensor:
     """Change of the white innovations (N, T, m, M) with inputs `drive` (N, T - 1, n, M) and `reading` (N, T, m, M),
-    under the gains of the filter run that gave `filtered`."""
+    either of which may have one column for all, under the gains of the filter run that gave `filtered`."""
     gains = filtered.sensing, filtered.injection, filtered.closed_loop
-    return _means(*gains, drive, filtered.whitening @ reading, torch.zeros_like(drive[:, 0]))[1]
+    start = drive.new_zeros(*drive[:, 0, :, 0].shape, max(drive.shape[-1], reading.shape[-1]))
+    return _means(*gains, drive, filtered.whitening @ reading, start)[1]
 
 
 def _means(

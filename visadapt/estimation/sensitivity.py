@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from visadapt.effects import Effect
+from visadapt.effects import Effect, SensingEffect
 from visadapt.estimation.candidate import COARSEST, CandidateModel
 from visadapt.estimation.kalman import forward, respond
 from visadapt.estimation.likelihood import FitState, linear_problem, variances
+from visadapt.estimation.linearise import integrate
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
 
@@ -109,8 +110,7 @@ class Sensitivity:
             if parameter.neutral is None:
                 theta[0, j - count_own] = tried[1, j]
         windows, length = rows.shape
-        count, n = len(theta), fits.state.shape[-1]
-        commands = model.commands(theta)[:, :, :-1].flatten(0, 2)
+        state, count = fits.state[0], len(theta)
 
         def spread(x: Tensor) -> Tensor:
             return x[None].expand(count, *x.shape).reshape(-1, *x.shape[2:])
@@ -118,13 +118,18 @@ class Sensitivity:
         def per_row(used: int) -> Tensor:
             return theta[:, None].expand(-1, windows * used, -1).flatten(0, 1)
 
-        state = fits.state[0]
-        after = model.at(per_row(length - 1)).integrate(
-            spread(rows.time[:, :-1]), spread(state[:, :-1]), commands, spread(rows.duration[:, :-1])
-        )
-        read = model.measure(per_row(length), spread(state))
-        after = after.reshape(count, windows, length - 1, n)
-        read = read.reshape(count, windows, length, -1)
+        if issubclass(effect, SensingEffect):
+            read = model.measure(per_row(length), spread(state)).reshape(count, windows, length, -1)
+            reading = -(read[1:] - read[:1]).movedim(0, -1) * rows.used[..., None]
+            return self.innovations.response(torch.zeros_like(state[:, 1:, :, None]), reading)
+        acted = model.commands(theta if model.acting_parameters else theta[:1])[:, :, :-1]
+        after = integrate(
+            model.at(theta[0]),
+            per_row(length - 1),
+            spread(rows.time[:, :-1]),
+            spread(state[:, :-1]),
+            acted.expand(count, *acted.shape[1:]).flatten(0, 2),
+            spread(rows.duration[:, :-1]),
+        ).reshape(count, windows, length - 1, -1)
         drive = (after[1:] - after[:1]).movedim(0, -1) * rows.inside[:, 1:, None, None]
-        reading = -(read[1:] - read[:1]).movedim(0, -1) * rows.used[..., None]
-        return self.innovations.response(drive, reading)
+        return self.innovations.response(drive, torch.zeros_like(rows.measured[..., None]))
