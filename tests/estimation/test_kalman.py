@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from visadapt.estimation.kalman import Linear, backward, forward, log_likelihood, noise_scores, respond
+from visadapt.estimation.kalman import Linear, backward, forward, log_likelihood, noise_scores, respond, weights
 
 N, T, STATES, CHANNELS, COLUMNS = 3, 7, 4, 2, 3
 
@@ -105,18 +105,17 @@ def test_noise_scores_are_the_derivatives_of_the_likelihood(problem):
     filtered = forward(problem, torch.diag_embed(process.exp()), noise.exp())
     log_likelihood(filtered, torch.ones(N, T, CHANNELS)).sum().backward()
     _, adjoint = backward(filtered)
-    by_process, by_noise, _, _ = noise_scores(filtered, adjoint, PROCESS, MEASUREMENT)
+    weight = weights(filtered, filtered.white, adjoint)
+    by_process, by_noise = noise_scores(filtered, adjoint[..., 0], weight[..., 0], PROCESS, MEASUREMENT)
     torch.testing.assert_close(by_process.sum(1), process.grad)
     torch.testing.assert_close(by_noise.sum(1), noise.grad)
 
 
-def test_smoothed_noises_are_what_the_smoothed_states_leave(problem):
+def test_weighted_variances_are_what_the_smoothed_states_leave_of_the_readings(problem):
     filtered = forward(problem, torch.diag_embed(PROCESS), MEASUREMENT)
     smoothed, adjoint = backward(filtered)
-    _, _, disturbance, residual = noise_scores(filtered, adjoint, PROCESS, MEASUREMENT)
-    carried = problem.transition @ smoothed[:, :-1] + problem.drive
-    torch.testing.assert_close(disturbance, (smoothed[:, 1:] - carried)[..., 0])
-    torch.testing.assert_close(residual, (problem.reading - problem.sensing @ smoothed)[..., 0])
+    noise = MEASUREMENT[:, None, :, None] * weights(filtered, filtered.white, adjoint)
+    torch.testing.assert_close(noise, problem.reading - problem.sensing @ smoothed)
 
 
 def test_states_of_an_unstable_system_are_found_over_many_precise_readings():

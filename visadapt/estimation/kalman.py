@@ -119,47 +119,54 @@ def _means(
 
 def backward(filtered: Filtered) -> tuple[Tensor, Tensor]:
     """Smoothed states (N, T, n, M), and adjoints (N, T, n, M): minus Q times them is the smoothed w before row t."""
-    sources = (-filtered.sensing.mT @ filtered.white).unbind(1)
-    adjoints = [sources[-1]]
-    for loop, source in zip(reversed(filtered.closed_loop.unbind(1)), reversed(sources[:-1]), strict=True):
-        adjoints.append(torch.baddbmm(source, loop.mT, adjoints[-1]))
-    adjoint = torch.stack(adjoints[::-1], 1)
+    adjoint = adjoints(filtered, filtered.white)
     return filtered.predicted - filtered.covariance @ adjoint, adjoint
 
 
+def adjoints(filtered: Filtered, white: Tensor) -> Tensor:
+    """Adjoints (N, T, n, M) of readings with these white innovations (N, T, m, M)."""
+    sources = (-filtered.sensing.mT @ white).unbind(1)
+    out = [sources[-1]]
+    for loop, source in zip(reversed(filtered.closed_loop.unbind(1)), reversed(sources[:-1]), strict=True):
+        out.append(torch.baddbmm(source, loop.mT, out[-1]))
+    return torch.stack(out[::-1], 1)
+
+
+def weights(filtered: Filtered, white: Tensor, adjoint: Tensor) -> Tensor:
+    """Smoothed measurement noises v (N, T, m, M) over their variances, given the white innovations' `adjoints`."""
+    left = white.clone()
+    left[:, :-1] += filtered.injection.mT @ adjoint[:, 1:]
+    return filtered.whitening.mT @ left
+
+
 def noise_scores(
-    filtered: Filtered, adjoint: Tensor, process: Tensor, noise: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Derivatives of the log likelihood of the data by the logs of the noises' variances, and the smoothed noises.
+    filtered: Filtered, adjoint: Tensor, weight: Tensor, process: Tensor, noise: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Derivatives of the log likelihood by the logs of the noises' variances.
 
     A variance is too small where the square of a smoothed noise exceeds what is expected of it under that variance
     (Koopman and Shephard 1992, Biometrika 79(4)).
 
     Args:
         filtered: a filter run with the variances `process` (N, n) and `noise` (N, m) of uncorrelated noises.
-        adjoint: (N, T, n, M) its adjoints.
+        adjoint, weight: (N, T, n) and (N, T, m) of the data.
 
     Returns:
         The derivatives by each process noise before each row but the first, (N, T - 1, n), and by each measurement
-        noise, (N, T, m), which are -1/2 where nothing was measured; then the smoothed w (N, T - 1, n) and v (N, T, m).
+        noise, (N, T, m), which are -1/2 where nothing was measured.
     """
     sources = (filtered.sensing.mT @ filtered.sensing).unbind(1)
     covariances = [sources[-1]]  # of the adjoints
     for loop, source in zip(reversed(filtered.closed_loop.unbind(1)), reversed(sources[1:-1]), strict=False):
         covariances.append(torch.baddbmm(source, torch.bmm(loop.mT, covariances[-1]), loop))
     covariance = torch.stack(covariances[::-1], 1)
-    following = adjoint[:, 1:, :, :1]
-    process, noise = process[:, None], noise[:, None]
-    disturbance = -process * following[..., 0]
-    by_process = 0.5 * (disturbance.square() / process - process * covariance.diagonal(dim1=-2, dim2=-1))
-    # Smoothed v over its variance, and the variance of that: of the row's own innovation, and of the rows after.
-    left, injected = filtered.white[..., :1].clone(), filtered.injection @ filtered.whitening[:, :-1]
-    left[:, :-1] += filtered.injection.mT @ following
-    weight = (filtered.whitening.mT @ left)[..., 0]
+    by_process = adjoint[:, 1:].square() - covariance.diagonal(dim1=-2, dim2=-1)
+    # The variance of the weights: of the row's own innovation, and of the rows after.
+    injected = filtered.injection @ filtered.whitening[:, :-1]
     variance = filtered.whitening.square().sum(-2)
     variance[:, :-1] += (injected * (covariance @ injected)).sum(-2)
-    by_noise = 0.5 * noise * (weight.square() - variance)
-    return by_process, by_noise, disturbance, noise * weight
+    by_noise = weight.square() - variance
+    return 0.5 * process[:, None] * by_process, 0.5 * noise[:, None] * by_noise
 
 
 def log_likelihood(filtered: Filtered, used: Tensor) -> Tensor:

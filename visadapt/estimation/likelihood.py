@@ -22,7 +22,7 @@ from torch import Tensor
 
 from visadapt.batch import Batch
 from visadapt.estimation.candidate import CandidateModel, linearise
-from visadapt.estimation.kalman import Linear, backward, forward, log_likelihood, noise_scores, respond
+from visadapt.estimation.kalman import Linear, adjoints, forward, log_likelihood, noise_scores, respond, weights
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
@@ -143,7 +143,7 @@ class Derivatives(Batch):
     information: Tensor  # (C, K, K)
     gradient: Tensor  # (C, K) of the log likelihood by the parameters
     noise_information: Tensor
-    """(C, G + S, G + S) average information of the log variances of process noise groups and kinds of sensors"""
+    """(C, G + S, G + S) Fisher information of the log variances of process noise groups and kinds of sensors"""
     noise_gradient: Tensor  # (C, G + S) of the log likelihood by these
     smoothed: Tensor  # (C, W, T, n, 1 + K) smoothed correction of the states, and its derivative by each parameter
 
@@ -161,20 +161,30 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState, window_used:
         return (white * used[..., None]).reshape(count, -1, white.shape[-1])
 
     error, columns = of_each(here.white).split((1, fits.theta.shape[1]), -1)
-    smoothed, adjoint = backward(here)
-    # The average of observed and expected information of the log variances (Gilmour, Thompson and Cullis 1995,
-    # Biometrics 51(4)): that of a column of inputs which are the smoothed noises of one group.
+    # The information of the log variances: that of inputs which are the smoothed noises of one group (Gilmour, Thompson
+    # and Cullis 1995, Biometrics 51(4)), in the mean of the data and of data that the model draws. The data alone would
+    # give steps that are too long far from the optimum, where they are unlike the model.
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.randn(*here.white.shape[:-1], 1, generator=generator, dtype=torch.float64) * used[..., None]
+    white = torch.cat((here.white, drawn), -1)
+    adjoint = adjoints(here, white)
+    weight = weights(here, white[..., [0, -1]], adjoint[..., [0, -1]])
+    smoothed = here.predicted - here.covariance @ adjoint[..., :-1]
     process = process.diagonal(dim1=1, dim2=2)
-    by_process, by_noise, disturbance, residual = noise_scores(here, adjoint, process, noise)
     driven, measured = noise_members(models[0])
-    working = of_each(respond(here, disturbance[..., None] * driven.T, residual[..., None] * measured.T))
-    inside = models[0].rows.inside[:, 1:].repeat(count, 1) * window_used.reshape(-1, 1)
-    score = (by_process * inside[..., None]).sum(1) @ driven.T + (by_noise * used).sum(1) @ measured.T
+    by_process, by_noise = noise_scores(here, adjoint[..., 0], weight[..., 0], process, noise)
+    score = (by_process * window_used.reshape(-1, 1, 1)).sum(1) @ driven.T + (by_noise * used).sum(1) @ measured.T
+    information = []
+    for column in (0, -1):
+        disturbance = -process[:, None] * adjoint[:, 1:, :, column]
+        residual = noise[:, None] * weight[..., column]
+        working = of_each(respond(here, disturbance[..., None] * driven.T, residual[..., None] * measured.T))
+        information.append(0.5 * working.mT @ working)
     return Derivatives(
         log_likelihood(here, used).reshape(count, windows).sum(-1),
         columns.mT @ columns,
         -(columns.mT @ error)[..., 0],
-        0.5 * working.mT @ working,
+        torch.stack(information).mean(0),
         score.reshape(count, windows, -1).sum(1),
         smoothed.reshape(*fits.state.shape, -1),
     )
