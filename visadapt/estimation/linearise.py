@@ -14,7 +14,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from visadapt.effects import DynamicsEffect, Parameter, Role
+from visadapt.effects import DynamicsEffect, Effect, Parameter, Role, SensingEffect
 from visadapt.systems import System
 from visadapt.world import World
 
@@ -110,7 +110,8 @@ def linearise_step(
         lasting = None if duration is None else duration.repeat(len(moved))
         return integrate(world, rows, time.repeat(len(moved)), states, commands.flatten(0, 1), lasting)
 
-    return _tangent(step, world, values, state, by_state, width if by_command else 0, width)
+    columns = _columns(world, sensing=False)
+    return _tangent(step, world, values, state, by_state, columns, width if by_command else 0, width)
 
 
 def linearise_reading(world: World, values: Tensor, state: Tensor, by_state: bool = True) -> Tangent:
@@ -119,7 +120,19 @@ def linearise_reading(world: World, values: Tensor, state: Tensor, by_state: boo
     def read(rows: Tensor, states: Tensor, moved: Sequence[int], pushed: Tensor) -> Tensor:
         return world.with_values(rows).reading(states)
 
-    return _tangent(read, world, values, state, by_state, 0, len(world.system.actions))
+    if not any(isinstance(effect, SensingEffect) for effect in world.effects):
+        count, n = state.shape
+        identity = torch.eye(n, dtype=state.dtype, device=state.device).expand(count, n, n)[..., : n if by_state else 0]
+        return Tangent(state, identity, state.new_zeros(count, n, values.shape[-1]), state.new_zeros(count, n, 0))
+    columns = _columns(world, sensing=True)
+    return _tangent(read, world, values, state, by_state, columns, 0, len(world.system.actions))
+
+
+def _columns(world: World, sensing: bool) -> list[int]:
+    """The parameters that change readings (`sensing`), or those that change steps: the ones of all other effects."""
+    effects = [effect for effect in world.effects if isinstance(effect, Effect)]
+    acts = [isinstance(effect, SensingEffect) == sensing for effect in effects for _ in effect.table]
+    return [k for k, each in enumerate(acts) if each]
 
 
 def _tangent(
@@ -128,27 +141,33 @@ def _tangent(
     values: Tensor,
     state: Tensor,
     by_state: bool,
+    columns: Sequence[int],
     commands: int,
     width: int,
 ) -> Tangent:
-    """Evaluate the base point, and with each state, parameter and command moved, as one batch."""
-    (count, n), parameters = state.shape, values.shape[-1]
+    """Evaluate the base point, and with each state, parameter of `columns` and command moved, as one batch.
+
+    The other parameters change nothing.
+    """
+    (count, n), parameters = state.shape, len(columns)
     states = n if by_state else 0
     replicas = 1 + states + parameters + commands
-    base = values.expand(count, parameters)
+    base = values.expand(count, values.shape[-1])
     steps = parameter_steps(world.table, base)
     rows, states_moved = base.repeat(replicas, 1, 1), state.repeat(replicas, 1, 1)
     pushed = state.new_zeros(replicas, width)
     moved = [0] * replicas
     for i in range(states):
         states_moved[1 + i, :, i] += STATE_STEP
-    for k in range(parameters):
-        rows[1 + states + k, :, k] += steps[:, k]
-        moved[1 + states + k] = 1 + k
+    for k, column in enumerate(columns):
+        rows[1 + states + k, :, column] += steps[:, column]
+        moved[1 + states + k] = 1 + column
     for k in range(commands):
         pushed[1 + states + parameters + k, k] = 1
     out = function(rows.flatten(0, 1), states_moved.flatten(0, 1), moved, pushed)
     out = out.reshape(replicas, count, out.shape[-1])
     change = (out[1:] - out[:1]).movedim(0, -1)
     by = change.split((states, parameters, commands), -1)
-    return Tangent(out[0], by[0] / STATE_STEP, by[1] / steps[:, None], by[2] / STATE_STEP)
+    by_parameter = out.new_zeros(*out[0].shape, values.shape[-1])
+    by_parameter[..., list(columns)] = by[1] / steps[:, None, list(columns)]
+    return Tangent(out[0], by[0] / STATE_STEP, by_parameter, by[2] / STATE_STEP)
