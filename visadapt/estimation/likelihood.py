@@ -168,23 +168,24 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState, window_used:
     drawn = torch.randn(*here.white.shape[:-1], 1, generator=generator, dtype=torch.float64) * used[..., None]
     white = torch.cat((here.white, drawn), -1)
     adjoint = adjoints(here, white)
-    weight = weights(here, white[..., [0, -1]], adjoint[..., [0, -1]])
     smoothed = here.predicted - here.covariance @ adjoint[..., :-1]
+    both = [0, -1]
+    adjoint = adjoint[..., both]
+    weight = weights(here, white[..., both], adjoint)
     process = process.diagonal(dim1=1, dim2=2)
     driven, measured = noise_members(models[0])
     by_process, by_noise = noise_scores(here, adjoint[..., 0], weight[..., 0], process, noise)
     score = (by_process * window_used.reshape(-1, 1, 1)).sum(1) @ driven.T + (by_noise * used).sum(1) @ measured.T
-    information = []
-    for column in (0, -1):
-        disturbance = -process[:, None] * adjoint[:, 1:, :, column]
-        residual = noise[:, None] * weight[..., column]
-        working = of_each(respond(here, disturbance[..., None] * driven.T, residual[..., None] * measured.T))
-        information.append(0.5 * working.mT @ working)
+    # The smoothed w is minus Q times the adjoint; what inputs add to the states is subtracted from the readings.
+    drive = (process[:, None, :, None] * adjoint[:, 1:])[..., None] * driven.T[:, None]
+    reading = (noise[:, None, :, None] * weight)[..., None] * measured.T[:, None]
+    working = of_each(respond(here, drive.flatten(-2), reading.flatten(-2)))
+    working = working.unflatten(-1, (2, len(driven))).flatten(1, 2)
     return Derivatives(
         log_likelihood(here, used).reshape(count, windows).sum(-1),
         columns.mT @ columns,
         -(columns.mT @ error)[..., 0],
-        torch.stack(information).mean(0),
+        0.25 * working.mT @ working,
         score.reshape(count, windows, -1).sum(1),
         smoothed.reshape(*fits.state.shape, -1),
     )
