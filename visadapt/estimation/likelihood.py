@@ -165,8 +165,8 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState, window_used:
     # and Cullis 1995, Biometrics 51(4)), in the mean of the data and of data that the model draws. The data alone would
     # give steps that are too long far from the optimum, where they are unlike the model.
     generator = torch.Generator().manual_seed(0)
-    drawn = torch.randn(*here.white.shape[:-1], 1, generator=generator, dtype=torch.float64) * used[..., None]
-    white = torch.cat((here.white, drawn), -1)
+    drawn = torch.randn(models[0].rows.used.shape, generator=generator, dtype=torch.float64)  # the same for every fit
+    white = torch.cat((here.white, (drawn.repeat(count, 1, 1) * used)[..., None]), -1)
     adjoint = adjoints(here, white)
     smoothed = here.predicted - here.covariance @ adjoint[..., :-1]
     both = [0, -1]
