@@ -217,6 +217,10 @@ class World(nn.Module):
         self._sensing = sorted((e for e in effects if isinstance(e, SensingEffect)), key=lambda effect: effect.order)
         self._dynamics = [effect for effect in effects if isinstance(effect, DynamicsEffect)]
         self._residuals = [effect for effect in effects if isinstance(effect, Residual)]
+        # Most effects do one of these three alone, and a step asks for them at every derivative.
+        self._varying = [e for e in self._dynamics if type(e).vary is not DynamicsEffect.vary]
+        self._loading = [e for e in self._dynamics if type(e).load is not DynamicsEffect.load]
+        self._rubbing = [e for e in self._dynamics if type(e).dry_friction is not DynamicsEffect.dry_friction]
 
     def _at_rest(self, state: Tensor) -> tuple[Tensor, ...]:
         """What effects remember at the start of an episode in the state (B, n_state)."""
@@ -272,7 +276,7 @@ class World(nn.Module):
         return state, tuple(remembered)
 
     def _varied(self, system: System, time: Tensor, state: Tensor) -> System:
-        for effect in self._dynamics:
+        for effect in self._varying:
             system = effect.vary(system, time, state)
         return system
 
@@ -282,12 +286,12 @@ class World(nn.Module):
 
     def _dry_friction(self, time: Tensor, state: Tensor, system: System) -> Tensor | None:
         """Sum over all effects of the largest dry friction; None without any."""
-        found = [effect.dry_friction(time, state, system) for effect in self._dynamics]
+        found = [effect.dry_friction(time, state, system) for effect in self._rubbing]
         limits = [each for each in found if each is not None]
         return sum(limits[1:], limits[0]) if limits else None
 
     def _load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         load = torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)
-        for effect in self._dynamics:
+        for effect in self._loading:
             load = load + effect.load(time, state, system)
         return load

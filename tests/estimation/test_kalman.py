@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from visadapt.estimation.kalman import Linear, backward, forward, log_likelihood, respond
+from visadapt.estimation.kalman import Linear, backward, forward, log_likelihood, noise_scores, respond, weights
 
 N, T, STATES, CHANNELS, COLUMNS = 3, 7, 4, 2, 3
 
@@ -63,7 +63,7 @@ def test_likelihood_is_that_of_the_whole_gaussian(problem):
 
 
 def test_smoothed_states_are_the_conditional_mean_for_every_column(problem):
-    smoothed, _ = backward(problem, forward(problem, torch.diag_embed(PROCESS), MEASUREMENT))
+    smoothed, _ = backward(forward(problem, torch.diag_embed(PROCESS), MEASUREMENT))
     for n in range(N):
         for column in range(COLUMNS):
             mean, covariance = dense(problem, n, column)
@@ -75,14 +75,14 @@ def test_smoothed_states_are_the_conditional_mean_for_every_column(problem):
 
 
 def test_smoothed_states_follow_the_model_with_the_smoothed_disturbances(problem):
-    smoothed, adjoint = backward(problem, forward(problem, torch.diag_embed(PROCESS), MEASUREMENT))
+    smoothed, adjoint = backward(forward(problem, torch.diag_embed(PROCESS), MEASUREMENT))
     disturbance = -(PROCESS[:, None, :, None] * adjoint)[:, 1:]
     carried = problem.transition @ smoothed[:, :-1] + problem.drive + disturbance
     torch.testing.assert_close(carried, smoothed[:, 1:])
 
 
 def test_without_process_noise_the_smoothed_states_follow_the_model(problem):
-    smoothed, _ = backward(problem, forward(problem, torch.zeros(N, STATES, STATES).double(), MEASUREMENT))
+    smoothed, _ = backward(forward(problem, torch.zeros(N, STATES, STATES).double(), MEASUREMENT))
     torch.testing.assert_close(problem.transition @ smoothed[:, :-1] + problem.drive, smoothed[:, 1:])
 
 
@@ -96,8 +96,26 @@ def test_inputs_pass_through_the_gains_like_columns(problem):
         torch.zeros_like(problem.start),
         problem.spread,
     )
-    expected = forward(quiet, torch.diag_embed(PROCESS), MEASUREMENT).innovation
-    torch.testing.assert_close(respond(problem, filtered, problem.drive, problem.reading), expected)
+    expected = forward(quiet, torch.diag_embed(PROCESS), MEASUREMENT).white
+    torch.testing.assert_close(respond(filtered, problem.drive, problem.reading), expected)
+
+
+def test_noise_scores_are_the_derivatives_of_the_likelihood(problem):
+    process, noise = (x.clone().requires_grad_() for x in (PROCESS.log(), MEASUREMENT.log()))
+    filtered = forward(problem, torch.diag_embed(process.exp()), noise.exp())
+    log_likelihood(filtered, torch.ones(N, T, CHANNELS)).sum().backward()
+    _, adjoint = backward(filtered)
+    weight = weights(filtered, filtered.white, adjoint)
+    by_process, by_noise = noise_scores(filtered, adjoint[..., 0], weight[..., 0], PROCESS, MEASUREMENT)
+    torch.testing.assert_close(by_process.sum(1), process.grad)
+    torch.testing.assert_close(by_noise.sum(1), noise.grad)
+
+
+def test_weighted_variances_are_what_the_smoothed_states_leave_of_the_readings(problem):
+    filtered = forward(problem, torch.diag_embed(PROCESS), MEASUREMENT)
+    smoothed, adjoint = backward(filtered)
+    noise = MEASUREMENT[:, None, :, None] * weights(filtered, filtered.white, adjoint)
+    torch.testing.assert_close(noise, problem.reading - problem.sensing @ smoothed)
 
 
 def test_states_of_an_unstable_system_are_found_over_many_precise_readings():
@@ -118,5 +136,5 @@ def test_states_of_an_unstable_system_are_found_over_many_precise_readings():
         torch.tensor([2.25, 25.0, 0.1, 100.0, 100.0, 0.1], dtype=torch.float64),
     )
     process = torch.diag(torch.tensor([0.0, 0, 0, 0, 1e-2, 1e-5], dtype=torch.float64))
-    smoothed, _ = backward(problem, forward(problem, process[None], torch.full((1, 2), 10.0).double()))
+    smoothed, _ = backward(forward(problem, process[None], torch.full((1, 2), 10.0).double()))
     assert smoothed[0, :, [0, 2]].abs().max() < 10 / precision

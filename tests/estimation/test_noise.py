@@ -45,7 +45,7 @@ def test_the_smoothed_path_is_the_least_squares_solution():
     covariance = torch.linalg.inv(torch.diag(1 / prior) + seen.T @ seen / noise)
     mean = covariance @ seen.T @ value[there, 0] / noise
     filtered = episode.filtered(Noise(torch.tensor([[0.3]]).double(), torch.tensor([2.0]).double()))
-    path = backward(episode.system, filtered)[0][0, ..., 0]
+    path = backward(filtered)[0][0, ..., 0]
     torch.testing.assert_close(path, maps @ mean, rtol=1e-6, atol=1e-8)
 
 

@@ -36,7 +36,13 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add("--json", metavar="F", help="write the result here, as visadapt/diagnosis/schema.json says")
     add("--report", metavar="F.html", help="write a page with figures here")
     _add_seed(parser)
-    add("--jobs", metavar="N", type=_positive, default=1, help="cores to use (default: 1)")
+    add(
+        "--jobs",
+        metavar="N",
+        type=_positive,
+        default=1,
+        help="threads of tensor operations (default: 1); few gain from more",
+    )
 
 
 def effects(parser: argparse.ArgumentParser) -> None:

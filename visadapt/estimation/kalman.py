@@ -7,6 +7,11 @@ Kalman (1960, J. Basic Eng. 82(1)) forwards, with a Cholesky factor of the innov
 innovation and variance are those given the channels before it; backwards the adjoint form of Bryson and Frazier (1963),
 which inverts no covariance and so also holds without process noise. c and r have M columns: the first is the data, the
 others are derivatives of it (sensitivities), which pass through the same gains.
+
+The gains do not depend on c and r. So only the covariances are computed row after row in full. With L the factor of
+the innovations' covariance and e = L^-1 (r - H x), all means and adjoints then follow from one product per row:
+
+    x_{t+1} = F_t x_t + c_t + J_t L^-1 r_t      F = A - J L^-1 H,  J = A P H' L^-T
 """
 
 from __future__ import annotations
@@ -43,88 +48,128 @@ class Linear:
 class Filtered:
     """The result of the forward pass."""
 
-    predicted: list[Tensor]  # T of (N, n, M): x_t given rows before t
-    covariance: list[Tensor]  # T of (N, n, n): its covariance
-    root: list[Tensor]  # T of (N, m, m): lower factors of the innovations' covariances
-    cross: list[Tensor]  # T of (N, m, n): change of the states per unit of a whitened innovation
-    innovation: Tensor  # (N, T, m, M) of each channel, given the rows before and the channels before it
-    variance: Tensor  # (N, T, m) variances of the innovations
+    covariance: Tensor  # (N, T, n, n) P of x_t given rows before t
+    whitening: Tensor  # (N, T, m, m) L^-1
+    sensing: Tensor  # (N, T, m, n) L^-1 H
+    injection: Tensor  # (N, T - 1, n, m) J
+    closed_loop: Tensor  # (N, T - 1, n, n) F
+    predicted: Tensor  # (N, T, n, M) x_t given rows before t
+    white: Tensor
+    """(N, T, m, M) e: of each channel, given the rows before and the channels before it, over its standard deviation"""
 
     @property
-    def white(self) -> Tensor:
-        """(N, T, m, M) innovations over their standard deviations."""
-        return self.innovation / self.variance.sqrt()[..., None]
+    def deviation(self) -> Tensor:
+        """(N, T, m) standard deviations of the innovations."""
+        return 1 / self.whitening.diagonal(dim1=-2, dim2=-1)
 
 
 def forward(problem: Linear, process: Tensor, noise: Tensor) -> Filtered:
     """Filter with process covariances Q (N, n, n) and measurement variances s (N, m)."""
-    rows = problem.reading.shape[1]
-    mean = problem.start
-    covariance = torch.diag_embed(problem.spread.expand(len(mean), -1))
-    n = covariance.shape[-1]
+    covariance = torch.diag_embed(problem.spread.expand(len(problem.start), -1))
     disturbed = torch.diag_embed(noise)
-    predicted, covariances, roots, crosses, innovations, variances = [], [], [], [], [], []
-    for t in range(rows):
+    transitions, sensings = problem.transition.unbind(1), problem.sensing.unbind(1)
+    covariances, roots, crosses, failures = [], [], [], []
+    for t, sensing in enumerate(sensings):
         if t:
-            a = problem.transition[:, t - 1]
-            mean = torch.baddbmm(problem.drive[:, t - 1], a, mean)
+            a = transitions[t - 1]
             covariance = torch.baddbmm(process, torch.bmm(a, covariance), a.mT)
             # No reading damps rounding errors that are not symmetric: in an unstable system they would grow.
             covariance = (covariance + covariance.mT) / 2
-        predicted.append(mean)
-        covariances.append(covariance)
-        sensing = problem.sensing[:, t]
         seen = torch.bmm(sensing, covariance)
         root, failed = torch.linalg.cholesky_ex(torch.baddbmm(disturbed, seen, sensing.mT))
-        # After too large a step of a fit the covariance may be indefinite: the likelihood is NaN, the step rejected.
-        root = torch.where(failed[:, None, None] > 0, math.nan, root)
-        error = torch.baddbmm(problem.reading[:, t], sensing, mean, alpha=-1)
-        cross, white = torch.linalg.solve_triangular(root, torch.cat((seen, error), -1), upper=False).split(
-            (n, error.shape[-1]), -1
-        )
-        mean = torch.baddbmm(mean, cross.mT, white)
-        covariance = torch.baddbmm(covariance, cross.mT, cross, alpha=-1)
-        deviation = root.diagonal(dim1=1, dim2=2)
+        cross = torch.linalg.solve_triangular(root, seen, upper=False)
+        covariances.append(covariance)
         roots.append(root)
         crosses.append(cross)
-        innovations.append(white * deviation[..., None])
-        variances.append(deviation.square())
-    return Filtered(predicted, covariances, roots, crosses, torch.stack(innovations, 1), torch.stack(variances, 1))
+        failures.append(failed)
+        covariance = torch.baddbmm(covariance, cross.mT, cross, alpha=-1)
+    # After too large a step of a fit the covariance may be indefinite: the likelihood is NaN, the step rejected.
+    root = torch.where(torch.stack(failures, 1)[..., None, None] > 0, math.nan, torch.stack(roots, 1))
+    identity = torch.eye(noise.shape[1], dtype=noise.dtype, device=noise.device).expand_as(root)
+    right = torch.cat((identity, problem.sensing), -1)
+    whitening, sensing = torch.linalg.solve_triangular(root, right, upper=False).split(
+        (noise.shape[1], covariance.shape[1]), -1
+    )
+    injection = problem.transition @ torch.stack(crosses, 1)[:, :-1].mT
+    closed_loop = problem.transition - injection @ sensing[:, :-1]
+    reading = whitening @ problem.reading
+    predicted, white = _means(sensing, injection, closed_loop, problem.drive, reading, problem.start)
+    return Filtered(torch.stack(covariances, 1), whitening, sensing, injection, closed_loop, predicted, white)
 
 
-def respond(problem: Linear, filtered: Filtered, drive: Tensor, reading: Tensor) -> Tensor:
-    """Change of the innovations (N, T, m, M) with inputs `drive` (N, T - 1, n, M) and `reading` (N, T, m, M), under the
-    gains of the filter run that gave `filtered`."""
-    mean = torch.zeros_like(drive[:, 0])
-    out = []
-    for t in range(reading.shape[1]):
-        if t:
-            mean = torch.baddbmm(drive[:, t - 1], problem.transition[:, t - 1], mean)
-        error = torch.baddbmm(reading[:, t], problem.sensing[:, t], mean, alpha=-1)
-        white = torch.linalg.solve_triangular(filtered.root[t], error, upper=False)
-        mean = torch.baddbmm(mean, filtered.cross[t].mT, white)
-        out.append(white * filtered.root[t].diagonal(dim1=1, dim2=2)[..., None])
-    return torch.stack(out, 1)
+def respond(filtered: Filtered, drive: Tensor, reading: Tensor) -> Tensor:
+    """Change of the white innovations (N, T, m, M) with inputs `drive` (N, T - 1, n, M) and `reading` (N, T, m, M),
+    either of which may have one column for all, under the gains of the filter run that gave `filtered`."""
+    gains = filtered.sensing, filtered.injection, filtered.closed_loop
+    start = drive.new_zeros(*drive[:, 0, :, 0].shape, max(drive.shape[-1], reading.shape[-1]))
+    return _means(*gains, drive, filtered.whitening @ reading, start)[1]
 
 
-def backward(problem: Linear, filtered: Filtered) -> tuple[Tensor, Tensor]:
+def _means(
+    sensing: Tensor, injection: Tensor, closed_loop: Tensor, drive: Tensor, reading: Tensor, start: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Predicted states and white innovations under known gains; `sensing` and `reading` are whitened."""
+    inputs = (drive + injection @ reading[:, :-1]).unbind(1)
+    means = [start]
+    for loop, each in zip(closed_loop.unbind(1), inputs, strict=True):
+        means.append(torch.baddbmm(each, loop, means[-1]))
+    predicted = torch.stack(means, 1)
+    return predicted, reading - sensing @ predicted
+
+
+def backward(filtered: Filtered) -> tuple[Tensor, Tensor]:
     """Smoothed states (N, T, n, M), and adjoints (N, T, n, M): minus Q times them is the smoothed w before row t."""
-    white = filtered.white
-    adjoint = torch.zeros_like(problem.start)
-    states, adjoints = [], []
-    for t in reversed(range(white.shape[1])):
-        along = torch.baddbmm(white[:, t], filtered.cross[t], adjoint)
-        weight = torch.linalg.solve_triangular(filtered.root[t].mT, along, upper=True)
-        adjoint = torch.baddbmm(adjoint, problem.sensing[:, t].mT, weight, alpha=-1)
-        states.append(filtered.predicted[t] - torch.bmm(filtered.covariance[t], adjoint))
-        adjoints.append(adjoint)
-        if t:
-            adjoint = torch.bmm(problem.transition[:, t - 1].mT, adjoint)
-    return torch.stack(states[::-1], 1), torch.stack(adjoints[::-1], 1)
+    adjoint = adjoints(filtered, filtered.white)
+    return filtered.predicted - filtered.covariance @ adjoint, adjoint
+
+
+def adjoints(filtered: Filtered, white: Tensor) -> Tensor:
+    """Adjoints (N, T, n, M) of readings with these white innovations (N, T, m, M)."""
+    sources = (-filtered.sensing.mT @ white).unbind(1)
+    out = [sources[-1]]
+    for loop, source in zip(reversed(filtered.closed_loop.unbind(1)), reversed(sources[:-1]), strict=True):
+        out.append(torch.baddbmm(source, loop.mT, out[-1]))
+    return torch.stack(out[::-1], 1)
+
+
+def weights(filtered: Filtered, white: Tensor, adjoint: Tensor) -> Tensor:
+    """Smoothed measurement noises v (N, T, m, M) over their variances, given the white innovations' `adjoints`."""
+    left = white.clone()
+    left[:, :-1] += filtered.injection.mT @ adjoint[:, 1:]
+    return filtered.whitening.mT @ left
+
+
+def noise_scores(
+    filtered: Filtered, adjoint: Tensor, weight: Tensor, process: Tensor, noise: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Derivatives of the log likelihood by the logs of the noises' variances.
+
+    A variance is too small where the square of a smoothed noise exceeds what is expected of it under that variance
+    (Koopman and Shephard 1992, Biometrika 79(4)).
+
+    Args:
+        filtered: a filter run with the variances `process` (N, n) and `noise` (N, m) of uncorrelated noises.
+        adjoint, weight: (N, T, n) and (N, T, m) of the data.
+
+    Returns:
+        The derivatives by each process noise before each row but the first, (N, T - 1, n), and by each measurement
+        noise, (N, T, m), which are -1/2 where nothing was measured.
+    """
+    sources = (filtered.sensing.mT @ filtered.sensing).unbind(1)
+    covariances = [sources[-1]]  # of the adjoints
+    for loop, source in zip(reversed(filtered.closed_loop.unbind(1)), reversed(sources[1:-1]), strict=False):
+        covariances.append(torch.baddbmm(source, torch.bmm(loop.mT, covariances[-1]), loop))
+    covariance = torch.stack(covariances[::-1], 1)
+    by_process = adjoint[:, 1:].square() - covariance.diagonal(dim1=-2, dim2=-1)
+    # The variance of the weights: of the row's own innovation, and of the rows after.
+    injected = filtered.injection @ filtered.whitening[:, :-1]
+    variance = filtered.whitening.square().sum(-2)
+    variance[:, :-1] += (injected * (covariance @ injected)).sum(-2)
+    by_noise = weight.square() - variance
+    return 0.5 * process[:, None] * by_process, 0.5 * noise[:, None] * by_noise
 
 
 def log_likelihood(filtered: Filtered, used: Tensor) -> Tensor:
     """(N,) of the first column; `used` (N, T, m) is 1 where something was measured."""
-    square = filtered.innovation[..., 0].square() / filtered.variance
-    terms = square + filtered.variance.log() + math.log(2 * math.pi)
+    terms = filtered.white[..., 0].square() + 2 * filtered.deviation.log() + math.log(2 * math.pi)
     return -0.5 * (terms * used).sum((1, 2))

@@ -5,7 +5,7 @@
 One-step residuals mislead where states are noisy, so the states are unknowns too: Gauss-Newton on states and
 parameters together, where the states are integrated out by a Kalman filter along their own estimate (a multiple
 shooting in which every row starts a shot; Bock and Plitt 1984, and Kristensen, Madsen and Jorgensen 2004, Automatica
-40(2), for the likelihood of innovations). Q and R follow by Fisher scoring on the same innovations. Where the effects
+40(2), for the likelihood of innovations). Q and R follow by scoring on the smoothed noises. Where the effects
 are right Q goes to zero, and every row of an episode informs every parameter; where an effect is missing Q grows to
 the variance of what is missing.
 """
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from visadapt.batch import Batch
 from visadapt.estimation.candidate import CandidateModel, linearise
-from visadapt.estimation.kalman import Linear, backward, forward, log_likelihood
+from visadapt.estimation.kalman import Linear, adjoints, forward, log_likelihood, noise_scores, respond, weights
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
@@ -41,9 +41,7 @@ MIN_MEASUREMENT_VARIANCE = 1e-12  # Lower bound of a measurement's variance, in 
 
 MAX_DAMPING = 100.0  # Damping at which a fit stops, since its steps have become too short to gain anything
 
-LOG_VARIANCE_STEP = 1e-3
-MAX_LOG_VARIANCE_CHANGE = 1.5
-"""Finite difference of a log variance, and its largest change in one iteration."""
+MAX_LOG_VARIANCE_CHANGE = 1.5  # Largest change of a log variance in one iteration
 
 
 @dataclass(frozen=True)
@@ -121,15 +119,17 @@ def variances(model: CandidateModel, log_process: Tensor, log_noise: Tensor) -> 
     return torch.diag_embed(process).repeat_interleave(windows, 0), log_noise.exp().repeat_interleave(windows, 0)
 
 
-def noise_groups(model: CandidateModel) -> Tensor:
-    """(G + S, G + m) 1 where a variance, of G process noise groups and m channels, equals the row's free variance.
+def noise_members(model: CandidateModel) -> tuple[Tensor, Tensor]:
+    """(G + S, n) and (G + S, m) 1 where the noise of a state or a channel has the row's free variance.
 
-    Channels of one of the S kinds of sensors share a variance.
+    There is one of each of G groups of driven velocities, and one of each of S kinds of sensors.
     """
-    groups, channels = len(model.profile.driven), model.rows.channels
+    channels = model.rows.channels
+    driven = [[float(k in group) for k in range(len(model.system.states))] for group in model.profile.driven]
     sensors = [[float(c in kind) for c in channels] for kind in model.profile.sensors]
-    measured = torch.tensor([row for row in sensors if any(row)], dtype=torch.float64)
-    return torch.block_diag(torch.eye(groups, dtype=torch.float64), measured)
+    measured = [row for row in sensors if any(row)]
+    whole = torch.block_diag(torch.tensor(driven), torch.tensor(measured)).double()
+    return whole[:, : len(model.system.states)], whole[:, len(model.system.states) :]
 
 
 Batched = TypeVar("Batched", "FitState", "Derivatives")
@@ -151,34 +151,42 @@ class Derivatives(Batch):
 def differentiate(models: Sequence[CandidateModel], fits: FitState, window_used: Tensor) -> Derivatives:
     """Likelihood, gradient and Fisher information at `fits`, over the windows where `window_used` (C, W) is 1."""
     count, windows = window_used.shape
-    logs = torch.cat((fits.log_process, fits.log_noise), 1)
     problem = linear_problem(models, fits)
     used = models[0].rows.used.repeat(count, 1, 1) * window_used.reshape(-1, 1, 1)
-    here = forward(problem, *variances(models[0], fits.log_process, fits.log_noise))
-    likelihood = log_likelihood(here, used).reshape(count, windows).sum(-1)
-    white = (here.white * used[..., None]).reshape(count, -1, here.innovation.shape[-1])
-    error, columns = white[..., :1], white[..., 1:]
-    # Derivatives by the noise: the data's column alone, filtered with each log variance a little larger.
-    tied = noise_groups(models[0])
-    larger = (logs + LOG_VARIANCE_STEP * tied[:, None]).flatten(0, 1)
-    larger = larger.split((fits.log_process.shape[1], used.shape[-1]), 1)
-    varied = forward(problem.data().repeat(len(tied)), *variances(models[0], *larger))
-    gains = log_likelihood(varied, used.repeat(len(tied), 1, 1)).reshape(-1, count, windows).sum(-1) - likelihood
+    process, noise = variances(models[0], fits.log_process, fits.log_noise)
+    here = forward(problem, process, noise)
 
-    def by_noise(value: Tensor, base: Tensor) -> Tensor:
-        change = (value.reshape(-1, *base.shape) - base) / LOG_VARIANCE_STEP * used
-        return change.reshape(len(tied), count, -1).permute(1, 2, 0)
+    def of_each(white: Tensor) -> Tensor:
+        """Whitened innovations (C, readings, M) of every fit."""
+        return (white * used[..., None]).reshape(count, -1, white.shape[-1])
 
-    by_variance = by_noise(varied.variance.log(), here.variance.log())
-    by_mean = by_noise(varied.innovation[..., 0], here.innovation[..., 0])
-    by_mean = by_mean / here.variance.sqrt().reshape(count, -1, 1)
-    smoothed, _ = backward(problem, here)
+    error, columns = of_each(here.white).split((1, fits.theta.shape[1]), -1)
+    # The information of the log variances: that of inputs which are the smoothed noises of one group (Gilmour, Thompson
+    # and Cullis 1995, Biometrics 51(4)), in the mean of the data and of data that the model draws. The data alone would
+    # give steps that are too long far from the optimum, where they are unlike the model.
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.randn(models[0].rows.used.shape, generator=generator, dtype=torch.float64)  # the same for every fit
+    white = torch.cat((here.white, (drawn.repeat(count, 1, 1) * used)[..., None]), -1)
+    adjoint = adjoints(here, white)
+    smoothed = here.predicted - here.covariance @ adjoint[..., :-1]
+    both = [0, -1]
+    adjoint = adjoint[..., both]
+    weight = weights(here, white[..., both], adjoint)
+    process = process.diagonal(dim1=1, dim2=2)
+    driven, measured = noise_members(models[0])
+    by_process, by_noise = noise_scores(here, adjoint[..., 0], weight[..., 0], process, noise)
+    score = (by_process * window_used.reshape(-1, 1, 1)).sum(1) @ driven.T + (by_noise * used).sum(1) @ measured.T
+    # The smoothed w is minus Q times the adjoint; what inputs add to the states is subtracted from the readings.
+    drive = (process[:, None, :, None] * adjoint[:, 1:])[..., None] * driven.T[:, None]
+    reading = (noise[:, None, :, None] * weight)[..., None] * measured.T[:, None]
+    working = of_each(respond(here, drive.flatten(-2), reading.flatten(-2)))
+    working = working.unflatten(-1, (2, len(driven))).flatten(1, 2)
     return Derivatives(
-        likelihood,
+        log_likelihood(here, used).reshape(count, windows).sum(-1),
         columns.mT @ columns,
         -(columns.mT @ error)[..., 0],
-        0.5 * by_variance.mT @ by_variance + by_mean.mT @ by_mean,
-        (gains / LOG_VARIANCE_STEP).T,
+        0.25 * working.mT @ working,
+        score.reshape(count, windows, -1).sum(1),
         smoothed.reshape(*fits.state.shape, -1),
     )
 
@@ -243,8 +251,9 @@ def _step(
     share = 1 / (1 + damping)[:, None]
     matrix = at.noise_information + 0.3 * torch.eye(at.noise_gradient.shape[1], dtype=change.dtype)
     move = torch.linalg.solve(matrix, at.noise_gradient[..., None])[..., 0]
-    log_change = move.clamp(-MAX_LOG_VARIANCE_CHANGE, MAX_LOG_VARIANCE_CHANGE) * share @ noise_groups(model)
+    log_change = move.clamp(-MAX_LOG_VARIANCE_CHANGE, MAX_LOG_VARIANCE_CHANGE) * share
     groups = fits.log_process.shape[1]
+    noise_change = log_change @ noise_members(model)[1]
     # Rounding to a resolution is noise with a deviation of resolution / sqrt(12).
     resolution = torch.tensor(model.rows.step, dtype=torch.float64)
     lowest_noise = (resolution.square() / 12 + MIN_MEASUREMENT_VARIANCE).log()
@@ -253,7 +262,7 @@ def _step(
         theta=theta,
         state=fits.state + (at.smoothed * moves[:, None, None, None]).sum(-1),
         log_process=(fits.log_process + log_change[:, :groups]).clamp(MIN_LOG_PROCESS, MAX_LOG_PROCESS),
-        log_noise=torch.maximum(fits.log_noise + log_change[:, groups:], lowest_noise),
+        log_noise=torch.maximum(fits.log_noise + noise_change, lowest_noise),
     )
 
 

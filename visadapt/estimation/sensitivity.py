@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from visadapt.effects import Effect
+from visadapt.effects import Effect, SensingEffect
 from visadapt.estimation.candidate import COARSEST, CandidateModel
 from visadapt.estimation.kalman import forward, respond
 from visadapt.estimation.likelihood import FitState, linear_problem, variances
+from visadapt.estimation.linearise import integrate
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
 
@@ -23,20 +24,19 @@ class Innovations:
     def __init__(self, model: CandidateModel, fits: FitState) -> None:
         rows = model.rows
         self.rows = rows
-        self._problem = linear_problem([model], fits)
-        self._filtered = forward(self._problem, *variances(model, fits.log_process, fits.log_noise))
-        white = self._white(self._filtered.innovation)
+        problem = linear_problem([model], fits)
+        self._filtered = forward(problem, *variances(model, fits.log_process, fits.log_noise))
+        white = self._readings(self._filtered.white)
         self._known, _ = torch.linalg.qr(white[:, 1:])
         self.error: Tensor = self._projected(white[:, :1])[:, 0]
         """(N,)"""
 
     def response(self, drive: Tensor, reading: Tensor) -> Tensor:
         """Change (N, M) of the innovations with M inputs: `drive` (W, T - 1, n, M) and `reading` (W, T, m, M)."""
-        return self._projected(self._white(respond(self._problem, self._filtered, drive, reading)))
+        return self._projected(self._readings(respond(self._filtered, drive, reading)))
 
-    def _white(self, innovation: Tensor) -> Tensor:
-        white = innovation / self._filtered.variance.sqrt()[..., None] * self.rows.used[..., None]
-        return white.reshape(-1, white.shape[-1])
+    def _readings(self, white: Tensor) -> Tensor:
+        return (white * self.rows.used[..., None]).reshape(-1, white.shape[-1])
 
     def _projected(self, white: Tensor) -> Tensor:
         return white - self._known @ (self._known.T @ white)
@@ -110,8 +110,7 @@ class Sensitivity:
             if parameter.neutral is None:
                 theta[0, j - count_own] = tried[1, j]
         windows, length = rows.shape
-        count, n = len(theta), fits.state.shape[-1]
-        commands = model.commands(theta)[:, :, :-1].flatten(0, 2)
+        state, count = fits.state[0], len(theta)
 
         def spread(x: Tensor) -> Tensor:
             return x[None].expand(count, *x.shape).reshape(-1, *x.shape[2:])
@@ -119,13 +118,18 @@ class Sensitivity:
         def per_row(used: int) -> Tensor:
             return theta[:, None].expand(-1, windows * used, -1).flatten(0, 1)
 
-        state = fits.state[0]
-        after = model.at(per_row(length - 1)).integrate(
-            spread(rows.time[:, :-1]), spread(state[:, :-1]), commands, spread(rows.duration[:, :-1])
-        )
-        read = model.measure(per_row(length), spread(state))
-        after = after.reshape(count, windows, length - 1, n)
-        read = read.reshape(count, windows, length, -1)
+        if issubclass(effect, SensingEffect):
+            read = model.measure(per_row(length), spread(state)).reshape(count, windows, length, -1)
+            reading = -(read[1:] - read[:1]).movedim(0, -1) * rows.used[..., None]
+            return self.innovations.response(torch.zeros_like(state[:, 1:, :, None]), reading)
+        acted = model.commands(theta if model.acting_parameters else theta[:1])[:, :, :-1]
+        after = integrate(
+            model.at(theta[0]),
+            per_row(length - 1),
+            spread(rows.time[:, :-1]),
+            spread(state[:, :-1]),
+            acted.expand(count, *acted.shape[1:]).flatten(0, 2),
+            spread(rows.duration[:, :-1]),
+        ).reshape(count, windows, length - 1, -1)
         drive = (after[1:] - after[:1]).movedim(0, -1) * rows.inside[:, 1:, None, None]
-        reading = -(read[1:] - read[:1]).movedim(0, -1) * rows.used[..., None]
-        return self.innovations.response(drive, reading)
+        return self.innovations.response(drive, torch.zeros_like(rows.measured[..., None]))

@@ -97,7 +97,7 @@ class Tracker:
             if turn < 2:
                 noise = most_probable_noise(problems, noise)
             assert noise is not None
-            paths = [backward(each.system, each.filtered(noise))[0][0, ..., 0] for each in problems]
+            paths = [backward(each.filtered(noise))[0][0, ..., 0] for each in problems]
         n = len(self.world.system.states)
         return [
             replace(episode, state=path[:, :n].numpy().astype(episode.action.dtype))

@@ -39,7 +39,7 @@ def disturbance(model: CandidateModel, fits: FitState, log_process: Tensor) -> D
     rows = model.rows
     problem = linear_problem([model], fits)
     process, noise = variances(model, fits.log_process, fits.log_noise)
-    _, adjoint = backward(problem, forward(problem, process, noise))
+    _, adjoint = backward(forward(problem, process, noise))
     added = -(adjoint[..., 0] @ process)[:, 1:, driven]
     by_load = loads_of(model, fits)[:, :, driven]
     # A coordinate that sticks has no response to a load, nor has the padding: the least load that acts is 0 there.

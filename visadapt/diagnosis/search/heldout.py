@@ -99,7 +99,7 @@ def rollout_errors(model: CandidateModel, fits: FitState, extra: Tensor | None =
     extra = torch.zeros_like(fits.state[0, :, 1:]) if extra is None else extra
     problem = linear_problem([model], fits)
     problem = replace(problem.data(), drive=problem.drive[..., :1] + extra[..., None])
-    smoothed, _ = backward(problem, forward(problem, *variances(model, fits.log_process, fits.log_noise)))
+    smoothed, _ = backward(forward(problem, *variances(model, fits.log_process, fits.log_noise)))
     predicted = _rollouts(model, fits.theta[0], fits.state[0] + smoothed[..., 0], horizon, extra)
     shape = (horizon + 1, windows, length, len(rows.channels))
     error, valid = torch.zeros(shape, dtype=torch.float64), torch.zeros(shape, dtype=torch.float64)
