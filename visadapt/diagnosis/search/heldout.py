@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from visadapt.diagnosis.search.black_box import BlackBox, fit_black_box, inputs
 from visadapt.diagnosis.search.unexplained import loads_of
@@ -53,6 +54,14 @@ class RolloutErrors:
         count = self.valid[1:].sum((1, 2)).clamp(min=1)
         return ((self.error[0].square() * self.valid[1:]).sum((1, 2)) / count).sqrt() / deviation
 
+    def by_stretch(self, deviation: Tensor) -> Tensor:
+        """(S,) mean square errors H rows ahead in stretches of H rows, in units of `deviation` (m,)."""
+        horizon = len(self.error) - 1
+        parts = ((self.error[-1] / deviation).square().sum(-1), self.valid[-1].sum(-1))
+        padding = -parts[0].shape[1] % horizon
+        square, count = (pad(each, (0, padding)).unflatten(1, (-1, horizon)).sum(-1).flatten() for each in parts)
+        return square[count > 0] / count[count > 0]
+
 
 def overall(errors: Tensor) -> Tensor:
     """(H,) root mean square over the channels of errors (H, m)."""
@@ -65,6 +74,18 @@ MIN_GAP = 1.02  # Error of the source over the noise floor, below which there is
 def closed(before: float, after: float, floor: float) -> float:
     """(before - after) / (before - floor); NaN where there is no gap to close."""
     return (before - after) / (before - floor) if before > floor * MIN_GAP else math.nan
+
+
+CLEAR = 3.0  # Value of t from which one model counts as predicting better than another: p < 0.01 from 10 stretches
+
+
+def predicts_better(other: RolloutErrors, one: RolloutErrors, deviation: Tensor) -> bool:
+    """Whether `other` predicts the same rows better than `one` by more than chance.
+
+    A paired t-test of the log errors at the longest horizon, in stretches of one horizon: those are nearly independent.
+    """
+    gain = (one.by_stretch(deviation) / other.by_stretch(deviation)).log()
+    return float(gain.mean() / gain.std() * math.sqrt(len(gain))) > CLEAR
 
 
 def folds(rows: Segments, most: int) -> Tensor:
