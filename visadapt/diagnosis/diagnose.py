@@ -29,7 +29,7 @@ from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.search.unexplained import black_box_functions
+from visadapt.diagnosis.search.unexplained import smooth_functions
 from visadapt.effects import EFFECTS, Effect
 from visadapt.effects.catalogue import catalogue as all_effects, twins
 from visadapt.estimation.candidate import CandidateModel
@@ -225,7 +225,7 @@ def _next(
         first = comparison.functions[0]
         if not gap.closed >= MIN_CLOSED_TO_EXPLAIN:
             source = CandidateModel(search.system, (), search.rows)
-            first = black_box_functions(source, search.source.fits)[0]
+            first = smooth_functions(source, search.source.fits)[0]
         return next_experiment.explain(first.port, first.variable)
     return next_experiment.separate([[one.effect for one in group] for group in groups], search.system)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from visadapt.diagnosis.search.search import ScoredModel, Search
-from visadapt.diagnosis.search.unexplained import BlackBoxFunction, black_box_functions
+from visadapt.diagnosis.search.unexplained import SmoothFunction, smooth_functions
 from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel
 
@@ -42,7 +42,7 @@ class ModelComparison:
 
     models: list[ComparedModel]  # the most probable first
     leftover: float  # log likelihood that process noise adds to the best
-    functions: list[BlackBoxFunction]  # of a black box added to the best, the largest log odds first
+    functions: list[SmoothFunction]  # each added alone to the best, the largest log odds first
     alternatives: dict[type[Effect], list[ComparedModel]]
     """for each effect of the best: the models with another effect in its place that fit as well"""
     gained: float  # log likelihood of the best minus that of the source
@@ -81,7 +81,7 @@ def compare(search: Search) -> ModelComparison:
     order = sorted(range(len(close)), key=lambda k: -scores[k])
     models = [ComparedModel(close[k], probabilities[k]) for k in order]
     best = models[0].model
-    functions = black_box_functions(CandidateModel(search.system, best.effects, search.rows), best.fits)
+    functions = smooth_functions(CandidateModel(search.system, best.effects, search.rows), best.fits)
     alternatives = {effect: _alternatives(models, effect) for effect in best.effects}
     gained = float(best.fits.likelihood[0] - search.source.fits.likelihood[0])
     threshold = search.profile.black_box_threshold

@@ -29,8 +29,8 @@ PRIOR_DEVIATIONS = (0.03, 0.3, 3.0, 30.0)
 
 
 @dataclass(frozen=True)
-class BlackBoxFunction:
-    """One function of the black box, fitted alone."""
+class SmoothFunction:
+    """One smooth function of one variable, fitted alone."""
 
     port: str  # the load, or the state whose reading is in error
     variable: str  # a state, a command, a command of the period before, or time
@@ -47,13 +47,13 @@ class Block:
     reading: Tensor  # (W, T, m, BUMPS) to the readings
 
 
-def black_box_functions(model: CandidateModel, fits: FitState) -> list[BlackBoxFunction]:
-    """Every function of the black box added alone to a fitted set, the largest log odds first."""
+def smooth_functions(model: CandidateModel, fits: FitState) -> list[SmoothFunction]:
+    """Every function added alone to a fitted set, the largest log odds first."""
     blocks = _blocks(model, fits)
     innovations = Innovations(model, fits)
     out = []
     for block, response in zip(blocks, _responses(innovations, blocks), strict=True):
-        out.append(BlackBoxFunction(block.port, block.variable, _regression(response, innovations.error)[1]))
+        out.append(SmoothFunction(block.port, block.variable, _regression(response, innovations.error)[1]))
     return sorted(out, key=lambda function: -function.log_odds)
 
 
