@@ -17,7 +17,7 @@ from torch import Tensor
 
 from visadapt.diagnosis.search.unexplained import loads_of, variables_of, with_loads
 from visadapt.estimation.candidate import COARSE, CandidateModel
-from visadapt.estimation.kalman import forward, log_likelihood, respond
+from visadapt.estimation.kalman import forward, respond
 from visadapt.estimation.likelihood import MIN_LOG_PROCESS, FitState, linear_problem, variances
 from visadapt.world import World
 
@@ -33,6 +33,10 @@ LOG_LENGTH = math.log(2.0)  # Mean of a log length before anything is seen, in s
 LOG_SPREAD = 3.0  # Standard deviation of log lengths and log amplitudes before anything is seen
 
 MAX_DECADES = 4  # Decades at most by which process noise becomes less beside the black box
+
+MIN_GAIN = 3.0
+"""Log likelihood that a black box with less process noise must gain on other windows: it would also follow what does
+not repeat."""
 
 JITTER = 1e-6  # Added to the kernel's diagonal, whose values are 1
 
@@ -70,20 +74,22 @@ def fit_black_box(model: CandidateModel, fits: FitState, window_used: Tensor) ->
     centre, scale = values[here > 0].mean(0), values[here > 0].std(0).clamp(min=1e-9)
     values = (values - centre) / scale
     gains = loads_of(model, fits) * here[..., None, None]
-    best: tuple[float, FitState, Tensor, _Regression] | None = None
-    for decade in range(1 + MAX_DECADES):
+    values = values * here[..., None]
+    first = regression = _Regression.of(model, fits, window_used, gains, values, here)
+    logs = regression.optimised(regression.start(), ITERATIONS)
+    best = nominal = first.validated(regression, logs), fits, logs, regression
+    for decade in range(1, 1 + MAX_DECADES):
         # What the black box explains is process noise no more.
         tried = replace(fits, log_process=(fits.log_process - decade * math.log(10)).clamp(min=MIN_LOG_PROCESS))
-        regression, likelihood = _Regression.of(model, tried, window_used, gains, values * here[..., None], here)
-        start = regression.start() if best is None else best[2]
-        logs = regression.optimised(start, ITERATIONS if best is None else REFINING_ITERATIONS)
-        value = likelihood + float(regression.evidence(logs)[0])
-        if best is not None and value <= best[0]:
+        regression = _Regression.of(model, tried, window_used, gains, values, here)
+        logs = regression.optimised(logs, REFINING_ITERATIONS)
+        gain = first.validated(regression, logs)
+        if gain <= best[0]:
             break
-        best = value, tried, logs, regression
-    _, fits, logs, regression = best
+        best = gain, tried, logs, regression
+    _, remaining, logs, regression = best if best[0] > nominal[0] + MIN_GAIN else nominal
     lengths, weights = regression.weights(logs)
-    return BlackBox(with_loads(model, COARSE), fits, centre, scale * lengths, regression.points / lengths, weights)
+    return BlackBox(with_loads(model, COARSE), remaining, centre, scale * lengths, regression.points / lengths, weights)
 
 
 @dataclass(frozen=True)
@@ -99,8 +105,8 @@ class _Regression:
     @classmethod
     def of(
         cls, model: CandidateModel, fits: FitState, window_used: Tensor, gains: Tensor, values: Tensor, here: Tensor
-    ) -> tuple[_Regression, float]:
-        """The regression with the filter of `fits`, and the log likelihood without loads.
+    ) -> _Regression:
+        """The regression with the filter of `fits`.
 
         `gains` (W, T - 1, n, L) is the change of the states per unit of each load.
         """
@@ -115,8 +121,7 @@ class _Regression:
         information = (response.mT @ response).reshape(windows, loads, steps, loads, steps).transpose(2, 3)
         gradient = -(response.mT @ error).reshape(windows, loads, steps)
         chosen = torch.randperm(int(here.sum()), generator=torch.Generator().manual_seed(0))[:POINTS]
-        likelihood = float((log_likelihood(filtered, model.rows.used) * window_used).sum())
-        return cls(values, here, values[here > 0][chosen], information, gradient), likelihood
+        return cls(values, here, values[here > 0][chosen], information, gradient)
 
     def start(self) -> Tensor:
         """Log lengths (D,) and log amplitudes (L,), together, before anything is seen: loads are as large as noise."""
@@ -164,6 +169,23 @@ class _Regression:
         white = torch.linalg.solve_triangular(root, gradient[:, None], upper=False)
         value = 0.5 * white.square().sum() - root.diagonal().log().sum()
         return value, size * torch.linalg.solve_triangular(root.mT, white, upper=True)[:, 0]
+
+    def validated(self, other: _Regression, logs: Tensor) -> float:
+        """Log likelihood gained in each half of the windows by the loads that `other` finds in the other half."""
+        gain = 0.0
+        ordinal = self.here.amax(1).cumsum(0)
+        for parity in (0, 1):
+            half = (ordinal % 2 == parity).to(self.values.dtype)
+            part = replace(
+                other,
+                information=other.information * half[:, None, None, None, None],
+                gradient=other.gradient * half[:, None, None],
+            )
+            lengths, weights = part.weights(logs)
+            loads = (_kernel(self.values / lengths, self.points / lengths) @ weights * self.here[..., None]).mT
+            square = torch.einsum("wat,wabts,wbs->w", loads, self.information, loads)
+            gain += float(((1 - half) * ((self.gradient * loads).sum((1, 2)) - 0.5 * square)).sum())
+        return gain
 
     def weights(self, logs: Tensor) -> tuple[Tensor, Tensor]:
         """Lengths (D,), and weights (M, L) of the kernel's functions."""
