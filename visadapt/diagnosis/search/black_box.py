@@ -1,10 +1,10 @@
 """The black box: the best that a flexible model predicts beside a fitted set of effects.
 
 It is a Gaussian process of all variables together (states, commands, commands of the period before, time) for the load
-on each degree of freedom, with an own length for each variable. Loads pass through the fitted set's filter, as those of
+on each degree of freedom, with a length for each variable. Loads pass through the fitted set's filter, as those of
 `unexplained.py` do: so noisy and missing states are taken into account, and for given lengths and amplitudes the
-posterior mean and the marginal likelihood are exact, up to the approximation by a subset of regressors (Quinonero-
-Candela and Rasmussen 2005, Journal of Machine Learning Research 6). Lengths and amplitudes maximise it.
+posterior mean and the marginal likelihood, which they maximise, are exact. The process is approximated by a subset of
+regressors (Quinonero-Candela and Rasmussen 2005, Journal of Machine Learning Research 6).
 """
 
 from __future__ import annotations
