@@ -30,7 +30,7 @@ from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.search.unexplained import black_box_functions
+from visadapt.diagnosis.search.unexplained import smooth_functions
 from visadapt.effects import EFFECTS, Effect
 from visadapt.effects.catalogue import catalogue as all_effects, twins
 from visadapt.estimation.candidate import CandidateModel
@@ -123,12 +123,15 @@ def diagnose(
     corrected = predicted[frozenset(best.names)]
     black_box = heldout.held_out(system, rows, [(best.effects, best.fits)], black_box=True)[0]
     noise = (best.fits.log_noise[0] / 2).exp()
-    reached = torch.minimum(corrected.rms(noise), black_box.rms(noise))
+    reached = min((corrected.rms(noise), black_box.rms(noise)), key=lambda error: float(heldout.overall(error)[-1]))
     errors = Errors(source.rms(noise), corrected.rms(noise), corrected.floor(noise), reached, noise)
+    gap = errors.gap()
+    left = heldout.closed(gap.before, gap.black_box, gap.floor) - gap.closed
+    improvable = left > 1 - MIN_GAP_CLOSED and heldout.predicts_better(black_box, corrected, noise)
     gap_closed = {names: errors.closed_by(each) for names, each in predicted.items()}
 
     explaining = (*repeat_causes, *causes(search, comparison, groups, gap_closed))
-    verdict = _verdict(comparison, errors, explaining, bool(repeats))
+    verdict = _verdict(comparison, gap, improvable, explaining, bool(repeats))
     found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
     before, after = disturbances(search, comparison)
     regions = _regions(found, before if found else after, effects, profile.region_variables, seed)
@@ -143,9 +146,14 @@ def diagnose(
         ),
         causes=found,
         ranking=ranking(comparison, effects, system, gap_closed, repeat_causes),
-        gap=errors.gap(),
-        next_experiment=_next(search, comparison, verdict, groups, errors.gap()),
-        warnings=(*recording.warnings, *prepared.warnings, *_warnings(comparison, verdict), *_at_bounds(comparison)),
+        gap=gap,
+        next_experiment=_next(search, comparison, verdict, groups, gap),
+        warnings=(
+            *recording.warnings,
+            *prepared.warnings,
+            *_warnings(comparison, verdict, improvable),
+            *_at_bounds(comparison),
+        ),
         figures=figure_data(search, source, corrected, errors, before, after, regions),
         policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, best),
     )
@@ -161,21 +169,28 @@ def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effec
     return out
 
 
-def _verdict(comparison: ModelComparison, errors: Errors, explaining: Sequence[Cause], repeats: bool) -> str:
-    """The verdict where these causes are what explains the gap best; `repeats`: readings are repeated."""
-    gap = errors.gap()
-    if comparison.unexplained:
+def _verdict(
+    comparison: ModelComparison, gap: Gap, improvable: bool, explaining: Sequence[Cause], repeats: bool
+) -> str:
+    """The verdict where these causes are what explains the gap best.
+
+    Args:
+        improvable: a black box beside them clearly closes more of the gap.
+        repeats: readings are repeated.
+    """
+    unexplained = comparison.unexplained(improvable)
+    if unexplained:
         # Where the noise is low, any model of a real machine leaves something significant: then the share of the gap
         # that is closed decides, otherwise whether what is unexplained is negligible.
         clear = gap.after > CLEAR_OF_NOISE * gap.floor
-        enough = gap.closed >= MIN_GAP_CLOSED if clear else comparison.negligible
+        enough = gap.closed >= MIN_GAP_CLOSED if clear else comparison.negligible and not improvable
         if not (comparison.best.effects and enough):
             return UNEXPLAINED
     elif math.isnan(gap.closed) and not repeats:
         return NO_GAP  # the source predicts as well as the noise allows
     carrying = without_slight(explaining)
     if not carrying:
-        return UNEXPLAINED if comparison.unexplained else NO_GAP
+        return UNEXPLAINED if unexplained else NO_GAP
     return AMBIGUOUS if any(cause.indistinguishable_from for cause in carrying) else IDENTIFIED
 
 
@@ -211,7 +226,7 @@ def _next(
         first = comparison.functions[0]
         if not gap.closed >= MIN_CLOSED_TO_EXPLAIN:
             source = CandidateModel(search.system, (), search.rows)
-            first = black_box_functions(source, search.source.fits)[0]
+            first = smooth_functions(source, search.source.fits)[0]
         return next_experiment.explain(first.port, first.variable)
     return next_experiment.separate([[one.effect for one in group] for group in groups], search.system)
 
@@ -229,8 +244,8 @@ def _at_bounds(comparison: ModelComparison) -> list[str]:
     ]
 
 
-def _warnings(comparison: ModelComparison, verdict: str) -> list[str]:
-    if verdict in (IDENTIFIED, AMBIGUOUS) and comparison.unexplained:
+def _warnings(comparison: ModelComparison, verdict: str, improvable: bool) -> list[str]:
+    if verdict in (IDENTIFIED, AMBIGUOUS) and comparison.unexplained(improvable):
         first = comparison.functions[0]
         return [
             "the causes close the gap but do not explain everything: an unexplained disturbance acts as "

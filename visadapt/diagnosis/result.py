@@ -93,7 +93,7 @@ class Gap:
     before: float  # of the source
     after: float  # of the source with the causes
     floor: float  # of the measurement noise alone
-    black_box: float  # the best that a black box of smooth functions reaches beside the causes; at most `after`
+    black_box: float  # the best that a black box reaches beside the causes; at most `after`
     closed: float  # (before - after) / (before - floor); NaN where there is no gap to close
 
 

@@ -15,8 +15,10 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from visadapt.diagnosis.search import unexplained
+from visadapt.diagnosis.search.black_box import BlackBox, fit_black_box, inputs
+from visadapt.diagnosis.search.unexplained import loads_of
 from visadapt.estimation.candidate import COARSE, CandidateModel
 from visadapt.estimation.fit_states import Effects, single_fit, stacked
 from visadapt.estimation.kalman import backward, forward
@@ -52,6 +54,14 @@ class RolloutErrors:
         count = self.valid[1:].sum((1, 2)).clamp(min=1)
         return ((self.error[0].square() * self.valid[1:]).sum((1, 2)) / count).sqrt() / deviation
 
+    def by_stretch(self, deviation: Tensor) -> Tensor:
+        """(S,) mean square errors H rows ahead in stretches of H rows, in units of `deviation` (m,)."""
+        horizon = len(self.error) - 1
+        parts = ((self.error[-1] / deviation).square().sum(-1), self.valid[-1].sum(-1))
+        padding = -parts[0].shape[1] % horizon
+        square, count = (pad(each, (0, padding)).unflatten(1, (-1, horizon)).sum(-1).flatten() for each in parts)
+        return square[count > 0] / count[count > 0]
+
 
 def overall(errors: Tensor) -> Tensor:
     """(H,) root mean square over the channels of errors (H, m)."""
@@ -64,6 +74,18 @@ MIN_GAP = 1.02  # Error of the source over the noise floor, below which there is
 def closed(before: float, after: float, floor: float) -> float:
     """(before - after) / (before - floor); NaN where there is no gap to close."""
     return (before - after) / (before - floor) if before > floor * MIN_GAP else math.nan
+
+
+CLEAR = 3.0  # Value of t from which one model counts as predicting better than another: p < 0.01 from 10 stretches
+
+
+def predicts_better(other: RolloutErrors, one: RolloutErrors, deviation: Tensor) -> bool:
+    """Whether `other` predicts the same rows better than `one` by more than chance.
+
+    A paired t-test of the log errors at the longest horizon, in stretches of one horizon: those are nearly independent.
+    """
+    gain = (one.by_stretch(deviation) / other.by_stretch(deviation)).log()
+    return float(gain.mean() / gain.std() * math.sqrt(len(gain))) > CLEAR
 
 
 def folds(rows: Segments, most: int) -> Tensor:
@@ -86,21 +108,22 @@ def held_out(
     parts = []
     for k, model in enumerate(models):
         one = single_fit(fitted, k, len(model.table))
-        extra = unexplained.black_box(model, one, used[k]) if black_box else None
-        parts.append(rollout_errors(model, one, extra))
+        parts.append(rollout_errors(model, one, fit_black_box(model, one, used[k]) if black_box else None))
     return [_merged(parts[k * count : (k + 1) * count], out.argmax(0)) for k in range(len(sets))]
 
 
-def rollout_errors(model: CandidateModel, fits: FitState, extra: Tensor | None = None) -> RolloutErrors:
-    """Errors of one fitted set from every row; `extra` (W, T - 1, n) is what a black box adds to its states."""
+def rollout_errors(model: CandidateModel, fits: FitState, black_box: BlackBox | None = None) -> RolloutErrors:
+    """Errors of one fitted set from every row, perhaps with a black box, whose loads follow the predicted states."""
     rows = model.rows
     windows, length = rows.shape
     horizon = max(1, round(PREDICTION_TIME / rows.period))
-    extra = torch.zeros_like(fits.state[0, :, 1:]) if extra is None else extra
-    problem = linear_problem([model], fits)
-    problem = replace(problem.data(), drive=problem.drive[..., :1] + extra[..., None])
+    fits = fits if black_box is None else black_box.fits
+    problem = linear_problem([model], fits).data()
+    if black_box is not None:
+        loads = black_box.loads(inputs(model, fits.state[0])[:, :-1, None]) * rows.inside[:, 1:, None, None]
+        problem = replace(problem, drive=problem.drive + (loads_of(model, fits) * loads).sum(-1, keepdim=True))
     smoothed, _ = backward(forward(problem, *variances(model, fits.log_process, fits.log_noise)))
-    predicted = _rollouts(model, fits.theta[0], fits.state[0] + smoothed[..., 0], horizon, extra)
+    predicted = _rollouts(model, fits.theta[0], fits.state[0] + smoothed[..., 0], horizon, black_box)
     shape = (horizon + 1, windows, length, len(rows.channels))
     error, valid = torch.zeros(shape, dtype=torch.float64), torch.zeros(shape, dtype=torch.float64)
     for h in range(horizon + 1):
@@ -111,25 +134,28 @@ def rollout_errors(model: CandidateModel, fits: FitState, extra: Tensor | None =
     return RolloutErrors(error * valid, valid, predicted)
 
 
-def _rollouts(model: CandidateModel, theta: Tensor, state: Tensor, horizon: int, extra: Tensor) -> Tensor:
+def _rollouts(model: CandidateModel, theta: Tensor, state: Tensor, horizon: int, black_box: BlackBox | None) -> Tensor:
     """(W, T, horizon + 1, n) states simulated from every row with the recorded commands."""
     rows = model.rows
-    windows, length = rows.shape
+    length = rows.shape[1]
+
     # Padding: predictions that leave the window are not valid.
-    padding = torch.zeros(windows, horizon + 1, extra.shape[-1], dtype=extra.dtype)
-    extra = torch.cat((extra, padding), 1)
-    commands = model.commands(theta[None])[0]
-    commands = torch.cat((commands, commands[:, -1:].expand(-1, horizon, -1, -1)), 1)
-    duration = torch.cat((rows.duration, rows.duration[:, -1:].expand(-1, horizon)), 1)
+    def padded(values: Tensor) -> Tensor:
+        return torch.cat((values, values[:, -1:].expand(-1, horizon, *values.shape[2:])), 1)
+
+    commands, duration = padded(model.commands(theta[None])[0]), padded(rows.duration)
+    commanded = padded(inputs(model, state)[..., state.shape[-1] : -1])
     world = model.at(theta)
     time, out = rows.time, [state]
     for h in range(horizon):
         now = slice(h, h + length)
-        lasting = duration[:, now]
+        if black_box is not None:
+            variables = torch.cat((out[-1], commanded[:, now], time[..., None]), -1)
+            world = black_box.at(variables.flatten(0, 1))
         after = world.integrate(
-            time.flatten(), out[-1].flatten(0, 1), commands[:, now].flatten(0, 1), lasting.flatten()
+            time.flatten(), out[-1].flatten(0, 1), commands[:, now].flatten(0, 1), duration[:, now].flatten()
         )
-        time, after = time + lasting, after.reshape(state.shape) + extra[:, now]
+        time, after = time + duration[:, now], after.reshape(state.shape)
         out.append(after.nan_to_num(STATE_LIMIT, STATE_LIMIT, -STATE_LIMIT).clamp(-STATE_LIMIT, STATE_LIMIT))
     return torch.stack(out, 2)
 

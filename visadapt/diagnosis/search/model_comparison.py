@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from visadapt.diagnosis.search.search import ScoredModel, Search
-from visadapt.diagnosis.search.unexplained import BlackBoxFunction, black_box_functions
+from visadapt.diagnosis.search.unexplained import SmoothFunction, smooth_functions
 from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel
 
@@ -17,6 +17,9 @@ COMPARE_WITHIN = 10.0  # Log posterior odds; models further behind the best are 
 MIN_LEFTOVER = 5.0
 """Log likelihood that process noise must add to a model for something to count as unexplained, and the most that a
 model's score is lowered for it."""
+
+CLEAR_LOG_ODDS = 10.0
+"""Log odds of a load above which it counts as unexplained although the black box closes no more of the gap."""
 
 SLIGHT_SHARE = 0.05
 """Share of the best model's gain in log likelihood below which what it leaves unexplained is negligible."""
@@ -39,21 +42,26 @@ class ModelComparison:
 
     models: list[ComparedModel]  # the most probable first
     leftover: float  # log likelihood that process noise adds to the best
-    functions: list[BlackBoxFunction]  # of a black box added to the best, the largest log odds first
+    functions: list[SmoothFunction]  # each added alone to the best, the largest log odds first
     alternatives: dict[type[Effect], list[ComparedModel]]
     """for each effect of the best: the models with another effect in its place that fit as well"""
     gained: float  # log likelihood of the best minus that of the source
-    threshold: float  # log odds of a function above which it counts as something unexplained
+    threshold: float  # log odds above which a function of a reading counts as something unexplained
+    loads: tuple[str, ...]  # ports of the other functions, loads
 
     @property
     def best(self) -> ScoredModel:
         """The most probable model."""
         return self.models[0].model
 
-    @property
-    def unexplained(self) -> bool:
-        """Whether the best model leaves something unexplained."""
-        return self.leftover > MIN_LEFTOVER or self.functions[0].log_odds > self.threshold
+    def unexplained(self, improvable: bool) -> bool:
+        """Whether the best model leaves something unexplained; `improvable`: a black box beside it clearly predicts
+        better on held-out episodes."""
+        if improvable or self.leftover > MIN_LEFTOVER:
+            return True
+        # A load that is of no use on held-out episodes must be beyond doubt; of readings the black box has no errors.
+        required = {load: max(self.threshold, CLEAR_LOG_ODDS) for load in self.loads}
+        return any(each.log_odds > required.get(each.port, self.threshold) for each in self.functions)
 
     @property
     def negligible(self) -> bool:
@@ -73,11 +81,12 @@ def compare(search: Search) -> ModelComparison:
     order = sorted(range(len(close)), key=lambda k: -scores[k])
     models = [ComparedModel(close[k], probabilities[k]) for k in order]
     best = models[0].model
-    functions = black_box_functions(CandidateModel(search.system, best.effects, search.rows), best.fits)
+    functions = smooth_functions(CandidateModel(search.system, best.effects, search.rows), best.fits)
     alternatives = {effect: _alternatives(models, effect) for effect in best.effects}
     gained = float(best.fits.likelihood[0] - search.source.fits.likelihood[0])
     threshold = search.profile.black_box_threshold
-    return ModelComparison(models, leftover[order[0]], functions, alternatives, gained, threshold)
+    loads = tuple(load.name for load in search.system.loads)
+    return ModelComparison(models, leftover[order[0]], functions, alternatives, gained, threshold, loads)
 
 
 def _alternatives(models: Sequence[ComparedModel], effect: type[Effect]) -> list[ComparedModel]:

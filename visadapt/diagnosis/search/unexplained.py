@@ -1,4 +1,4 @@
-"""What a fitted set leaves unexplained: a black box of smooth functions of one variable each, and their log odds.
+"""What a fitted set leaves unexplained: the log odds of smooth functions of one variable, each added alone.
 
 A function adds a load (a force on the cart, say) or an error of a reading. It is a sum of Gaussian bumps of one state,
 the command, the previous command, or time. What it adds passes through the gains of the fitted set's filter, so that
@@ -15,14 +15,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from visadapt.estimation.candidate import CandidateModel, linearise
+from visadapt.estimation.candidate import FINE, CandidateModel, linearise
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.linearise import load_effect
 from visadapt.estimation.sensitivity import Innovations
 
 BUMPS = 10  # Gaussian bumps of a function
-
-MAX_FUNCTIONS = 8  # Functions of a black box at most
 
 PREVIOUS_PREFIX = "previous_"  # Prefix of the name of a command in the period before
 
@@ -31,8 +29,8 @@ PRIOR_DEVIATIONS = (0.03, 0.3, 3.0, 30.0)
 
 
 @dataclass(frozen=True)
-class BlackBoxFunction:
-    """One function of the black box, fitted alone."""
+class SmoothFunction:
+    """One smooth function of one variable, fitted alone."""
 
     port: str  # the load, or the state whose reading is in error
     variable: str  # a state, a command, a command of the period before, or time
@@ -49,37 +47,14 @@ class Block:
     reading: Tensor  # (W, T, m, BUMPS) to the readings
 
 
-def black_box_functions(model: CandidateModel, fits: FitState) -> list[BlackBoxFunction]:
-    """Every function of the black box added alone to a fitted set, the largest log odds first."""
+def smooth_functions(model: CandidateModel, fits: FitState) -> list[SmoothFunction]:
+    """Every function added alone to a fitted set, the largest log odds first."""
     blocks = _blocks(model, fits)
     innovations = Innovations(model, fits)
     out = []
     for block, response in zip(blocks, _responses(innovations, blocks), strict=True):
-        out.append(BlackBoxFunction(block.port, block.variable, _regression(response, innovations.error)[1]))
+        out.append(SmoothFunction(block.port, block.variable, _regression(response, innovations.error)[1]))
     return sorted(out, key=lambda function: -function.log_odds)
-
-
-def black_box(model: CandidateModel, fits: FitState, window_used: Tensor) -> Tensor:
-    """What a black box adds to the states in a period, (W, T - 1, n), in all windows.
-
-    Its functions are loads, fitted to the windows where `window_used` (W,) is 1: one after the other, that of largest
-    log odds first, each to the residual of those before.
-    """
-    blocks = [block for block in _blocks(model, fits) if not bool(block.reading.any())]
-    innovations = Innovations(model, fits)
-    used = (model.rows.used * window_used[:, None, None]).flatten()
-    responses = [response * used[:, None] for response in _responses(innovations, blocks)]
-    residual = innovations.error * used
-    drive = torch.zeros_like(blocks[0].drive[..., 0])
-    for _ in range(MAX_FUNCTIONS):
-        fitted = [_regression(response, residual) for response in responses]
-        best = max(range(len(fitted)), key=lambda k: fitted[k][1])
-        weights, log_odds = fitted[best]
-        if log_odds <= 0:
-            break
-        residual = residual + responses[best] @ weights
-        drive = drive + blocks[best].drive @ weights
-    return drive
 
 
 def _responses(innovations: Innovations, blocks: Sequence[Block]) -> tuple[Tensor, ...]:
@@ -113,7 +88,7 @@ def _blocks(model: CandidateModel, fits: FitState) -> list[Block]:
 
 
 def variables_of(model: CandidateModel, state: Tensor) -> dict[str, Tensor]:
-    """(W, T) of every state, command and previous command, and of time, by name; along states (W, T, n)."""
+    """(W, T) of every state, command and previous command, and of time last, by name; along states (W, T, n)."""
     rows = model.rows
     index = rows.index
     command = rows.command[rows.episode[:, None], index]
@@ -127,9 +102,13 @@ def variables_of(model: CandidateModel, state: Tensor) -> dict[str, Tensor]:
 def loads_of(model: CandidateModel, fits: FitState) -> Tensor:
     """Change of the states after a period per unit of each load, (W, T - 1, n, loads)."""
     count = len(model.system.loads)
-    loaded = CandidateModel(model.system, [*model.effects, load_effect(type(model.system))], model.rows)
     theta = torch.cat((fits.theta[0, : len(model.table)], torch.zeros(count, dtype=torch.float64)))
-    return linearise(loaded, theta, fits.state[0]).by_parameter[..., -count:]
+    return linearise(with_loads(model, FINE), theta, fits.state[0]).by_parameter[..., -count:]
+
+
+def with_loads(model: CandidateModel, accuracy: int) -> CandidateModel:
+    """The set of a model with a constant load on each degree of freedom, whose values are its last parameters."""
+    return CandidateModel(model.system, [*model.effects, load_effect(type(model.system))], model.rows, accuracy)
 
 
 def _bumps(values: Tensor, inside: Tensor) -> Tensor:
