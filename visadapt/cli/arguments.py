@@ -41,7 +41,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         type=_positive,
         default=1,
-        help="threads of tensor operations (default: 1); few gain from more",
+        help="processes that share the work (default: 1)",
     )
 
 

@@ -73,7 +73,7 @@ def diagnose(
         world: the source, without effects; the parameters of its system are taken as known.
         catalogue: the effects that may be causes; by default all that are registered for the system.
         seed: of the random shifts that give the p-values of regions; nothing else is random.
-        jobs: threads that tensor operations may use.
+        jobs: processes that share the work.
         progress: called with (stage, steps done, steps in all, loss).
         policy: a policy on states, in the units and signs of the source and at the rate of the recording; with it, the
             terms of the paper's Theorem 1 are computed (`Diagnosis.policy`).
@@ -97,14 +97,14 @@ def diagnose(
         raise ValueError("diagnose: the world is the source and has no effects; give the bare system")
     system = world.system
     profile = profile_of(system)
-    torch.set_num_threads(jobs)
+    torch.set_num_threads(1)  # operations are too small for threads; processes share the work
     effects = list(all_effects(system) if catalogue is None else catalogue)
     if policy is not None:
         policy_bound.check(policy, system)
     candidates = searched(effects, system)
     prepared = prepare(recording, system, candidates)
     rows = prepared.rows
-    search = Search(system, rows, candidates, prepared.source)
+    search = Search(system, rows, candidates, prepared.source, jobs)
     search.run(staged(progress, "search"))
     comparison = compare(search)
     best = comparison.best
@@ -117,11 +117,11 @@ def diagnose(
     runners_up = [compared.model for compared in comparison.models[1 : 1 + RUNNERS_UP]]
     without = [search.without(best, effect) for effect in best.effects]
     sets = {frozenset(f.names): f for f in [search.source, best, *alone, *without, *runners_up]}
-    rollouts = heldout.held_out(system, rows, [(f.effects, f.fits) for f in sets.values()])
+    rollouts = heldout.held_out(system, rows, [(f.effects, f.fits) for f in sets.values()], jobs=jobs)
     predicted = dict(zip(sets, rollouts, strict=True))
     source = errors_with_repeats(prepared, search) if repeats else predicted[frozenset()]
     corrected = predicted[frozenset(best.names)]
-    black_box = heldout.held_out(system, rows, [(best.effects, best.fits)], black_box=True)[0]
+    black_box = heldout.held_out(system, rows, [(best.effects, best.fits)], black_box=True, jobs=jobs)[0]
     noise = (best.fits.log_noise[0] / 2).exp()
     reached = min((corrected.rms(noise), black_box.rms(noise)), key=lambda error: float(heldout.overall(error)[-1]))
     errors = Errors(source.rms(noise), corrected.rms(noise), corrected.floor(noise), reached, noise)

@@ -19,6 +19,7 @@ from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.estimation.sensitivity import Sensitivity
+from visadapt.processes import shared_out
 from visadapt.systems import System
 
 STRENGTH_POINTS = 9
@@ -122,11 +123,16 @@ class Candidate:
 
 
 def screen(
-    system: System, effects: Sequence[type[Effect]], fits: FitState, rows: Segments, candidates: Sequence[type[Effect]]
+    system: System,
+    effects: Sequence[type[Effect]],
+    fits: FitState,
+    rows: Segments,
+    candidates: Sequence[type[Effect]],
+    jobs: int = 1,
 ) -> list[Candidate]:
     """The best parameter values of every effect of `candidates` that raises the likelihood, the largest gain first.
 
-    They are added to a set of `effects` with its fit (C = 1).
+    They are added to a set of `effects` with its fit (C = 1); `jobs` processes share the work.
     """
     covered = spans(system, rows, fits.state[0])
     by_stride: dict[int, Sensitivity] = {}
@@ -136,16 +142,16 @@ def screen(
             by_stride[stride] = Sensitivity.on_every(stride, system, effects, fits, rows)
         return by_stride[stride]
 
-    found = []
-    for effect in candidates:
+    def best(effect: type[Effect]) -> Candidate | None:
         points, columns = starts(effect, covered) if needs_descent(effect) else grid(effect, covered)
         stride = _window_stride(profile_of(system).screening_rows, rows, len(points) * (1 + len(columns)))
         if needs_descent(effect):
-            found.append(_descend(sensitivity(1), effect, _best_start(sensitivity(stride), effect, points, columns)))
-        else:
-            some = sensitivity(stride)
-            best = _best(effect, points, columns, some.innovations.error, some.by_unit(effect, points, columns))
-            found.append(None if best is None else replace(best, gain=stride * best.gain))
+            return _descend(sensitivity(1), effect, _best_start(sensitivity(stride), effect, points, columns))
+        some = sensitivity(stride)
+        found = _best(effect, points, columns, some.innovations.error, some.by_unit(effect, points, columns))
+        return None if found is None else replace(found, gain=stride * found.gain)
+
+    found = shared_out(lambda indices: [best(candidates[k]) for k in indices], len(candidates), jobs)
     return sorted((one for one in found if one is not None), key=lambda one: -one.gain)
 
 

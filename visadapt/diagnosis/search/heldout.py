@@ -25,6 +25,7 @@ from visadapt.estimation.kalman import backward, forward
 from visadapt.estimation.likelihood import FitState, fit, linear_problem, variances
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
+from visadapt.processes import shared_out
 from visadapt.systems import System
 
 PREDICTION_TIME = 0.5  # s; the horizon at which the gap is measured
@@ -96,19 +97,28 @@ def folds(rows: Segments, most: int) -> Tensor:
 
 
 def held_out(
-    system: System, rows: Segments, sets: Sequence[tuple[Effects, FitState]], black_box: bool = False
+    system: System, rows: Segments, sets: Sequence[tuple[Effects, FitState]], black_box: bool = False, jobs: int = 1
 ) -> list[RolloutErrors]:
-    """Cross-validated predictions of each set of effects, given its fit to all rows, perhaps with a black box added."""
+    """Cross-validated predictions of each set of effects, given its fit to all rows, perhaps with a black box added.
+
+    `jobs` processes share the work.
+    """
     out = folds(rows, profile_of(system).folds)
     count = len(out)
-    models = [CandidateModel(system, effects, rows, COARSE) for effects, _ in sets for _ in range(count)]
-    starts = stacked([fits for _, fits in sets for _ in range(count)])
-    used = (1 - out).repeat(len(sets), 1) if count > 1 else torch.ones(len(sets), rows.shape[0], dtype=out.dtype)
-    fitted = fit(models, starts, used, REFIT_ITERATIONS)
-    parts = []
-    for k, model in enumerate(models):
-        one = single_fit(fitted, k, len(model.table))
-        parts.append(rollout_errors(model, one, fit_black_box(model, one, used[k]) if black_box else None))
+    used = 1 - out if count > 1 else torch.ones_like(out)
+
+    def predicted(indices: Sequence[int]) -> list[RolloutErrors]:
+        chosen = [(*sets[k // count], used[k % count]) for k in indices]
+        models = [CandidateModel(system, effects, rows, COARSE) for effects, _, _ in chosen]
+        windows = torch.stack([windows for *_, windows in chosen])
+        fitted = fit(models, stacked([fits for _, fits, _ in chosen]), windows, REFIT_ITERATIONS)
+        parts = []
+        for k, model in enumerate(models):
+            one = single_fit(fitted, k, len(model.table))
+            parts.append(rollout_errors(model, one, fit_black_box(model, one, windows[k]) if black_box else None))
+        return parts
+
+    parts = shared_out(predicted, len(sets) * count, jobs)
     return [_merged(parts[k * count : (k + 1) * count], out.argmax(0)) for k in range(len(sets))]
 
 

@@ -32,6 +32,7 @@ from visadapt.estimation.likelihood import FitState, fit
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.screening import Candidate, screen
 from visadapt.estimation.segments import Segments
+from visadapt.processes import shared_out
 from visadapt.progress import Progress
 from visadapt.systems import System
 
@@ -74,16 +75,24 @@ class ScoredModel:
 class Search:
     """The sets of effects of a catalogue fitted so far to one recording, and how to fit more.
 
-    `source` is the fit of the source to these rows, if it is already known.
+    Args:
+        source: the fit of the source to these rows, if it is already known.
+        jobs: processes that share the work.
     """
 
     def __init__(
-        self, system: System, rows: Segments, catalogue: Sequence[type[Effect]], source: FitState | None = None
+        self,
+        system: System,
+        rows: Segments,
+        catalogue: Sequence[type[Effect]],
+        source: FitState | None = None,
+        jobs: int = 1,
     ) -> None:
         self.system = system
         self.profile = profile_of(system)
         self.rows = rows
         self.catalogue = tuple(catalogue)
+        self.jobs = jobs
         self.fitted: dict[frozenset[str], ScoredModel] = {}
         self._slopes: tuple[Tensor, Tensor] | None = None
         self._screened: dict[tuple[str, ...], tuple[FitState, list[Candidate]]] = {}
@@ -171,7 +180,7 @@ class Search:
         fits, screened = self._screened.get(base.names, (None, []))
         if fits is not base.fits:
             rest = [e for e in self.catalogue if e not in base.effects]
-            screened = screen(self.system, base.effects, base.fits, self.rows, rest)
+            screened = screen(self.system, base.effects, base.fits, self.rows, rest, self.jobs)
             self._screened[base.names] = base.fits, screened
         return screened
 
@@ -194,7 +203,8 @@ class Search:
             # Along the states of the whole set what is removed shows as a disturbance, without a fit of what is left.
             kept, fits = _without(centre, removed)
             rest = [e for e in self.catalogue if e not in centre.effects]
-            for candidate in self._promising(screen(self.system, kept, fits, self.rows, rest))[:MAX_EXCHANGES]:
+            screened = screen(self.system, kept, fits, self.rows, rest, self.jobs)
+            for candidate in self._promising(screened)[:MAX_EXCHANGES]:
                 effects = (*kept, candidate.effect)
                 exchange = centre.names, _key(effects)
                 if exchange not in self._exchanged:
@@ -248,15 +258,18 @@ class Search:
         if not starts:
             return []
         iterations, accuracy = effort
-        models = [CandidateModel(self.system, effects, self.rows, accuracy) for effects, _ in starts]
-        for model in models:
-            model.slopes = self._slopes
-        out = fit(models, stacked([fits for _, fits in starts]), self._all_windows(len(starts)), iterations)
-        if self._slopes is None:
-            self._slopes = models[0].slopes
+
+        def fitted_share(indices: Sequence[int]) -> list[FitState]:
+            models = [CandidateModel(self.system, starts[k][0], self.rows, accuracy) for k in indices]
+            for model in models:
+                model.slopes = self._slopes
+            out = fit(models, stacked([starts[k][1] for k in indices]), self._all_windows(len(indices)), iterations)
+            if self._slopes is None:
+                self._slopes = models[0].slopes
+            return [single_fit(out, k, len(model.table)) for k, model in enumerate(models)]
+
         results = []
-        for k, (effects, _) in enumerate(starts):
-            fits = single_fit(out, k, len(models[k].table))
+        for (effects, _), fits in zip(starts, shared_out(fitted_share, len(starts), self.jobs), strict=True):
             fitted = ScoredModel(effects, fits, log_posterior_odds(effects, fits, len(self.catalogue)))
             key = _key(effects)
             if key not in self.fitted or self.fitted[key].log_odds < fitted.log_odds:

@@ -1,0 +1,36 @@
+"""Work shared out among processes gives what one process gives, in its order; errors come back."""
+
+import os
+
+import pytest
+import torch
+
+from visadapt.processes import shared_out
+
+
+@pytest.mark.parametrize("jobs", [1, 2, 3, 9])
+def test_results_are_in_order(jobs):
+    table = torch.arange(14.0).reshape(7, 2)
+    with torch.inference_mode():
+        found = shared_out(lambda indices: [table[k] ** 2 for k in indices], 7, jobs)
+    torch.testing.assert_close(torch.stack(found), table**2)
+
+
+@pytest.mark.parametrize(("jobs", "processes"), [(1, 1), (2, 2), (8, 5)])
+def test_each_share_has_a_process_of_its_own(jobs, processes):
+    assert len(set(shared_out(lambda indices: [os.getpid()] * len(indices), 5, jobs))) == processes
+
+
+@pytest.mark.parametrize("bad", [0, 1])
+def test_an_error_in_any_process_is_raised(bad):
+    def work(indices):
+        if bad in indices:
+            raise ValueError(f"index {bad}")
+        return list(indices)
+
+    with pytest.raises(ValueError, match=f"index {bad}"):
+        shared_out(work, 4, 2)
+
+
+def test_nothing_to_do():
+    assert shared_out(lambda indices: [], 0, 4) == []

@@ -1,0 +1,55 @@
+"""Work shared out among processes, for tensor operations so small that threads do not speed them up."""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection
+from typing import TypeVar
+
+Result = TypeVar("Result")
+Work = Callable[[Sequence[int]], Sequence[Result]]
+"""Gives a result for each index that it is handed, whichever others it is handed along with it."""
+
+
+def shared_out(work: Work[Result], count: int, jobs: int) -> list[Result]:
+    """The results of `work` for indices 0 to `count` - 1, computed in at most `jobs` processes.
+
+    Processes are forked: they see what this one has made so far, and what they change is lost but for the results.
+    Where the operating system cannot fork, this process does all the work. An error in any process is raised here.
+
+    >>> shared_out(lambda indices: [10 * index for index in indices], 5, jobs=2)
+    [0, 10, 20, 30, 40]
+    """
+    jobs = min(jobs, count) if "fork" in multiprocessing.get_all_start_methods() else 1
+    if jobs < 2:
+        return list(work(range(count)))
+    context = multiprocessing.get_context("fork")
+    # Neighbours may be alike in cost, so each process takes every `jobs`-th.
+    shares = [range(first, count, jobs) for first in range(jobs)]
+    started = []
+    for share in shares[1:]:
+        receiver, sender = context.Pipe(duplex=False)
+        process = context.Process(target=_run, args=(work, share, sender), daemon=True)
+        process.start()
+        sender.close()
+        started.append((process, receiver))
+    results: list[Result | None] = [None] * count
+    results[shares[0].start :: jobs] = work(shares[0])
+    for share, (process, receiver) in zip(shares[1:], started, strict=True):
+        # Pickled by hand: sent as they are, tensors would pass through shared memory, of which there may be little.
+        found = pickle.loads(receiver.recv_bytes())
+        process.join()
+        if isinstance(found, BaseException):
+            raise found
+        results[share.start :: jobs] = found
+    return results  # type: ignore[return-value]  # every index is in one share
+
+
+def _run(work: Work[Result], share: Sequence[int], sender: Connection) -> None:
+    try:
+        found: object = list(work(share))
+    except Exception as error:
+        found = error
+    sender.send_bytes(pickle.dumps(found))
