@@ -41,6 +41,10 @@ MIN_MEASUREMENT_VARIANCE = 1e-12  # Lower bound of a measurement's variance, in 
 
 MAX_DAMPING = 100.0  # Damping at which a fit stops, since its steps have become too short to gain anything
 
+OUT_OF_REACH = 100.0
+"""Log likelihood short of its rival's at which a fit stops: where it would end if it gained in every iteration that is
+left what it gained in the last one."""
+
 MAX_LOG_VARIANCE_CHANGE = 1.5  # Largest change of a log variance in one iteration
 
 
@@ -192,11 +196,19 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState, window_used:
 
 
 def fit(
-    models: Sequence[CandidateModel], start: FitState, window_used: Tensor, iterations: int, process_noise: bool = True
+    models: Sequence[CandidateModel],
+    start: FitState,
+    window_used: Tensor,
+    iterations: int,
+    process_noise: bool = True,
+    rival: float = -math.inf,
 ) -> FitState:
     """The best fits of C models of the same rows in at most `iterations` damped Gauss-Newton steps from `start`.
 
-    `window_used` (C, W) is 1 for the windows that each fit uses. Without `process_noise` that stays at its lower bound.
+    Args:
+        window_used: (C, W) 1 for the windows that each fit uses.
+        process_noise: without it, process noise stays at its lower bound.
+        rival: log likelihood of another fit; fits that cannot come near it stop early.
     """
     if not process_noise:
         start = replace(start, log_process=torch.full_like(start.log_process, MIN_LOG_PROCESS))
@@ -206,6 +218,7 @@ def fit(
         low[c, : len(model.table)], high[c, : len(model.table)] = model.low, model.high
     damping = torch.full((len(models),), 1e-3, dtype=torch.float64)
     stalled = torch.zeros(len(models), dtype=torch.long)
+    gained = torch.full_like(damping, math.inf)  # by the last step that gained something
     active = torch.arange(len(models))
     here = best = start
     at: Derivatives | None = None
@@ -225,8 +238,10 @@ def fit(
             stalled[active] = torch.where(better & (gain < MIN_ITERATION_GAIN), stalled[active] + 1, 0)
             best = _replaced(best, active[better], tried, better)
             at = _replaced(at, active[better], now, better)
+            gained[active] = torch.where(better, gain, gained[active])
+            in_reach = best.likelihood + (iterations - 1 - iteration) * gained > rival - OUT_OF_REACH
             # Fits that have converged leave the batch.
-            active = active[(stalled[active] < 2) & (damping[active] < MAX_DAMPING)]
+            active = active[(stalled[active] < 2) & (damping[active] < MAX_DAMPING) & in_reach[active]]
             if not len(active):
                 break
         here = _step(best, at, damping, (low, high), models[0])

@@ -96,7 +96,7 @@ class Search:
         self.fitted: dict[frozenset[str], ScoredModel] = {}
         self._slopes: tuple[Tensor, Tensor] | None = None
         self._screened: dict[tuple[str, ...], tuple[FitState, list[Candidate]]] = {}
-        self._exchanged: set[tuple[tuple[str, ...], frozenset[str]]] = set()
+        self._exchanged: set[tuple[frozenset[str], frozenset[str]]] = set()
         if source is None:
             self.fit([((), initial_fit(system, rows))], CAREFUL)
         else:
@@ -131,8 +131,10 @@ class Search:
         if not leads or leads[0].gain < FIT_ALL_ABOVE:
             return []
         values = {one.effect: one.values for one in leads}
-        every = [((e,), with_effect(self.source.fits, values.get(e, neutral(e)))) for e in self.catalogue]
-        return self.fit(every, QUICK)
+        # The leads first: the others need not be fitted to the end where they fall far behind.
+        order = [*values, *(e for e in self.catalogue if e not in values)]
+        every = [((e,), with_effect(self.source.fits, values.get(e, neutral(e)))) for e in order]
+        return self.fit(every[:MAX_CANDIDATES], QUICK) + self.fit(every[MAX_CANDIDATES:], QUICK)
 
     def _settle(self) -> None:
         """Exchange, remove and fit carefully until the best set stays the best."""
@@ -202,15 +204,15 @@ class Search:
         for removed in (*combinations(centre.effects, 1), *combinations(centre.effects, 2)):
             # Along the states of the whole set what is removed shows as a disturbance, without a fit of what is left.
             kept, fits = _without(centre, removed)
+            if (exchange := (_key(centre.effects), _key(kept))) in self._exchanged:
+                continue
+            self._exchanged.add(exchange)
             rest = [e for e in self.catalogue if e not in centre.effects]
             screened = screen(self.system, kept, fits, self.rows, rest, self.jobs)
             for candidate in self._promising(screened)[:MAX_EXCHANGES]:
-                effects = (*kept, candidate.effect)
-                exchange = centre.names, _key(effects)
-                if exchange not in self._exchanged:
-                    self._exchanged.add(exchange)
-                    process = centre.fits.log_process.clamp(min=EXCHANGE_LOG_PROCESS)
-                    exchanges.append((effects, replace(with_effect(fits, candidate.values), log_process=process)))
+                process = centre.fits.log_process.clamp(min=EXCHANGE_LOG_PROCESS)
+                start = replace(with_effect(fits, candidate.values), log_process=process)
+                exchanges.append(((*kept, candidate.effect), start))
         self.fit(exchanges, QUICK)
 
     def polish(self) -> None:
@@ -258,12 +260,14 @@ class Search:
         if not starts:
             return []
         iterations, accuracy = effort
+        rival = max((float(each.fits.likelihood[0]) for each in self.fitted.values()), default=-math.inf)
 
         def fitted_share(indices: Sequence[int]) -> list[FitState]:
             models = [CandidateModel(self.system, starts[k][0], self.rows, accuracy) for k in indices]
             for model in models:
                 model.slopes = self._slopes
-            out = fit(models, stacked([starts[k][1] for k in indices]), self._all_windows(len(indices)), iterations)
+            windows = self._all_windows(len(indices))
+            out = fit(models, stacked([starts[k][1] for k in indices]), windows, iterations, rival=rival)
             if self._slopes is None:
                 self._slopes = models[0].slopes
             return [single_fit(out, k, len(model.table)) for k, model in enumerate(models)]
