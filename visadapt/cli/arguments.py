@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from visadapt.systems import System
 
-SYSTEMS_HELP = "cartpole, quadrotor or fixed_wing"
+SYSTEMS_HELP = "cartpole, quadrotor, fixed_wing, or my_rig.py:Class, a system of your own (docs/own_system.md)"
 SCORE_SEED = 2026
 """`evaluation.SCORE_SEED`, which a test holds it to."""
 
@@ -207,12 +207,21 @@ def _finite(text: str) -> float:
 
 
 def _system(text: str) -> type[System]:
-    """The system of a name."""
+    """The system of a name, or of a file of the user's."""
     from visadapt.systems import SYSTEMS
 
-    if text not in SYSTEMS:
-        raise argparse.ArgumentTypeError(f"there is no system {text!r}; there are {', '.join(SYSTEMS)}")
-    return SYSTEMS[text]
+    if text in SYSTEMS:
+        return SYSTEMS[text]
+    if ".py" not in text:
+        raise argparse.ArgumentTypeError(
+            f"there is no system {text!r}; there are {', '.join(SYSTEMS)}, and your own as my_rig.py:Class"
+        )
+    from visadapt.cli.own_system import InputError, find_system
+
+    try:
+        return find_system(text)
+    except InputError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _columns(text: str) -> dict[str, str]:

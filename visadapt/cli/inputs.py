@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from visadapt.diagnosis.saved import load_effects
@@ -118,13 +119,21 @@ def import_effects(options: argparse.Namespace) -> None:
     Raises:
         InputError: the file is missing, no Python, or raises; names its line.
     """
-    if not options.effects:
-        return
-    path = Path(options.effects).absolute()  # as Python's own messages name it
+    if options.effects:
+        import_file(options.effects)
+
+
+def import_file(given: str) -> ModuleType:
+    """The module in a file of the user's.
+
+    Raises:
+        InputError: the file is missing, no Python, or raises; names its line.
+    """
+    path = Path(given).absolute()  # as Python's own messages name it
     if not path.is_file():
         raise InputError(f"{path}: there is no such file")
     # Under a name of its own, by which worker processes find its classes.
-    name = f"visadapt_effects_{path.stem}"
+    name = f"visadapt_own_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise InputError(f"{path}: not a Python file; a name that ends in .py is right")
@@ -134,6 +143,7 @@ def import_effects(options: argparse.Namespace) -> None:
         spec.loader.exec_module(module)
     except Exception as error:
         raise InputError(f"{path}: {describe(error, str(path))}") from error
+    return module
 
 
 def find_factory(name: str) -> Callable[[], Any]:

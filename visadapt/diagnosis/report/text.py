@@ -9,7 +9,7 @@ from typing import Any
 import jinja2
 
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, Cause, Diagnosis, Estimate, Region
-from visadapt.systems import SYSTEMS
+from visadapt.systems.base import NAMED
 
 UNKNOWN = "unknown"
 
@@ -58,12 +58,12 @@ def _rounded(value: float, one: Estimate) -> str:
 
 def plain(name: str) -> str:
     """A standard name with spaces."""
-    return name.replace("_", " ")
+    return name.replace("_", " ").replace(".", " ")
 
 
 def unit_of(variable: str, system: str) -> str:
     """The unit of the variable of a region or a profile."""
-    known = {one.name: one.unit for one in (*SYSTEMS[system].states, *SYSTEMS[system].actions)}
+    known = {one.name: one.unit for one in (*NAMED[system].states, *NAMED[system].actions)}
     return {"time": "s", "episode": "1"}.get(variable) or known.get(variable, "1")
 
 
