@@ -50,6 +50,16 @@ def effects(parser: argparse.ArgumentParser) -> None:
     add("--effects", metavar="FILE.py", help="a file that defines effects of your own, listed too")
 
 
+def check(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `visadapt check`."""
+    parser.description = (
+        "Tests a system of your own, a class that derives from visadapt.System: names, units and ranges, and a "
+        "derivative that is finite, differentiable and batched and fits them. Says what is missing, a line each; exit "
+        "status 0: nothing is, 2: something is."
+    )
+    parser.add_argument("system", type=_system, metavar="my_rig.py:Class", help="the file and the class")
+
+
 def renderer(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `visadapt renderer`."""
     parser.description = (

@@ -23,7 +23,8 @@ from visadapt.effects.base import expect
 from visadapt.effects.catalogue import catalogue
 from visadapt.progress import Report, reporting
 from visadapt.storage.run_folder import open_run
-from visadapt.systems import System
+from visadapt.systems import SYSTEMS, System
+from visadapt.systems.contract import complaints
 from visadapt.systems.parameter_file import load_parameters
 
 
@@ -69,8 +70,16 @@ def fingerprint(path: str | Path | None) -> str | None:
 
 
 def the_system(options: argparse.Namespace) -> System:
-    """The system of --system with the parameters of --params."""
-    return load_parameters(options.params, options.system) if options.params else options.system()
+    """The system of --system with the parameters of --params.
+
+    Raises:
+        InputError: a system of the user's own that is not what visadapt can work with.
+        ParameterFileError: a parameter file that cannot be used.
+    """
+    if options.system not in SYSTEMS.values() and (wrong := complaints(options.system)):
+        more = f" (and {len(wrong) - 1} more: `visadapt check` lists them)" if len(wrong) > 1 else ""
+        raise InputError(f"{options.system.__name__}: {wrong[0]}{more}")
+    return load_parameters(options.params, options.system) if getattr(options, "params", None) else options.system()
 
 
 def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:

@@ -61,6 +61,9 @@ class System(ABC):
     def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:
         """Time derivative (B, n_state) of a state (B, n_state) under a command (B, n_action) and a load (B, n_load)."""
 
+    def __post_init__(self) -> None:
+        self.check_parameters()
+
     def to(self, like: Tensor) -> Self:
         """The same system; parameters that are tensors get the device and dtype of `like`."""
         itself: Any = self  # subclasses are dataclasses, this base is not
