@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
+from typing import Any, ClassVar
 
 import torch
 
@@ -23,8 +24,11 @@ class Pendulum(System):
     gravity: float | torch.Tensor = 9.81
 
     name = "pendulum"
-    states = (Variable("angle", "rad", -3.0, 3.0), Variable("rate", "rad/s", -12.0, 12.0))
-    actions = (Variable("torque", "N m", -2.0, 2.0),)
+    states: ClassVar[tuple[Variable, ...]] = (
+        Variable("angle", "rad", -3.0, 3.0),
+        Variable("rate", "rad/s", -12.0, 12.0),
+    )
+    actions: ClassVar[tuple[Variable, ...]] = (Variable("torque", "N m", -2.0, 2.0),)
     loads = (Variable("joint", "N m", -1.0, 1.0),)
     coordinates = ((0, 1),)
 
@@ -42,7 +46,7 @@ def page_code() -> tuple[str, str]:
 
 
 @cache
-def furuta() -> type[System]:
+def furuta() -> Any:
     """The page's class."""
     module = sys.modules["furuta_of_the_page"] = ModuleType("furuta_of_the_page")
     exec(compile(page_code()[0], "furuta.py", "exec"), vars(module))

@@ -226,7 +226,8 @@ def _system(text: str) -> type[System]:
         raise argparse.ArgumentTypeError(
             f"there is no system {text!r}; there are {', '.join(SYSTEMS)}, and your own as my_rig.py:Class"
         )
-    from visadapt.cli.own_system import InputError, find_system
+    from visadapt.cli.inputs import InputError
+    from visadapt.cli.own_system import find_system
 
     try:
         return find_system(text)

@@ -64,7 +64,9 @@ def _settings(options: argparse.Namespace, system: System, seconds: float) -> di
 
 def _state_policy(path: Path, system: System) -> StatePolicy:
     if is_own(type(system)):
-        raise InputError(f"--policy: {path} is for one of {', '.join(SYSTEMS)}; no policy is trained on a {system.name}")
+        raise InputError(
+            f"--policy: {path} is for one of {', '.join(SYSTEMS)}; no policy is trained on a {system.name}"
+        )
     policy = load_policy(path)
     if not isinstance(policy, StatePolicy):
         raise InputError(f"{path}: holds a {type(policy).__name__}, a StatePolicy is needed")

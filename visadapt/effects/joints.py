@@ -171,7 +171,7 @@ class AddedInertia(laws.JointEffect):
     def alter(self, system: System) -> System:
         values = {f"{_ADDED}{self.joint}": getattr(self, self.table[0].name)}
         if isinstance(system, Inertial):
-            return replace(system, **values)
+            return replace(system, **values)  # type: ignore[type-var]  # a dataclass
         kept = {field.name: getattr(system, field.name) for field in fields(system)}  # type: ignore[arg-type]
         altered: System = _inertial(type(system))(**kept, **values)
         return altered
@@ -193,7 +193,7 @@ class Inertial(System):
         joints = [joint for joint, value in enumerate(inertia) if isinstance(value, Tensor) or value]
         own = [self.coordinates[joint][1] for joint in joints]
         units = load[None] + torch.eye(load.shape[1]).to(load)[joints, None]
-        gain = torch.stack([super(Inertial, self).derivative(state, command, unit) - free for unit in units], -1)
+        gain = torch.stack([super(Inertial, self).derivative(state, command, unit) - free for unit in units], -1)  # type: ignore[safe-super]
         added = beside([inertia[joint] for joint in joints], load)
         # The added inertia's reaction to the joints' accelerations, which it changes: a = free + gain (-inertia a).
         matrix = torch.eye(len(joints)).to(load) + gain[:, own] * added[..., None, :]
@@ -270,11 +270,19 @@ def _actuation(system: type[System]) -> Iterator[Made]:
             actuation.ActuatorLag,
         ):
             table = tuple(_in_units_of(parameter, action, most) for parameter in base.table)
-            attributes = {"table": table, "action": index, "__doc__": (base.__doc__ or "").partition("\n\n")[0]}
+            says = _SAYS.get(base, (base.__doc__ or "").partition("\n\n")[0])
+            attributes = {"table": table, "action": index, "__doc__": says}
             if alone and base is actuation.ActuatorDelay:
                 attributes |= {**delays, "settled_by": settled}
             kind = type(base.__name__, (OneCommand, base), {})
             yield f"{action.name}.{base.name}", kind, attributes
+
+
+_SAYS: dict[type[Effect], str] = {
+    actuation.ActuatorSaturation: "A limit on the command that the motor follows, of its supply or its current.",
+    actuation.ActuatorBias: "A constant added to every command.",
+}
+"""What an effect does, where the library's words are of a cart-pole."""
 
 
 def _in_units_of(parameter: Parameter, action: Variable, most: float) -> Parameter:
@@ -317,7 +325,7 @@ def _sensing(system: type[System]) -> Iterator[Made]:
                 "__doc__": f"A sensor of {name} whose zero is off.",
                 "equation": f"{name} measured = {name} + offset",
                 "table": (Parameter("offset", unit, -most, most, 0.0, linear=True),),
-                "column": column,
+                "sensor": column,
             },
         )
         if column in rates.values():

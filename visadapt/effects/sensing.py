@@ -15,7 +15,8 @@ class MeasurementDelay(SensingEffect):
     """Measurements that arrive late, by any delay.
 
     Between two rows, positions are interpolated by the cubic with the rows' positions and velocities (Hermite), and
-    velocities are its slope; states without a velocity are interpolated linearly. Before the episode, its first state is taken as measured.
+    velocities are its slope; states without a velocity are interpolated linearly. Before the episode, its first state
+    is taken as measured.
     """
 
     name = "measurement_delay"
@@ -134,11 +135,11 @@ class SensorOffset(SensingEffect):
     """An offset, () or (B,), on the reading of one state."""
 
     source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (additive sensor fault)"
-    column: ClassVar[int]  # of the state that it reads
+    sensor: ClassVar[int]  # column of the state that it reads
 
     def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
         out = measured.clone()
-        out[:, self.column] = out[:, self.column] + self.value("offset", measured)
+        out[:, self.sensor] = out[:, self.sensor] + self.value("offset", measured)
         return out, memory
 
 
@@ -150,7 +151,7 @@ class AngleOffset(SensorOffset):
     systems = (CartPole,)
     equation = "theta measured = theta + offset"
     table = (Parameter("offset", "rad", -0.2, 0.2, 0.0, linear=True),)
-    column = CartPole.index("theta")
+    sensor = CartPole.index("theta")
 
 
 class PositionOffset(SensorOffset):
@@ -165,7 +166,7 @@ class PositionOffset(SensorOffset):
     systems = (CartPole,)
     equation = "x measured = x + offset"
     table = (Parameter("offset", "m", -0.5, 0.5, 0.0, linear=True),)
-    column = CartPole.index("x")
+    sensor = CartPole.index("x")
 
 
 class Dropout(SensingEffect):

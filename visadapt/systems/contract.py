@@ -27,15 +27,17 @@ def complaints(system: type[System]) -> list[str]:
     >>> complaints(va.CartPole)
     []
     """
-    found = [*_form(system)] or [*_variables(system)]
-    if found:
-        return found
+    for check in (_form, _variables):
+        if found := list(check(system)):
+            return found
     try:
         example = system()
     except Exception as error:
         return [f"{system.__name__}() raises {_said(error)}; every field needs a default that its check accepts"]
     try:
-        return [*_shape(example)] or [*_gradients(example), *_loads(example), *_coordinates(example), *_batches(example)]
+        if wrong := list(_shape(example)):
+            return wrong
+        return [*_gradients(example), *_loads(example), *_coordinates(example), *_batches(example)]
     except Exception as error:
         return [f"derivative raises {_said(error)}"]
 
@@ -50,11 +52,9 @@ def _form(system: type[System]) -> Iterator[str]:
     for name in ("name", "states", "actions", "loads"):
         if not hasattr(system, name):
             yield f"{system.__name__} has no {name}: {_EXAMPLES[name]} would be right"
-    for name in ("name", "states", "actions", "loads", "coordinates"):
-        if name in system.__dataclass_fields__ and name not in {f.name for f in fields(system)}:
-            continue  # a ClassVar
-        if name in {f.name for f in fields(system)}:
-            yield f"{name} is a field, which is for parameters: write it without an annotation, or as a ClassVar"
+    for field in fields(itself):
+        if field.name in ("name", "states", "actions", "loads", "coordinates"):
+            yield f"{field.name} is a field, which is a parameter: write it without an annotation, or as a ClassVar"
 
 
 _EXAMPLES = {
@@ -87,7 +87,7 @@ def _variable(kind: str, variable: Variable) -> Iterator[str]:
     if not isinstance(name, str) or not name.isidentifier() or name in ("time", "episode"):
         yield f"{kind}: the name {name!r} is not a word of its own, such as angle (time and episode are taken)"
     if not isinstance(unit, str) or not unit.strip():
-        yield f"{kind}: {name} has no unit; an SI unit such as m, rad/s or N m, or 1 where there is none, would be right"
+        yield f"{kind}: {name} has no unit; an SI unit such as m, rad/s or N m, or 1 for a number, would be right"
     numbers = isinstance(low, int | float) and isinstance(high, int | float)
     if not numbers or not isfinite(low) or not isfinite(high) or low >= high:
         yield f"{kind}: {name} goes from {low!r} to {high!r}; two finite numbers, the lower first, would be right"
@@ -129,7 +129,7 @@ def _shape(system: System) -> Iterator[str]:
         yield f"derivative turns {given[0].dtype} into {rates.dtype}: make new tensors with state.new_tensor"
     alone = torch.cat([system.derivative(*(each[k : k + 1] for each in given)) for k in range(ROWS)])
     if not _equal(rates, alone):
-        yield "derivative mixes rows: each row of a batch (B, n) is a machine of its own, and state[:, 0] its first state"
+        yield "derivative mixes rows: each row of a batch (B, n) is a machine of its own"
 
 
 def _gradients(system: System) -> Iterator[str]:
@@ -144,16 +144,16 @@ def _gradients(system: System) -> Iterator[str]:
             )
             return
         by_column = [torch.autograd.grad(r, tracked, retain_graph=True, allow_unused=True) for r in rates.sum(0)]
-    for k, (kind, variables) in enumerate((("state", system.states), ("command", system.actions), ("load", system.loads))):
+    for k, (kind, variables) in enumerate(
+        (("state", system.states), ("command", system.actions), ("load", system.loads))
+    ):
         for column, variable in enumerate(variables):
             step = STEP * (variable.high - variable.low)
             moved = [each.clone() for each in given], [each.clone() for each in given]
             moved[0][k][:, column] -= step
             moved[1][k][:, column] += step
             expected = (system.derivative(*moved[1]) - system.derivative(*moved[0])) / (2 * step)
-            found = torch.stack(
-                [torch.zeros(ROWS).double() if g[k] is None else g[k][:, column] for g in by_column], 1
-            )
+            found = torch.stack([torch.zeros(ROWS).double() if g[k] is None else g[k][:, column] for g in by_column], 1)
             if float((found - expected).abs().max()) > TOLERANCE * max(1.0, float(expected.abs().max())):
                 yield (
                     f"derivative by the {kind} {variable.name} is not what torch differentiates: compute it from the "
