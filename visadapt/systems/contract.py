@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Iterator
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, replace
 from math import isfinite
 from typing import Any
 
@@ -44,7 +44,8 @@ def complaints(system: type[System]) -> list[str]:
 
 def _form(system: type[System]) -> Iterator[str]:
     itself: Any = system
-    if not is_dataclass(system) or not itself.__dataclass_params__.frozen or "__dataclass_fields__" not in vars(system):
+    made = vars(system).get("__dataclass_params__")
+    if made is None or not made.frozen:
         yield f"{system.__name__} is no frozen dataclass: write @dataclass(frozen=True) above it"
         return
     if getattr(system.derivative, "__isabstractmethod__", False):
