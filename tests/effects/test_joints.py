@@ -115,3 +115,23 @@ def test_the_catalogue_names_the_system_and_leaves_the_librarys_effects_out():
     assert "hinge.viscous_friction (dynamics)" in text
     assert "systems: furuta" in text
     assert not any("." in effect.name for effect in catalogue(CartPole()))
+
+
+def test_effects_that_are_the_same_are_known_to_be():
+    @dataclass(frozen=True)
+    class Motor(Pendulum):
+        max_torque: float = 2.0
+
+        name = "motor"
+        actions = (replace(Pendulum.actions[0], name="command", unit="1", low=-1.0, high=1.0),)
+
+        def derivative(self, state, command, load):
+            return super().derivative(state, self.max_torque * command, load)
+
+    effects = {effect.name: effect for effect in catalogue(Motor())}
+    assert effects["command.actuator_gain"].indistinguishable_from == ("max_torque.scale",)
+    assert effects["max_torque.scale"].indistinguishable_from == ("command.actuator_gain",)
+    assert effects["joint.constant_load"].indistinguishable_from == ("command.actuator_bias",)
+    assert effects["inertia.scale"].indistinguishable_from == ()
+    # With friction of the motor's voltage against its speed, the resistance is no gain.
+    assert BY_NAME["resistance.scale"].indistinguishable_from == ()

@@ -20,6 +20,7 @@ from visadapt.effects import actuation, laws, sensing
 from visadapt.effects.base import EFFECTS, ActuationEffect, Effect, Parameter, Role
 from visadapt.effects.parameters import ParameterScale
 from visadapt.systems import SYSTEMS, System, Variable
+from visadapt.systems.contract import equal, inputs
 from visadapt.systems.integrators import Duration
 from visadapt.systems.rigid_body import beside
 
@@ -48,17 +49,52 @@ def own_effects(system: type[System]) -> list[type[Effect]]:
 @cache
 def _made(system: type[System]) -> tuple[type[Effect], ...]:
     every = (*_actuation(system), *_dynamics(system), *_parameters(system), *_sensing(system))
-    return tuple(_named(system, *each) for each in every)
+    alike: dict[str, tuple[str, ...]] = {}
+    for one, other in _alike(system()):
+        alike[one] = (*alike.get(one, ()), other)
+        alike[other] = (*alike.get(other, ()), one)
+    return tuple(_named(system, *each, alike.get(each[0], ())) for each in every)
+
+
+def _alike(system: System) -> Iterator[tuple[str, str]]:
+    """Pairs of effects that are the same, by name: they change every rate alike, with some other value."""
+    state, command, load = inputs(system)
+    rest = torch.zeros_like(load)
+    free = system.derivative(state, command, rest)
+    for a, action in enumerate(system.actions):
+        unit = torch.eye(command.shape[1]).double()[a]
+        by_command = system.derivative(state, command + unit, rest) - free
+        for k, joint in enumerate(system.loads):
+            by_load = system.derivative(state, command, rest + torch.eye(load.shape[1]).double()[k]) - free
+            if bool(by_command.any()) and equal(
+                by_load * (by_command * by_load).sum() / by_load.square().sum(), by_command
+            ):
+                yield f"{action.name}.actuator_bias", f"{joint.name}.constant_load"
+        stronger = system.derivative(state, command * (1 + unit), rest)
+        for field in _scalable(system):
+            for factor in (2.0, 0.5):
+                scaled: Any = replace(system, **{field: factor * getattr(system, field)})  # type: ignore[type-var]
+                if equal(scaled.derivative(state, command, rest), stronger):
+                    yield f"{action.name}.actuator_gain", f"{field}.scale"
 
 
 Made = tuple[str, type[Effect], dict[str, Any]]
 """An effect's name, the class it derives from, and its attributes."""
 
 
-def _named(system: type[System], name: str, base: type[Effect], attributes: dict[str, Any]) -> type[Effect]:
+def _named(
+    system: type[System], name: str, base: type[Effect], attributes: dict[str, Any], alike: tuple[str, ...]
+) -> type[Effect]:
     # The effects of two systems may have the same name: the later ones then take it.
     own = {"__module__": system.__module__, "__qualname__": name, "name": name, "systems": (system,)}
-    return type(name, (base,), {"indistinguishable_from": (), "settled_by": {}, **own, **attributes})
+    settled = {other: _MOTOR_OFF for other in alike if other.endswith(".constant_load")}
+    return type(name, (base,), {"indistinguishable_from": alike, "settled_by": settled, **own, **attributes})
+
+
+_MOTOR_OFF = (
+    "switch the motor off and measure the load on the joint with a balance: a constant load is still there, an "
+    "actuator's bias is gone"
+)
 
 
 def largest(variable: Variable) -> float:
@@ -219,20 +255,24 @@ def _inertia_of(system: System, joint: int) -> float:
 
 
 def _parameters(system: type[System]) -> Iterator[Made]:
-    nominal = system()
-    for field in fields(nominal):  # type: ignore[arg-type]  # subclasses are dataclasses, the base is not
-        if field.name != "gravity" and getattr(nominal, field.name) > 0:
-            yield (
-                f"{field.name}.scale",
-                ParameterScale,
-                {
-                    "__doc__": f"A machine whose {field.name} differs from the source's.",
-                    "equation": f"{field.name} = scale {field.name}_source",
-                    "source": f"the parameters of {system.name}",
-                    "table": (Parameter("scale", "1", 0.2, 5.0, 1.0),),
-                    "scaled": {"scale": field.name},
-                },
-            )
+    for field in _scalable(system()):
+        yield (
+            f"{field}.scale",
+            ParameterScale,
+            {
+                "__doc__": f"A machine whose {field} differs from the source's.",
+                "equation": f"{field} = scale {field}_source",
+                "source": f"the parameters of {system.name}",
+                "table": (Parameter("scale", "1", 0.2, 5.0, 1.0),),
+                "scaled": {"scale": field},
+            },
+        )
+
+
+def _scalable(system: System) -> list[str]:
+    """The positive parameters but gravity."""
+    names = [field.name for field in fields(system)]  # type: ignore[arg-type]  # subclasses are dataclasses
+    return [name for name in names if name != "gravity" and getattr(system, name) > 0]
 
 
 class OneCommand(ActuationEffect):

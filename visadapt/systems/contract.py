@@ -94,19 +94,19 @@ def _variable(kind: str, variable: Variable) -> Iterator[str]:
         yield f"{kind}: {name} goes from {low!r} to {high!r}; two finite numbers, the lower first, would be right"
 
 
-def _inputs(system: System, rows: int = ROWS) -> list[Tensor]:
-    """States, commands and loads (rows, ...) drawn from their ranges, in float64."""
+def inputs(system: System) -> list[Tensor]:
+    """States, commands and loads (ROWS, ...) drawn from their ranges, in float64."""
     generator = torch.Generator().manual_seed(0)
     out = []
     for variables in (system.states, system.actions, system.loads):
         low, high = torch.tensor([(one.low, one.high) for one in variables], dtype=torch.float64).T
-        out.append(low + (high - low) * torch.rand(rows, len(variables), dtype=torch.float64, generator=generator))
+        out.append(low + (high - low) * torch.rand(ROWS, len(variables), dtype=torch.float64, generator=generator))
     return out
 
 
 def _shape(system: System) -> Iterator[str]:
     """Complaints of what the derivative returns, after which nothing else can be tried."""
-    given = _inputs(system)
+    given = inputs(system)
     called = ", ".join(
         f"{name} {tuple(each.shape)}" for name, each in zip(("state", "command", "load"), given, strict=True)
     )
@@ -129,12 +129,12 @@ def _shape(system: System) -> Iterator[str]:
     if rates.dtype != given[0].dtype:
         yield f"derivative turns {given[0].dtype} into {rates.dtype}: make new tensors with state.new_tensor"
     alone = torch.cat([system.derivative(*(each[k : k + 1] for each in given)) for k in range(ROWS)])
-    if not _equal(rates, alone):
+    if not equal(rates, alone):
         yield "derivative mixes rows: each row of a batch (B, n) is a machine of its own"
 
 
 def _gradients(system: System) -> Iterator[str]:
-    given = _inputs(system)
+    given = inputs(system)
     with torch.inference_mode(False), torch.enable_grad():
         tracked = [each.clone().requires_grad_() for each in given]
         rates = system.derivative(*tracked)
@@ -163,9 +163,9 @@ def _gradients(system: System) -> Iterator[str]:
 
 
 def _loads(system: System) -> Iterator[str]:
-    state, command, load = _inputs(system)
+    state, command, load = inputs(system)
     free, whole = system.derivative(state, command, torch.zeros_like(load)), system.derivative(state, command, load)
-    if not _equal(free + 2 * (whole - free), system.derivative(state, command, 2 * load)):
+    if not equal(free + 2 * (whole - free), system.derivative(state, command, 2 * load)):
         yield "derivative is not linear in the load: a load is a force or a torque that adds to the others"
 
 
@@ -181,11 +181,11 @@ def _coordinates(system: System) -> Iterator[str]:
         if not isinstance(pair, tuple) or len(pair) != 2 or not all(k in range(len(states)) for k in pair):
             yield f"coordinates holds {pair!r}; {right} would be right: there are {len(states)} states"
             return
-    state, command, load = _inputs(system)
+    state, command, load = inputs(system)
     free = system.derivative(state, command, torch.zeros_like(load))
     for k, (position, velocity) in enumerate(pairs):
         names = states[position].name, states[velocity].name
-        if not _equal(free[:, position], state[:, velocity]):
+        if not equal(free[:, position], state[:, velocity]):
             yield f"coordinates: {names[1]} is not the rate of {names[0]} that derivative returns"
         unit = torch.zeros_like(load)
         unit[:, k] = 1
@@ -196,7 +196,7 @@ def _coordinates(system: System) -> Iterator[str]:
 
 def _batches(system: System) -> Iterator[str]:
     """A parameter may be one for each row: effects scale it, and fits try many values in one batch."""
-    given = _inputs(system)
+    given = inputs(system)
     itself: Any = system
     for field in fields(itself):
         value = getattr(system, field.name)
@@ -210,11 +210,12 @@ def _batches(system: System) -> Iterator[str]:
             replace(itself, **{field.name: float(one)}).derivative(*(each[k : k + 1] for each in given))
             for k, one in enumerate(values)
         ]
-        if together.shape != given[0].shape or not _equal(together, torch.cat(rows)):
+        if together.shape != given[0].shape or not equal(together, torch.cat(rows)):
             yield f"{field.name} as a tensor, one value for each row ({ROWS},), gives other rates than row by row"
 
 
-def _equal(one: Tensor, other: Tensor) -> bool:
+def equal(one: Tensor, other: Tensor) -> bool:
+    """Whether rates are the same up to rounding."""
     return torch.allclose(one, other, rtol=ROUNDING, atol=ROUNDING * float(other.abs().max()))
 
 
