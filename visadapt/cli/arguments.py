@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from visadapt.systems import System
 
-SYSTEMS_HELP = "cartpole, quadrotor, fixed_wing, or my_rig.py:Class, a system of your own (docs/own_system.md)"
+SYSTEMS_HELP = "cartpole, quadrotor or fixed_wing"
+OWN_HELP = "or my_rig.py:Class, a system of your own (docs/own_system.md)"
 SCORE_SEED = 2026
 """`evaluation.SCORE_SEED`, which a test holds it to."""
 
@@ -46,7 +47,7 @@ def effects(parser: argparse.ArgumentParser) -> None:
         "its equation and source, and its parameters with unit and searched range."
     )
     add = parser.add_argument
-    add("--system", type=_system, metavar="NAME", help=f"only those that act on it: {SYSTEMS_HELP}")
+    add("--system", type=_system, metavar="NAME", help=f"only those that act on it: {SYSTEMS_HELP}, {OWN_HELP}")
     add("--effects", metavar="FILE.py", help="a file that defines effects of your own, listed too")
 
 
@@ -146,7 +147,7 @@ def score(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_system(parser: argparse.ArgumentParser) -> None:
-    system_help = f"the source physics: {SYSTEMS_HELP}"
+    system_help = f"the source physics: {SYSTEMS_HELP}, {OWN_HELP}"
     parser.add_argument("--system", required=True, type=_system, metavar="NAME", help=system_help)
     parser.add_argument("--params", metavar="RIG.toml", help="the rig's own parameters, in a table [parameters]")
 

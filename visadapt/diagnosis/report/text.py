@@ -52,7 +52,8 @@ def _rounded(value: float, one: Estimate) -> str:
         return number(value)
     decimals = 1 - math.floor(math.log10(width))
     if decimals > 6:
-        return f"{value:.2e}"
+        digits = decimals + math.floor(math.log10(abs(value))) if value else 0
+        return f"{value:.{max(0, digits)}e}"
     return f"{value:.{decimals}f}" if decimals > 0 else f"{round(value, decimals):.0f}"
 
 
