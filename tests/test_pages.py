@@ -16,6 +16,7 @@ import tyro
 import visadapt.diagnosis
 from benchmarks.all import COMMANDS
 from benchmarks.pages import BLOCK, GENERATED, PAGES, TABLES, filled
+from tests.own_systems import page_code
 from visadapt.cli import main
 from visadapt.effects import EFFECTS
 from visadapt.systems import CartPole
@@ -166,7 +167,9 @@ def test_the_effect_of_ones_own_works():
 
 
 @pytest.mark.parametrize("line", [line for page in PAGES for line in COMMAND_LINES.findall(page.read_text())])
-def test_the_commands_that_pages_show_are_ones_that_the_command_line_takes(line):
+def test_the_commands_that_pages_show_are_ones_that_the_command_line_takes(line, tmp_path, monkeypatch):
+    (tmp_path / "furuta.py").write_text(page_code()[0])  # the one file that must be there
+    monkeypatch.chdir(tmp_path)
     parser = argparse.ArgumentParser(exit_on_error=False)
     commands = parser.add_subparsers(required=True)
     for command in main.COMMANDS:

@@ -27,6 +27,8 @@ class Mass(System):
         Variable("pivot_torque", "N m", -10.0, 10.0),
     )
 
+    coordinates: ClassVar[tuple[tuple[int, int], ...]] = ((0, 1), (2, 3))
+
     def derivative(self, state, command, load):
         acceleration = (command[:, 0] + load[:, 0]) / self.kilograms
         still = torch.zeros_like(acceleration)

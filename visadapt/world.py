@@ -155,7 +155,7 @@ class World(nn.Module):
         return acting.reshape(episodes, length, self.substeps, width)
 
     def step(self, at: WorldState, action: Tensor, history: History | None = None) -> WorldState:
-        """One period on, with `action` (B, n_action) in [-1, 1] held over it.
+        """One period on, with `action` (B, n_action), limited to its range, held over it.
 
         `history` is what the observer has seen up to now; a world with a residual needs it, and no other reads it.
         """
@@ -236,7 +236,7 @@ class World(nn.Module):
         self, commands: Tensor, memory: tuple[Tensor, ...], system: System, held: Tensor | None = None
     ) -> tuple[Tensor, tuple[Tensor, ...]]:
         """What acts (B, T substeps, n_action) of commands (B, T, n_action), and the new memory."""
-        acting = commands.clamp(-1, 1).repeat_interleave(self.substeps, 1)
+        acting = self.system.within_range(commands).repeat_interleave(self.substeps, 1)
         substep: Duration = self.period / self.substeps
         if held is not None:
             substep = (held / self.substeps).repeat_interleave(self.substeps, 1)

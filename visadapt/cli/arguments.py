@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from visadapt.systems import System
 
 SYSTEMS_HELP = "cartpole, quadrotor or fixed_wing"
+OWN_HELP = "or my_rig.py:Class, a system of your own (docs/own_system.md)"
 SCORE_SEED = 2026
 """`evaluation.SCORE_SEED`, which a test holds it to."""
 
@@ -52,8 +53,18 @@ def effects(parser: argparse.ArgumentParser) -> None:
         "its equation and source, and its parameters with unit and searched range."
     )
     add = parser.add_argument
-    add("--system", type=_system, metavar="NAME", help=f"only those that act on it: {SYSTEMS_HELP}")
+    add("--system", type=_system, metavar="NAME", help=f"only those that act on it: {SYSTEMS_HELP}, {OWN_HELP}")
     add("--effects", metavar="FILE.py", help="a file that defines effects of your own, listed too")
+
+
+def check(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `visadapt check`."""
+    parser.description = (
+        "Tests a system of your own, a class that derives from visadapt.System: names, units and ranges, and a "
+        "derivative that is finite, differentiable and batched and fits them. Says what is missing, a line each; exit "
+        "status 0: nothing is, 2: something is."
+    )
+    parser.add_argument("system", type=_system, metavar="my_rig.py:Class", help="the file and the class")
 
 
 def renderer(parser: argparse.ArgumentParser) -> None:
@@ -142,7 +153,7 @@ def score(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_system(parser: argparse.ArgumentParser) -> None:
-    system_help = f"the source physics: {SYSTEMS_HELP}"
+    system_help = f"the source physics: {SYSTEMS_HELP}, {OWN_HELP}"
     parser.add_argument("--system", required=True, type=_system, metavar="NAME", help=system_help)
     parser.add_argument("--params", metavar="RIG.toml", help="the rig's own parameters, in a table [parameters]")
 
@@ -213,12 +224,22 @@ def _finite(text: str) -> float:
 
 
 def _system(text: str) -> type[System]:
-    """The system of a name."""
+    """The system of a name, or of a file of the user's."""
     from visadapt.systems import SYSTEMS
 
-    if text not in SYSTEMS:
-        raise argparse.ArgumentTypeError(f"there is no system {text!r}; there are {', '.join(SYSTEMS)}")
-    return SYSTEMS[text]
+    if text in SYSTEMS:
+        return SYSTEMS[text]
+    if ".py" not in text:
+        raise argparse.ArgumentTypeError(
+            f"there is no system {text!r}; there are {', '.join(SYSTEMS)}, and your own as my_rig.py:Class"
+        )
+    from visadapt.cli.inputs import InputError
+    from visadapt.cli.own_system import find_system
+
+    try:
+        return find_system(text)
+    except InputError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _columns(text: str) -> dict[str, str]:

@@ -11,12 +11,13 @@ from visadapt import diagnosis
 from visadapt.cli.inputs import InputError, import_effects, progress, the_system
 from visadapt.diagnosis.report.html import write_report
 from visadapt.diagnosis.report.text import as_text
+from visadapt.effects.joints import is_own
 from visadapt.policies import StatePolicy
 from visadapt.recordings import load_recording
 from visadapt.setups.policy_file import load_policy
 from visadapt.storage.atomic_files import replacing
 from visadapt.storage.run_folder import versions
-from visadapt.systems import System
+from visadapt.systems import SYSTEMS, System
 from visadapt.world import World
 
 
@@ -62,6 +63,10 @@ def _settings(options: argparse.Namespace, system: System, seconds: float) -> di
 
 
 def _state_policy(path: Path, system: System) -> StatePolicy:
+    if is_own(type(system)):
+        raise InputError(
+            f"--policy: {path} is for one of {', '.join(SYSTEMS)}; no policy is trained on a {system.name}"
+        )
     policy = load_policy(path)
     if not isinstance(policy, StatePolicy):
         raise InputError(f"{path}: holds a {type(policy).__name__}, a StatePolicy is needed")

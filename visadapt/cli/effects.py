@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 
-from visadapt.cli.inputs import import_effects
+from visadapt.cli.inputs import import_effects, the_system
 from visadapt.effects.catalogue import catalogue_text
 
 
 def run(options: argparse.Namespace) -> None:
     """Print the catalogue."""
     import_effects(options)
-    print(catalogue_text(options.system() if options.system else None))
+    print(catalogue_text(the_system(options) if options.system else None))

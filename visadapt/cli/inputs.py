@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from visadapt.diagnosis.saved import load_effects
@@ -22,7 +23,8 @@ from visadapt.effects.base import expect
 from visadapt.effects.catalogue import catalogue
 from visadapt.progress import Report, reporting
 from visadapt.storage.run_folder import open_run
-from visadapt.systems import System
+from visadapt.systems import SYSTEMS, System
+from visadapt.systems.contract import complaints
 from visadapt.systems.parameter_file import load_parameters
 
 
@@ -68,8 +70,16 @@ def fingerprint(path: str | Path | None) -> str | None:
 
 
 def the_system(options: argparse.Namespace) -> System:
-    """The system of --system with the parameters of --params."""
-    return load_parameters(options.params, options.system) if options.params else options.system()
+    """The system of --system with the parameters of --params.
+
+    Raises:
+        InputError: a system of the user's own that is not what visadapt can work with.
+        ParameterFileError: a parameter file that cannot be used.
+    """
+    if options.system not in SYSTEMS.values() and (wrong := complaints(options.system)):
+        more = f" (and {len(wrong) - 1} more: `visadapt check` lists them)" if len(wrong) > 1 else ""
+        raise InputError(f"{options.system.__name__}: {wrong[0]}{more}")
+    return load_parameters(options.params, options.system) if getattr(options, "params", None) else options.system()
 
 
 def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
@@ -118,13 +128,21 @@ def import_effects(options: argparse.Namespace) -> None:
     Raises:
         InputError: the file is missing, no Python, or raises; names its line.
     """
-    if not options.effects:
-        return
-    path = Path(options.effects).absolute()  # as Python's own messages name it
+    if options.effects:
+        import_file(options.effects)
+
+
+def import_file(given: str) -> ModuleType:
+    """The module in a file of the user's.
+
+    Raises:
+        InputError: the file is missing, no Python, or raises; names its line.
+    """
+    path = Path(given).absolute()  # as Python's own messages name it
     if not path.is_file():
         raise InputError(f"{path}: there is no such file")
     # Under a name of its own, by which worker processes find its classes.
-    name = f"visadapt_effects_{path.stem}"
+    name = f"visadapt_own_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise InputError(f"{path}: not a Python file; a name that ends in .py is right")
@@ -134,6 +152,7 @@ def import_effects(options: argparse.Namespace) -> None:
         spec.loader.exec_module(module)
     except Exception as error:
         raise InputError(f"{path}: {describe(error, str(path))}") from error
+    return module
 
 
 def find_factory(name: str) -> Callable[[], Any]:

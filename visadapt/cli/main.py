@@ -13,6 +13,7 @@ from visadapt.cli import arguments as asked
 COMMANDS = {
     asked.diagnose: "where a rig departs from the simulator, which effect causes it, and how far that explains it",
     asked.effects: "the effects that a diagnosis can name: equations, parameters, units, ranges",
+    asked.check: "whether a class in a file of yours is a system that all of this works with, and what it lacks",
     asked.renderer: "learn from a camera's frames how a cart-pole looks in each state",
     asked.train: "train a policy in the simulator, with the effects of a diagnosis if there are any",
     asked.adapt: "adapt a policy to a target from few counted samples of it",

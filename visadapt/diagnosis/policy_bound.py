@@ -35,7 +35,7 @@ from visadapt.estimation.likelihood import linear_problem, variances
 from visadapt.estimation.segments import Segments
 from visadapt.history import HORIZON, LENGTH, History
 from visadapt.policies import ImagePolicy, Policy
-from visadapt.systems import System
+from visadapt.systems import CartPole, System
 
 StatesToActions = Policy | Callable[[Tensor], Any]
 """A policy on states: a `Policy`, or a function from states (N, n_state) to actions (N, n_action) in [-1, 1]."""
@@ -48,6 +48,8 @@ def check(policy: StatesToActions, system: System) -> None:
     n, n_action = len(system.states), len(system.actions)
     if n_action != 1:
         raise ValueError(f"diagnose: Theorem 1's terms need a system with one action; {system.name} has {n_action}")
+    if not isinstance(system, CartPole):
+        raise ValueError(f"diagnose: Theorem 1's terms are for a policy on a cartpole; the system is {system.name}")
     if isinstance(policy, ImagePolicy):
         raise ValueError("diagnose: the policy sees frames, and a diagnosis has states alone; give a policy on states")
     if isinstance(policy, Policy) and (policy.n_state, policy.n_action) != (n, n_action):

@@ -35,7 +35,7 @@ class ActuatorDelay(ActuationEffect):
     indistinguishable_from = ("measurement_delay",)
     settled_by: ClassVar[Mapping[str, str]] = {
         "measurement_delay": (
-            "time command and sensor against one clock: film the cart beside a lamp that lights with the command; a "
+            "time command and sensor against one clock: film the machine beside a lamp that lights with the command; a "
             "late motion is the actuator's delay, a late reading of it the sensor's"
         ),
         "actuator_lag": (

@@ -6,11 +6,14 @@ import inspect
 from collections.abc import Iterable
 
 from visadapt.effects.base import EFFECTS, ActuationEffect, DynamicsEffect, Effect, Parameter, SensingEffect
+from visadapt.effects.joints import is_own, own_effects
 from visadapt.systems import SYSTEMS, System
 
 
 def catalogue(system: System | None = None) -> list[type[Effect]]:
     """The named effects that act on a system, or on any: those on commands, dynamics and readings.
+
+    On a system of one's own the library's effects act joint by joint, command by command and sensor by sensor.
 
     >>> import visadapt as va
     >>> "viscous_friction" in [effect.name for effect in va.catalogue(va.CartPole())]
@@ -18,7 +21,11 @@ def catalogue(system: System | None = None) -> list[type[Effect]]:
     """
     stages = (ActuationEffect, DynamicsEffect, SensingEffect)
     named: list[type[Effect]] = [effect for effect in EFFECTS.values() if issubclass(effect, stages)]
-    return named if system is None else [effect for effect in named if isinstance(system, effect.systems)]
+    if system is None:
+        return named
+    own = own_effects(type(system)) if is_own(type(system)) else []
+    on_all = [effect for effect in named if isinstance(system, effect.systems) and effect not in own]
+    return own + [effect for effect in on_all if not any(issubclass(one, effect) for one in own)]
 
 
 def separable(one: type[Effect], other: type[Effect], system: System) -> bool:
@@ -99,4 +106,4 @@ def _facts(effect: type[Effect]) -> dict[str, str]:
 
 
 def _names(kinds: tuple[type[System], ...]) -> str:
-    return ", ".join(kind.name for kind in SYSTEMS.values() if issubclass(kind, kinds))
+    return ", ".join([kind.name for kind in SYSTEMS.values() if issubclass(kind, kinds)] or [k.name for k in kinds])

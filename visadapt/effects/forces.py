@@ -8,55 +8,33 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
-from visadapt.effects.base import DynamicsEffect, Parameter, Role, expect, inside
+from visadapt.effects.base import DynamicsEffect, Parameter, Role, expect
+from visadapt.effects.laws import ConstantLaw, JointLoad, PeriodicLaw, PulseLaw, SpringLaw
 from visadapt.systems import CartPole, RigidBody, System
 
 
-class ForceAlongX(DynamicsEffect):
-    """A force along x alone, on the cart or along the world's x on a vehicle; subclasses give its size."""
+class CartForce(JointLoad):
+    """A force on the cart alone; subclasses give its size in `push`, N."""
 
-    systems: ClassVar[tuple[type[System], ...]] = (CartPole, RigidBody)
-
-    def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        """Force in N, (B,)."""
-        raise NotImplementedError
-
-    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        # Of all these systems the first load is the force along x.
-        return pad(self.push(time, state, system)[:, None], (0, len(system.loads) - 1))
+    systems: ClassVar[tuple[type[System], ...]] = (CartPole,)
 
 
-class CartForce(ForceAlongX):
-    """A force on the cart alone; subclasses give its size."""
-
-    systems = (CartPole,)
-
-    def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        # The two loads of a cart-pole: on a vehicle, where `push` would read wrong columns, the shapes do not fit.
-        push = self.push(time, state, system)
-        return torch.stack((push, torch.zeros_like(push)), -1)
-
-
-class ConstantForce(ForceAlongX):
+class ConstantForce(ConstantLaw):
     """A constant force along x, such as a cable's pull.
 
     On a cart-pole it is indistinguishable from actuator_bias; on a vehicle it is not, since commands act elsewhere.
     """
 
     name = "constant_force"
+    systems: ClassVar[tuple[type[System], ...]] = (CartPole, RigidBody)
     equation = "F = force"
-    source = "Newton's second law; the paper, section 3.2.1"
     table = (Parameter("force", "N", -10.0, 10.0, 0.0, linear=True),)
     indistinguishable_from = ("actuator_bias",)
     separable_on = (RigidBody,)
 
-    def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        return self.value("force", state).expand_as(time)
 
-
-class PeriodicForce(ForceAlongX):
+class PeriodicForce(PeriodicLaw):
     """A sinusoidal force along x, with an offset.
 
     The phase is that at the start of the episode. 2 (sin t + 1) N is amplitude 2, offset 2, phase -pi/2;
@@ -64,8 +42,8 @@ class PeriodicForce(ForceAlongX):
     """
 
     name = "periodic_force"
+    systems: ClassVar[tuple[type[System], ...]] = (CartPole, RigidBody)
     equation = "F = amplitude cos(2 pi frequency t + phase) + offset"
-    source = "the paper, section 3.2.2"
     table = (
         Parameter("amplitude", "N", 0.0, 10.0, 0.0, linear=True),
         Parameter("frequency", "Hz", 0.02, 5.0, None, role=Role.FREQUENCY),
@@ -73,12 +51,8 @@ class PeriodicForce(ForceAlongX):
         Parameter("offset", "N", -10.0, 10.0, 0.0, linear=True),
     )
 
-    def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        angle = 2 * math.pi * self.value("frequency", state) * time + self.value("phase", state)
-        return self.value("amplitude", state) * angle.cos() + self.value("offset", state)
 
-
-class Gust(CartForce):
+class Gust(PulseLaw):
     """A constant force between two times, counted from the start of the episode.
 
     Its edges are logistic, 10 % to 90 % in 18 ms, so that integration steps of 12.5 ms resolve them; its impulse,
@@ -86,7 +60,7 @@ class Gust(CartForce):
     """
 
     name = "gust"
-    abrupt = True
+    systems: ClassVar[tuple[type[System], ...]] = (CartPole,)
     equation = "F = force for start <= t < end"
     source = "Newton's second law; discrete gusts: Hoblit (1988), Gust Loads on Aircraft, chapter 2 (here on a cart)"
     table = (
@@ -95,23 +69,14 @@ class Gust(CartForce):
         Parameter("force", "N", -15.0, 15.0, 0.0, linear=True),
     )
 
-    EDGE: ClassVar[float] = 0.004  # s
 
-    def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        start, end = self.value("start", state), self.value("end", state)
-        return self.value("force", state) * inside(time, start, end, self.EDGE)
-
-
-class Spring(CartForce):
+class Spring(SpringLaw):
     """A spring, such as a cable or a rubber band, that pulls the cart to its rest position."""
 
     name = "spring"
+    systems: ClassVar[tuple[type[System], ...]] = (CartPole,)
     equation = "F = -stiffness (x - rest)"
-    source = "Hooke's law"
     table = (Parameter("stiffness", "N/m", 0.0, 50.0, 0.0, linear=True), Parameter("rest", "m", -1.5, 1.5, None))
-
-    def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        return -self.value("stiffness", state) * (state[:, 0] - self.value("rest", state))
 
 
 class TrackTilt(DynamicsEffect):

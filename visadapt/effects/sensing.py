@@ -15,7 +15,8 @@ class MeasurementDelay(SensingEffect):
     """Measurements that arrive late, by any delay.
 
     Between two rows, positions are interpolated by the cubic with the rows' positions and velocities (Hermite), and
-    velocities are its slope. Before the episode, its first state is taken as measured.
+    velocities are its slope; states without a velocity are interpolated linearly. Before the episode, its first state
+    is taken as measured.
     """
 
     name = "measurement_delay"
@@ -28,6 +29,9 @@ class MeasurementDelay(SensingEffect):
     )
     table = (Parameter("delay", "s", 0.0, 0.2, 0.0),)
     indistinguishable_from = ("actuator_delay",)
+
+    positions: ClassVar[list[int]] = [CartPole.index("x"), CartPole.index("theta")]
+    velocities: ClassVar[list[int]] = [CartPole.index("x_dot"), CartPole.index("theta_dot")]
 
     def memory(self, state: Tensor, period: float) -> Tensor:
         shift = self._shift(state, period).detach()
@@ -47,15 +51,15 @@ class MeasurementDelay(SensingEffect):
         index = torch.arange(len(rows), device=rows.device), rows.shape[1] - 1 - whole.long()
         later, earlier = rows[index], rows[index[0], index[1] - 1]
         back = (shift - whole)[:, None]  # periods before the later row
-        end, start = later[:, _POSITIONS], earlier[:, _POSITIONS]
-        end_slope, start_slope = period * later[:, _VELOCITIES], period * earlier[:, _VELOCITIES]
+        end, start = later[:, self.positions], earlier[:, self.positions]
+        end_slope, start_slope = period * later[:, self.velocities], period * earlier[:, self.velocities]
         # The cubic in `back`, which runs from the later row (0) to the earlier one (1).
         bend = 3 * (start - end) + 2 * end_slope + start_slope
         twist = 2 * (end - start) - end_slope - start_slope
         position = end - back * (end_slope - back * (bend + back * twist))
         velocity = (end_slope - back * (2 * bend + 3 * back * twist)) / period
-        out = measured.clone()
-        out[:, _POSITIONS], out[:, _VELOCITIES] = position, velocity
+        out = (later + back * (earlier - later))[:, :-1]
+        out[:, self.positions], out[:, self.velocities] = position, velocity
         return out, rows[:, 1:]
 
     def _shift(self, state: Tensor, period: float) -> Tensor:
@@ -115,16 +119,27 @@ class SensorScale(SensingEffect):
         return measured * torch.stack((position, position, angle, angle), 1), memory
 
 
-class SensorOffset(SensingEffect):
-    """An offset, () or (B,), on the reading of one state."""
+class SensorGain(SensingEffect):
+    """A sensor whose counts per unit differ from those assumed; a velocity that is read from it scales too."""
 
-    systems = (CartPole,)
-    state: ClassVar[str]  # its name in the system
+    source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (multiplicative sensor fault)"
+    columns: ClassVar[list[int]]  # of the states that it reads
 
     def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
         out = measured.clone()
-        column = CartPole.index(self.state)
-        out[:, column] = out[:, column] + self.value("offset", measured)
+        out[:, self.columns] = out[:, self.columns] * self.value("scale", measured)[..., None]
+        return out, memory
+
+
+class SensorOffset(SensingEffect):
+    """An offset, () or (B,), on the reading of one state."""
+
+    source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (additive sensor fault)"
+    sensor: ClassVar[int]  # column of the state that it reads
+
+    def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
+        out = measured.clone()
+        out[:, self.sensor] = out[:, self.sensor] + self.value("offset", measured)
         return out, memory
 
 
@@ -133,10 +148,10 @@ class AngleOffset(SensorOffset):
 
     name = "angle_offset"
     order = 40
+    systems = (CartPole,)
     equation = "theta measured = theta + offset"
-    source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (additive sensor fault)"
     table = (Parameter("offset", "rad", -0.2, 0.2, 0.0, linear=True),)
-    state = "theta"
+    sensor = CartPole.index("theta")
 
 
 class PositionOffset(SensorOffset):
@@ -148,10 +163,10 @@ class PositionOffset(SensorOffset):
 
     name = "position_offset"
     order = 50
+    systems = (CartPole,)
     equation = "x measured = x + offset"
-    source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (additive sensor fault)"
     table = (Parameter("offset", "m", -0.5, 0.5, 0.0, linear=True),)
-    state = "x"
+    sensor = CartPole.index("x")
 
 
 class Dropout(SensingEffect):
@@ -181,6 +196,4 @@ class Dropout(SensingEffect):
         return out, torch.cat((out, torch.ones_like(out[:, :1])), 1)[:, None]
 
 
-_POSITIONS = [CartPole.index("x"), CartPole.index("theta")]
-_VELOCITIES = [CartPole.index("x_dot"), CartPole.index("theta_dot")]
 _POLE = [CartPole.index("theta"), CartPole.index("theta_dot")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 
 from visadapt.systems import CartPole, FixedWing, Quadrotor, System
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY
@@ -140,12 +141,33 @@ DIAGNOSABLE: dict[str, type[System]] = {system.name: system for system in PROFIL
 
 
 def profile_of(system: System) -> SystemProfile:
-    """The profile of a system, or of the class that it derives from.
-
-    Raises:
-        ValueError: the system has no profile, so it cannot be diagnosed.
-    """
+    """The profile of a system, or of the class that it derives from; of a system of one's own, what its class says."""
     for kind, profile in PROFILES.items():
         if isinstance(system, kind):
             return profile
-    raise ValueError(f"diagnose: {system.name} cannot be diagnosed; {', '.join(DIAGNOSABLE)} can")
+    return _own_profile(type(system))
+
+
+FIRST_STATE_SHARE = 0.3
+"""Deviation of a window's first state from its measurement, as a share of the largest size in the state's range."""
+
+
+@cache
+def _own_profile(system: type[System]) -> SystemProfile:
+    """From the states, actions, loads and coordinates of a system of one's own, each sensor and each joint alone."""
+    names, units = [state.name for state in system.states], [state.unit for state in system.states]
+    positions, velocities = ([pair[k] for pair in system.coordinates] for k in (0, 1))
+    places = {units[p]: names[p] for p in positions if sum(units[p] == units[q] for q in positions) == 1}
+    return SystemProfile(
+        driven=tuple((velocity,) for velocity in velocities),
+        position_of=dict(zip(velocities, positions, strict=True)),
+        sensors=tuple((column,) for column in range(len(names))),
+        quaternion=(),
+        initial_variance=tuple((FIRST_STATE_SHARE * max(abs(s.low), abs(s.high))) ** 2 for s in system.states),
+        region_variables={"s": "time", **places},
+        plotted_variables=(names[velocities[0]], names[positions[0]], system.actions[0].name, "time"),
+        residual_name=system.loads[0].name.replace("_", " "),
+        black_box_factors={
+            load.name: (None, names[velocity]) for load, velocity in zip(system.loads, velocities, strict=True)
+        },
+    )

@@ -62,8 +62,8 @@ def check_commands(episodes: Sequence[RawEpisode], actions: Sequence[Variable], 
         right = f"within [{variable.low:g}, {variable.high:g}] is right"
         if share > 0.5 or abs(largest) > 2 * scale:
             raise RecordingError(
-                f"{raw.cell(row, variable.name)} is {largest:g}, and {share:.0%} of the column lie outside; {right} "
-                "(name a column in N 'force')"
+                f"{raw.cell(row, variable.name)} is {largest:g}, and {share:.0%} of the column lie outside; {right}"
+                + (" (name a column in N 'force')" if variable.unit == "1" else f" ({variable.unit})")
             )
         note(f"{share:.1%} of {variable.name} lie outside, up to {largest:g}; {right}", "the recording")
 
@@ -83,10 +83,10 @@ def check_units(raw: RawEpisode, system: System) -> None:
                 f"{raw.cell(row, name)} jumps from {columns[name][row - 1]:g} to {columns[name][row]:g}; radians are "
                 "right (these look like degrees)"
             )
-    _check_exchanged(raw, variables)
+    _check_exchanged(raw, variables, {name: rate for name in columns if (rate := system.rate_of(name))})
     for name in columns:
-        if f"{name}_dot" in variables:
-            _check_rate(raw, variables[name], variables[f"{name}_dot"])
+        if (rate := system.rate_of(name)) is not None:
+            _check_rate(raw, variables[name], variables[rate])
     if are_degrees(raw, system):
         name, values = angles[0], columns[angles[0]]
         raise RecordingError(
@@ -146,17 +146,16 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable) -> None:
                 )
 
 
-def _check_exchanged(raw: RawEpisode, variables: Mapping[str, Variable]) -> None:
-    """Raises RecordingError where two columns are evidently exchanged."""
+def _check_exchanged(raw: RawEpisode, variables: Mapping[str, Variable], rates: Mapping[str, str]) -> None:
+    """Raises RecordingError where two columns are evidently exchanged; `rates` are the rates of those that have one."""
     columns = raw.states
-    bases = [name for name in columns if f"{name}_dot" in variables]
-    changes = {name: _rates(raw.time, columns[name], variables[name].unit == "rad") for name in bases}
-    measured = {name: columns[f"{name}_dot"] for name in bases if f"{name}_dot" in columns}
+    changes = {name: _rates(raw.time, columns[name], variables[name].unit == "rad") for name in rates}
+    measured = {name: columns[rate] for name, rate in rates.items() if rate in columns}
     for name, rate in measured.items():
         crossed = correlation(_rates(raw.time, rate, False), columns[name][1:])
         if crossed > IS_RATE_CORRELATION and correlation(changes[name], rate[1:]) < NOT_RATE_CORRELATION:
             raise RecordingError(
-                f"{raw.source}: {raw.column(name)} and {raw.column(f'{name}_dot')} are evidently exchanged: "
+                f"{raw.source}: {raw.column(name)} and {raw.column(rates[name])} are evidently exchanged: "
                 "the first is the second's rate of change"
             )
     for name, other in combinations(measured, 2):
@@ -165,9 +164,9 @@ def _check_exchanged(raw: RawEpisode, variables: Mapping[str, Variable]) -> None
         if crossed > IS_RATE_CORRELATION and own < NOT_RATE_CORRELATION:
             raise RecordingError(
                 f"{raw.source}: {raw.column(name)} and {raw.column(other)} are evidently exchanged: "
-                f"{name} changes as {other}_dot says, and {other} as {name}_dot says"
+                f"{name} changes as {rates[other]} says, and {other} as {rates[name]} says"
             )
-    for name in bases:
+    for name in rates:
         steps = np.abs(np.diff(columns[name]))
         row = int(steps.argmax())
         wraps = abs(steps[row] - TURN) < 0.5 and np.abs(columns[name]).max() < 0.55 * TURN

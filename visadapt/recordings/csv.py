@@ -127,10 +127,10 @@ def read_rows(path: Path, system: System, given: Mapping[str, str]) -> list[RawE
 
 
 def needed(system: System) -> tuple[str, ...]:
-    """Columns that a recording must have: time, states and actions; rates of change (`_dot`) may be missing."""
+    """Columns that a recording must have: time, states and actions; rates of change may be missing."""
     names = [variable.name for variable in system.states]
-    states = [name for name in names if not name.endswith("_dot") or name.removesuffix("_dot") not in names]
-    return ("time", *states, *(variable.name for variable in system.actions))
+    rates = {system.rate_of(name) for name in names}
+    return ("time", *(name for name in names if name not in rates), *(variable.name for variable in system.actions))
 
 
 def _match(path: Path, header: tuple[str, ...], system: System, given: Mapping[str, str]) -> dict[str, int]:

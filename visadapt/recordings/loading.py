@@ -156,7 +156,8 @@ def _shared(episodes: Sequence[RawEpisode], system: System, note: Note) -> list[
 def _commands(episodes: list[RawEpisode], system: System, note: Note) -> list[RawEpisode]:
     """The episodes with commands in [-1, 1]: a command column 'force' may be in N."""
     forces = [
-        any(raw.names.get(variable.name, "").lower() == "force" for variable in system.actions) for raw in episodes
+        any(raw.names.get(one.name, "").lower() == "force" for one in system.actions if one.unit == "1")
+        for raw in episodes
     ]
     largest = max((np.abs(raw.action).max() for raw, force in zip(episodes, forces, strict=True) if force), default=0)
     limit = getattr(system, "max_force", None)

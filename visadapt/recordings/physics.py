@@ -41,7 +41,8 @@ def are_degrees(raw: RawEpisode, system: System) -> bool:
         return False
     columns = _columns(raw)
     radians, radian_slope = _fits(raw, columns, system)[angles[0]]
-    scaled = {name: values * (DEGREE if name.startswith(angles[0]) else 1) for name, values in columns.items()}
+    angular = (angles[0], system.rate_of(angles[0]))
+    scaled = {name: values * (DEGREE if name in angular else 1) for name, values in columns.items()}
     degrees, slope = _fits(raw, scaled, system)[angles[0]]
     return degrees > EXPLAINED_CORRELATION and 1 / 3 < slope < 3 and (degrees > radians + 0.2 or radian_slope > 10)
 
@@ -55,7 +56,8 @@ def exchanged(raw: RawEpisode, system: System, one: str, other: str) -> bool:
     if not _can_decide(raw, system, (one, other)):
         return False
     columns = _columns(raw)
-    to = {one: other, other: one, f"{one}_dot": f"{other}_dot", f"{other}_dot": f"{one}_dot"}
+    rate, other_rate = system.rate_of(one) or "", system.rate_of(other) or ""
+    to = {one: other, other: one, rate: other_rate, other_rate: rate}
     swapped = {to.get(name, name): values for name, values in columns.items()}
     fits = _fits(raw, swapped, system)
     if not all(1 / 4 < fits[name][1] < 4 for name in (one, other)):
@@ -73,9 +75,8 @@ def _columns(raw: RawEpisode) -> Columns:
 
 
 def _can_decide(raw: RawEpisode, system: System, names: Sequence[str]) -> bool:
-    states = [variable.name for variable in system.states]
     return (
-        all(f"{name}_dot" in states for name in names)
+        all(system.rate_of(name) for name in names)
         and raw.time[min(len(raw.time), MOST_ROWS) - 1] - raw.time[0] > 40 * DIFFERENCE_S
         and float(np.ptp(raw.action[:MOST_ROWS], axis=0).max()) > 0
     )
@@ -99,8 +100,9 @@ def _fits(raw: RawEpisode, columns: Columns, system: System, delay: int = 0) -> 
         name: (values[: -2 * stride] + values[stride:-stride] + values[2 * stride :]) / 3
         for name, values in columns.items()
     }
-    for name, values in columns.items():
-        middle.setdefault(f"{name}_dot", (values[2 * stride :] - values[: -2 * stride]) / span)
+    rates = {name: rate for name in columns if (rate := system.rate_of(name))}
+    for name, rate in rates.items():
+        middle.setdefault(rate, (columns[name][2 * stride :] - columns[name][: -2 * stride]) / span)
     # The mean command over the span.
     action = np.vstack([np.repeat(action[:1], delay, axis=0), action[: len(action) - delay]])
     kernel = np.ones(2 * stride) / (2 * stride)
@@ -109,10 +111,10 @@ def _fits(raw: RawEpisode, columns: Columns, system: System, delay: int = 0) -> 
     load = torch.zeros(len(state), len(system.loads), dtype=torch.float64)
     predicted = system.derivative(torch.from_numpy(state), torch.from_numpy(action), load).numpy()
     fits = {}
-    for name, values in columns.items():
-        if f"{name}_dot" in names:
-            measured = (values[2 * stride :] - 2 * values[stride:-stride] + values[: -2 * stride]) / (span / 2) ** 2
-            fits[name] = _fit(measured, predicted[:, names.index(f"{name}_dot")])
+    for name, rate in rates.items():
+        values = columns[name]
+        measured = (values[2 * stride :] - 2 * values[stride:-stride] + values[: -2 * stride]) / (span / 2) ** 2
+        fits[name] = _fit(measured, predicted[:, names.index(rate)])
     return fits
 
 

@@ -61,6 +61,9 @@ class System(ABC):
     def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:
         """Time derivative (B, n_state) of a state (B, n_state) under a command (B, n_action) and a load (B, n_load)."""
 
+    def __post_init__(self) -> None:
+        self.check_parameters()
+
     def to(self, like: Tensor) -> Self:
         """The same system; parameters that are tensors get the device and dtype of `like`."""
         itself: Any = self  # subclasses are dataclasses, this base is not
@@ -77,6 +80,29 @@ class System(ABC):
                 right = "finite" if field.name in either_sign else "positive"
                 raise ValueError(f"{self.name}: {field.name} must be {right}, got {value!r}")
 
+    def __init_subclass__(cls, **kwargs: object) -> None:
+        super().__init_subclass__(**kwargs)
+        if "name" in cls.__dict__:
+            NAMED[cls.name] = cls
+
+    @classmethod
+    def within_range(cls, command: Tensor) -> Tensor:
+        """Commands (..., n_action), each limited to its range."""
+        ranges = [(action.low, action.high) for action in cls.actions]
+        if len(set(ranges)) == 1:
+            return command.clamp(*ranges[0])
+        low, high = command.new_tensor(ranges).unbind(-1)
+        return command.clamp(low, high)
+
+    @classmethod
+    def rate_of(cls, name: str) -> str | None:
+        """The state that is the rate of change of the state `name`; None where there is none."""
+        names = [variable.name for variable in cls.states]
+        for position, velocity in cls.coordinates:
+            if names[position] == name:
+                return names[velocity]
+        return f"{name}_dot" if f"{name}_dot" in names else None
+
     @classmethod
     def index(cls, name: str) -> int:
         """Column of the state `name`; raises KeyError, which lists the states, if there is none."""
@@ -84,6 +110,9 @@ class System(ABC):
         if name not in names:
             raise KeyError(f"{cls.name} has no state {name!r}; its states are {', '.join(names)}")
         return names.index(name)
+
+
+NAMED: dict[str, type[System]] = {}  # Every system by its name, also the user's own
 
 
 def holds(condition: bool | Tensor) -> bool:

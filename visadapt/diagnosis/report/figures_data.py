@@ -98,11 +98,12 @@ def figure_data(
     units = {v.name: v.unit for v in (*search.system.states, *search.system.actions)} | {"time": "s"}
     plotted = [region.variable for region in regions] + list(search.profile.plotted_variables)
     names = [name for name in dict.fromkeys(plotted) if name in units][:MAX_PROFILES]
+    residual = search.profile.residual_name, search.system.loads[0].unit
     return FigureData(
         _predictions(search, source, corrected),
-        tuple(_profile(name, units[name], search.profile.residual_name, before, after) for name in names),
+        tuple(_profile(name, units[name], residual, before, after) for name in names),
         errors.growth(search.rows.period),
-        _spectrum(search.profile.residual_name, before, after, search.rows.period),
+        _spectrum(residual, before, after, search.rows.period),
     )
 
 
@@ -131,8 +132,11 @@ def _predictions(search: Search, source: RolloutErrors, corrected: RolloutErrors
     return tuple(out)
 
 
-def _profile(name: str, unit: str, quantity: str, before: Disturbance, after: Disturbance) -> Chart:
-    """The mean disturbance on the first load over one variable, without and with the causes."""
+def _profile(name: str, unit: str, residual: tuple[str, str], before: Disturbance, after: Disturbance) -> Chart:
+    """The mean disturbance on the first load over one variable, without and with the causes.
+
+    `residual` is what the load is called, and its unit.
+    """
     here = before.valid.flatten() > 0
     values = before.variables[name].flatten()[here]
     edges, bins = binned(values)
@@ -145,10 +149,10 @@ def _profile(name: str, unit: str, quantity: str, before: Disturbance, after: Di
         error = np.array([float(s.std() / math.sqrt(len(s))) if len(s) > 1 else math.nan for s in binned_load])
         curves.append(Curve(label, mean, error))
     centres = np.array([float(values[bins == k].mean()) if bool((bins == k).any()) else math.nan for k in range(count)])
-    return Chart(name, unit, quantity, "N", centres, tuple(curves))
+    return Chart(name, unit, *residual, centres, tuple(curves))
 
 
-def _spectrum(quantity: str, before: Disturbance, after: Disturbance, period: float) -> Chart:
+def _spectrum(residual: tuple[str, str], before: Disturbance, after: Disturbance, period: float) -> Chart:
     """Power spectral density of the disturbance on the first load, averaged over windows (Welch 1967, one Hann window
     each)."""
     curves = []
@@ -158,4 +162,6 @@ def _spectrum(quantity: str, before: Disturbance, after: Disturbance, period: fl
         power = torch.fft.rfft(load * window, dim=1).abs().square().mean(0)
         curves.append(Curve(label, (2 * period * power / window.square().sum()).numpy()))
     frequency = np.fft.rfftfreq(before.load.shape[1], period)
-    return Chart("frequency", "Hz", quantity, "N2/Hz", frequency, tuple(curves))
+    quantity, unit = residual
+    squared = f"({unit})2" if " " in unit else f"{unit}2"
+    return Chart("frequency", "Hz", quantity, f"{squared}/Hz", frequency, tuple(curves))

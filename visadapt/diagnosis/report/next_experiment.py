@@ -12,7 +12,7 @@ from visadapt.systems import System
 
 MOTIONS: dict[Stage, str] = {
     Stage.ACTUATION: "steps and chirps of the command over its whole range",
-    Stage.DYNAMICS: "free motions with the motor off, slow and fast, over the whole track",
+    Stage.DYNAMICS: "free motions with the motor off, slow and fast, over the whole range of positions",
     Stage.SENSING: "known positions and angles, set by hand and held still",
 }
 """What to record to separate effects of a stage from others, for a system on a track."""
@@ -54,7 +54,7 @@ def more(profile: SystemProfile) -> str:
     """The experiment that could show a gap where none was found."""
     return (
         "Nothing departs from the source beyond the noise. A gap that shows only elsewhere needs other motions: larger "
-        f"commands, higher speeds, other {'winds and heights' if profile.is_aircraft else 'parts of the track'}."
+        f"commands, higher speeds, other {'winds and heights' if profile.is_aircraft else 'positions'}."
     )
 
 

@@ -18,7 +18,7 @@ from visadapt.diagnosis.result import (
     Region,
     without_slight,
 )
-from visadapt.systems import SYSTEMS
+from visadapt.systems.base import NAMED
 
 UNKNOWN = "unknown"
 
@@ -61,18 +61,19 @@ def _rounded(value: float, one: Estimate) -> str:
         return number(value)
     decimals = 1 - math.floor(math.log10(width))
     if decimals > 6:
-        return f"{value:.2e}"
+        digits = decimals + math.floor(math.log10(abs(value))) if value else 0
+        return f"{value:.{max(0, digits)}e}"
     return f"{value:.{decimals}f}" if decimals > 0 else f"{round(value, decimals):.0f}"
 
 
 def plain(name: str) -> str:
     """A standard name with spaces."""
-    return name.replace("_", " ")
+    return name.replace("_", " ").replace(".", " ")
 
 
 def unit_of(variable: str, system: str) -> str:
     """The unit of the variable of a region or a profile."""
-    known = {one.name: one.unit for one in (*SYSTEMS[system].states, *SYSTEMS[system].actions)}
+    known = {one.name: one.unit for one in (*NAMED[system].states, *NAMED[system].actions)}
     return {"time": "s", "episode": "1"}.get(variable) or known.get(variable, "1")
 
 

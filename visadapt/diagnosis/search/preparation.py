@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from visadapt.diagnosis.search import sensor_checks
+from visadapt.diagnosis.search.heldout import PREDICTION_TIME
 from visadapt.diagnosis.search.search import Search
 from visadapt.effects import Effect
 from visadapt.estimation.likelihood import FitState
@@ -43,13 +44,16 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
     stamps = [torch.tensor(np.asarray(e.time, dtype=np.float64)) for e in recording.episodes]
     repeats = find_repeats(states, channels, profile.angle_sensor)
 
+    # A window holds predictions from half of its rows, however fast these follow each other.
+    longest = max(profile.window_rows, round(2 * PREDICTION_TIME / recording.period))
+
     def windows(
         measured: Sequence[Tensor], stretches: Sequence[tuple[int, int, int]] | None = None
     ) -> tuple[Segments, Segments, list[str]]:
         """`rows` and `raw` of episodes or stretches of these, and a warning if not all windows are used."""
         all_used = [torch.ones_like(m) for m in measured]
         rows, raw = (
-            cut(measured, valid, commands, stamps, channels, recording.period, profile.window_rows, stretches)
+            cut(measured, valid, commands, stamps, channels, recording.period, longest, stretches)
             for valid in (repeats.used, all_used)
         )
         count, length = rows.shape

@@ -1,0 +1,75 @@
+"""A diagnosis of a system of one's own: a friction, a gain, a delay, and nothing, of a driven pendulum."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tests.own_systems import Pendulum
+from visadapt.diagnosis import diagnose
+from visadapt.diagnosis.report.html import as_html
+from visadapt.diagnosis.report.text import plain
+from visadapt.effects.catalogue import catalogue
+from visadapt.recordings import Episode, Recording
+from visadapt.world import World
+
+PERIOD = 0.02
+BY_NAME = {effect.name: effect for effect in catalogue(Pendulum())}
+SEARCHED = [
+    BY_NAME[name]
+    for name in (
+        *("joint.viscous_friction", "joint.coulomb_friction", "joint.spring", "joint.constant_load", "inertia.scale"),
+        *("torque.actuator_gain", "torque.actuator_bias", "torque.actuator_delay", "torque.actuator_lag"),
+        *("sensors.measurement_delay", "angle.sensor_offset"),
+    )
+]
+
+
+def recording(*effects):
+    """Two episodes of 2 s of the pendulum under torques of up to 1.6 N m."""
+    world = World(Pendulum(), effects, PERIOD, "midpoint", 10).double()
+    generator = torch.Generator().manual_seed(1)
+    noise = torch.tensor([1e-3, 1e-2], dtype=torch.float64)
+    episodes = []
+    for episode in range(2):
+        time = PERIOD * np.arange(100)
+        torque = 0.8 * np.sin((3 + episode) * time) + 0.8 * np.sin(9 * time + episode)
+        at = world.start(torch.zeros(1, 2, dtype=torch.float64))
+        rows = []
+        for command in torch.from_numpy(torque)[:, None, None]:
+            row, at = world.measure(at)
+            rows.append(row[0] + noise * torch.randn(2, dtype=torch.float64, generator=generator))
+            at = world.step(at, command)
+        episodes.append(Episode(time, torque[:, None], torch.stack(rows).detach().numpy()))
+    return Recording(tuple(episodes), ("angle", "rate"), PERIOD, ("one", "two"))
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("joint.coulomb_friction", {"torque": 0.1}),
+        ("torque.actuator_gain", {"scale": 0.8}),
+        ("torque.actuator_delay", {"delay": 0.03}),
+    ],
+)
+def test_what_is_there_is_found(name, values):
+    found = diagnose(recording(BY_NAME[name](**values)), World(Pendulum(), period=PERIOD), SEARCHED)
+    first = found.causes[0]
+    assert first.effect == name
+    ((parameter, value),) = values.items()
+    assert first.parameters[parameter].value == pytest.approx(value, rel=0.05)
+    carrying = [cause.effect for cause in found.causes if not cause.slight]
+    late = name == "torque.actuator_delay"
+    assert carrying == ([name, "sensors.measurement_delay"] if late else [name])
+    assert found.verdict == ("ambiguous" if late else "identified")
+    if late:
+        assert "time command and sensor against one clock" in found.next_experiment
+    page = as_html(found, {})
+    assert f"{math.floor(100 * found.gap.closed)}" in page
+    assert plain(first.effect) in page
+
+
+def test_nothing_is_found_where_nothing_is():
+    found = diagnose(recording(), World(Pendulum(), period=PERIOD), SEARCHED)
+    assert (found.verdict, found.causes) == ("no_gap", ())

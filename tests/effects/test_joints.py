@@ -1,0 +1,137 @@
+"""The effects of a system of one's own: which there are, in which units, and that each does what it says."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+import torch
+
+from tests.own_systems import Pendulum, furuta
+from tests.worlds import columns
+from visadapt.effects import EFFECTS
+from visadapt.effects.catalogue import catalogue, catalogue_text, twins
+from visadapt.systems import CartPole
+from visadapt.world import World
+
+FURUTA = furuta()()
+BY_NAME = {effect.name: effect for effect in catalogue(FURUTA)}
+STATE = columns(0.3, 1.2, 2.0, -3.0)
+LOADS = [
+    ("arm_axis.viscous_friction", {"coefficient": 1e-3}, "N m s/rad", [-2e-3, 0]),
+    ("hinge.viscous_friction", {"coefficient": 1e-3}, "N m s/rad", [0, 3e-3]),
+    ("hinge.quadratic_drag", {"coefficient": 1e-4}, "N m s2/rad2", [0, 9e-4]),
+    ("arm_axis.spring", {"stiffness": 0.01, "rest": 0.1}, "N m/rad", [-2e-3, 0]),
+    ("hinge.constant_load", {"torque": 2e-3}, "N m", [0, 2e-3]),
+    ("hinge.push", {"start": 1.0, "end": 2.0, "torque": 2e-3}, "s", [0, 2e-3]),
+    ("arm_axis.periodic_load", {"amplitude": 1e-3, "frequency": 0.5, "phase": 0.0, "offset": 0.0}, "N m", [0, 0]),
+    ("arm_axis.coulomb_friction", {"torque": 3e-3}, "N m", [-3e-3, 0]),
+    ("hinge.directional_friction", {"forward": 1e-3, "backward": 2e-3}, "N m", [0, 2e-3]),
+    ("hinge.stribeck_friction", {"torque": 1e-3, "breakaway": 3e-3, "velocity": 0.1}, "N m", [0, 1e-3]),
+]
+
+
+@pytest.mark.parametrize(("name", "values", "unit", "expected"), LOADS)
+def test_the_load_of_a_joint_acts_on_it_alone(name, values, unit, expected):
+    effect = BY_NAME[name](**values)
+    assert effect.table[0].unit == unit
+    at = World(FURUTA, [effect]).start(STATE, torch.full((1,), 1.5, dtype=torch.float64))
+    load = World(FURUTA, [effect]).load(at)[0]
+    torch.testing.assert_close(load, torch.tensor(expected, dtype=torch.float64), rtol=1e-6, atol=1e-9)
+
+
+def test_added_inertia_is_that_of_a_heavier_arm():
+    added = BY_NAME["arm_axis.added_inertia"](inertia=1e-4)
+    command, load = columns(2.0), columns(1e-3, -1e-3)
+    heavier = replace(FURUTA, arm_inertia=FURUTA.arm_inertia + 1e-4)
+    found = World(FURUTA, [added, BY_NAME["hinge.added_inertia"](inertia=0.0)]).altered(STATE)
+    torch.testing.assert_close(
+        found.derivative(STATE, command, load), heavier.derivative(STATE, command, load), rtol=1e-6, atol=1e-6
+    )
+    scaled: Any = World(FURUTA, [added, BY_NAME["half_length.scale"](scale=2.0)]).altered(STATE)
+    assert scaled.half_length.item() == pytest.approx(0.129)
+
+
+def test_a_parameter_is_scaled_by_a_factor_for_each_row():
+    factors = torch.tensor([1.0, 2.0])
+    altered: Any = World(FURUTA, [BY_NAME["resistance.scale"](scale=factors)]).altered(STATE)
+    assert altered.resistance.tolist() == pytest.approx([8.4, 16.8])
+    assert "gravity.scale" not in BY_NAME
+
+
+def test_a_command_is_limited_to_its_range_and_has_effects_in_its_unit():
+    saturation = BY_NAME["voltage.actuator_saturation"]
+    (limit,) = saturation.table
+    assert (limit.unit, limit.high, limit.neutral) == ("V", 10.0, 10.0)
+    volts = columns(-30.0, 4.0, 30.0)[..., None]
+    assert World(FURUTA).actuate(volts)[0, :, 0, 0].tolist() == [-10, 4, 10]
+    assert World(FURUTA, [saturation(limit=3.0)]).actuate(volts)[0, :, 0, 0].tolist() == [-3, 3, 3]
+    assert World(CartPole()).actuate(volts)[0, :, 0, 0].tolist() == [-1, 1, 1]
+
+
+def test_of_two_commands_an_effect_changes_its_own():
+    @dataclass(frozen=True)
+    class Two(Pendulum):
+        name = "two_motors"
+        actions = tuple(replace(Pendulum.actions[0], name=name) for name in ("upper", "lower"))
+
+    system = Two()
+    effects = {effect.name: effect for effect in catalogue(system)}
+    commands = torch.tensor([[[1.0, 1.0], [2.0, -1.0]]])
+    delayed = World(system, [effects["lower.actuator_delay"](delay=0.05)]).actuate(commands)
+    assert delayed.flatten().tolist() == pytest.approx([1, 0, 2, 1], abs=1e-5)
+    both = World(system, [effects["commands.actuator_delay"](delay=0.05)]).actuate(commands)
+    assert both.flatten().tolist() == pytest.approx([0, 0, 1, 1], abs=1e-5)
+    assert [e.name for e in twins(effects["commands.actuator_delay"], effects.values(), system)] == [
+        "sensors.measurement_delay"
+    ]
+
+
+def test_sensors_of_an_angle_scale_its_rate_too_and_an_offset_does_not():
+    world = World(FURUTA, [BY_NAME["arm.sensor_scale"](scale=2.0), BY_NAME["pendulum.sensor_offset"](offset=0.1)])
+    assert world.reading(STATE)[0].tolist() == pytest.approx([0.6, 1.3, 4.0, -3.0])
+
+
+def test_a_late_measurement_is_a_late_command():
+    torch.manual_seed(0)
+    commands = torch.randn(20, 1, 1, dtype=torch.float64)
+    seen = []
+    for name in ("sensors.measurement_delay", "voltage.actuator_delay"):
+        world = World(FURUTA, [BY_NAME[name](delay=0.02)], period=0.02, substeps=2)
+        at = world.start(torch.zeros(1, 4, dtype=torch.float64))
+        rows = []
+        for command in commands:
+            row, at = world.measure(at)
+            rows.append(row)
+            at = world.step(at, command)
+        seen.append(torch.cat(rows))
+    torch.testing.assert_close(seen[0], seen[1])
+
+
+def test_the_catalogue_names_the_system_and_leaves_the_librarys_effects_out():
+    assert "actuator_gain" not in BY_NAME
+    assert "cart_mass" not in BY_NAME
+    text = catalogue_text(FURUTA)
+    assert EFFECTS["hinge.viscous_friction"] is BY_NAME["hinge.viscous_friction"]
+    assert "hinge.viscous_friction (dynamics)" in text
+    assert "systems: furuta" in text
+    assert not any("." in effect.name for effect in catalogue(CartPole()))
+
+
+def test_effects_that_are_the_same_are_known_to_be():
+    @dataclass(frozen=True)
+    class Motor(Pendulum):
+        max_torque: float = 2.0
+
+        name = "motor"
+        actions = (replace(Pendulum.actions[0], name="command", unit="1", low=-1.0, high=1.0),)
+
+        def derivative(self, state, command, load):
+            return super().derivative(state, self.max_torque * command, load)
+
+    effects = {effect.name: effect for effect in catalogue(Motor())}
+    assert effects["command.actuator_gain"].indistinguishable_from == ("max_torque.scale",)
+    assert effects["max_torque.scale"].indistinguishable_from == ("command.actuator_gain",)
+    assert effects["joint.constant_load"].indistinguishable_from == ("command.actuator_bias",)
+    assert effects["inertia.scale"].indistinguishable_from == ()
+    # With friction of the motor's voltage against its speed, the resistance is no gain.
+    assert BY_NAME["resistance.scale"].indistinguishable_from == ()

@@ -1,0 +1,20 @@
+"""visadapt check: whether a class of the user's own is a system that visadapt can work with."""
+
+from __future__ import annotations
+
+import argparse
+
+from visadapt.cli.inputs import InputError
+from visadapt.effects.catalogue import catalogue
+from visadapt.systems.contract import complaints
+
+
+def run(options: argparse.Namespace) -> None:
+    """Print what the class states; or what is wrong with it, a line each."""
+    system = options.system
+    if wrong := complaints(system):
+        raise InputError("\nvisadapt: ".join(f"{system.__name__}: {line}" for line in wrong))
+    for kind in ("states", "actions", "loads"):
+        shown = (f"{one.name} {one.unit} ({one.low:g} to {one.high:g})" for one in getattr(system, kind))
+        print(f"{kind:8} {', '.join(shown)}")
+    print(f"{system.name} is right; {len(catalogue(system()))} effects act on it (visadapt effects --system ...)")

@@ -1,0 +1,227 @@
+"""What a system must keep to, so that worlds, effects and diagnoses may rely on it: the test of a class."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from math import isfinite
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from visadapt.systems.base import System, Variable
+from visadapt.systems.rigid_body import RigidBody
+
+ROWS = 5  # States that the derivative is tried in, drawn from the states' ranges
+TOLERANCE = 1e-4  # Largest error of a derivative by automatic differentiation, as a share of the largest of all
+STEP = 1e-6  # Finite difference, as a share of a variable's range
+ROUNDING = 1e-9  # Share by which numbers may differ that ought to be equal
+
+
+def complaints(system: type[System]) -> list[str]:
+    """What the class of a system lacks or does wrong, a line each; empty where nothing is wrong.
+
+    >>> import visadapt as va
+    >>> complaints(va.CartPole)
+    []
+    """
+    for check in (_form, _variables):
+        if found := list(check(system)):
+            return found
+    try:
+        example = system()
+    except Exception as error:
+        return [f"{system.__name__}() raises {_said(error)}; every field needs a default that its check accepts"]
+    try:
+        if wrong := list(_shape(example)):
+            return wrong
+        return [*_gradients(example), *_loads(example), *_coordinates(example), *_batches(example)]
+    except Exception as error:
+        return [f"derivative raises {_said(error)}"]
+
+
+def _form(system: type[System]) -> Iterator[str]:
+    itself: Any = system
+    made = vars(system).get("__dataclass_params__")
+    if made is None or not made.frozen:
+        yield f"{system.__name__} is no frozen dataclass: write @dataclass(frozen=True) above it"
+        return
+    if getattr(system.derivative, "__isabstractmethod__", False):
+        yield f"{system.__name__} has no derivative(self, state, command, load)"
+    for name in ("name", "states", "actions", "loads"):
+        if not hasattr(system, name):
+            yield f"{system.__name__} has no {name}: {_EXAMPLES[name]} would be right"
+    for field in fields(itself):
+        if field.name in ("name", "states", "actions", "loads", "coordinates"):
+            yield f"{field.name} is a field, which is a parameter: write it without an annotation, or as a ClassVar"
+
+
+_EXAMPLES = {
+    "name": 'name = "my_rig"',
+    "states": 'states = (Variable("angle", "rad", -3.0, 3.0), ...)',
+    "actions": 'actions = (Variable("torque", "N m", -1.0, 1.0),)',
+    "loads": 'loads = (Variable("joint", "N m", -1.0, 1.0),)',
+}
+
+
+def _variables(system: type[System]) -> Iterator[str]:
+    if not isinstance(system.name, str) or not system.name.isidentifier():
+        yield f"name is {system.name!r}; a word such as {_EXAMPLES['name']} would be right"
+    for kind in ("states", "actions", "loads"):
+        every = getattr(system, kind)
+        if not isinstance(every, tuple) or not every:
+            yield f"{kind} is {every!r}; a tuple, {_EXAMPLES[kind]}, would be right"
+            continue
+        for variable in every:
+            if not isinstance(variable, Variable):
+                yield f"{kind} holds {variable!r}; {_EXAMPLES[kind]} would be right"
+            else:
+                yield from _variable(kind, variable)
+        names = [getattr(variable, "name", None) for variable in every]
+        yield from (f"{kind} has {name!r} twice" for name in dict.fromkeys(names) if names.count(name) > 1)
+
+
+def _variable(kind: str, variable: Variable) -> Iterator[str]:
+    name, unit, low, high = variable.name, variable.unit, variable.low, variable.high
+    if not isinstance(name, str) or not name.isidentifier() or name in ("time", "episode"):
+        yield f"{kind}: the name {name!r} is not a word of its own, such as angle (time and episode are taken)"
+    if not isinstance(unit, str) or not unit.strip():
+        yield f"{kind}: {name} has no unit; an SI unit such as m, rad/s or N m, or 1 for a number, would be right"
+    numbers = isinstance(low, int | float) and isinstance(high, int | float)
+    if not numbers or not isfinite(low) or not isfinite(high) or low >= high:
+        yield f"{kind}: {name} goes from {low!r} to {high!r}; two finite numbers, the lower first, would be right"
+
+
+def inputs(system: System) -> list[Tensor]:
+    """States, commands and loads (ROWS, ...) drawn from their ranges, in float64."""
+    generator = torch.Generator().manual_seed(0)
+    out = []
+    for variables in (system.states, system.actions, system.loads):
+        low, high = torch.tensor([(one.low, one.high) for one in variables], dtype=torch.float64).T
+        out.append(low + (high - low) * torch.rand(ROWS, len(variables), dtype=torch.float64, generator=generator))
+    return out
+
+
+def _shape(system: System) -> Iterator[str]:
+    """Complaints of what the derivative returns, after which nothing else can be tried."""
+    given = inputs(system)
+    called = ", ".join(
+        f"{name} {tuple(each.shape)}" for name, each in zip(("state", "command", "load"), given, strict=True)
+    )
+    try:
+        rates = system.derivative(*given)
+    except Exception as error:
+        yield f"derivative of {called} raises {_said(error)}"
+        return
+    right = (len(given[0]), len(system.states))
+    if not isinstance(rates, Tensor) or rates.shape != right:
+        shape = f"the shape {tuple(rates.shape)}" if isinstance(rates, Tensor) else f"a {type(rates).__name__}"
+        yield f"derivative of {called} has {shape}; a tensor {right}, the rate of each state, would be right"
+        return
+    bad = ~rates.isfinite()
+    if bad.any():
+        row, column = bad.nonzero()[0].tolist()
+        at = ", ".join(f"{s.name} {v:.3g}" for s, v in zip(system.states, given[0][row].tolist(), strict=True))
+        yield f"derivative: the rate of {system.states[column].name} is {rates[row, column]} at {at}, within the ranges"
+        return
+    if rates.dtype != given[0].dtype:
+        yield f"derivative turns {given[0].dtype} into {rates.dtype}: make new tensors with state.new_tensor"
+    alone = torch.cat([system.derivative(*(each[k : k + 1] for each in given)) for k in range(ROWS)])
+    if not equal(rates, alone):
+        yield "derivative mixes rows: each row of a batch (B, n) is a machine of its own"
+
+
+def _gradients(system: System) -> Iterator[str]:
+    given = inputs(system)
+    with torch.inference_mode(False), torch.enable_grad():
+        tracked = [each.clone().requires_grad_() for each in given]
+        rates = system.derivative(*tracked)
+        if not rates.requires_grad:
+            yield (
+                "derivative is not differentiable: compute it from the tensors with torch alone, without numpy, item() "
+                "or detach()"
+            )
+            return
+        by_column = [torch.autograd.grad(r, tracked, retain_graph=True, allow_unused=True) for r in rates.sum(0)]
+    for k, (kind, variables) in enumerate(
+        (("state", system.states), ("command", system.actions), ("load", system.loads))
+    ):
+        for column, variable in enumerate(variables):
+            step = STEP * (variable.high - variable.low)
+            moved = [each.clone() for each in given], [each.clone() for each in given]
+            moved[0][k][:, column] -= step
+            moved[1][k][:, column] += step
+            expected = (system.derivative(*moved[1]) - system.derivative(*moved[0])) / (2 * step)
+            found = torch.stack([torch.zeros(ROWS).double() if g[k] is None else g[k][:, column] for g in by_column], 1)
+            if float((found - expected).abs().max()) > TOLERANCE * max(1.0, float(expected.abs().max())):
+                yield (
+                    f"derivative by the {kind} {variable.name} is not what torch differentiates: compute it from the "
+                    "tensors with torch alone, without numpy, item(), detach() or rounding"
+                )
+
+
+def _loads(system: System) -> Iterator[str]:
+    state, command, load = inputs(system)
+    free, whole = system.derivative(state, command, torch.zeros_like(load)), system.derivative(state, command, load)
+    if not equal(free + 2 * (whole - free), system.derivative(state, command, 2 * load)):
+        yield "derivative is not linear in the load: a load is a force or a torque that adds to the others"
+
+
+def _coordinates(system: System) -> Iterator[str]:
+    if isinstance(system, RigidBody):  # its attitude is no coordinate
+        return
+    pairs, states, loads = system.coordinates, system.states, system.loads
+    right = "a pair (column of the position, column of the velocity) for each load, as in ((0, 1), (2, 3)),"
+    if not isinstance(pairs, tuple) or len(pairs) != len(loads):
+        yield f"coordinates is {pairs!r}; {right} would be right: there are {len(loads)} loads"
+        return
+    for pair in pairs:
+        if not isinstance(pair, tuple) or len(pair) != 2 or not all(k in range(len(states)) for k in pair):
+            yield f"coordinates holds {pair!r}; {right} would be right: there are {len(states)} states"
+            return
+    state, command, load = inputs(system)
+    free = system.derivative(state, command, torch.zeros_like(load))
+    for k, (position, velocity) in enumerate(pairs):
+        names = states[position].name, states[velocity].name
+        if not equal(free[:, position], state[:, velocity]):
+            yield f"coordinates: {names[1]} is not the rate of {names[0]} that derivative returns"
+        unit = torch.zeros_like(load)
+        unit[:, k] = 1
+        gain = (system.derivative(state, command, unit) - free)[:, velocity]
+        if not bool((gain > 0).all()):
+            yield f"loads: {loads[k].name} does not accelerate {names[1]}: its coordinates, or its sign, are wrong"
+
+
+def _batches(system: System) -> Iterator[str]:
+    """A parameter may be one for each row: effects scale it, and fits try many values in one batch."""
+    given = inputs(system)
+    itself: Any = system
+    for field in fields(itself):
+        value = getattr(system, field.name)
+        values = value * torch.linspace(1.0, 1.02, ROWS, dtype=torch.float64)
+        try:
+            together = replace(itself, **{field.name: values}).derivative(*given)
+        except Exception as error:
+            yield f"{field.name} as a tensor, one value for each row ({ROWS},), raises {_said(error)}"
+            continue
+        rows = [
+            replace(itself, **{field.name: float(one)}).derivative(*(each[k : k + 1] for each in given))
+            for k, one in enumerate(values)
+        ]
+        if together.shape != given[0].shape or not equal(together, torch.cat(rows)):
+            yield f"{field.name} as a tensor, one value for each row ({ROWS},), gives other rates than row by row"
+
+
+def equal(one: Tensor, other: Tensor) -> bool:
+    """Whether rates are the same up to rounding."""
+    return torch.allclose(one, other, rtol=ROUNDING, atol=ROUNDING * float(other.abs().max()))
+
+
+def _said(error: Exception) -> str:
+    """An exception in one line, with the line of the file that raised it."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if "/torch/" not in frame.filename and frame.filename != __file__]
+    where = f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}{where}"
