@@ -41,7 +41,7 @@ def test_an_episode_at_once_is_the_same_as_step_by_step(name, data):
     generator = torch.Generator().manual_seed(2)
     actions = 2 * torch.rand(3, 11, 1, generator=generator, dtype=torch.float64) - 1
     commands = actions.repeat_interleave(4, 1)
-    whole, last = effect.apply_to(commands, effect.memory(commands, 0.0125), 0.0125)
+    whole, last = effect.apply_to(commands, effect.memory(commands[:, :4], 0.0125), 0.0125)
     memory, parts = effect.memory(commands[:, :4], 0.0125), []
     for k in range(11):
         part, memory = effect.apply_to(commands[:, 4 * k : 4 * k + 4], memory, 0.0125)
@@ -58,12 +58,15 @@ def test_on_an_unsteady_clock_it_is_what_fine_equal_substeps_give(name):
     half = torch.randint(20, 31, (12,), generator=torch.Generator().manual_seed(4))
     held = half.repeat_interleave(2)
     commands = 2 * torch.rand(1, 12, 1, generator=torch.Generator().manual_seed(5), dtype=torch.float64) - 1
-    memory = effect.memory(commands, 0.025)
+    memory = effect.memory(commands[:, :2], 0.025)
     unsteady, _ = effect.apply_to(commands.repeat_interleave(2, 1), memory, fine * held[None].double())
     every = commands.repeat_interleave(2 * half, 1)
-    steady, _ = effect.apply_to(every, effect.memory(every, fine), fine)
-    means = torch.stack([part.mean(1) for part in steady.split(held.tolist(), 1)], 1)
-    torch.testing.assert_close(unsteady, means, rtol=0, atol=1e-9)
+    steady, _ = effect.apply_to(every, effect.memory(every[:, :1], fine), fine)
+    impulses = torch.stack([part.sum(1) for part in steady.split(held.tolist(), 1)], 1)
+    found = unsteady * held[None, :, None]
+    if name == "actuator_delay":  # substeps of a period give each other some of their impulse
+        impulses, found = (each.unflatten(1, (-1, 2)).sum(2) for each in (impulses, found))
+    torch.testing.assert_close(found, impulses, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", CHAIN)
@@ -91,10 +94,10 @@ def test_the_chain_runs_in_the_stated_order_whatever_the_order_of_the_list():
 class TestActuatorDelay:
     ACTIONS = (0.6, -0.9, 0.3, 0.8, -0.2)
 
-    def velocities(self, delay, substeps):
-        """x_dot after each period of a mass of 2 kg under the delayed commands."""
+    def states(self, delay, substeps):
+        """States after each period of a mass of 2 kg under the delayed commands."""
         world = World(Mass(), [ActuatorDelay(delay=delay).double()], PERIOD, "rk4", substeps)
-        return run(world, columns(0, 0, 0, 0), [columns(a) for a in self.ACTIONS])[1:, 0, 1].tolist()
+        return run(world, columns(0, 0, 0, 0), [columns(a) for a in self.ACTIONS])[1:, 0]
 
     def impulse(self, delay, time):
         """Integral over the time of command(t - delay), the commands held over a period each and 0 before."""
@@ -107,7 +110,21 @@ class TestActuatorDelay:
     @pytest.mark.parametrize("delay", [0.0, 0.05, 0.1, 0.02, 0.013, 0.0771, 0.3])
     def test_the_velocity_is_that_of_the_delayed_command(self, delay, substeps):
         expected = [self.impulse(delay, (k + 1) * PERIOD) / 2.0 for k in range(len(self.ACTIONS))]
-        assert self.velocities(delay, substeps) == pytest.approx(expected, abs=1e-8)
+        assert self.states(delay, substeps)[:, 1].tolist() == pytest.approx(expected, abs=1e-8)
+
+    def displacement(self, delay, time):
+        """Integral of that impulse over the time."""
+        total = 0.0
+        for k, action in enumerate(self.ACTIONS):
+            since = max(time - delay - k * PERIOD, 0.0)
+            total += action * 0.5 * (since**2 - max(since - PERIOD, 0.0) ** 2)
+        return total
+
+    @pytest.mark.parametrize("substeps", [2, 3, 8])
+    @pytest.mark.parametrize("delay", [0.0, 0.05, 0.013, 0.047, 0.0771, 0.3])
+    def test_the_position_is_that_of_the_delayed_command(self, delay, substeps):
+        expected = [self.displacement(delay, (k + 1) * PERIOD) / 2.0 for k in range(len(self.ACTIONS))]
+        assert self.states(delay, substeps)[:, 0].tolist() == pytest.approx(expected, abs=1e-8)
 
     def test_a_delay_of_whole_periods_is_the_same_commands_later(self):
         state, actions = inputs(2)

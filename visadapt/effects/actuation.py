@@ -14,6 +14,7 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from visadapt.effects.base import ActuationEffect, Parameter
 from visadapt.systems.integrators import Duration
@@ -22,9 +23,10 @@ from visadapt.systems.integrators import Duration
 class ActuatorDelay(ActuationEffect):
     """A pure delay of any length, also a fraction of a substep.
 
-    A delayed command can change inside a substep; its mean over the substep acts, which is exact in the limit of fine
-    substeps and differentiable in the delay. Only the start of an episode could separate it from measurement_delay,
-    and only if the first state were known without noise and not at rest.
+    A delayed command can change inside a substep. What acts instead is constant over a substep and moves a mass just as
+    far and as fast by the end of the period: the mean over the substep, and a little of the impulse of the substep
+    after or before it. That is differentiable in the delay. Only the start of an episode could separate it from
+    measurement_delay, and only if the first state were known without noise and not at rest.
     """
 
     name = "actuator_delay"
@@ -45,30 +47,58 @@ class ActuatorDelay(ActuationEffect):
     }
 
     def memory(self, commands: Tensor, substep: float) -> Tensor:
-        # Past commands, and how long each was held. Twice what the delay reaches, for substeps down to half as long.
+        # Past commands, how long each was held, and the number of substeps in a period. Twice what the delay reaches,
+        # for substeps down to half as long.
         delay = self.value("delay", commands).detach()
         if not bool((delay >= 0).all()):
             raise ValueError(f"actuator_delay: delay must not be negative, got {float(delay.min()):g} s")
         reach = 2 * math.ceil(float(delay.max()) / substep) + 1
         held = torch.full_like(commands[:, :1, :1], substep)
-        return torch.cat((torch.zeros_like(commands[:, :1]), held), -1).expand(-1, reach, -1)
+        count = torch.full_like(held, commands.shape[1])
+        return torch.cat((torch.zeros_like(commands[:, :1]), held, count), -1).expand(-1, reach, -1)
 
     def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
         batch, count, width = commands.shape
         held = torch.as_tensor(substep, dtype=commands.dtype, device=commands.device).expand(batch, count)
-        past = torch.cat((memory, torch.cat((commands, held[..., None]), -1)), 1)
-        # The command's integral up to each edge between substeps, from the first that is remembered.
-        lasting = past[..., -1]
-        edge = torch.cat((torch.zeros_like(lasting[:, :1]), lasting.cumsum(1)), 1)
-        whole = (past[..., :-1] * lasting[..., None]).cumsum(1)
-        whole = torch.cat((torch.zeros_like(whole[:, :1]), whole), 1)
-        # ... and up to a delay before each edge of the present substeps: its differences are the delayed impulses.
+        period = memory[:, -1:, -1:].expand(-1, count, -1)
+        past = torch.cat((memory, torch.cat((commands, held[..., None], period), -1)), 1)
+        command, lasting = past[..., :-2], past[..., -2:-1]
+        # The command's integral, and the integral of that, up to each edge between substeps, from the first remembered.
+        edge = _from_zero(lasting)[..., 0]
+        once = _from_zero(command * lasting)
+        twice = _from_zero(once[:, :-1] * lasting + 0.5 * command * lasting.square())
+        # ... and up to a delay before each edge of the present substeps: the first one's differences are impulses.
         wanted = (edge[:, -count - 1 :] - self.value("delay", commands).expand(batch)[:, None]).clamp_min(0)
         left = (torch.searchsorted(edge.detach(), wanted.detach()) - 1).clamp(0, past.shape[1] - 1)
         columns = left[..., None].expand(-1, -1, width)
         inside = (wanted - edge.gather(1, left))[..., None]
-        impulse = whole.gather(1, columns) + inside * past[..., :-1].gather(1, columns)
-        return impulse.diff(dim=1) / held[..., None], past[:, count:]
+        command, once, twice = (table.gather(1, columns) for table in (command, once, twice))
+        twice = twice + once * inside + 0.5 * command * inside.square()
+        once = once + command * inside
+        impulse, lasting = once.diff(dim=1), held[..., None]
+        # How much further the command moves a mass of one than its mean does.
+        excess = twice.diff(dim=1) - lasting * (once[:, :-1] + 0.5 * impulse)
+        return (impulse + _shifts(excess, lasting, int(memory[0, -1, -1]))) / lasting, past[:, count:]
+
+
+def _from_zero(values: Tensor) -> Tensor:
+    """Sums (B, S + 1, n) of values (B, S, n) up to each, from none."""
+    return pad(values.cumsum(1), (0, 0, 1, 0))
+
+
+def _shifts(excess: Tensor, lasting: Tensor, period: int) -> Tensor:
+    """Impulses (B, S, n), of sum zero in a period of `period` substeps, that move a mass of one further by `excess`.
+
+    A substep gives what its neighbour takes: the one before it the last of a period, the others the one after.
+    """
+    count = excess.shape[1]
+    if period == 1 or not bool(excess.any()):
+        return torch.zeros_like(excess)
+    apart = 0.5 * (lasting[:, 1:] + lasting[:, :-1])
+    last = (torch.arange(count, device=excess.device) % period == period - 1)[:, None]
+    given = torch.where(last[:-1], 0.0, excess[:, :-1]) / apart  # by the substep after
+    taken = torch.where(last[1:], excess[:, 1:], 0.0) / apart  # from the last one, by that before
+    return pad(given + taken, (0, 0, 0, 1)) - pad(given + taken, (0, 0, 1, 0))
 
 
 class ActuatorBacklash(ActuationEffect):

@@ -167,7 +167,7 @@ class ActuationEffect(Effect):
     def memory(self, commands: Tensor, substep: float) -> Tensor:
         """The effect's memory at the start of an episode, (B, any, n_action).
 
-        `commands` (B, S, n_action) gives shape and dtype; before an episode begins the command was zero.
+        `commands` (B, S, n_action), those of a period, give shape and dtype; before an episode the command was zero.
         """
         return commands[:, :0]
 

@@ -17,8 +17,8 @@ from visadapt.systems import System
 from visadapt.world import World, WorldState
 
 COARSEST, COARSE, FINE = 0, 1, 2
-"""Accuracy of integration, an index into `SystemProfile.substeps`: for screening, for cross-validated and quick fits,
-and for reported results."""
+"""Accuracy of integration, an index into `SystemProfile.longest_abrupt_steps`: for screening, for cross-validated and
+quick fits, and for reported results."""
 
 
 class CandidateModel:
@@ -32,10 +32,10 @@ class CandidateModel:
         self.profile = profile_of(system)
         self.effects = tuple(effects)
         self.rows = rows
-        abrupt = any(effect.abrupt for effect in effects)
-        longest = float(rows.held.max())
-        smooth = 1 if accuracy == COARSEST else math.ceil(longest / self.profile.longest_step - 1e-9)
-        substeps = max(smooth, self.profile.substeps[accuracy] if abrupt else 1)
+        longest_step = math.inf if accuracy == COARSEST else self.profile.longest_step
+        if any(effect.abrupt for effect in effects):
+            longest_step = min(longest_step, self.profile.longest_abrupt_steps[accuracy])
+        substeps = max(1, math.ceil(float(rows.held.max()) / longest_step - 1e-9))
         placeholders = [effect(**{parameter.name: 0.0 for parameter in effect.table}) for effect in effects]
         self._world = World(system, placeholders, rows.period, substeps=substeps)
         self.table = self._world.table

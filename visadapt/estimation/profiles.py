@@ -46,8 +46,8 @@ class SystemProfile:
     """rows of a window; longer episodes are cut, which loses little since states far apart hardly inform each other"""
     longest_step: float = float("inf")
     """s, the longest Runge-Kutta step for smooth physics when an effect is fitted (screening takes one per period)"""
-    substeps: tuple[int, int, int] = (1, 4, 10)
-    """integration steps per period under abrupt effects, at the accuracies COARSEST, COARSE and FINE"""
+    longest_abrupt_steps: tuple[float, float, float] = (float("inf"), 0.0125, 0.005)
+    """s, the longest integration steps under abrupt effects, at the accuracies COARSEST, COARSE and FINE"""
     relinearise_every: int = 1
     """iterations of a fit between two computations of the derivatives by the states; more than 1 is accurate enough
     where all states are measured"""
@@ -112,7 +112,7 @@ _VEHICLE = SystemProfile(
     max_rows=650,
     is_aircraft=True,
     window_rows=25,
-    substeps=(2, 3, 4),
+    longest_abrupt_steps=(0.05, 0.034, 0.025),
     relinearise_every=4,
     check_sensors=False,
     min_gain_per_parameter=3.0,
