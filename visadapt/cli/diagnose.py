@@ -11,7 +11,7 @@ from visadapt import diagnosis
 from visadapt.cli.inputs import InputError, import_effects, progress, the_system
 from visadapt.diagnosis.report.html import write_report
 from visadapt.diagnosis.report.text import as_text
-from visadapt.effects.joints import is_own
+from visadapt.effects.own import is_own
 from visadapt.policies import StatePolicy
 from visadapt.recordings import load_recording
 from visadapt.setups.policy_file import load_policy

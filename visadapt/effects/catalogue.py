@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Iterable
 
 from visadapt.effects.base import EFFECTS, ActuationEffect, DynamicsEffect, Effect, Parameter, SensingEffect
-from visadapt.effects.joints import is_own, own_effects
+from visadapt.effects.own import is_own, own_effects
 from visadapt.systems import SYSTEMS, System
 
 

@@ -1,0 +1,81 @@
+"""The effects of a system of one's own: those that make sense on any mechanism, joint by joint.
+
+From what the class states of its states, actions, loads and coordinates, and from its fields, which are parameters,
+this makes one effect for each joint, action, sensor and parameter and each kind. `shoulder.viscous_friction` is that
+of the joint with the load `shoulder`. Units and ranges searched follow from those that the class states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import torch
+
+from visadapt.effects.base import EFFECTS, Effect
+from visadapt.effects.own.commands import on_commands
+from visadapt.effects.own.dynamics import on_joints, on_parameters, scalable
+from visadapt.effects.own.sensors import on_sensors
+from visadapt.systems import SYSTEMS, System
+from visadapt.systems.contract import equal, inputs
+
+
+def is_own(system: type[System]) -> bool:
+    """Whether a system is the user's own: neither one of the library's nor derived from one of these."""
+    return not issubclass(system, tuple(SYSTEMS.values()))
+
+
+def own_effects(system: type[System]) -> list[type[Effect]]:
+    """The effects of a system of one's own; they are then found by name in `EFFECTS`."""
+    made = _made(system)
+    EFFECTS.update({effect.name: effect for effect in made})
+    return list(made)
+
+
+@cache
+def _made(system: type[System]) -> tuple[type[Effect], ...]:
+    every = (*on_commands(system), *on_joints(system), *on_parameters(system), *on_sensors(system))
+    alike: dict[str, tuple[str, ...]] = {}
+    for one, other in _alike(system()):
+        alike[one] = (*alike.get(one, ()), other)
+        alike[other] = (*alike.get(other, ()), one)
+    return tuple(_named(system, *each, alike.get(each[0], ())) for each in every)
+
+
+def _alike(system: System) -> Iterator[tuple[str, str]]:
+    """Pairs of effects that are the same, by name: they change every rate alike, with some other value."""
+    state, command, load = inputs(system)
+    rest = torch.zeros_like(load)
+    free = system.derivative(state, command, rest)
+    for a, action in enumerate(system.actions):
+        unit = torch.eye(command.shape[1]).double()[a]
+        by_command = system.derivative(state, command + unit, rest) - free
+        for k, joint in enumerate(system.loads):
+            by_load = system.derivative(state, command, rest + torch.eye(load.shape[1]).double()[k]) - free
+            if bool(by_command.any()) and equal(
+                by_load * (by_command * by_load).sum() / by_load.square().sum(), by_command
+            ):
+                yield f"{action.name}.actuator_bias", f"{joint.name}.constant_load"
+        stronger = system.derivative(state, command * (1 + unit), rest)
+        for field in scalable(system):
+            for factor in (2.0, 0.5):
+                scaled: Any = replace(system, **{field: factor * getattr(system, field)})  # type: ignore[type-var]
+                if equal(scaled.derivative(state, command, rest), stronger):
+                    yield f"{action.name}.actuator_gain", f"{field}.scale"
+
+
+def _named(
+    system: type[System], name: str, base: type[Effect], attributes: dict[str, Any], alike: tuple[str, ...]
+) -> type[Effect]:
+    # The effects of two systems may have the same name: the later ones then take it.
+    own = {"__module__": system.__module__, "__qualname__": name, "name": name, "systems": (system,)}
+    settled = {other: _MOTOR_OFF for other in alike if other.endswith(".constant_load")}
+    return type(name, (base,), {"indistinguishable_from": alike, "settled_by": settled, **own, **attributes})
+
+
+_MOTOR_OFF = (
+    "switch the motor off and measure the load on the joint with a balance: a constant load is still there, an "
+    "actuator's bias is gone"
+)

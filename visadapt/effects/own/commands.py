@@ -1,0 +1,81 @@
+"""Effects on the commands of a system of one's own, one command at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from visadapt.effects import actuation
+from visadapt.effects.base import ActuationEffect, Effect, Parameter
+from visadapt.effects.own.statement import ALL_COMMANDS, ALL_SENSORS, Made, largest
+from visadapt.systems import System, Variable
+from visadapt.systems.integrators import Duration
+
+
+class OneCommand(ActuationEffect):
+    """An effect on one command of several; `action` is its index."""
+
+    action: int
+
+    def memory(self, commands: Tensor, substep: float) -> Tensor:
+        return super().memory(self._own(commands), substep)
+
+    def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
+        acting, memory = super().apply_to(self._own(commands), memory, substep)
+        before, after = commands[..., : self.action], commands[..., self.action + 1 :]
+        return torch.cat((before, acting, after), -1), memory
+
+    def _own(self, commands: Tensor) -> Tensor:
+        return commands[..., self.action : self.action + 1]
+
+
+def on_commands(system: type[System]) -> Iterator[Made]:
+    """Those on each command, and a delay of all."""
+    delays = {"indistinguishable_from": (f"{ALL_SENSORS}.measurement_delay",)}
+    settled = {f"{ALL_SENSORS}.measurement_delay": actuation.ActuatorDelay.settled_by["measurement_delay"]}
+    alone = len(system.actions) == 1
+    if not alone:
+        yield f"{ALL_COMMANDS}.actuator_delay", actuation.ActuatorDelay, {**delays, "settled_by": settled}
+    for index, action in enumerate(system.actions):
+        most = largest(action)
+        for base in (
+            actuation.ActuatorDelay,
+            actuation.ActuatorBacklash,
+            actuation.ActuatorDeadzone,
+            actuation.ActuatorSaturation,
+            actuation.ActuatorGain,
+            actuation.ActuatorBias,
+            actuation.ActuatorLag,
+        ):
+            table = tuple(_in_units_of(parameter, action, most) for parameter in base.table)
+            says = _SAYS.get(base, (base.__doc__ or "").partition("\n\n")[0])
+            attributes = {"table": table, "action": index, "__doc__": says}
+            if alone and base is actuation.ActuatorDelay:
+                attributes |= {**delays, "settled_by": settled}
+            kind = type(base.__name__, (OneCommand, base), {})
+            yield f"{action.name}.{base.name}", kind, attributes
+
+
+_SAYS: dict[type[Effect], str] = {
+    actuation.ActuatorSaturation: "A limit on the command that the motor follows, of its supply or its current.",
+    actuation.ActuatorBias: "A constant added to every command.",
+}
+"""What an effect does, where the library's words are of a cart-pole."""
+
+
+def _in_units_of(parameter: Parameter, action: Variable, most: float) -> Parameter:
+    """A parameter in units of the command, in those of an action; a scale and a time stay as they are."""
+    if parameter.unit != "1" or parameter.name == "scale":
+        return parameter
+    neutral = None if parameter.neutral is None else parameter.neutral * most
+    return Parameter(
+        parameter.name,
+        action.unit,
+        parameter.low * most,
+        parameter.high * most,
+        neutral,
+        parameter.linear,
+        parameter.role,
+    )

@@ -1,0 +1,134 @@
+"""Effects on the joints and on the parameters of a system of one's own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import fields
+
+from visadapt.effects import laws
+from visadapt.effects.base import Parameter, Role
+from visadapt.effects.own.added_inertia import AddedInertia, inertia_of
+from visadapt.effects.own.statement import Made, largest
+from visadapt.effects.parameters import ParameterScale
+from visadapt.systems import System, Variable
+
+
+def on_joints(system: type[System]) -> Iterator[Made]:
+    """Those on each joint: its loads, and added inertia."""
+    for joint, (load, (position, velocity)) in enumerate(zip(system.loads, system.coordinates, strict=True)):
+        kinds = _laws(load, system.states[position], system.states[velocity])
+        for kind, (law, equation, table) in kinds.items():
+            yield f"{load.name}.{kind}", law, {"joint": joint, "equation": equation, "table": table}
+        most = 5 * inertia_of(system(), joint)
+        unit = {"N": "kg", "N m": "kg m2"}.get(load.unit, _per(load, system.states[velocity]))
+        yield (
+            f"{load.name}.added_inertia",
+            AddedInertia,
+            {
+                "joint": joint,
+                "equation": f"Q = -inertia d({system.states[velocity].name})/dt",
+                "table": (Parameter("inertia", unit, 0.0, most, 0.0),),
+            },
+        )
+
+
+def _per(load: Variable, variable: Variable, power: int = 1) -> str:
+    """The unit of a load over a position, or over a power of a velocity."""
+    unit, _, over = variable.unit.partition("/")
+    times = f" {over}{power if power > 1 else ''}" if over else ""
+    return f"{load.unit}{times}/{unit}{power if power > 1 else ''}"
+
+
+def _laws(
+    load: Variable, position: Variable, velocity: Variable
+) -> dict[str, tuple[type[laws.JointEffect], str, tuple[Parameter, ...]]]:
+    most, fastest, farthest = (largest(variable) for variable in (load, velocity, position))
+    size = "torque" if load.unit == "N m" else "force"
+    q, v, unit = position.name, velocity.name, load.unit
+
+    def linear(name: str, low: float, unit: str = unit, high: float = most) -> Parameter:
+        return Parameter(name, unit, low, high, 0.0, linear=True)
+
+    def friction(*names: str) -> tuple[Parameter, ...]:
+        return tuple(Parameter(name, unit, 0.0, most, 0.0) for name in names)
+
+    # A coefficient is searched up to where a third of the range of motion takes the largest load.
+    per_velocity, per_position = 3 * most / fastest, 3 * most / farthest
+    return {
+        "viscous_friction": (
+            laws.ViscousLaw,
+            f"Q = -coefficient {v}",
+            (linear("coefficient", 0.0, _per(load, velocity), per_velocity),),
+        ),
+        "quadratic_drag": (
+            laws.DragLaw,
+            f"Q = -coefficient |{v}| {v}",
+            (linear("coefficient", 0.0, _per(load, velocity, 2), 3 * per_velocity / fastest),),
+        ),
+        "coulomb_friction": (
+            laws.CoulombLaw,
+            f"Q = -{size} sign({v}); at rest, what holds the joint, up to {size}",
+            friction(size),
+        ),
+        "stribeck_friction": (
+            laws.StribeckLaw,
+            f"Q = -({size} + (breakaway - {size}) exp(-({v} / velocity)^2)) sign({v}); at rest, up to breakaway",
+            (*friction(size, "breakaway"), Parameter("velocity", velocity.unit, fastest / 500, fastest / 5, None)),
+        ),
+        "directional_friction": (
+            laws.DirectionalLaw,
+            f"Q = -forward where {v} > 0, backward where {v} < 0; at rest, what holds the joint, up to these",
+            friction("forward", "backward"),
+        ),
+        "spring": (
+            laws.SpringLaw,
+            f"Q = -stiffness ({q} - rest)",
+            (
+                linear("stiffness", 0.0, _per(load, position), per_position),
+                Parameter("rest", position.unit, position.low, position.high, None),
+            ),
+        ),
+        "constant_load": (laws.ConstantLaw, f"Q = {size}", (linear(size, -most),)),
+        "periodic_load": (
+            laws.PeriodicLaw,
+            "Q = amplitude cos(2 pi frequency t + phase) + offset",
+            (
+                linear("amplitude", 0.0),
+                Parameter("frequency", "Hz", 0.02, 5.0, None, role=Role.FREQUENCY),
+                Parameter("phase", "rad", -math.pi, math.pi, None, role=Role.PHASE),
+                linear("offset", -most),
+            ),
+        ),
+        "push": (
+            laws.PulseLaw,
+            f"Q = {size} for start <= t < end",
+            (
+                Parameter("start", "s", 0.0, 20.0, None, role=Role.START),
+                Parameter("end", "s", 0.0, 20.0, None, role=Role.END),
+                linear(size, -most),
+            ),
+        ),
+    }
+
+
+def on_parameters(system: type[System]) -> Iterator[Made]:
+    """A factor on each positive parameter but gravity."""
+    for field in scalable(system()):
+        yield (
+            f"{field}.scale",
+            ParameterScale,
+            {
+                "__doc__": f"A machine whose {field} differs from the source's.",
+                "equation": f"{field} = scale {field}_source",
+                "source": f"the parameters of {system.name}",
+                "table": (Parameter("scale", "1", 0.2, 5.0, 1.0),),
+                "scaled": {"scale": field},
+            },
+        )
+
+
+def scalable(system: System) -> list[str]:
+    """The positive parameters but gravity."""
+    names = [field.name for field in fields(system)]  # type: ignore[arg-type]  # subclasses are dataclasses
+    return [name for name in names if name != "gravity" and getattr(system, name) > 0]

@@ -1,0 +1,53 @@
+"""Effects on the sensors of a system of one's own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from visadapt.effects import sensing
+from visadapt.effects.base import Parameter
+from visadapt.effects.own.statement import ALL_COMMANDS, ALL_SENSORS, Made, largest
+from visadapt.systems import System
+
+
+def on_sensors(system: type[System]) -> Iterator[Made]:
+    """Offset and scale of each sensor, and a delay of all."""
+    rates = dict(system.coordinates)
+    delayed = f"{ALL_COMMANDS}.actuator_delay"
+    if len(system.actions) == 1:
+        delayed = f"{system.actions[0].name}.actuator_delay"
+    yield (
+        f"{ALL_SENSORS}.measurement_delay",
+        sensing.MeasurementDelay,
+        {
+            "positions": list(rates),
+            "velocities": list(rates.values()),
+            "indistinguishable_from": (delayed,),
+        },
+    )
+    for column, state in enumerate(system.states):
+        name, unit = state.name, state.unit
+        most = 0.2 * largest(state)
+        yield (
+            f"{name}.sensor_offset",
+            sensing.SensorOffset,
+            {
+                "__doc__": f"A sensor of {name} whose zero is off.",
+                "equation": f"{name} measured = {name} + offset",
+                "table": (Parameter("offset", unit, -most, most, 0.0, linear=True),),
+                "sensor": column,
+            },
+        )
+        if column in rates.values():
+            continue
+        scaled = [column, rates[column]] if column in rates else [column]
+        both = ", ".join(system.states[one].name for one in scaled)
+        yield (
+            f"{name}.sensor_scale",
+            sensing.SensorGain,
+            {
+                "equation": f"({both}) measured = scale ({both})",
+                "table": (Parameter("scale", "1", 0.5, 2.0, 1.0, linear=True),),
+                "columns": scaled,
+            },
+        )
