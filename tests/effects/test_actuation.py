@@ -4,6 +4,7 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 
+from tests.effects.registry import LIBRARY
 from tests.effects.test_effects import build, from_table, inputs, world_of
 from tests.worlds import Mass, columns, run
 from visadapt.effects import (
@@ -22,7 +23,7 @@ from visadapt.systems import CartPole
 from visadapt.world import World
 
 PERIOD = 0.05
-CHAIN = sorted(name for name, effect in EFFECTS.items() if issubclass(effect, ActuationEffect))
+CHAIN = sorted(name for name, effect in LIBRARY.items() if issubclass(effect, ActuationEffect))
 
 
 def acting(effect, values, substep=0.01):

@@ -1,10 +1,11 @@
 import pytest
 
+from tests.effects.registry import LIBRARY
 from visadapt.effects import EFFECTS, ActuatorBias, ActuatorDelay, ConstantForce, Dropout, Payload, ViscousFriction
 from visadapt.effects.catalogue import catalogue, catalogue_markdown, catalogue_text, twins
 from visadapt.systems import SYSTEMS, CartPole, Quadrotor
 
-NAMED = sorted(EFFECTS.keys() - {"residual"})
+NAMED = sorted(LIBRARY.keys() - {"residual"})
 
 
 def test_a_system_has_the_effects_that_act_on_it():

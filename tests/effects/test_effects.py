@@ -9,11 +9,12 @@ import torch
 from hypothesis import given, settings, strategies as st
 
 import visadapt.effects
+from tests.effects.registry import LIBRARY
 from visadapt.effects import EFFECTS, ConstantForce, Effect, Role, Stage
 from visadapt.systems import SYSTEMS, CartPole
 from visadapt.world import World
 
-NAMED = sorted(EFFECTS.keys() - {"residual"})
+NAMED = sorted(LIBRARY.keys() - {"residual"})
 """The effects with parameters; the residual, a network, has tests of its own in test_world.py."""
 
 PAIRS = [
