@@ -11,9 +11,9 @@ class TestClock:
         table["time"][5] = later
         refuses(rf"row 6 \(line 7\), column 'time': the clock {problem}", write(file, table))
 
-    def test_a_clock_that_jitters_a_little_is_a_steady_one(self, file):
+    def test_rounded_stamps_are_those_of_a_steady_clock(self, file):
         table = a_table(rows=200, period=0.0203)
-        table["time"] = 1234.5 + table["time"] + np.random.default_rng(0).normal(0, 0.0003, 200)
+        table["time"] = np.round(1234.5 + table["time"], 3)
         recording = load(write(file, table))
         assert recording.period == pytest.approx(0.0203, rel=1e-3)
         assert recording.warnings == ()

@@ -177,8 +177,8 @@ def _lost(holds: RepeatedReadings) -> tuple[Tensor, Tensor]:
 
 def _frozen(holds: RepeatedReadings, states: Sequence[Tensor], found: FitState, angle: int) -> tuple[Tensor, Tensor]:
     """Start and end (2,) of the angles at which the sensor stands still, and their covariance (2, 2)."""
-    # A first reading has none before it to repeat, and a lost row says nothing of the sensor.
-    seen = torch.cat([~lost[1:] for lost in holds.lost])
+    # A first reading has none before it to repeat.
+    seen = torch.cat([~silent[1:] for silent in holds.silent])
     held = torch.cat([frozen[1:] for frozen in holds.frozen])[seen]
     if not bool(held.any()):
         width = torch.tensor([p.high - p.low for p in FrozenZone.table], dtype=torch.float64)

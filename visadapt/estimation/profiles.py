@@ -112,7 +112,7 @@ _VEHICLE = SystemProfile(
     max_rows=650,
     is_aircraft=True,
     window_rows=25,
-    longest_abrupt_steps=(0.05, 0.034, 0.025),
+    longest_abrupt_steps=(0.05, 0.034, 0.0125),
     relinearise_every=4,
     check_sensors=False,
     min_gain_per_parameter=3.0,
@@ -132,7 +132,7 @@ PROFILES: dict[type[System], SystemProfile] = {
     CartPole: _CART_POLE,
     # Runge-Kutta must be stable: the rate loop decays at 16.6 1/s, the wing's roll rate at 1.95 per metre flown.
     Quadrotor: replace(_VEHICLE, longest_step=0.035),
-    FixedWing: replace(_VEHICLE, longest_step=0.025),
+    FixedWing: replace(_VEHICLE, longest_step=0.025, longest_abrupt_steps=(0.025, 0.017, 0.0125)),
 }
 """The profile of each system class."""
 

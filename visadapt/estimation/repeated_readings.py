@@ -42,6 +42,7 @@ class RepeatedReadings:
     used: list[Tensor]  # (T, m) 1 where a reading is a measurement
     lost: list[Tensor]  # (T,) whether the whole row is repeated
     frozen: list[Tensor]  # (T,) whether the angle is repeated and the rest of the row is not
+    silent: list[Tensor]  # (T,) whether a row says nothing of where the angle sensor stands still
 
 
 def find_repeats(
@@ -66,13 +67,28 @@ def find_repeats(
         alone = [each[:, angle] & ~whole & ~rest for each, whole, rest in zip(same, whole_rows, resting, strict=True)]
         frozen = _unless_by_chance(alone, by_chance[angle])
     used = []
-    for each, whole, still in zip(same, lost, frozen, strict=True):
-        partial = each & pole & still[:, None]
+    doubtful = frozen if angle is None else _between_held([values[:, angle] for values in measured], frozen)
+    for whole, still in zip(lost, doubtful, strict=True):
+        partial = pole & still[:, None]
         # The first reading after a standstill may still be mixed with the repeated value.
         waking = torch.zeros_like(partial)
         waking[1:] = partial[:-1] & ~partial[1:]
         used.append(1.0 - (whole[:, None] | partial | waking).double())
-    return RepeatedReadings(used, lost, frozen)
+    silent = [whole | (still & ~sure) for whole, still, sure in zip(lost, doubtful, frozen, strict=True)]
+    return RepeatedReadings(used, lost, frozen, silent)
+
+
+def _between_held(angles: Sequence[Tensor], frozen: Sequence[Tensor]) -> list[Tensor]:
+    """Which readings (T,) of episodes equal the one before and lie within the range of those that are `frozen`.
+
+    Where the sensor stands still, runs of equal readings that a slow motion enters or leaves are repeated as well.
+    """
+    held = torch.cat([angle[still] for angle, still in zip(angles, frozen, strict=True)])
+    if not len(held):
+        return list(frozen)
+    low, high = held.min(), held.max()
+    equal = [angle.diff(prepend=angle[:1] - 1) == 0 for angle in angles]
+    return [same & (angle >= low) & (angle <= high) for same, angle in zip(equal, angles, strict=True)]
 
 
 def _resting(values: Tensor) -> Tensor:

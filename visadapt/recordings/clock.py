@@ -19,8 +19,8 @@ GAP_PERIODS = 1.5
 """Two rows further apart than this have a missing row between them."""
 MOST_GAPS = 0.05
 """Share of gaps among the steps above which a clock is irregular; below it, rows are missing."""
-MOST_ROUNDING_PERIODS = 0.02
-"""Root mean square by which the stamps of a steady clock may deviate from it: their rounding, and a real rig's 0.01."""
+MOST_DECIMALS = 6
+"""Decimals up to which stamps in s may be rounded; a float32 of an hour has about as many."""
 UNSTEADY_PERIODS = 0.1
 """Difference between the longest and the shortest step above which the clock is reported as unsteady."""
 LONGEST_STEP_PERIODS = 3.0
@@ -106,13 +106,16 @@ def uninterrupted(raw: RawEpisode, note: Note) -> list[RawEpisode]:
 
 
 def _clocked(part: RawEpisode, note: Note) -> RawEpisode:
-    """The part on a steady clock where its stamps deviate by no more than their rounding; else with its own stamps."""
+    """The part on a steady clock where its stamps deviate by no more than their rounding; else with its own stamps.
+
+    Whether unsteady stamps are those of the readings, or of a log that was late to write them, the diagnosis decides.
+    """
     index = np.arange(len(part.time))
     if len(index) < 3:
         return part
     period, start = np.polyfit(index, part.time, 1)
     off = part.time - (start + period * index)
-    if np.sqrt(np.mean(off**2)) <= MOST_ROUNDING_PERIODS * period:
+    if np.abs(off).max() <= _rounding(part.time):
         return replace(part, time=part.time[0] + period * index)
     steps = np.diff(part.time)
     if np.ptp(steps) > UNSTEADY_PERIODS * period:
@@ -122,6 +125,15 @@ def _clocked(part: RawEpisode, note: Note) -> RawEpisode:
             part.source,
         )
     return part
+
+
+def _rounding(time: NDArray[np.float64]) -> float:
+    """The decimal, in s, that all stamps (T,) are rounded to."""
+    for decimals in range(MOST_DECIMALS):
+        ticks = time * 10**decimals
+        if np.abs(ticks - np.round(ticks)).max() < 0.01:
+            return float(10**-decimals)
+    return float(10**-MOST_DECIMALS)
 
 
 def alike(parts: list[RawEpisode], note: Note) -> tuple[list[RawEpisode], float]:

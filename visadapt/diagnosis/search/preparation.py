@@ -33,6 +33,17 @@ class PreparedRecording:
     source: FitState | None = None  # the fit of the source to `rows`, if a check needed it
 
 
+MIN_JITTER = 1e-3
+"""Deviation of stamps from even spacing, in periods, above which it is decided whether it is that of the readings."""
+
+
+def _evenly_spaced(stamps: Tensor) -> Tensor:
+    """Stamps (T,), in s, of a steady clock that is closest to these."""
+    index = torch.arange(len(stamps), dtype=stamps.dtype)
+    index = index - index.mean()
+    return stamps.mean() + index * (index @ stamps) / (index @ index)
+
+
 def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effect]] = ()) -> PreparedRecording:
     """Prepare a recording of some or all states, and the commands; `catalogue` are the effects that may be there."""
     profile = profile_of(system)
@@ -65,10 +76,23 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
         return rows.select(chosen), raw.select(chosen), [warning]
 
     rows, raw, thinning = windows(states)
-    if not profile.check_sensors:
-        return PreparedRecording(rows, raw, repeats, None, tuple(thinning))
-    unchecked, source = rows, Search(system, rows, ()).source.fits
     warnings: list[str] = []
+    source = None
+    read, stamps = stamps, [_evenly_spaced(each) for each in stamps]
+    if any(float((a - b).abs().max()) > MIN_JITTER * recording.period for a, b in zip(read, stamps, strict=True)):
+        source = Search(system, rows, ()).source.fits
+        steady, steady_raw, _ = windows(states)
+        steady_source = Search(system, steady, ()).source.fits
+        if float(steady_source.likelihood[0]) > float(source.likelihood[0]):
+            rows, raw, source = steady, steady_raw, steady_source
+            warnings.append("the stamps jitter, the readings do not: they were taken to be evenly spaced")
+        else:
+            stamps = read
+    if not profile.check_sensors:
+        return PreparedRecording(rows, raw, repeats, None, (*warnings, *thinning), source)
+    if source is None:
+        source = Search(system, rows, ()).source.fits
+    unchecked = rows
     defect = sensor_checks.angle_defect(system, rows, source)
     band = None
     if defect is not None:

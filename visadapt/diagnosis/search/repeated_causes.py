@@ -85,7 +85,7 @@ def _zone(recording: PreparedRecording, search: Search, comparison: ModelCompari
     """Start and end (2,) of the angles at which the sensor stands still, and their standard deviations."""
     rows = recording.rows
     fits = comparison.best.fits
-    inside = (rows.inside > 0) & ~_in_windows(rows, recording.repeats.lost)  # a lost row says nothing of the sensor
+    inside = (rows.inside > 0) & ~_in_windows(rows, recording.repeats.silent)
     if recording.defect is not None:
         edges = torch.tensor(recording.defect, dtype=torch.float64)
         return edges, torch.full_like(edges, BAND)
