@@ -23,13 +23,13 @@ def test_linearisation_predicts_small_steps(viscous):
     generator = torch.Generator().manual_seed(0)
     state = 0.2 * torch.randn(*viscous.shape, 4, generator=generator, dtype=torch.float64)
     at = linearise(model, theta, state)
-    step = 1e-4 * torch.randn(*state.shape, generator=generator, dtype=torch.float64)
-    turn = 1e-4 * torch.randn(len(theta), generator=generator, dtype=torch.float64)
+    step = 3e-5 * torch.randn(*state.shape, generator=generator, dtype=torch.float64)
+    turn = 3e-5 * torch.randn(len(theta), generator=generator, dtype=torch.float64)
     there = linearise(model, theta + turn, state + step)
     change = (at.transition @ step[:, :-1, :, None])[..., 0] + at.by_parameter @ turn
-    torch.testing.assert_close(there.next_state - at.next_state, change, atol=2e-7, rtol=0)
+    torch.testing.assert_close(there.next_state - at.next_state, change, atol=6e-8, rtol=0)
     seen = (at.sensing @ step[..., None])[..., 0] + at.sensing_by_parameter @ turn
-    torch.testing.assert_close(there.measured - at.measured, seen, atol=2e-7, rtol=0)
+    torch.testing.assert_close(there.measured - at.measured, seen, atol=6e-8, rtol=0)
 
 
 def test_a_fit_finds_size_and_noise_and_leaves_no_disturbance(viscous):

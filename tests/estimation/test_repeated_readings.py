@@ -57,3 +57,15 @@ def test_an_angle_that_stands_still_in_a_zone_of_an_encoder_is_found():
     found = find_repeats([with_repeats(values, frozen, [1])], (0, 2), ANGLE).frozen[0]
     assert int((found & ~frozen).sum()) <= 2
     assert int((frozen & ~found).sum()) <= 0.1 * int(frozen.sum())
+
+
+def test_a_slow_motion_through_that_zone_is_not_measured_there():
+    fast, slow = moving(), moving()
+    slow[:, 1] = ((0.035 + 0.02 * (0.2 * torch.arange(len(slow)) * 0.05).sin()) / COUNTS[1]).round() * COUNTS[1]
+    held = [(each[:, 1] > 0.02) & (each[:, 1] < 0.05) for each in (fast, slow)]
+    for each in held:
+        each[0] = False
+    episodes = [with_repeats(values, frozen, [1]) for values, frozen in zip((fast, slow), held, strict=True)]
+    repeats = find_repeats(episodes, (0, 2), ANGLE)
+    assert not bool(repeats.used[1][held[1], 1].any())
+    assert bool(repeats.silent[1][held[1]].any())  # nor do they say where the sensor stands still

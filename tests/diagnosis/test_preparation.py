@@ -1,0 +1,34 @@
+"""Whether unsteady stamps are those of the readings or of a late log."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tests.diagnosed import record
+from visadapt.diagnosis.search.preparation import prepare
+from visadapt.recordings import Episode
+from visadapt.systems import CartPole
+
+WHOLE = record(measured=("x", "x_dot", "theta", "theta_dot"), noise=(0.0, 0.0, 0.0, 0.0))
+
+
+def jittered(read_late: bool):
+    """Positions and angles of WHOLE with stamps up to 6 ms late; the readings are late as well, or the log alone is."""
+    generator = np.random.default_rng(0)
+    episodes = []
+    for episode in WHOLE.episodes:
+        late = generator.uniform(0, 0.006, len(episode.time))
+        state = episode.state[:, [0, 2]] + read_late * late[:, None] * episode.state[:, [1, 3]]
+        state = state + generator.normal(0, 2e-4, state.shape)
+        episodes.append(Episode(episode.time + late, episode.action, state))
+    return dataclasses.replace(WHOLE, episodes=tuple(episodes), measured=("x", "theta"))
+
+
+@pytest.mark.parametrize("read_late", [True, False])
+def test_it_is_decided_whether_the_readings_or_the_log_were_late(read_late):
+    recording = jittered(read_late)
+    prepared = prepare(recording, CartPole())
+    assert any("evenly spaced" in warning for warning in prepared.warnings) != read_late
+    steps = prepared.rows.time[0].diff()
+    assert bool((steps - steps.mean()).abs().max() < 1e-9) != read_late
