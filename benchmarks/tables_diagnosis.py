@@ -43,8 +43,8 @@ def blind(first: Rows, second: Rows) -> Lines:
 
 
 def blind_rigs(rows: Rows) -> Lines:
-    """Lab's machines, and the rows of `datasets.blind.table`, without the measures that neither set has."""
-    header, *lines = _check(rows, ("rig-all", "table"))
+    """Lab's machines, large effects, and the rows of `datasets.blind.table`, without the measures that no set has."""
+    header, *lines = _check(rows, ("rig-all", "large-all", "table"))
     return [header, *(line for _, *line in lines if any(line[1:]))]
 
 
