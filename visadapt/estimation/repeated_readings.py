@@ -136,7 +136,7 @@ def zone(repeated: Tensor, angle: Tensor, deviation: float) -> tuple[Tensor, Ten
     """Start and end (2,) in rad of the zone of angles in which a sensor stands still, and their standard deviations.
 
     Given whether each of N readings is `repeated`, and their estimated angles with a normal error of `deviation` rad.
-    Posterior mean over a grid of both edges, with a uniform prior.
+    Posterior mean over a grid of both edges, with a uniform prior; then over a finer grid around it.
     """
     inside = angle[repeated]
     # An edge may lie anywhere between the last angle with a repeated reading and the next without.
@@ -145,6 +145,17 @@ def zone(repeated: Tensor, angle: Tensor, deviation: float) -> tuple[Tensor, Ten
     first, last = lower.max() if len(lower) else least, higher.min() if len(higher) else most
     low = torch.linspace(float(first) - 3 * deviation, middle, ZONE_EDGE_POINTS, dtype=angle.dtype)
     high = torch.linspace(middle, float(last) + 3 * deviation, ZONE_EDGE_POINTS, dtype=angle.dtype)
+    edges, spread = _zone_on((low, high), repeated, angle, deviation)
+    wide = [torch.maximum(2 * grid.diff()[0], 4 * own) for grid, own in zip((low, high), spread, strict=True)]
+    finer = [
+        edge + width * torch.linspace(-1, 1, ZONE_EDGE_POINTS).to(edge) for edge, width in zip(edges, wide, strict=True)
+    ]
+    return _zone_on(finer, repeated, angle, deviation)
+
+
+def _zone_on(grids: Sequence[Tensor], repeated: Tensor, angle: Tensor, deviation: float) -> tuple[Tensor, Tensor]:
+    """The same over given values of start and end."""
+    low, high = grids
     below = torch.special.ndtr((low[:, None] - angle) / deviation)
     above = torch.special.ndtr((angle - high[:, None]) / deviation)
     chance = (1 - below[:, None] - above[None]).clamp(1e-6, 1 - 1e-6)
