@@ -38,8 +38,8 @@ class SystemProfile:
     region_variables: Mapping[str, str]  # unit of a region's edges to the variable along which that region lies
     plotted_variables: tuple[str, ...]  # variables over which the report plots the residual, the most instructive first
     residual_name: str  # the first load in words, as the report's figures label it
-    black_box_factors: Mapping[str, tuple[str | None, ...]]
-    """load to the variables that multiply a black-box function on it (None: no factor); (None,) for loads not listed"""
+    smooth_function_factors: Mapping[str, tuple[str | None, ...]]
+    """load to the variables that multiply a smooth function on it (None: no factor); (None,) for loads not listed"""
     max_rows: int = 1600  # rows that a search uses; of a longer recording, windows spread evenly over it
     is_aircraft: bool = False  # whether experiments are advised as flights instead of motions on a track
     window_rows: int = 120
@@ -62,7 +62,7 @@ class SystemProfile:
     min_gain_share: float = 0.0  # share of the best candidate's gain that a candidate must reach to be fitted
     refit_subsets: bool = False
     """whether a subset that was fitted before is fitted again, starting from the larger set's parameters"""
-    black_box_threshold: float = 4.0  # log odds above which a black-box function counts as something unexplained
+    smooth_function_threshold: float = 4.0  # log odds above which a smooth function counts as something unexplained
     compared_models: int = 8  # models, the most probable ones, that are compared
     folds: int = 4  # folds of the cross-validation
     beam_width: int = 3  # models of each size to which the search adds another effect
@@ -84,7 +84,7 @@ _CART_POLE = SystemProfile(
     region_variables={"s": "time", "m": "x", "rad": "theta"},
     plotted_variables=("x_dot", "x", "command", "time", "theta", "theta_dot"),
     residual_name="force on the cart",
-    black_box_factors={"cart_force": (None, "x_dot", "command"), "pivot_torque": (None, "theta_dot")},
+    smooth_function_factors={"cart_force": (None, "x_dot", "command"), "pivot_torque": (None, "theta_dot")},
     angle_sensor=(2, 3),
     sign_conventions=(
         Convention("the angle", -1, 1),
@@ -108,7 +108,7 @@ _VEHICLE = SystemProfile(
     region_variables={"s": "time", "m": "z"},
     plotted_variables=("x_dot", "thrust", "time", "z"),
     residual_name="force along x",
-    black_box_factors={},
+    smooth_function_factors={},
     max_rows=650,
     is_aircraft=True,
     window_rows=25,
@@ -119,7 +119,7 @@ _VEHICLE = SystemProfile(
     min_gain_share=0.3,
     refit_subsets=True,
     # With more functions to choose from, the largest log odds by chance are higher.
-    black_box_threshold=6.0,
+    smooth_function_threshold=6.0,
     compared_models=4,
     folds=2,
     beam_width=2,
@@ -167,7 +167,7 @@ def _own_profile(system: type[System]) -> SystemProfile:
         region_variables={"s": "time", **places},
         plotted_variables=(names[velocities[0]], names[positions[0]], system.actions[0].name, "time"),
         residual_name=system.loads[0].name.replace("_", " "),
-        black_box_factors={
+        smooth_function_factors={
             load.name: (None, names[velocity]) for load, velocity in zip(system.loads, velocities, strict=True)
         },
     )

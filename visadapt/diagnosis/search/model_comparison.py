@@ -84,7 +84,7 @@ def compare(search: Search) -> ModelComparison:
     functions = smooth_functions(CandidateModel(search.system, best.effects, search.rows), best.fits)
     alternatives = {effect: _alternatives(models, effect) for effect in best.effects}
     gained = float(best.fits.likelihood[0] - search.source.fits.likelihood[0])
-    threshold = search.profile.black_box_threshold
+    threshold = search.profile.smooth_function_threshold
     loads = tuple(load.name for load in search.system.loads)
     return ModelComparison(models, leftover[order[0]], functions, alternatives, gained, threshold, loads)
 

@@ -74,7 +74,7 @@ def _blocks(model: CandidateModel, fits: FitState) -> list[Block]:
         bumps = _bumps(values, rows.inside > 0)
         inner = bumps[:, :-1] * rows.inside[:, 1:, None]
         for k, load in enumerate(system.loads):
-            for factor in model.profile.black_box_factors.get(load.name, (None,)):
+            for factor in model.profile.smooth_function_factors.get(load.name, (None,)):
                 factors = 1.0 if factor is None else variables[factor][:, :-1, None]
                 drive = loads[..., k, None] * (factors * inner)[:, :, None]
                 out.append(Block(load.name, name, drive, no_reading))
