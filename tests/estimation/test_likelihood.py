@@ -1,5 +1,7 @@
 """Linearisation against autograd and finite steps; fits against the truth."""
 
+import math
+
 import pytest
 import torch
 
@@ -67,3 +69,13 @@ def test_a_batch_of_sets_is_fitted_as_each_alone(viscous):
         alone = Search(CartPole(), viscous, []).fit([start], CAREFUL)[0]
         torch.testing.assert_close(found.fits.theta, alone.fits.theta, atol=1e-4, rtol=1e-3)
         assert found.log_odds == pytest.approx(alone.log_odds, abs=0.05)
+
+
+def test_a_large_effect_is_found_from_a_source_that_took_positions_as_free_of_noise():
+    noise = (1e-3, 5e-3, 1e-3, 5e-3)
+    measured = ("x", "x_dot", "theta", "theta_dot")
+    rows = prepare(record([CartMass(scale=1.774)], 8, 120, measured=measured, noise=noise), CartPole()).rows
+    search = Search(CartPole(), rows, [CartMass])
+    assert float(search.source.fits.log_noise[0, 0]) < math.log(1e-4**2)
+    fits = search.single(CartMass).fits
+    torch.testing.assert_close((fits.log_noise[0] / 2).exp(), torch.tensor(noise).double(), rtol=0.1, atol=0)

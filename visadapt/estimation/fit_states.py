@@ -35,10 +35,16 @@ def initial_fit(system: System, rows: Segments) -> FitState:
     )
 
 
+START_LOG_NOISE = math.log(0.003**2)
+"""Least log variance of a measurement, in its unit squared, with which a fit with one more effect starts. Without the
+effect, readings of positions may have been taken as free of noise, and it cannot be told from those of velocities that
+they are not: the likelihood has a second maximum there."""
+
+
 def with_effect(base: FitState, values: Sequence[float]) -> FitState:
     """A start for the set of `base` with one more effect, which has these parameter values."""
     theta = torch.cat((base.theta, torch.tensor([list(values)], dtype=torch.float64)), 1)
-    return replace(base, theta=theta)
+    return replace(base, theta=theta, log_noise=base.log_noise.clamp(min=START_LOG_NOISE))
 
 
 def neutral(effect: type[Effect]) -> tuple[float, ...]:

@@ -60,8 +60,6 @@ class SystemProfile:
     min_gain: float = 1.0  # log likelihood that an effect must gain in the screening to be fitted
     min_gain_per_parameter: float = 0.0  # log likelihood required in addition for each of the effect's parameters
     min_gain_share: float = 0.0  # share of the best candidate's gain that a candidate must reach to be fitted
-    refit_subsets: bool = False
-    """whether a subset that was fitted before is fitted again, starting from the larger set's parameters"""
     smooth_function_threshold: float = 4.0  # log odds above which a smooth function counts as something unexplained
     compared_models: int = 8  # models, the most probable ones, that are compared
     folds: int = 4  # folds of the cross-validation
@@ -117,7 +115,6 @@ _VEHICLE = SystemProfile(
     check_sensors=False,
     min_gain_per_parameter=3.0,
     min_gain_share=0.3,
-    refit_subsets=True,
     # With more functions to choose from, the largest log odds by chance are higher.
     smooth_function_threshold=6.0,
     compared_models=4,

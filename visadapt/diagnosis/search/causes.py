@@ -55,8 +55,13 @@ def causes(
     """Every alternative as a cause; `gap_closed` holds each effect alone, the best set, and it less each effect."""
     out = []
     best = frozenset(comparison.best.names)
+    reopens = {e: gap_closed[best] - gap_closed[best - {e.name}] for e in comparison.best.effects}
+    alone = {e: gap_closed.get(frozenset({e.name}), math.nan) for e in comparison.best.effects}
+    carrying = [effect for effect, reopened in reopens.items() if not reopened < SLIGHT]
+    if not carrying and gap_closed[best] > SLIGHT:
+        # Each can stand in for another, so that none is missed: then the one carries that closes most by itself.
+        carrying = [max(alone, key=lambda effect: alone[effect])]
     for effect, group in zip(comparison.best.effects, groups, strict=True):
-        reopened = gap_closed[best] - gap_closed[best - {effect.name}]
         names = [one.effect.name for one in group]
         for one in group:
             fitted = estimates(search, one.compared.model, one.canonical)
@@ -66,8 +71,8 @@ def causes(
                     fitted if one.effect is one.canonical else _twin(search, one, fitted),
                     _probability(comparison, one, group),
                     gap_closed.get(frozenset({one.canonical.name}), math.nan),
-                    reopened,
-                    reopened < SLIGHT,
+                    reopens[effect],
+                    effect not in carrying,
                     tuple(name for name in names if name != one.effect.name),
                 )
             )

@@ -28,7 +28,7 @@ from visadapt.estimation.fit_states import (
     stacked,
     with_effect,
 )
-from visadapt.estimation.likelihood import FitState, fit
+from visadapt.estimation.likelihood import OUT_OF_REACH, FitState, fit
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.screening import Candidate, screen
 from visadapt.estimation.segments import Segments
@@ -40,6 +40,8 @@ MAX_EFFECTS = 6  # Effects in a set at most
 
 MAX_CANDIDATES, MAX_EXCHANGES = 8, 5
 """Effects that are fitted in addition to each set when sets grow, and when effects are exchanged."""
+
+LEADERS = 4  # Sets that are fitted before the others, where some fall far behind
 
 FIT_ALL_ABOVE = 100.0  # Log likelihood that the best effect promises, above which every effect is fitted alone
 
@@ -131,10 +133,12 @@ class Search:
         if not leads or leads[0].gain < FIT_ALL_ABOVE:
             return []
         values = {one.effect: one.values for one in leads}
-        # The leads first: the others need not be fitted to the end where they fall far behind.
         order = [*values, *(e for e in self.catalogue if e not in values)]
-        every = [((e,), with_effect(self.source.fits, values.get(e, neutral(e)))) for e in order]
-        return self.fit(every[:MAX_CANDIDATES], QUICK) + self.fit(every[MAX_CANDIDATES:], QUICK)
+        return self._in_turn([((e,), with_effect(self.source.fits, values.get(e, neutral(e)))) for e in order])
+
+    def _in_turn(self, starts: Sequence[tuple[Effects, FitState]]) -> list[ScoredModel]:
+        """Fit the first few sets, which promise most, then the others, which stop early where they fall far behind."""
+        return self.fit(starts[:LEADERS], QUICK) + self.fit(starts[LEADERS:], QUICK)
 
     def _settle(self) -> None:
         """Exchange, remove and fit carefully until the best set stays the best."""
@@ -162,16 +166,20 @@ class Search:
 
     def extend(self, bases: Sequence[ScoredModel], most: int = MAX_CANDIDATES) -> list[ScoredModel]:
         """Every base with one more effect, fitted unless it was, for the `most` best candidates of its screening."""
+        leads = [(base, candidate) for base in bases for candidate in self._candidates(base)[:most]]
+        promised = [float(base.fits.likelihood[0]) + candidate.gain for base, candidate in leads]
         known, starts = [], {}
-        for base in bases:
-            for candidate in self._candidates(base)[:most]:
-                effects = (*base.effects, candidate.effect)
-                key = _key(effects)
-                if key in self.fitted:
-                    known.append(self.fitted[key])
-                elif key not in starts:
-                    starts[key] = effects, with_effect(base.fits, candidate.values)
-        return known + self.fit(list(starts.values()), QUICK)
+        for k in sorted(range(len(leads)), key=lambda k: -promised[k]):
+            base, candidate = leads[k]
+            effects = (*base.effects, candidate.effect)
+            key = _key(effects)
+            if key in self.fitted:
+                known.append(self.fitted[key])
+            elif key not in starts:
+                starts[key] = effects, with_effect(base.fits, candidate.values)
+        far_behind = leads and max(promised) - min(promised) > OUT_OF_REACH
+        every = list(starts.values())
+        return known + (self._in_turn(every) if far_behind else self.fit(every, QUICK))
 
     def _candidates(self, base: ScoredModel) -> list[Candidate]:
         """Effects whose screening promises enough to fit them in addition to a set, the largest gain first."""
@@ -197,9 +205,8 @@ class Search:
 
     def neighbours(self, centre: ScoredModel) -> None:
         """Fit the sets with one effect removed, with one exchanged for another, and with two exchanged for one."""
-        smaller = [_without(centre, [removed]) for removed in centre.effects]
-        known = set() if self.profile.refit_subsets else self.fitted.keys()
-        self.fit([each for each in smaller if _key(each[0]) not in known], QUICK)
+        # Sets that were fitted before too: from the larger set's parameters a fit may reach what it did not alone.
+        self.fit([_without(centre, [removed]) for removed in centre.effects], QUICK)
         exchanges = []
         for removed in (*combinations(centre.effects, 1), *combinations(centre.effects, 2)):
             # Along the states of the whole set what is removed shows as a disturbance, without a fit of what is left.
@@ -210,8 +217,8 @@ class Search:
             rest = [e for e in self.catalogue if e not in centre.effects]
             screened = screen(self.system, kept, fits, self.rows, rest, self.jobs)
             for candidate in self._promising(screened)[:MAX_EXCHANGES]:
-                process = centre.fits.log_process.clamp(min=EXCHANGE_LOG_PROCESS)
-                start = replace(with_effect(fits, candidate.values), log_process=process)
+                process, noise = centre.fits.log_process.clamp(min=EXCHANGE_LOG_PROCESS), centre.fits.log_noise
+                start = replace(with_effect(fits, candidate.values), log_process=process, log_noise=noise)
                 exchanges.append(((*kept, candidate.effect), start))
         self.fit(exchanges, QUICK)
 
