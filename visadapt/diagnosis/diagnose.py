@@ -45,7 +45,8 @@ MIN_GAP_CLOSED = 0.95
 """Share of the gap that the causes must close to count as identified although something remains unexplained."""
 
 CLEAR_OF_NOISE = 3.0
-"""Error of the corrected predictions over the noise, above which the share of the gap closed decides the verdict."""
+"""Error of predictions over the noise, above which there is a gap, and above which, with the causes, the share of it
+that they close decides the verdict."""
 
 AT_BOUND = 1e-3  # Distance from an end of its range, as a share of it, within which a strength is at that end
 
@@ -190,7 +191,7 @@ def _verdict(
         return NO_GAP  # the source predicts as well as the noise allows
     carrying = without_slight(explaining)
     if not carrying:
-        return UNEXPLAINED if unexplained else NO_GAP
+        return UNEXPLAINED if unexplained or gap.before > CLEAR_OF_NOISE * gap.floor else NO_GAP
     return AMBIGUOUS if any(cause.indistinguishable_from for cause in carrying) else IDENTIFIED
 
 
