@@ -37,6 +37,13 @@ MIN_JITTER = 1e-3
 """Deviation of stamps from even spacing, in periods, above which it is decided whether it is that of the readings."""
 
 
+def _likelihood(system: System, rows: Segments) -> float:
+    """Log likelihood of the source's fit; without velocities whose positions are measured, which may be derived."""
+    position_of = profile_of(system).position_of
+    kept = [k for k, channel in enumerate(rows.channels) if position_of.get(channel) not in rows.channels]
+    return float(Search(system, rows.with_channels(kept), ()).source.fits.likelihood[0])
+
+
 def _evenly_spaced(stamps: Tensor) -> Tensor:
     """Stamps (T,), in s, of a steady clock that is closest to these."""
     index = torch.arange(len(stamps), dtype=stamps.dtype)
@@ -77,22 +84,17 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
 
     rows, raw, thinning = windows(states)
     warnings: list[str] = []
-    source = None
     read, stamps = stamps, [_evenly_spaced(each) for each in stamps]
     if any(float((a - b).abs().max()) > MIN_JITTER * recording.period for a, b in zip(read, stamps, strict=True)):
-        source = Search(system, rows, ()).source.fits
         steady, steady_raw, _ = windows(states)
-        steady_source = Search(system, steady, ()).source.fits
-        if float(steady_source.likelihood[0]) > float(source.likelihood[0]):
-            rows, raw, source = steady, steady_raw, steady_source
+        if _likelihood(system, steady) > _likelihood(system, rows):
+            rows, raw = steady, steady_raw
             warnings.append("the stamps jitter, the readings do not: they were taken to be evenly spaced")
         else:
             stamps = read
     if not profile.check_sensors:
-        return PreparedRecording(rows, raw, repeats, None, (*warnings, *thinning), source)
-    if source is None:
-        source = Search(system, rows, ()).source.fits
-    unchecked = rows
+        return PreparedRecording(rows, raw, repeats, None, (*warnings, *thinning))
+    unchecked, source = rows, Search(system, rows, ()).source.fits
     defect = sensor_checks.angle_defect(system, rows, source)
     band = None
     if defect is not None:
