@@ -58,7 +58,7 @@ def causes(
     reopens = {e: gap_closed[best] - gap_closed[best - {e.name}] for e in comparison.best.effects}
     alone = {e: gap_closed.get(frozenset({e.name}), math.nan) for e in comparison.best.effects}
     carrying = [effect for effect, reopened in reopens.items() if not reopened < SLIGHT]
-    if not carrying and gap_closed[best] > SLIGHT:
+    if best and not carrying and gap_closed[best] > SLIGHT:
         # Each can stand in for another, so that none is missed: then the one carries that closes most by itself.
         carrying = [max(alone, key=lambda effect: alone[effect])]
     for effect, group in zip(comparison.best.effects, groups, strict=True):
