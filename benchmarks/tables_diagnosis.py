@@ -72,7 +72,7 @@ def _check(rows: Rows, kinds: tuple[str, ...]) -> Lines:
     found = {(row["kind"], row["diagnoser"], row["measure"]): row for row in rows}
     run = {key[:2] for key in found}
     columns = [(kind, name) for kind in kinds for name in DIAGNOSERS if (kind, name) in run]
-    header = ["sealed check", *(f"{kind.replace('_', ' ')}: {name}" for kind, name in columns)]
+    header = ["sealed check", *(f"{kind.removesuffix('-all').replace('_', ' ')}: {name}" for kind, name in columns)]
     return [
         header,
         *([key, name, *(_cell(found.get((*column, key))) for column in columns)] for key, name in MEASURES.items()),
