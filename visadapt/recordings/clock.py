@@ -119,11 +119,7 @@ def _clocked(part: RawEpisode, note: Note) -> RawEpisode:
         return replace(part, time=part.time[0] + period * index)
     steps = np.diff(part.time)
     if np.ptp(steps) > UNSTEADY_PERIODS * period:
-        note(
-            f"an unsteady clock: its steps last {steps.min():.3g} to {steps.max():.3g} s; every row and command counts "
-            "at its own time",
-            part.source,
-        )
+        note(f"an unsteady clock: its steps last {steps.min():.3g} to {steps.max():.3g} s", part.source)
     return part
 
 
