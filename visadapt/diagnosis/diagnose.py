@@ -132,7 +132,8 @@ def diagnose(
     gap_closed = {names: errors.closed_by(each) for names, each in predicted.items()}
 
     explaining = (*repeat_causes, *causes(search, comparison, groups, gap_closed))
-    verdict = _verdict(comparison, gap, improvable, explaining, bool(repeats))
+    unexplained = comparison.unexplained(improvable)
+    verdict = _verdict(comparison, gap, unexplained, improvable, explaining, bool(repeats))
     found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
     before, after = disturbances(search, comparison)
     regions = _regions(found, before if found else after, effects, profile.region_variables, seed)
@@ -152,7 +153,7 @@ def diagnose(
         warnings=(
             *recording.warnings,
             *prepared.warnings,
-            *_warnings(comparison, verdict, improvable),
+            *_warnings(comparison, verdict, unexplained),
             *_at_bounds(comparison),
         ),
         figures=figure_data(search, source, corrected, errors, before, after, regions),
@@ -171,15 +172,20 @@ def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effec
 
 
 def _verdict(
-    comparison: ModelComparison, gap: Gap, improvable: bool, explaining: Sequence[Cause], repeats: bool
+    comparison: ModelComparison,
+    gap: Gap,
+    unexplained: bool,
+    improvable: bool,
+    explaining: Sequence[Cause],
+    repeats: bool,
 ) -> str:
     """The verdict where these causes are what explains the gap best.
 
     Args:
+        unexplained: they leave something.
         improvable: a black box beside them clearly closes more of the gap.
         repeats: readings are repeated.
     """
-    unexplained = comparison.unexplained(improvable)
     if unexplained:
         # Where the noise is low, any model of a real machine leaves something significant: then the share of the gap
         # that is closed decides, otherwise whether what is unexplained is negligible.
@@ -245,8 +251,8 @@ def _at_bounds(comparison: ModelComparison) -> list[str]:
     ]
 
 
-def _warnings(comparison: ModelComparison, verdict: str, improvable: bool) -> list[str]:
-    if verdict in (IDENTIFIED, AMBIGUOUS) and comparison.unexplained(improvable):
+def _warnings(comparison: ModelComparison, verdict: str, unexplained: bool) -> list[str]:
+    if verdict in (IDENTIFIED, AMBIGUOUS) and unexplained:
         first = comparison.functions[0]
         return [
             "the causes close the gap but do not explain everything: an unexplained disturbance acts as "

@@ -160,7 +160,7 @@ def _own_profile(system: type[System]) -> SystemProfile:
         position_of=dict(zip(velocities, positions, strict=True)),
         sensors=tuple((column,) for column in range(len(names))),
         quaternion=(),
-        initial_variance=tuple((FIRST_STATE_SHARE * max(abs(s.low), abs(s.high))) ** 2 for s in system.states),
+        initial_variance=tuple((FIRST_STATE_SHARE * s.largest) ** 2 for s in system.states),
         region_variables={"s": "time", **places},
         plotted_variables=(names[velocities[0]], names[positions[0]], system.actions[0].name, "time"),
         residual_name=system.loads[0].name.replace("_", " "),

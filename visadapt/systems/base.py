@@ -26,6 +26,11 @@ class Variable:
     low: float
     high: float
 
+    @property
+    def largest(self) -> float:
+        """The largest size in its range."""
+        return max(abs(self.low), abs(self.high))
+
 
 class System(ABC):
     """Physics of the source simulator in continuous time, batched and differentiable.

@@ -61,10 +61,12 @@ def causes(
     if best and not carrying and gap_closed[best] > SLIGHT:
         # Each can stand in for another, so that none is missed: then the one carries that closes most by itself.
         carrying = [max(alone, key=lambda effect: alone[effect])]
+    models = {one.compared.model.names: one.compared.model for group in groups for one in group}
+    found = {names: estimates(search, model) for names, model in models.items()}
     for effect, group in zip(comparison.best.effects, groups, strict=True):
         names = [one.effect.name for one in group]
         for one in group:
-            fitted = estimates(search, one.compared.model, one.canonical)
+            fitted = found[one.compared.model.names][one.canonical]
             out.append(
                 Cause(
                     one.effect.name,
@@ -89,18 +91,15 @@ def _twin(search: Search, one: Alternative, fitted: Mapping[str, Estimate]) -> M
     """The parameters with which a twin has the same effect."""
     if [(p.name, p.unit) for p in one.effect.table] == [(p.name, p.unit) for p in one.canonical.table]:
         return fitted
-    return estimates(search, search.exchange(one.compared.model, one.canonical, one.effect), one.effect)
+    return estimates(search, search.exchange(one.compared.model, one.canonical, one.effect))[one.effect]
 
 
-def estimates(search: Search, model: ScoredModel, effect: type[Effect]) -> dict[str, Estimate]:
-    """Maximum likelihood estimates of one effect's parameters, with 90 % intervals that hold under misfit as well."""
+def estimates(search: Search, model: ScoredModel) -> dict[type[Effect], dict[str, Estimate]]:
+    """Maximum likelihood estimates of each effect's parameters, with 90 % intervals that hold under misfit as well."""
     deviation = deviations(CandidateModel(search.system, model.effects, search.rows), model.fits)
-    first = sum(len(e.table) for e in model.effects[: model.effects.index(effect)])
     covered = spans(search.system, search.rows, model.fits.state[0])
-    out = {}
-    for k, parameter in enumerate(effect.table, first):
-        out[parameter.name] = _estimate(parameter, float(model.fits.theta[0, k]), float(deviation[k]), covered)
-    return out
+    fitted = zip(model.fits.theta[0].tolist(), deviation.tolist(), strict=True)
+    return {e: {p.name: _estimate(p, *next(fitted), covered) for p in e.table} for e in model.effects}
 
 
 def _estimate(

@@ -66,12 +66,12 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
     longest = max(profile.window_rows, round(2 * PREDICTION_TIME / recording.period))
 
     def windows(
-        measured: Sequence[Tensor], stretches: Sequence[tuple[int, int, int]] | None = None
+        measured: Sequence[Tensor], clock: Sequence[Tensor], stretches: Sequence[tuple[int, int, int]] | None = None
     ) -> tuple[Segments, Segments, list[str]]:
         """`rows` and `raw` of episodes or stretches of these, and a warning if not all windows are used."""
         all_used = [torch.ones_like(m) for m in measured]
         rows, raw = (
-            cut(measured, valid, commands, stamps, channels, recording.period, longest, stretches)
+            cut(measured, valid, commands, clock, channels, recording.period, longest, stretches)
             for valid in (repeats.used, all_used)
         )
         count, length = rows.shape
@@ -82,16 +82,14 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
         warning = f"of {count} windows of up to {length} rows, {most}, spread evenly over the recording, were used"
         return rows.select(chosen), raw.select(chosen), [warning]
 
-    rows, raw, thinning = windows(states)
+    rows, raw, thinning = windows(states, stamps)
     warnings: list[str] = []
-    read, stamps = stamps, [_evenly_spaced(each) for each in stamps]
-    if any(float((a - b).abs().max()) > MIN_JITTER * recording.period for a, b in zip(read, stamps, strict=True)):
-        steady, steady_raw, _ = windows(states)
+    even = [_evenly_spaced(each) for each in stamps]
+    if any(float((a - b).abs().max()) > MIN_JITTER * recording.period for a, b in zip(stamps, even, strict=True)):
+        steady, steady_raw, _ = windows(states, even)
         if _likelihood(system, steady) > _likelihood(system, rows):
-            rows, raw = steady, steady_raw
+            rows, raw, stamps = steady, steady_raw, even
             warnings.append("the stamps jitter, the readings do not: they were taken to be evenly spaced")
-        else:
-            stamps = read
     if not profile.check_sensors:
         return PreparedRecording(rows, raw, repeats, None, (*warnings, *thinning))
     unchecked, source = rows, Search(system, rows, ()).source.fits
@@ -105,7 +103,7 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
             # A potentiometer's dead zone has an unknown width, so windows end at it, and the angle runs from one of its
             # edges to the other, so that an error of the sensor's scale is symmetric about upright.
             states = [sensor_checks.on_one_turn(values, angle, 0.5 * (band[0] + band[1])) for values in states]
-            rows, raw, thinning = windows(states, sensor_checks.stretches_without(bad))
+            rows, raw, thinning = windows(states, stamps, sensor_checks.stretches_without(bad))
         else:
             rows = sensor_checks.without_angles(rows, profile.angle_sensor, *band)
         warnings.append(

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from visadapt.effects import actuation
 from visadapt.effects.base import ActuationEffect, Effect, Parameter
-from visadapt.effects.own.statement import ALL_COMMANDS, ALL_SENSORS, Made, largest
+from visadapt.effects.own.statement import ALL_SENSORS, Made, delay_of_all
 from visadapt.systems import System, Variable
 from visadapt.systems.integrators import Duration
 
@@ -33,13 +33,12 @@ class OneCommand(ActuationEffect):
 
 def on_commands(system: type[System]) -> Iterator[Made]:
     """Those on each command, and a delay of all."""
-    delays = {"indistinguishable_from": (f"{ALL_SENSORS}.measurement_delay",)}
-    settled = {f"{ALL_SENSORS}.measurement_delay": actuation.ActuatorDelay.settled_by["measurement_delay"]}
-    alone = len(system.actions) == 1
-    if not alone:
-        yield f"{ALL_COMMANDS}.actuator_delay", actuation.ActuatorDelay, {**delays, "settled_by": settled}
+    twin = f"{ALL_SENSORS}.measurement_delay"
+    settled = {twin: actuation.ActuatorDelay.settled_by["measurement_delay"]}
+    delay_in_common = {"indistinguishable_from": (twin,), "settled_by": settled}
+    if len(system.actions) > 1:
+        yield delay_of_all(system), actuation.ActuatorDelay, delay_in_common
     for index, action in enumerate(system.actions):
-        most = largest(action)
         for base in (
             actuation.ActuatorDelay,
             actuation.ActuatorBacklash,
@@ -49,13 +48,12 @@ def on_commands(system: type[System]) -> Iterator[Made]:
             actuation.ActuatorBias,
             actuation.ActuatorLag,
         ):
-            table = tuple(_in_units_of(parameter, action, most) for parameter in base.table)
+            table = tuple(_in_units_of(parameter, action) for parameter in base.table)
             says = _SAYS.get(base, (base.__doc__ or "").partition("\n\n")[0])
-            attributes = {"table": table, "action": index, "__doc__": says}
-            if alone and base is actuation.ActuatorDelay:
-                attributes |= {**delays, "settled_by": settled}
-            kind = type(base.__name__, (OneCommand, base), {})
-            yield f"{action.name}.{base.name}", kind, attributes
+            name, attributes = f"{action.name}.{base.name}", {"table": table, "action": index, "__doc__": says}
+            if name == delay_of_all(system):
+                attributes |= delay_in_common
+            yield name, type(base.__name__, (OneCommand, base), {}), attributes
 
 
 _SAYS: dict[type[Effect], str] = {
@@ -65,10 +63,11 @@ _SAYS: dict[type[Effect], str] = {
 """What an effect does, where the library's words are of a cart-pole."""
 
 
-def _in_units_of(parameter: Parameter, action: Variable, most: float) -> Parameter:
+def _in_units_of(parameter: Parameter, action: Variable) -> Parameter:
     """A parameter in units of the command, in those of an action; a scale and a time stay as they are."""
     if parameter.unit != "1" or parameter.name == "scale":
         return parameter
+    most = action.largest
     neutral = None if parameter.neutral is None else parameter.neutral * most
     return Parameter(
         parameter.name,

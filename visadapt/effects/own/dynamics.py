@@ -9,7 +9,7 @@ from dataclasses import fields
 from visadapt.effects import laws
 from visadapt.effects.base import Parameter, Role
 from visadapt.effects.own.added_inertia import AddedInertia, inertia_of
-from visadapt.effects.own.statement import Made, largest
+from visadapt.effects.own.statement import Made
 from visadapt.effects.parameters import ParameterScale
 from visadapt.systems import System, Variable
 
@@ -43,7 +43,7 @@ def _per(load: Variable, variable: Variable, power: int = 1) -> str:
 def _laws(
     load: Variable, position: Variable, velocity: Variable
 ) -> dict[str, tuple[type[laws.JointEffect], str, tuple[Parameter, ...]]]:
-    most, fastest, farthest = (largest(variable) for variable in (load, velocity, position))
+    most, fastest, farthest = (variable.largest for variable in (load, velocity, position))
     size = "torque" if load.unit == "N m" else "force"
     q, v, unit = position.name, velocity.name, load.unit
 

@@ -6,28 +6,25 @@ from collections.abc import Iterator
 
 from visadapt.effects import sensing
 from visadapt.effects.base import Parameter
-from visadapt.effects.own.statement import ALL_COMMANDS, ALL_SENSORS, Made, largest
+from visadapt.effects.own.statement import ALL_SENSORS, Made, delay_of_all
 from visadapt.systems import System
 
 
 def on_sensors(system: type[System]) -> Iterator[Made]:
     """Offset and scale of each sensor, and a delay of all."""
     rates = dict(system.coordinates)
-    delayed = f"{ALL_COMMANDS}.actuator_delay"
-    if len(system.actions) == 1:
-        delayed = f"{system.actions[0].name}.actuator_delay"
     yield (
         f"{ALL_SENSORS}.measurement_delay",
         sensing.MeasurementDelay,
         {
             "positions": list(rates),
             "velocities": list(rates.values()),
-            "indistinguishable_from": (delayed,),
+            "indistinguishable_from": (delay_of_all(system),),
         },
     )
     for column, state in enumerate(system.states):
         name, unit = state.name, state.unit
-        most = 0.2 * largest(state)
+        most = 0.2 * state.largest
         yield (
             f"{name}.sensor_offset",
             sensing.SensorOffset,

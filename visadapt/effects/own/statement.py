@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from visadapt.effects.base import Effect
-from visadapt.systems import Variable
+from visadapt.systems import System
 
 ALL_COMMANDS, ALL_SENSORS = "commands", "sensors"
 """Before the dot in the name of an effect on all commands, or on all readings."""
@@ -14,6 +14,6 @@ Made = tuple[str, type[Effect], dict[str, Any]]
 """An effect's name, the class it derives from, and its attributes."""
 
 
-def largest(variable: Variable) -> float:
-    """The largest size in a variable's range."""
-    return max(abs(variable.low), abs(variable.high))
+def delay_of_all(system: type[System]) -> str:
+    """Name of the delay that all commands have in common, which passive data cannot tell from that of all sensors."""
+    return f"{system.actions[0].name if len(system.actions) == 1 else ALL_COMMANDS}.actuator_delay"
