@@ -46,15 +46,22 @@ class Policy(nn.Module):
         nn.init.zeros_(self.feedforward.weight)
         self.residual: Residual | None = None
 
-    def plan(self, history: History, correction: Tensor) -> Tensor:
-        """Commands (B, HORIZON * n_action) before the last tanh, from a history and the correction (B, n_state)."""
+    def embed(self, history: History) -> Tensor:
+        """What a plan is made of beside the correction, (B, inputs): the features of frames, or the history itself."""
         raise NotImplementedError
+
+    def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:
+        """Commands (B, HORIZON * n_action) before the last tanh, from the inputs and the correction (B, n_state)."""
+        raise NotImplementedError
+
+    def decide(self, inputs: Tensor, correction: Tensor) -> Tensor:
+        """Planned actions (B, HORIZON, n_action)."""
+        out = (self.plan(inputs, correction) + self.feedforward(correction)).tanh()
+        return out.unflatten(-1, (HORIZON, self.n_action))
 
     def forward(self, history: History) -> Tensor:
         """Planned actions (B, HORIZON, n_action)."""
-        correction = self.correction(history)
-        out = (self.plan(history, correction) + self.feedforward(correction)).tanh()
-        return out.unflatten(-1, (HORIZON, self.n_action))
+        return self.decide(self.embed(history), self.correction(history))
 
     def act(self, history: History) -> Tensor:
         """The action (B, n_action) to execute now."""

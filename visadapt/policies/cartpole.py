@@ -30,8 +30,12 @@ class ImagePolicy(Policy):
         self.out = nn.Linear(64, HORIZON * n_action)
         ignore_correction(self.hidden, n_state)
 
-    def plan(self, history: History, correction: Tensor) -> Tensor:
-        out: Tensor = self.out(self.hidden(torch.cat((self.encoder(history), correction), 1)).relu())
+    def embed(self, history: History) -> Tensor:
+        features: Tensor = self.encoder(history)
+        return features
+
+    def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:
+        out: Tensor = self.out(self.hidden(torch.cat((inputs, correction), 1)).relu())
         return out
 
 
@@ -47,8 +51,10 @@ class StatePolicy(Policy):
         self.rest = mlp(32, 64, 64, 32, HORIZON * n_action)
         ignore_correction(self.first, n_state)
 
-    def plan(self, history: History, correction: Tensor) -> Tensor:
+    def embed(self, history: History) -> Tensor:
         states, actions = history.observations, history.actions
-        seen = (states.flatten(1), actions.flatten(1)) if self.with_history else (states[:, -1],)
-        out: Tensor = self.rest(self.first(torch.cat((*seen, correction), 1)).tanh())
+        return torch.cat((states.flatten(1), actions.flatten(1)), 1) if self.with_history else states[:, -1]
+
+    def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:
+        out: Tensor = self.rest(self.first(torch.cat((inputs, correction), 1)).tanh())
         return out

@@ -21,7 +21,7 @@ from visadapt.recordings import Episode
 from visadapt.setups.base import Setup
 from visadapt.setups.policy_file import residual_for
 from visadapt.systems import CartPole
-from visadapt.tasks.balance import CENTRED_CARTPOLE, PAPER_CARTPOLE, Balance
+from visadapt.tasks.balance import CENTRED_CARTPOLE, PAPER_CARTPOLE, Balance, Cost, RegulatorCost, cost_to_go
 from visadapt.weights import shipped
 from visadapt.world import World
 
@@ -52,28 +52,36 @@ FROM_STATES = SetupSettings(
 
 CONTRAST = 0.2  # Grey levels, of 1, that frames are divided by before the networks see them
 
-REACH = 1.45  # m to either side that a camera has to see for `FROM_FRAMES`, of the drawn cart-pole, which sees 1.5 m
+REACH = 1.45  # m to either side that a camera has to see for `from_frames`, of the drawn cart-pole, which sees 1.5 m
 
-FROM_FRAMES = SetupSettings(
-    source=TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500),
-    tuning=TuneSettings(
-        Balance(
-            CENTRED_CARTPOLE,
-            start_spread=(0.3, 0.1, 0.1, 0.1),
-            # A kick would look like a force to the residual, which would go on pushing.
-            kick=(0.0, 0.0, 0.0, 0.0),
-            divergence=(1.2, 2.0, 0.25, 3.0),
-            first_divergence=0.4,
+REST_WEIGHTS = (1.0, 6.0, 1.0, 0.1)
+"""of the squared distances from rest in tuning: above all the cart, which is scored by its speed, is not to move"""
+
+
+def from_frames(source: World) -> SetupSettings:
+    """How the cart-pole that is shown frames learns, tuned for a source."""
+    to_go = cost_to_go(source, REST_WEIGHTS, Cost.action)
+    return SetupSettings(
+        source=TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500),
+        tuning=TuneSettings(
+            Balance(
+                RegulatorCost(REST_WEIGHTS, to_go=to_go),
+                start_spread=(0.3, 0.1, 0.1, 0.1),
+                # A kick would look like a force to the residual, which would go on pushing.
+                kick=(0.0, 0.0, 0.0, 0.0),
+                divergence=(1.2, 2.0, 0.25, 3.0),
+            ),
+            iterations=1200,
+            batch=256,
+            longest=60,
+            streams=32,
+            every=10,
+            curriculum=False,
+            recorded=0.8,
         ),
-        iterations=50,
-        batch=32,
-        learning_rate=2e-4,
-        longest=25,
-        recorded=0.8,
-    ),
-    observations="camera",
-    perception=PerceptionSettings(),
-)
+        observations="camera",
+        perception=PerceptionSettings(),
+    )
 
 
 def cartpole_states(
@@ -104,7 +112,7 @@ def cartpole_frames(
         source: the physics known beforehand, whose states begin with x, x_dot, theta, theta_dot; without it, the
             paper's CartPole, 0.05 s between commands.
         renderer: states to frames, trained, or the file of one; without it, that of the drawn cart-pole.
-        settings: how the policy learns; without it, `FROM_FRAMES`, narrowed to what the renderer's camera sees.
+        settings: how the policy learns; without it, `from_frames`, narrowed to what the renderer's camera sees.
 
     Raises:
         RendererError: the file holds no layered renderer.
@@ -113,7 +121,7 @@ def cartpole_frames(
     seen = renderer if isinstance(renderer, LayeredRenderer) else _load(Path(renderer or shipped("renderer")))
     seen.requires_grad_(False).eval()
     tracker = Tracker(seen, source)
-    settings = settings or _narrowed(FROM_FRAMES, seen)
+    settings = settings or _narrowed(from_frames(source), seen)
     perception = settings.perception or PerceptionSettings()
 
     def observe(state: Tensor) -> Tensor:
