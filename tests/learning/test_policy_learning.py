@@ -255,6 +255,23 @@ class TestReplay:
         assert Stepped.steps == 4 * 100
         assert score(policy, SyntheticTarget(), 20, 0, 100).survived == 20
 
+    def test_on_frames_the_cost_falls_and_the_encoder_stays_as_it_is(self):
+        torch.manual_seed(0)
+        renderer = small_renderer()
+        network = image_residual_network(renderer)
+        policy = ImagePolicy(background(renderer), CONTRAST)
+        policy.residual = Residual(network, torch.tensor([0.0, 0.05, 0.0, -0.05]))
+        with torch.no_grad():
+            network.head.weight[:, 0] = 1.0  # the further the cart is on the right, the more it is pushed
+        world = World(CartPole(), [policy.residual])
+        before = {key: value.clone() for key, value in policy.encoder.state_dict().items()}
+        task = Balance(PAPER_CARTPOLE, start_spread=(0.5, 0.3, 0.05, 0.1), kick=(0.0,) * 4)
+        settings = TuneSettings(task, 200, 64, 1e-2, longest=20, streams=8, every=10, curriculum=False)
+        losses = tune(policy, world, observing(renderer), settings, torch.Generator().manual_seed(0))
+        assert sum(losses[-20:]) < 0.7 * sum(losses[:20])
+        for key, value in before.items():
+            assert torch.equal(value, policy.encoder.state_dict()[key]), key
+
 
 class TestResuming:
     @pytest.mark.parametrize("more", [{}, {"streams": 3, "every": 2}])

@@ -41,9 +41,9 @@ class TuneSettings:
     learning_rate: float = 1e-3
     longest: int = 150  # steps after which a stream starts anew
     streams: int | None = None
-    """number of streams where that is not `batch`: what they pass through is then kept, and each batch is drawn from all
-    of it, so that few steps are simulated, and few frames drawn. An encoder stays as it is, and the residual's
-    correction is held over a plan"""
+    """number of streams where that is not `batch`: what they pass through is then kept, and each batch is drawn from
+    all of it, so that few steps are simulated and few frames rendered; a policy's encoder stays as it is, and the
+    residual's correction is constant over a plan"""
     every: int = 1  # iterations between two steps of the streams
     curriculum: bool = True
     """whether streams start, and are kept, closer to the reference at first; not for a trained policy"""
@@ -179,7 +179,7 @@ def visit(policy: Policy, world: World, stream: StreamState, shown: History) -> 
 
 
 def held(world: World, at: WorldState, plan: Tensor, correction: Tensor) -> Tensor:
-    """The states (B, K, n_state) that follow a plan (B, K, n_action) while the correction (B, n_state) stays as it is."""
+    """The states (B, K, n_state) that follow a plan (B, K, n_action) under a constant correction (B, n_state)."""
     states = []
     for k in range(plan.shape[1]):
         at = world.step(at, plan[:, k], correction=correction)

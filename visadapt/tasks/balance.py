@@ -55,7 +55,7 @@ class SettlingCost(Cost):
 
 @dataclass(frozen=True)
 class RegulatorCost(Cost):
-    """The distances to the goal itself, and what it costs to come to rest from the last planned state, s_{t+K}' V s_{t+K}.
+    """The distances to the goal itself, and what coming to rest from the last planned state costs: s_{t+K}' V s_{t+K}.
 
     With the V of `cost_to_go` the plan of K steps that costs least begins like one without end, as K had no end. A
     plan of half a second that leaves off where it likes lets a force push the cart instead.
@@ -72,14 +72,15 @@ class RegulatorCost(Cost):
 
 
 def cost_to_go(source: World, state: tuple[float, ...], action: float) -> tuple[tuple[float, ...], ...]:
-    """V of `RegulatorCost` with these weights, for the source linearised at rest.
+    """V of `RegulatorCost` with these weights, for the source without effects, linearised at rest.
 
     s' V s is the least sum of the costs of all states and commands that follow a state s, by the discrete algebraic
     Riccati equation, iterated from V = 0.
     """
+    bare = World(source.system, (), source.period, source.integrator, source.substeps)
     rest = torch.zeros(1, len(state), dtype=torch.float64)
-    still = rest.new_zeros(1, source.substeps, len(source.system.actions))
-    step = linearise_step(source, source.values.to(rest), rest[:, 0], rest, still, by_command=True)
+    still = rest.new_zeros(1, bare.substeps, len(bare.system.actions))
+    step = linearise_step(bare, bare.values.to(rest), rest[:, 0], rest, still, by_command=True)
     a, b, weights = step.by_state[0], step.by_command[0], torch.diag(rest.new_tensor(state))
     price, to_go = action * torch.eye(b.shape[1]).to(b), torch.zeros_like(weights)
     for _ in range(RICCATI_STEPS):
