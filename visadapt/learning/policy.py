@@ -4,6 +4,9 @@ A batch of simulated streams runs under the policy. At each iteration the policy
 (physics, effects, residual, renderer) carries them out, and the gradient of the cost flows back through all of it.
 Then every stream takes the first planned step. A stream further than delta_div from the reference starts anew, and
 delta_div grows as training goes on, so the policy learns to recover from ever further off.
+
+Where what streams pass through is kept (`TuneSettings.streams`), the gradient flows through physics and effects alone:
+the residual's correction is held over a plan, and no frame is rendered along it.
 """
 
 from __future__ import annotations
