@@ -119,7 +119,7 @@ class Sensitivity:
             return theta[:, None].expand(-1, windows * used, -1).flatten(0, 1)
 
         if issubclass(effect, SensingEffect):
-            read = model.measure(per_row(length), spread(state)).reshape(count, windows, length, -1)
+            read = model.measure(theta, state.expand(count, *state.shape))
             reading = -(read[1:] - read[:1]).movedim(0, -1) * rows.used[..., None]
             return self.innovations.response(torch.zeros_like(state[:, 1:, :, None]), reading)
         acted = model.commands(theta if model.acting_parameters else theta[:1])[:, :, :-1]

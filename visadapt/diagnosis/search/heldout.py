@@ -138,8 +138,7 @@ def rollout_errors(model: CandidateModel, fits: FitState, black_box: BlackBox | 
     error, valid = torch.zeros(shape, dtype=torch.float64), torch.zeros(shape, dtype=torch.float64)
     for h in range(horizon + 1):
         ends = predicted[:, : length - h, h]
-        read = model.measure(fits.theta[0], ends.flatten(0, 1))
-        error[h, :, h:] = read.reshape(windows, length - h, -1) - rows.measured[:, h:]
+        error[h, :, h:] = model.measure(fits.theta[0], ends, first=h) - rows.measured[:, h:]
         valid[h, :, h:] = rows.used[:, h:]
     return RolloutErrors(error * valid, valid, predicted)
 
