@@ -135,6 +135,7 @@ def diagnose(
     unexplained = comparison.unexplained(improvable)
     verdict = _verdict(comparison, gap, unexplained, improvable, explaining, bool(repeats))
     found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
+    carrying = {cause.effect for cause in without_slight(found)}
     before, after = disturbances(search, comparison)
     regions = _regions(found, before if found else after, effects, profile.region_variables, seed)
     return Diagnosis(
@@ -155,6 +156,7 @@ def diagnose(
             *prepared.warnings,
             *_warnings(comparison, verdict, unexplained),
             *_at_bounds(comparison),
+            *(f"{one.name}: {one.caveat}" for one in best.effects if one.caveat and one.name in carrying),
         ),
         figures=figure_data(search, source, corrected, errors, before, after, regions),
         policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, best),

@@ -94,6 +94,8 @@ class Effect(nn.Module):
     """Systems on which passive data do separate it from those effects."""
     settled_by: ClassVar[Mapping[str, str]] = {}
     """The experiment that tells this effect from another one, by the other's name; stated on one of the two."""
+    caveat: ClassVar[str] = ""
+    """What else may be meant where a recording shows this effect: a warning of the diagnosis."""
     order: ClassVar[int] = 1000
     """Position among the effects of its stage, which act in ascending order; without one, it acts last."""
     abrupt: ClassVar[bool] = False
