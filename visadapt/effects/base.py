@@ -221,10 +221,10 @@ class DynamicsEffect(Effect):
         """
         return torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)
 
-    def dry_friction(self, time: Tensor, state: Tensor, system: System) -> Tensor | None:
+    def dry_friction(self, time: Tensor, state: Tensor, command: Tensor, system: System) -> Tensor | None:
         """The largest dry friction (B, n_load, 2) against positive and against negative motion; None without any.
 
-        Constant over an integration step; arguments as those of `load`.
+        Constant over an integration step, in which `command` (B, n_action) acts; the others as in `load`.
         """
         return None
 
