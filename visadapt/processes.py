@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import pickle
+import signal
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from typing import TypeVar
@@ -48,6 +49,8 @@ def shared_out(work: Work[Result], count: int, jobs: int) -> list[Result]:
 
 
 def _run(work: Work[Result], share: Sequence[int], sender: Connection) -> None:
+    # An interrupt from the keyboard reaches every process; the one that shares out the work ends the others.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         found: object = list(work(share))
     except Exception as error:

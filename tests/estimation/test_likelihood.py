@@ -11,6 +11,7 @@ from visadapt.diagnosis.search.search import Search
 from visadapt.effects import ActuatorDelay, CartMass, ConstantForce, SensorScale, ViscousFriction
 from visadapt.estimation.candidate import CandidateModel, linearise
 from visadapt.estimation.fit_states import CAREFUL
+from visadapt.estimation.fitting import fit, refitted
 from visadapt.systems import CartPole
 
 
@@ -53,12 +54,24 @@ def test_information_is_the_curvature_of_the_likelihood(viscous):
     for side in (-step, step):
         # A range of no width holds the parameter where it is while the states settle.
         model.low = model.high = best.theta[0] + side
-        from visadapt.estimation.likelihood import fit  # the one place that needs the bare fit
-
         held = best[torch.tensor([0])]
         object.__setattr__(held, "theta", best.theta + side)
-        losses.append(float(best.likelihood[0] - fit([model], held, torch.ones(1, viscous.shape[0]), 10).likelihood[0]))
+        losses.append(float(best.likelihood[0] - fit([model], held, 10).likelihood[0]))
     assert sum(losses) / 2 == pytest.approx(0.5, rel=0.1)
+
+
+def test_a_refit_without_some_windows_is_a_fit_of_the_others(viscous):
+    used = torch.ones(1, viscous.shape[0], dtype=torch.float64)
+    used[:, 0] = 0
+    found = []
+    for rows in (viscous, viscous.select(used[0].nonzero()[:, 0])):
+        search = Search(CartPole(), rows, [ViscousFriction])
+        found.append(search.fit([((ViscousFriction,), search.single(ViscousFriction).fits)], CAREFUL)[0].fits)
+    best, alone = found
+    with torch.inference_mode():
+        theta = refitted(CandidateModel(CartPole(), [ViscousFriction], viscous), best, used).theta
+    deviation = float(best.information[0, 0, 0].rsqrt())
+    assert abs(float(theta - alone.theta)) < 0.1 * deviation < abs(float(alone.theta - best.theta))
 
 
 def test_a_batch_of_sets_is_fitted_as_each_alone(viscous):

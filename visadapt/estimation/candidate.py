@@ -34,12 +34,16 @@ class CandidateModel:
         self.profile = profile_of(system)
         self.effects = tuple(effects)
         self.rows = rows
-        longest_step = math.inf if accuracy == COARSEST else self.profile.longest_step
+        smooth = math.inf if accuracy == COARSEST else self.profile.longest_step
+        longest_step = smooth
         if any(effect.abrupt for effect in effects):
             longest_step = min(longest_step, self.profile.longest_abrupt_steps[accuracy])
-        substeps = max(1, math.ceil(float(rows.held.max()) / longest_step - 1e-9))
         placeholders = [effect(**{parameter.name: 0.0 for parameter in effect.table}) for effect in effects]
-        self._world = World(system, placeholders, rows.period, substeps=substeps)
+        self._world, self._smooth = (
+            World(system, placeholders, rows.period, substeps=max(1, math.ceil(float(rows.held.max()) / step - 1e-9)))
+            for step in (longest_step, smooth)
+        )
+        self._only_commands_jump = not any(e.abrupt and not issubclass(e, ActuationEffect) for e in effects)
         self.table = self._world.table
         self.low, self.high = search_range(self.table)
         acting = [effect for effect in effects if issubclass(effect, ActuationEffect)]
@@ -68,6 +72,15 @@ class CandidateModel:
         acting = self.at(theta.repeat_interleave(episodes, 0)).actuate(given, held)
         return acting.unflatten(0, (len(theta), episodes))
 
+    def stepping(self, theta: Tensor, acting: Tensor) -> tuple[World, Tensor]:
+        """The world with parameters (P,), and what acts (..., substeps, n_action), in no more substeps than it takes.
+
+        A command that an effect scales or limits is still held over its period, and smooth physics need no more.
+        """
+        if self._only_commands_jump and bool((acting == acting[..., :1, :]).all()):
+            return self._smooth.with_values(theta), acting[..., : self._smooth.substeps, :]
+        return self.at(theta), acting
+
     def started(self, theta: Tensor, state: Tensor) -> WorldState:
         """World states of all rows, flattened, for states (W, T, n): at the rows' times, with the memory of each effect
         as the recorded commands leave it; parameters (P,)."""
@@ -78,27 +91,27 @@ class CandidateModel:
         time = rows.time[:, :length].flatten()
         return WorldState(time, state.flatten(0, 1), tuple(m[episode, index] for m in memory))
 
-    def measure(self, theta: Tensor, state: Tensor, first: int = 0) -> Tensor:
+    def measure(self, theta: Tensor, state: Tensor, first: int = 0, stride: int = 1) -> Tensor:
         """Measurements, without noise, for parameters (P,) of states (W, T', n) of the windows' rows from the `first`
-        on; or for parameters (R, P) of states (R, W, T', n)."""
-        values, past = theta, self.past(theta, first, state.shape[-2])
+        on, every `stride`-th; or for parameters (R, P) of states (R, W, T', n)."""
+        values, past = theta, self.past(theta, slice(first, first + stride * state.shape[-2], stride))
         if theta.dim() > 1:
             values = theta.repeat_interleave(math.prod(state.shape[1:-1]), 0)
             past = None if past is None else past.repeat(len(theta))
         seen = reading(self.at(values), state.flatten(0, -2), past)
         return seen[:, list(self.rows.channels)].unflatten(0, state.shape[:-1])
 
-    def past(self, theta: Tensor, first: int = 0, length: int | None = None) -> Past | None:
-        """What led to the states of `length` rows of every window from the `first` on, as far back as late sensors
-        with parameters (..., P) read; None without such sensors. The first of the parameters decide what acted."""
+    def past(self, theta: Tensor, chosen: slice = slice(None)) -> Past | None:
+        """What led to the states of the `chosen` rows of every window, as far back as late sensors with parameters
+        (..., P) read; None without such sensors. The first of the parameters decide what acted."""
         if not self.delays:
             return None
         rows, every = self.rows, theta.reshape(-1, theta.shape[-1])
         count = 1 + math.ceil(float(every[:, self.delays].max()) / rows.period)
-        index = rows.index[:, first:][:, :length, None] - 1 - torch.arange(count)
+        index = rows.index[:, chosen, None] - 1 - torch.arange(count)
         episode, before = rows.episode[:, None, None], index.clamp_min(0)
         acting = self._acting(every[:1])[0].mean(2)[episode, before]
-        time = rows.time[:, first:][:, :length]
+        time = rows.time[:, chosen]
         return Past(time.flatten(), acting.flatten(0, 1), rows.held[episode, before].flatten(0, 1))
 
 
@@ -121,9 +134,8 @@ def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised
     shifted = torch.cat((theta[None], theta + torch.diag(parameter_steps(model.table, theta))))
     # What acts changes with the parameters of actuation effects alone: for the others it is computed once.
     variants = [0, *(1 + k for k in model.acting_parameters)]
-    acting = model.commands(shifted[variants])[:, :, :-1].flatten(1, 2)
+    world, acting = model.stepping(theta, model.commands(shifted[variants])[:, :, :-1].flatten(1, 2))
     commands = acting[[variants.index(k) if k in variants else 0 for k in range(len(shifted))]]
-    world = model.at(theta)
     time, duration = model.rows.time[:, :-1].flatten(), model.rows.duration[:, :-1].flatten()
     step = linearise_step(
         world, theta, time, state[:, :-1].flatten(0, 1), commands, by_state=known is None, duration=duration

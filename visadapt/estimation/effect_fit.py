@@ -35,7 +35,8 @@ from visadapt.estimation.fit_states import (
     stacked,
     with_effect,
 )
-from visadapt.estimation.likelihood import FitState, fit
+from visadapt.estimation.fitting import fit
+from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.repeated_readings import SMOOTHING_RATIO, RepeatedReadings, find_repeats, zone
 from visadapt.estimation.screening import screen
@@ -133,7 +134,7 @@ def _best(
     """The likeliest fit of one set of effects from several starts."""
     iterations, care = effort
     models = [CandidateModel(system, effects, rows, care) for _ in starts]
-    out = fit(models, stacked(starts), torch.ones(len(starts), rows.shape[0], dtype=torch.float64), iterations)
+    out = fit(models, stacked(starts), iterations)
     return single_fit(out, int(out.likelihood.argmax()), len(models[0].table))
 
 

@@ -38,6 +38,11 @@ class Linear:
         """The same systems with the first column, the data, alone."""
         return replace(self, drive=self.drive[..., :1], reading=self.reading[..., :1], start=self.start[..., :1])
 
+    def of(self, systems: slice) -> Linear:
+        """Some of the systems."""
+        tensors = {f.name: getattr(self, f.name)[systems] for f in fields(self) if f.name != "spread"}
+        return replace(self, **tensors)
+
     def repeat(self, count: int) -> Linear:
         """`count` copies of the N systems."""
         tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "spread"}

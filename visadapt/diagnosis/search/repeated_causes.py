@@ -56,7 +56,7 @@ def repeated_reading_causes(
 def errors_with_repeats(recording: PreparedRecording, search: Search) -> RolloutErrors:
     """Prediction errors of the source fitted with repeated readings taken for measurements."""
     source = Search(search.system, recording.raw, ()).source
-    return heldout.held_out(search.system, recording.raw, [((), source.fits)])[0]
+    return heldout.held_out(search.system, recording.raw, [((), source.fits)], lambda errors: errors)[0]
 
 
 def _in_windows(rows: Segments, marks: Sequence[Tensor]) -> Tensor:
