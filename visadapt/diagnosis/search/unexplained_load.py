@@ -1,0 +1,227 @@
+"""The load that a motion takes beyond what a world explains, over whole episodes, and what else may explain it.
+
+Readings of positions are smoothed and differentiated twice; the accelerations less those of the world, over their gain
+by the loads, are the load in question (inverse dynamics; Khalil and Dombre 2002, chapter 12). It is linear in what a
+world may have wrong: friction, the commands' gain and delay, the parameters, the zero of a sensor, a drive that gives.
+Those columns are taken along the world's own accelerations, not the measured ones: then no factor common to all of
+them explains anything.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from visadapt.effects.own.dynamics import scalable
+from visadapt.recordings import Episode, Recording
+from visadapt.systems import System
+from visadapt.world import World, WorldState
+
+SMOOTHING = 0.065  # s, deviation of the Gaussian that smooths the load, or one period if that is longer
+
+STEP = 0.04  # s between the instants at which the load is given, or one period if that is longer
+
+SLOW = 0.01  # Speed over the largest of its range below which a joint may stick
+
+SLACK = 0.1  # Command over the largest of its range at which the play of a drive is taken up
+
+DIFFERENCE = 1e-4  # Finite difference of a state in its unit, and of the log of a parameter
+
+
+@dataclass(frozen=True)
+class LoadTrack:
+    """The unexplained loads on J joints over one episode, at N instants; all smoothed alike."""
+
+    time: Tensor  # (N,) s since the episode began
+    load: Tensor  # (N, J)
+    columns: Tensor  # (K, N, J) loads that state and command may explain, of unit root mean square over the recording
+    reaction: Tensor
+    """(K, N, J, J) change of the columns per unit of load that nothing explains: they are those of the modelled motion"""
+    activity: Tensor  # (N, F) logs of speeds, accelerations and changes of commands, with which errors grow
+    smoothing: float  # s, deviation of the smoothing Gaussian
+
+
+def load_tracks(recording: Recording, world: World) -> list[LoadTrack]:
+    """The unexplained loads in each episode that is long enough; none where a joint's position was not measured."""
+    system = world.system
+    measured = [system.index(name) for name in recording.measured]
+    in_pairs = {column for pair in system.coordinates for column in pair}
+    if not system.coordinates or len(system.coordinates) < len(system.loads):
+        return []
+    if any(position not in measured for position, _ in system.coordinates):
+        return []
+    if any(column not in measured for column in range(len(system.states)) if column not in in_pairs):
+        return []
+    tracks = [_track(episode, world, measured, recording.period) for episode in recording.episodes]
+    found = [track for track in tracks if track is not None]
+    if not found:
+        return []
+    size = torch.cat([track.columns.square().flatten(1) for track in found], 1).mean(1).sqrt()
+    kept = size > 1e-9 * size.max()
+    return [_scaled(track, kept, size) for track in found]
+
+
+def _scaled(track: LoadTrack, kept: Tensor, size: Tensor) -> LoadTrack:
+    by = size[kept, None, None]
+    return replace(track, columns=track.columns[kept] / by, reaction=track.reaction[kept] / by[..., None])
+
+
+def _track(episode: Episode, world: World, measured: Sequence[int], period: float) -> LoadTrack | None:
+    system = world.system
+    stamps, readings, given = (
+        torch.as_tensor(values, dtype=torch.float64) for values in (episode.time, episode.state, episode.action)
+    )
+    smoothing = max(SMOOTHING, period)
+    time = torch.arange(float(stamps[0]), float(stamps[-1]), period, dtype=torch.float64)
+    if len(time) * period < 20 * smoothing:
+        return None
+    state = torch.zeros(len(time), len(system.states), dtype=torch.float64)
+    after = torch.searchsorted(stamps, time, right=True).clamp(1, len(stamps) - 1)
+    share = (time - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
+    for k, column in enumerate(measured):
+        values = _unwrapped(readings[:, k]) if system.states[column].unit == "rad" else readings[:, k]
+        state[:, column] = torch.lerp(values[after - 1], values[after], share)
+    held = torch.cat((stamps.diff(), stamps.new_tensor([period])))
+    acting = world.actuate(given[None], held[None])[0].mean(1)[after - 1]
+
+    def smooth(values: Tensor, deviation: float = smoothing) -> Tensor:
+        return _smoothed(values, deviation / period)
+
+    def rate(values: Tensor) -> Tensor:
+        return torch.gradient(values, spacing=period, dim=0)[0]
+
+    positions, velocities = (list(columns) for columns in zip(*system.coordinates, strict=True))
+    state[:, positions] = smooth(state[:, positions], 0.1 * smoothing)
+    state[:, velocities] = rate(state[:, positions])
+    acceleration = rate(state[:, velocities])
+    commanded = smooth(acting, 0.1 * smoothing)
+    load, columns, reaction = _Motion(world, time, state, acting, acceleration).explainable(rate, commanded)
+    largest = torch.tensor([action.largest for action in system.actions], dtype=torch.float64)
+    fastest = torch.tensor([system.states[v].largest for v in velocities], dtype=torch.float64)
+    stormy = smooth(acceleration.abs(), 2 * smoothing)
+    activity = torch.cat(
+        (
+            (stormy / stormy.mean(0) + 0.1).log(),
+            (smooth(state[:, velocities].abs(), 2 * smoothing) / fastest + 0.03).log(),
+            (smooth(rate(commanded).abs(), 2 * smoothing) / largest + 0.3).log(),
+            smooth((-(state[:, velocities] / (SLOW * fastest)).square()).exp()),
+        ),
+        1,
+    )
+    edge, stride = round(2 * smoothing / period), max(1, round(STEP / period))
+    inner = slice(edge, len(time) - edge, stride)
+    smoothed = smooth(columns.flatten(1)).unflatten(1, columns.shape[1:])
+    return LoadTrack(
+        time[inner],
+        smooth(load)[inner],
+        smoothed[inner].movedim(1, 0),
+        reaction[inner].movedim(1, 0),
+        activity[inner],
+        smoothing,
+    )
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """A world along the T instants of an episode, and the accelerations of the joints that were measured."""
+
+    world: World
+    time: Tensor  # (T,)
+    state: Tensor  # (T, n)
+    acting: Tensor  # (T, n_action)
+    measured: Tensor  # (T, J)
+
+    def acceleration(self, state: Tensor, acting: Tensor, push: int | None = None, own: System | None = None) -> Tensor:
+        """(T, J) accelerations of the joints by the world, or by the bare system `own`; a unit load pushes a joint."""
+        at = WorldState(self.time, state, ())
+        load = self.world.load(at)
+        if push is not None:
+            load = load + torch.eye(load.shape[1], dtype=load.dtype)[push]
+        system = self.world.system_at(at) if own is None else own
+        return system.derivative(state, acting, load)[:, [velocity for _, velocity in system.coordinates]]
+
+    def gain(self, own: System | None = None) -> tuple[Tensor, Tensor]:
+        """(T, J) accelerations without a push, and (T, J, J) their change per unit of each load."""
+        free = self.acceleration(self.state, self.acting, own=own)
+        joints = range(free.shape[1])
+        pushed = [self.acceleration(self.state, self.acting, push=k, own=own) for k in joints]
+        return free, torch.stack(pushed, -1) - free[..., None]
+
+    def explainable(self, rate: Callable[[Tensor], Tensor], commanded: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(T, J) the unexplained load; (T, K, J) what a world may have wrong of it; (T, K, J, J) the change of these
+        per unit of acceleration-equivalent load.
+
+        `rate` differentiates by time, `commanded` (T, n_action) are the commands that act, slightly smoothed.
+        """
+        system, state, acting = self.world.system, self.state, self.acting
+        free, gain = self.gain()
+
+        def load(acceleration: Tensor) -> Tensor:
+            return torch.linalg.solve(gain, acceleration[..., None])[..., 0]
+
+        joints = torch.eye(gain.shape[-1], dtype=state.dtype)
+        columns: list[Tensor] = []
+        reactions: dict[int, Tensor] = {}
+        response = [
+            load(self.acceleration(state, acting + unit) - free) for unit in torch.eye(acting.shape[1]).to(acting)
+        ]
+        for by_unit, command in zip(response, commanded.unbind(1), strict=True):
+            columns += [by_unit * command[:, None], by_unit * rate(command)[:, None]]
+        driven = sum(by_unit * command[:, None] for by_unit, command in zip(response, commanded.unbind(1), strict=True))
+        largest = torch.tensor([action.largest for action in system.actions], dtype=state.dtype)
+        slack = (commanded / (SLACK * largest)).tanh()
+        for j, (position, velocity) in enumerate(system.coordinates):
+            v = state[:, velocity]
+            slip = v / (SLOW * system.states[velocity].largest)
+            sign, near_rest = slip.tanh(), (-(0.2 * slip).square()).exp()
+            friction = (sign, sign * near_rest, sign * driven[:, j].abs(), v, v * v.abs(), torch.ones_like(v))
+            columns += [each[:, None] * joints[j] for each in friction]
+            # Added inertia; then errors of the position: of the sensor's zero, and of a drive that gives or has play.
+            reactions[len(columns)] = joints[j][:, None] * gain[:, j, None, :]
+            columns.append(self.measured[:, j, None] * joints[j])
+            moved = [_moved(state, column) for column in (position, velocity)]
+            slopes = [(self.acceleration(each, acting) - free) / DIFFERENCE for each in moved]
+            for error in (torch.ones_like(v), *commanded.unbind(1), *slack.unbind(1)):
+                first = rate(error)
+                change = -slopes[0] * error[:, None] - slopes[1] * first[:, None] + rate(first)[:, None] * joints[j]
+                columns.append(load(change))
+        own: Any = system
+        plain = self.gain(own)
+        for name in scalable(system):
+            scaled = self.gain(replace(own, **{name: getattr(own, name) * math.exp(DIFFERENCE)}))
+            loads = [torch.linalg.solve(g, (self.measured - f)[..., None])[..., 0] for f, g in (plain, scaled)]
+            reactions[len(columns)] = (torch.eye(len(joints)).to(state) - torch.linalg.solve(scaled[1], plain[1])) / DIFFERENCE
+            columns.append((loads[0] - loads[1]) / DIFFERENCE)
+        reaction = state.new_zeros(len(state), len(columns), len(joints), len(joints))
+        for k, each in reactions.items():
+            reaction[:, k] = each
+        return load(self.measured - free), torch.stack(columns, 1), reaction
+
+
+def _moved(state: Tensor, column: int) -> Tensor:
+    """States (T, n) with one column a little larger."""
+    out = state.clone()
+    out[:, column] += DIFFERENCE
+    return out
+
+
+def _unwrapped(angle: Tensor) -> Tensor:
+    """An angle (T,) that does not jump by turns."""
+    turns = (angle.diff() / (2 * math.pi)).round().cumsum(0)
+    return torch.cat((angle[:1], angle[1:] - 2 * math.pi * turns))
+
+
+def _smoothed(values: Tensor, deviation: float) -> Tensor:
+    """Values (T, M) smoothed by a Gaussian of this deviation in rows; beyond the ends they go on as they came."""
+    reach = math.ceil(4 * deviation)
+    lags = torch.arange(-reach, reach + 1, dtype=values.dtype)
+    kernel = torch.exp(-0.5 * (lags / max(deviation, 1e-6)).square())
+    first, last = values[:1], values[-1:]
+    before, beyond = 2 * first - values[1 : reach + 1].flip(0), 2 * last - values[-reach - 1 : -1].flip(0)
+    padded = torch.cat((before, values, beyond)).T[:, None]
+    return torch.nn.functional.conv1d(padded, (kernel / kernel.sum())[None, None])[:, 0].T
