@@ -1,238 +1,294 @@
-"""Passing loads on one joint that no function of state and command explains: when, where and how hard.
+"""Pushes: passing loads on one joint that no function of state and command explains; when, where and how hard.
 
-The unexplained load is a sum of columns that state and command explain, errors, and pushes: bumps in time. Errors grow
-with speed, acceleration and changes of the command, and neighbouring ones are alike; how much, the recording shows
-itself. A bump is tried at every instant, in several widths, on every joint (a matched filter, in the generalised least
-squares that the errors call for; Kay 1998, Fundamentals of Statistical Signal Processing II, section 4.4); the one that
-stands out most is kept, and all is fitted again beside it.
+The unexplained load is a sum of columns that state and command explain, of errors, and of pushes: bumps in time. Errors
+grow with speed, acceleration and changes of the command, and neighbouring ones are alike; how much, the recording shows
+itself. A bump is tried at every instant, in several widths, on every joint: a matched filter, by generalised least
+squares (Kay 1998, Fundamentals of Statistical Signal Processing II, section 4.4). Those that stand out are fitted
+together with all else, and those that then do not stand out clearly are dropped, the weakest first.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool1d, pad
 
-from visadapt.diagnosis.search.unexplained_load import LoadTrack
+from visadapt.diagnosis.result import Push
+from visadapt.diagnosis.search.unexplained_load import LoadTrack, load_tracks
+from visadapt.recordings import Recording
+from visadapt.world import World
 
-WIDTHS = (0.06, 0.085, 0.12, 0.17)  # s, deviations of the Gaussian bumps
+WIDTHS = (0.06, 0.085, 0.12, 0.17)  # s, deviations of the Gaussian bumps that are tried
 
-REACH = 2.45  # Deviations of a bump from its middle at which it has 5 % of its peak: there a push starts and ends
+EDGE = 2.45  # Deviations of a bump from its middle where it has 5 % of its peak: there a push starts and ends
 
-PRIOR = 0.3  # Deviation of the loads that a column explains, over that of the joints' unexplained loads
+CANDIDATE, CLEAR = 3.0, 5.0
+"""Height over its deviation from which a bump is fitted with all else, and from which it is then called a push: far
+more than chance, since errors of a model are not normally distributed."""
 
-CUT = 9.0  # Squared errors over their median above which they are cut off when the errors' size is fitted
+SHAPE_ERROR = 0.1  # Deviation of an impulse, as a share of it, because a push need not have the shape of a bump
 
-LAGS = 8  # Order of the autoregressive errors
+MOST = 6  # Bumps on an episode at most
 
-ROUNDS = 6  # Rounds in which errors and columns are fitted
+PRIOR = 0.3  # Deviation of the load that a column explains, over the size of the unexplained load
 
-OUTLIER = 2.5  # Errors in deviations above which they count less (Huber)
+OWN = 0.5  # Deviation of an episode's weights of columns from those of all episodes, over that of these
 
-WHITE = 0.03  # Share of the errors' variance that is taken as white at least, so that they can be whitened
+LAGS = 8  # Order of the autoregression of errors
 
-MOST = 8  # Pushes in an episode at most
+ROUNDS, ROUNDS_AGAIN = 6, 3  # Rounds in which columns and errors are fitted in turn, at first and with another bump
+
+OUTLIER = 2.5  # Errors, in deviations, above which they count less (Huber)
+
+CUT = 9.0  # Squared errors over their median, at which they are cut off when the size of errors is fitted
+
+WHITE = 0.03  # Share of the errors' variance that is taken as white, so that errors can be whitened
+
+DISTINCT = 0.15  # Least share of a bump's information that columns and other bumps leave to it
+
+TALL = 10.0  # Prior deviation of a bump's height, over the size of the unexplained load
+
+Z_90 = 1.6449  # Half-width of a normal distribution's 90 % interval, in standard deviations
+
+
+def pushes(recording: Recording, world: World) -> tuple[Push, ...]:
+    """The pushes in a recording beyond what a world explains, in the order of time."""
+    tracks = load_tracks(recording, world)
+    if not tracks:
+        return ()
+    found = _Fit(tracks).pushes()
+    tries = sum(len(track.time) for track in tracks) * tracks[0].load.shape[1]
+    loads = world.system.loads
+    named = [_named(one, tracks[one.part].episode, loads[one.joint].name, loads[one.joint].unit, tries) for one in found]
+    return tuple(sorted(named, key=lambda push: (push.episode, push.start)))
 
 
 @dataclass(frozen=True)
-class Bump:
+class _Bump:
     """A Gaussian bump of load on a joint."""
 
-    episode: int
+    part: int
     joint: int
     middle: float  # s
     width: float  # s, deviation
-    height: float  # in the load's unit
-    deviation: float  # of the height
-    score: float  # height over its deviation
+    height: float = 0.0  # in the load's unit
+    deviation: float = math.inf  # of the height
 
     @property
-    def impulse(self) -> float:
-        return self.height * self.width * math.sqrt(2 * math.pi)
+    def score(self) -> float:
+        return abs(self.height) / self.deviation
 
-
-class Detector:
-    """Columns, errors and bumps fitted to all tracks together."""
-
-    def __init__(self, tracks: Sequence[LoadTrack], threshold: float) -> None:
-        self.tracks = tracks
-        self.threshold = threshold
-        self.bumps: list[Bump] = []
-        size = torch.cat([t.load for t in tracks]).square().mean().sqrt()
-        self.base = [PRIOR * size * t.columns for t in tracks]
-        self.reaction = [PRIOR * size * t.reaction for t in tracks]
-        self.left = [torch.zeros_like(t.load) for t in tracks]
-        self.spread = [t.load.abs().median(0).values.expand_as(t.load) + 1e-12 for t in tracks]
-        joints = tracks[0].load.shape[1]
-        self.ar = torch.zeros(joints, LAGS, dtype=torch.float64)
-        self.innovation = torch.ones(joints, dtype=torch.float64)
-
-    def whitened(self, k: int, values: Tensor) -> Tensor:
-        """Values (..., N, J) over their errors' deviation, less what the errors before foretell."""
-        values = values / self.spread[k]
-        out = values.clone()
-        for lag in range(1, LAGS + 1):
-            out[..., lag:, :] -= self.ar[:, lag - 1] * values[..., :-lag, :]
-        return out / self.innovation
-
-    def design(self, k: int) -> Tensor:
-        """(K, N, J) columns of an episode: common to all, its own, and its bumps."""
-        track = self.tracks[k]
-        common = self.base[k] - torch.einsum('knij,nj->kni', self.reaction[k], self.left[k])
-        own = [one for one in self.bumps if one.episode == k]
-        shapes = [bump(track, one.joint, one.middle, one.width) * 10 for one in own]
-        return torch.cat((common, *[s[None] for s in shapes])) if shapes else common
-
-    def fit(self, rounds: int = ROUNDS) -> None:
-        count = len(self.base[0])
-        eye = torch.eye
-        for r in range(rounds):
-            # Common columns over all episodes, then each episode around these.
-            parts = []
-            for k, track in enumerate(self.tracks):
-                design = self.design(k)
-                white, target = self.whitened(k, design).flatten(1), self.whitened(k, track.load).flatten()
-                weight = torch.ones_like(target)
-                if r:
-                    left = (target - white.T @ self.weights[k]).abs()
-                    weight = (OUTLIER / left.clamp(min=1e-9)).clamp(max=1)
-                parts.append((white, target, weight))
-            normal, gradient = eye(count).double(), torch.zeros(count).double()
-            for white, target, weight in parts:
-                # bumps of the episode are projected out
-                common, shapes = white[:count], white[count:]
-                a, g = (common * weight) @ common.T, (common * weight) @ target
-                if len(shapes):
-                    c, d = (common * weight) @ shapes.T, (shapes * weight) @ shapes.T + 1e-9 * eye(len(shapes)).double()
-                    a = a - c @ torch.linalg.solve(d, c.T)
-                    g = g - c @ torch.linalg.solve(d, (shapes * weight) @ target)
-                normal, gradient = normal + a, gradient + g
-            mean = torch.linalg.solve(normal, gradient)
-            several = len(self.tracks) > 1
-            precision = (1 / OWN**2 if several else 1.0)
-            self.weights, self.roots = [], []
-            for white, target, weight in parts:
-                prior = torch.full((len(white),), 1e-2, dtype=torch.float64)
-                prior[:count] = precision
-                start = torch.zeros(len(white), dtype=torch.float64)
-                if several:
-                    start[:count] = mean
-                a = (white * weight) @ white.T + torch.diag(prior)
-                g = (white * weight) @ target + prior * start
-                root = torch.linalg.cholesky(a)
-                self.roots.append(root)
-                self.weights.append(torch.cholesky_solve(g[:, None], root)[:, 0])
-            self.left = [t.load - torch.einsum('k,knj->nj', w, self.design(k)) for k, (t, w) in enumerate(zip(self.tracks, self.weights, strict=True))]
-            if r + 1 < rounds:
-                self._errors()
-
-    def _errors(self) -> None:
-        left, explained = [], []
-        for k, track in enumerate(self.tracks):
-            design = self.design(k)
-            left.append(self.left[k])
-            explained.append(torch.linalg.solve_triangular(self.roots[k], design.flatten(1), upper=False).reshape(design.shape))
-        activity = torch.cat([t.activity for t in self.tracks])
-        middle = activity.mean(0)
-        basis = torch.cat((torch.ones(len(activity), 1).double(), activity - middle), 1)
-        for j in range(self.ar.shape[0]):
-            power = torch.cat([local_mean(e[:, j].square().clamp(max=CUT * e[:, j].square().median()) + x[..., j].square().sum(0)) for e, x in zip(left, explained, strict=True)])
-            logs = (power + 1e-4 * power.mean()).log()
-            ridge = torch.eye(basis.shape[1]).double() * 3.0
-            ridge[0, 0] = 0
-            coefficients = torch.linalg.solve(basis.T @ basis / 8 + ridge, basis.T @ logs / 8)
-            coefficients[1:] = coefficients[1:].clamp(min=0)
-            logs = basis @ coefficients
-            # the level again, by the mean of the power over what is expected
-            logs = logs + (power / logs.exp()).clamp(max=9).mean().log()
-            deviation = (0.5 * logs).exp().split([len(t.load) for t in self.tracks])
-            moments = torch.zeros(LAGS + 1, dtype=torch.float64)
-            for k, (e, x) in enumerate(zip(left, explained, strict=True)):
-                self.spread[k] = self.spread[k].clone()
-                self.spread[k][:, j] = deviation[k]
-                scaled, own = (e[:, j] / deviation[k]).clamp(-3, 3), x[..., j] / deviation[k]
-                for lag in range(LAGS + 1):
-                    moments[lag] += scaled[lag:] @ scaled[: len(scaled) - lag]
-                    moments[lag] += (own[:, lag:] * own[:, : len(scaled) - lag]).sum()
-            moments /= sum(len(t.load) for t in self.tracks)
-            moments[0] *= 1 + WHITE
-            index = (torch.arange(LAGS)[:, None] - torch.arange(LAGS)).abs()
-            self.ar[j] = torch.linalg.solve(moments[index], moments[1:])
-            self.innovation[j] = (moments[0] - self.ar[j] @ moments[1:]).clamp(min=1e-6).sqrt()
-
-    def scan(self, k: int) -> Bump | None:
-        """The bump that stands out most in an episode."""
-        track = self.tracks[k]
-        white = self.whitened(k, self.design(k)).flatten(1)
-        left = self.whitened(k, track.load).flatten() - white.T @ self.weights[k]
-        best: Bump | None = None
-        for width in WIDTHS:
-            middles = torch.arange(float(track.time[0]) + width, float(track.time[-1]) - width, 0.3 * width, dtype=torch.float64)
-            for j in range(track.load.shape[1]):
-                shapes = torch.stack([bump(track, j, float(m), width) for m in middles])
-                tried = self.whitened(k, shapes).flatten(1)
-                shared = torch.linalg.solve_triangular(self.roots[k], white @ tried.T, upper=False)
-                information = (tried.square().sum(1) - shared.square().sum(0)).clamp(min=1e-9)
-                height = tried @ left / information
-                score = height * information.sqrt() * (information > 0.15 * tried.square().sum(1))
-                i = int(score.abs().argmax())
-                if best is None or abs(float(score[i])) > abs(best.score):
-                    best = Bump(k, j, float(middles[i]), width, float(height[i]), float(information[i] ** -0.5), float(score[i]))
-        return best
-
-    def run(self, most: int = MOST) -> list[Bump]:
-        self.fit()
-        for _ in range(most):
-            found = [one for k in range(len(self.tracks)) if (one := self.scan(k)) is not None and abs(one.score) > CANDIDATE]
-            if not found:
-                break
-            self.bumps += found
-            self.fit(3)
-        while self.bumps:
-            self.bumps = self.scored()
-            weakest = min(range(len(self.bumps)), key=lambda i: abs(self.bumps[i].score))
-            if abs(self.bumps[weakest].score) > self.threshold:
-                break
-            weakest_of = {}
-            for i, one in enumerate(self.bumps):
-                if abs(one.score) <= self.threshold and (one.episode not in weakest_of or abs(one.score) < abs(self.bumps[weakest_of[one.episode]].score)):
-                    weakest_of[one.episode] = i
-            gone = set(weakest_of.values())
-            self.bumps = [one for i, one in enumerate(self.bumps) if i not in gone]
-            self.fit(3)
-        return self.bumps
-
-    def scored(self) -> list[Bump]:
-        out = []
-        from dataclasses import replace
-        for k in range(len(self.tracks)):
-            own = [one for one in self.bumps if one.episode == k]
-            if not own:
-                continue
-            inverse = torch.cholesky_inverse(self.roots[k])
-            first = len(self.weights[k]) - len(own)
-            for i, one in enumerate(own):
-                height, deviation = 10 * float(self.weights[k][first + i]), 10 * float(inverse[first + i, first + i]) ** 0.5
-                out.append(replace(one, height=height, deviation=deviation, score=height / deviation))
+    def on(self, track: LoadTrack) -> Tensor:
+        """(N, J) the bump with unit height, smoothed as the track is."""
+        out = torch.zeros_like(track.load)
+        out[:, self.joint] = _bumps(track, torch.tensor([self.middle], dtype=torch.float64), self.width)[0]
         return out
 
 
-CANDIDATE = 2.8
-
-OWN = 0.5  # Deviation of an episode's weights around those of all, in prior deviations
-
-
-def bump(track: LoadTrack, joint: int, middle: float, width: float) -> Tensor:
-    """(N, J) a bump of unit height, smoothed as the track is."""
+def _bumps(track: LoadTrack, middles: Tensor, width: float) -> Tensor:
+    """(M, N) bumps of unit height at M instants, smoothed as the track is."""
     whole = math.hypot(width, track.smoothing)
-    out = torch.zeros_like(track.load)
-    out[:, joint] = width / whole * torch.exp(-0.5 * ((track.time - middle) / whole).square())
-    return out
+    return width / whole * torch.exp(-0.5 * ((track.time - middles[:, None]) / whole).square())
 
 
-def local_mean(values: Tensor, reach: int = 4) -> Tensor:
-    padded = torch.nn.functional.pad(values[None, None], (reach, reach), mode="replicate")
-    return torch.nn.functional.avg_pool1d(padded, 2 * reach + 1, 1)[0, 0]
+def _named(bump: _Bump, episode: int, load: str, unit: str, tries: int) -> Push:
+    area = bump.width * math.sqrt(2 * math.pi)
+    impulse = bump.height * area
+    spread = Z_90 * math.hypot(bump.deviation * area, SHAPE_ERROR * impulse)
+    reach = EDGE * bump.width
+    p_value = min(1.0, tries * math.erfc(bump.score / math.sqrt(2)))
+    ends = max(0.0, bump.middle - reach), bump.middle + reach
+    return Push(episode, load, *ends, bump.height, unit, impulse, (impulse - spread, impulse + spread), p_value)
+
+
+class _Fit:
+    """Columns, errors and bumps, fitted to all parts of a recording together."""
+
+    def __init__(self, tracks: Sequence[LoadTrack]) -> None:
+        self.tracks = tracks
+        self.bumps: list[_Bump] = []
+        joints = tracks[0].load.shape[1]
+        self.size = torch.cat([track.load for track in tracks]).square().mean().sqrt() + 1e-300
+        self.left = [torch.zeros_like(track.load) for track in tracks]
+        self.weights = [torch.zeros(0, dtype=torch.float64) for _ in tracks]
+        self.roots = [torch.zeros(0, 0, dtype=torch.float64) for _ in tracks]
+        self.spread = [self.size.expand_as(track.load) for track in tracks]
+        self.autoregression = torch.zeros(joints, LAGS, dtype=torch.float64)
+        self.innovation = torch.ones(joints, dtype=torch.float64)
+
+    def pushes(self) -> list[_Bump]:
+        """The bumps that stand out clearly."""
+        self._fit(ROUNDS)
+        searched: Sequence[int] = range(len(self.tracks))
+        for _ in range(MOST):
+            found = [one for part in searched if (one := self._highest(part)).score > CANDIDATE]
+            if not found:
+                break
+            self.bumps += found
+            searched = [one.part for one in found]
+            self._fit(ROUNDS_AGAIN)
+        while self.bumps:
+            self.bumps = self._measured()
+            weakest = {one.part: one for one in sorted(self.bumps, key=lambda one: -one.score) if one.score < CLEAR}
+            if not weakest:
+                break
+            self.bumps = [one for one in self.bumps if one not in weakest.values()]
+            self._fit(ROUNDS_AGAIN)
+        return self.bumps
+
+    def _design(self, part: int) -> Tensor:
+        """(K, N, J) loads of unit prior deviation: of the columns, and of the bumps on this part."""
+        track = self.tracks[part]
+        columns = track.columns - torch.einsum("knij,nj->kni", track.reaction, self.left[part])
+        bumps = [TALL * self.size * one.on(track) for one in self.bumps if one.part == part]
+        return torch.cat((PRIOR * self.size * columns, *(one[None] for one in bumps)))
+
+    def _whitened(self, part: int, values: Tensor) -> Tensor:
+        """Loads (..., N, J) over the errors' deviation, less what the errors before foretell; (..., N J)."""
+        values = values / self.spread[part]
+        out = values.clone()
+        for lag, factor in enumerate(self.autoregression.unbind(1), 1):
+            out[..., lag:, :] -= factor * values[..., :-lag, :]
+        return (out / self.innovation).flatten(-2)
+
+    def _fit(self, rounds: int) -> None:
+        for k in range(rounds):
+            self._weigh(robust=bool(self.weights[0].numel()) and k > 0)
+            self._size_errors()
+        self._weigh(robust=True)
+
+    def _weigh(self, robust: bool) -> None:
+        """The weights of columns and bumps, given the errors: those of each part around those of all."""
+        count = len(self.tracks[0].columns)
+        identity = torch.eye(count, dtype=torch.float64)
+        several = len(self.tracks) > 1
+        total, along = identity.clone(), torch.zeros(count, dtype=torch.float64)
+        problems = []
+        for part, track in enumerate(self.tracks):
+            design, target = self._whitened(part, self._design(part)), self._whitened(part, track.load)
+            weighted = design
+            if robust:
+                error = self._whitened(part, self.left[part]).abs()
+                weighted = design * (OUTLIER / error.clamp(min=1e-9)).clamp(max=1)
+            normal, gradient = weighted @ design.T, weighted @ target
+            problems.append((normal, gradient))
+            if several:
+                # Without the bumps, and given that the part's own weights differ from those of all.
+                bumps = normal[count:, count:] + torch.eye(len(normal) - count, dtype=torch.float64)
+                gone = torch.linalg.solve(bumps, normal[count:, :count]).mT
+                normal = normal[:count, :count] - gone @ normal[count:, :count]
+                gradient = gradient[:count] - gone @ gradient[count:]
+                inner = identity + OWN**2 * normal
+                total, along = total + torch.linalg.solve(inner, normal), along + torch.linalg.solve(inner, gradient)
+        common = torch.linalg.solve(total, along)
+        for part, (normal, gradient) in enumerate(problems):
+            precision = torch.ones(len(normal), dtype=torch.float64)
+            if several:
+                precision[:count] = OWN**-2
+                gradient = gradient + pad(OWN**-2 * common, (0, len(normal) - count))
+            self.roots[part] = torch.linalg.cholesky(normal + torch.diag(precision))
+            self.weights[part] = torch.cholesky_solve(gradient[:, None], self.roots[part])[:, 0]
+            explained = torch.einsum("k,knj->nj", self.weights[part], self._design(part))
+            self.left[part] = self.tracks[part].load - explained
+
+    def _size_errors(self) -> None:
+        """How errors grow with activity, and their autoregression (Yule-Walker), joint by joint.
+
+        What is left is smaller than the errors, by what the weights took of them: their covariance is added.
+        """
+        taken = [
+            torch.linalg.solve_triangular(root, self._design(part).flatten(1), upper=False).unflatten(
+                1, self.left[part].shape
+            )
+            for part, root in enumerate(self.roots)
+        ]
+        activity = torch.cat([track.activity for track in self.tracks])
+        basis = pad(activity - activity.mean(0), (1, 0), value=1.0)
+        lengths = [len(track.time) for track in self.tracks]
+        for j in range(len(self.innovation)):
+            left = [each[:, j] for each in self.left]
+            own = [each[..., j] for each in taken]
+            most = CUT * torch.cat(left).square().median()
+            power = torch.cat(
+                [_local_mean(e.square().clamp(max=most) + v.square().sum(0)) for e, v in zip(left, own, strict=True)]
+            )
+            deviation = (0.5 * _log_power(basis, power)).exp()
+            at_rest = torch.cat([track.at_rest[:, j] for track in self.tracks])
+            friction = torch.cat(
+                [
+                    (weights[track.dry[j]] * PRIOR * self.size * track.columns[track.dry[j], :, j]).abs().amax().expand(n)
+                    for track, weights, n in zip(self.tracks, self.weights, lengths, strict=True)
+                ]
+            )
+            # At rest, dry friction is what holds the joint.
+            deviations = torch.hypot(deviation, friction * at_rest).split(lengths)
+            moments = torch.zeros(LAGS + 1, dtype=torch.float64)
+            for part, each in enumerate(deviations):
+                self.spread[part] = self.spread[part].clone()
+                self.spread[part][:, j] = each
+                white, more = (left[part] / each).clamp(-3, 3), own[part] / each
+                for lag in range(LAGS + 1):
+                    end = len(each) - lag
+                    moments[lag] += white[lag:] @ white[:end] + (more[:, lag:] * more[:, :end]).sum()
+            moments = moments / sum(lengths)
+            moments[0] *= 1 + WHITE
+            lags = torch.arange(LAGS)
+            self.autoregression[j] = torch.linalg.solve(moments[(lags[:, None] - lags).abs()], moments[1:])
+            self.innovation[j] = (moments[0] - self.autoregression[j] @ moments[1:]).clamp(min=1e-9).sqrt()
+
+    def _highest(self, part: int) -> _Bump:
+        """The bump on a part that stands out most beside what is fitted."""
+        time, joints = self.tracks[part].time, self.tracks[part].load.shape[1]
+        shape = (-1, len(time), joints)
+        design = self._whitened(part, self._design(part)).unflatten(1, shape[1:])
+        left = self._whitened(part, self.left[part]).unflatten(0, shape[1:])
+
+        def best(joint: int, middles: Tensor, width: float) -> _Bump:
+            tried = _bumps(self.tracks[part], middles, width)[..., None]
+            shapes = self._whitened(part, pad(tried, (joint, joints - 1 - joint)))[:, joint::joints]
+            shared = torch.linalg.solve_triangular(self.roots[part], design[..., joint] @ shapes.mT, upper=False)
+            alone = shapes.square().sum(1)
+            information = (alone - shared.square().sum(0)).clamp(min=DISTINCT * alone)
+            height = shapes @ left[:, joint] / information
+            k = int((height.abs() * information.sqrt()).argmax())
+            return _Bump(part, joint, float(middles[k]), width, float(height[k]), float(information[k] ** -0.5))
+
+        tried = (
+            best(joint, torch.arange(float(time[0]) + width, float(time[-1]) - width, 0.3 * width).double(), width)
+            for width in WIDTHS
+            for joint in range(joints)
+        )
+        return max(tried, key=lambda one: one.score)
+
+    def _measured(self) -> list[_Bump]:
+        """The bumps with their heights as fitted together."""
+        out = []
+        for part in range(len(self.tracks)):
+            own = [one for one in self.bumps if one.part == part]
+            if not own:
+                continue
+            unit = TALL * float(self.size)
+            deviation = unit * torch.cholesky_inverse(self.roots[part]).diagonal().sqrt()
+            heights = unit * self.weights[part]
+            for k, one in enumerate(own, len(heights) - len(own)):
+                out.append(replace(one, height=float(heights[k]), deviation=float(deviation[k])))
+        return out
+
+
+def _log_power(basis: Tensor, power: Tensor) -> Tensor:
+    """Logs (N,) of an expected power that grows with the columns of `basis` (N, F), the first of which is 1."""
+    logs = (power + 1e-4 * power.mean()).log()
+    ridge = torch.full((basis.shape[1],), 24.0, dtype=torch.float64)
+    ridge[0] = 0.0
+    slopes = torch.linalg.solve(basis.T @ basis + torch.diag(ridge), basis.T @ logs)
+    expected = basis @ torch.cat((slopes[:1], slopes[1:].clamp(min=0)))
+    return expected + (power / expected.exp()).clamp(max=CUT).mean().log()
+
+
+def _local_mean(values: Tensor, reach: int = 4) -> Tensor:
+    """Values (N,) averaged over so many neighbours on either side."""
+    return avg_pool1d(pad(values[None], (reach, reach), mode="replicate"), 2 * reach + 1, 1)[0]

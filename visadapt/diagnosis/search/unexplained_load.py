@@ -12,10 +12,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import conv1d
 
 from visadapt.effects.own.dynamics import scalable
 from visadapt.recordings import Episode, Recording
@@ -26,6 +28,10 @@ SMOOTHING = 0.065  # s, deviation of the Gaussian that smooths the load, or one 
 
 STEP = 0.04  # s between the instants at which the load is given, or one period if that is longer
 
+SHORTEST = 25  # Length over the smoothing's deviation below which an episode tells nothing of pushes
+
+LONGEST = 300  # Instants in a part: what drifts is fitted part by part, and the work grows with its square
+
 SLOW = 0.01  # Speed over the largest of its range below which a joint may stick
 
 SLACK = 0.1  # Command over the largest of its range at which the play of a drive is taken up
@@ -35,15 +41,35 @@ DIFFERENCE = 1e-4  # Finite difference of a state in its unit, and of the log of
 
 @dataclass(frozen=True)
 class LoadTrack:
-    """The unexplained loads on J joints over one episode, at N instants; all smoothed alike."""
+    """The unexplained loads on J joints over an episode or a part of it, at N instants; all smoothed alike."""
 
+    episode: int
     time: Tensor  # (N,) s since the episode began
     load: Tensor  # (N, J)
     columns: Tensor  # (K, N, J) loads that state and command may explain, of unit root mean square over the recording
     reaction: Tensor
     """(K, N, J, J) change of the columns per unit of load that nothing explains: they are those of the modelled motion"""
+    dry: tuple[int, ...]  # the column of each joint's dry friction
+    at_rest: Tensor  # (N, J) from 0 to 1: whether a joint is so slow that it may stick
     activity: Tensor  # (N, F) logs of speeds, accelerations and changes of commands, with which errors grow
     smoothing: float  # s, deviation of the smoothing Gaussian
+
+    def parts(self) -> list[LoadTrack]:
+        """In parts of about LONGEST instants."""
+        count = max(1, round(len(self.time) / LONGEST))
+        edges = [round(k * len(self.time) / count) for k in range(count + 1)]
+        return [
+            replace(
+                self,
+                time=self.time[a:b],
+                load=self.load[a:b],
+                columns=self.columns[:, a:b],
+                reaction=self.reaction[:, a:b],
+                at_rest=self.at_rest[a:b],
+                activity=self.activity[a:b],
+            )
+            for a, b in pairwise(edges)
+        ]
 
 
 def load_tracks(recording: Recording, world: World) -> list[LoadTrack]:
@@ -57,29 +83,29 @@ def load_tracks(recording: Recording, world: World) -> list[LoadTrack]:
         return []
     if any(column not in measured for column in range(len(system.states)) if column not in in_pairs):
         return []
-    tracks = [_track(episode, world, measured, recording.period) for episode in recording.episodes]
-    found = [track for track in tracks if track is not None]
+    found = [
+        part
+        for number, episode in enumerate(recording.episodes)
+        for part in _track(number, episode, world, measured, recording.period)
+    ]
     if not found:
         return []
-    size = torch.cat([track.columns.square().flatten(1) for track in found], 1).mean(1).sqrt()
-    kept = size > 1e-9 * size.max()
-    return [_scaled(track, kept, size) for track in found]
+    size = torch.cat([track.columns.square().flatten(1) for track in found], 1).mean(1).sqrt() + 1e-300
+    return [
+        replace(t, columns=t.columns / size[:, None, None], reaction=t.reaction / size[:, None, None, None])
+        for t in found
+    ]
 
 
-def _scaled(track: LoadTrack, kept: Tensor, size: Tensor) -> LoadTrack:
-    by = size[kept, None, None]
-    return replace(track, columns=track.columns[kept] / by, reaction=track.reaction[kept] / by[..., None])
-
-
-def _track(episode: Episode, world: World, measured: Sequence[int], period: float) -> LoadTrack | None:
+def _track(number: int, episode: Episode, world: World, measured: Sequence[int], period: float) -> list[LoadTrack]:
     system = world.system
     stamps, readings, given = (
         torch.as_tensor(values, dtype=torch.float64) for values in (episode.time, episode.state, episode.action)
     )
     smoothing = max(SMOOTHING, period)
     time = torch.arange(float(stamps[0]), float(stamps[-1]), period, dtype=torch.float64)
-    if len(time) * period < 20 * smoothing:
-        return None
+    if len(time) * period < SHORTEST * smoothing:
+        return []
     state = torch.zeros(len(time), len(system.states), dtype=torch.float64)
     after = torch.searchsorted(stamps, time, right=True).clamp(1, len(stamps) - 1)
     share = (time - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
@@ -100,7 +126,7 @@ def _track(episode: Episode, world: World, measured: Sequence[int], period: floa
     state[:, velocities] = rate(state[:, positions])
     acceleration = rate(state[:, velocities])
     commanded = smooth(acting, 0.1 * smoothing)
-    load, columns, reaction = _Motion(world, time, state, acting, acceleration).explainable(rate, commanded)
+    load, columns, reaction, dry = _Motion(world, time, state, acting, acceleration).explainable(rate, commanded)
     largest = torch.tensor([action.largest for action in system.actions], dtype=torch.float64)
     fastest = torch.tensor([system.states[v].largest for v in velocities], dtype=torch.float64)
     stormy = smooth(acceleration.abs(), 2 * smoothing)
@@ -109,21 +135,26 @@ def _track(episode: Episode, world: World, measured: Sequence[int], period: floa
             (stormy / stormy.mean(0) + 0.1).log(),
             (smooth(state[:, velocities].abs(), 2 * smoothing) / fastest + 0.03).log(),
             (smooth(rate(commanded).abs(), 2 * smoothing) / largest + 0.3).log(),
-            smooth((-(state[:, velocities] / (SLOW * fastest)).square()).exp()),
         ),
         1,
     )
+    at_rest = smooth((-(state[:, velocities] / (SLOW * fastest)).square()).exp())
     edge, stride = round(2 * smoothing / period), max(1, round(STEP / period))
     inner = slice(edge, len(time) - edge, stride)
-    smoothed = smooth(columns.flatten(1)).unflatten(1, columns.shape[1:])
-    return LoadTrack(
+    both = torch.cat((load[:, None], columns), 1)
+    smoothed = _smoothed(both.flatten(1), smoothing / period, edge, stride).unflatten(1, both.shape[1:])
+    whole = LoadTrack(
+        number,
         time[inner],
-        smooth(load)[inner],
-        smoothed[inner].movedim(1, 0),
+        smoothed[:, 0],
+        smoothed[:, 1:].movedim(1, 0),
         reaction[inner].movedim(1, 0),
+        dry,
+        at_rest[inner],
         activity[inner],
         smoothing,
     )
+    return whole.parts()
 
 
 @dataclass(frozen=True)
@@ -152,9 +183,8 @@ class _Motion:
         pushed = [self.acceleration(self.state, self.acting, push=k, own=own) for k in joints]
         return free, torch.stack(pushed, -1) - free[..., None]
 
-    def explainable(self, rate: Callable[[Tensor], Tensor], commanded: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(T, J) the unexplained load; (T, K, J) what a world may have wrong of it; (T, K, J, J) the change of these
-        per unit of acceleration-equivalent load.
+    def explainable(self, rate: Callable[[Tensor], Tensor], commanded: Tensor) -> tuple[Tensor, Tensor, Tensor, tuple[int, ...]]:
+        """(T, J) the unexplained load, (T, K, J) columns, (T, K, J, J) reactions and the columns of dry friction.
 
         `rate` differentiates by time, `commanded` (T, n_action) are the commands that act, slightly smoothed.
         """
@@ -167,6 +197,7 @@ class _Motion:
         joints = torch.eye(gain.shape[-1], dtype=state.dtype)
         columns: list[Tensor] = []
         reactions: dict[int, Tensor] = {}
+        dry: list[int] = []
         response = [
             load(self.acceleration(state, acting + unit) - free) for unit in torch.eye(acting.shape[1]).to(acting)
         ]
@@ -180,6 +211,7 @@ class _Motion:
             slip = v / (SLOW * system.states[velocity].largest)
             sign, near_rest = slip.tanh(), (-(0.2 * slip).square()).exp()
             friction = (sign, sign * near_rest, sign * driven[:, j].abs(), v, v * v.abs(), torch.ones_like(v))
+            dry.append(len(columns))
             columns += [each[:, None] * joints[j] for each in friction]
             # Added inertia; then errors of the position: of the sensor's zero, and of a drive that gives or has play.
             reactions[len(columns)] = joints[j][:, None] * gain[:, j, None, :]
@@ -200,7 +232,7 @@ class _Motion:
         reaction = state.new_zeros(len(state), len(columns), len(joints), len(joints))
         for k, each in reactions.items():
             reaction[:, k] = each
-        return load(self.measured - free), torch.stack(columns, 1), reaction
+        return load(self.measured - free), torch.stack(columns, 1), reaction, tuple(dry)
 
 
 def _moved(state: Tensor, column: int) -> Tensor:
@@ -216,12 +248,15 @@ def _unwrapped(angle: Tensor) -> Tensor:
     return torch.cat((angle[:1], angle[1:] - 2 * math.pi * turns))
 
 
-def _smoothed(values: Tensor, deviation: float) -> Tensor:
-    """Values (T, M) smoothed by a Gaussian of this deviation in rows; beyond the ends they go on as they came."""
+def _smoothed(values: Tensor, deviation: float, edge: int = 0, stride: int = 1) -> Tensor:
+    """Values (T, M) smoothed by a Gaussian of this deviation in rows; beyond the ends they go on as they came.
+
+    Of the rows, every `stride`-th from `edge` on, up to as far from the end.
+    """
     reach = math.ceil(4 * deviation)
     lags = torch.arange(-reach, reach + 1, dtype=values.dtype)
     kernel = torch.exp(-0.5 * (lags / max(deviation, 1e-6)).square())
     first, last = values[:1], values[-1:]
     before, beyond = 2 * first - values[1 : reach + 1].flip(0), 2 * last - values[-reach - 1 : -1].flip(0)
-    padded = torch.cat((before, values, beyond)).T[:, None]
-    return torch.nn.functional.conv1d(padded, (kernel / kernel.sum())[None, None])[:, 0].T
+    padded = torch.cat((before, values, beyond))[edge : len(values) + 2 * reach - edge].T[:, None]
+    return conv1d(padded, (kernel / kernel.sum())[None, None], stride=stride)[:, 0].T
