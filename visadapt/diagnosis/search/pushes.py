@@ -20,13 +20,14 @@ from torch.nn.functional import avg_pool1d, pad
 from visadapt.diagnosis.result import Push
 from visadapt.diagnosis.search.unexplained_load import LoadTrack, load_tracks
 from visadapt.recordings import Recording
+from visadapt.systems import Variable
 from visadapt.world import World
 
 WIDTHS = (0.06, 0.085, 0.12, 0.17)  # s, deviations of the Gaussian bumps that are tried
 
 EDGE = 2.45  # Deviations of a bump from its middle where it has 5 % of its peak: there a push starts and ends
 
-CANDIDATE, CLEAR = 3.0, 5.0
+CANDIDATE, CLEAR = 3.5, 5.0
 """Height over its deviation from which a bump is fitted with all else, and from which it is then called a push: far
 more than chance, since errors of a model are not normally distributed."""
 
@@ -63,7 +64,7 @@ def pushes(recording: Recording, world: World) -> tuple[Push, ...]:
     found = _Fit(tracks).pushes()
     tries = sum(len(track.time) for track in tracks) * tracks[0].load.shape[1]
     loads = world.system.loads
-    named = [_named(one, tracks[one.part].episode, loads[one.joint].name, loads[one.joint].unit, tries) for one in found]
+    named = [_named(one, tracks[one.part].episode, loads[one.joint], tries) for one in found]
     return tuple(sorted(named, key=lambda push: (push.episode, push.start)))
 
 
@@ -95,14 +96,15 @@ def _bumps(track: LoadTrack, middles: Tensor, width: float) -> Tensor:
     return width / whole * torch.exp(-0.5 * ((track.time - middles[:, None]) / whole).square())
 
 
-def _named(bump: _Bump, episode: int, load: str, unit: str, tries: int) -> Push:
+def _named(bump: _Bump, episode: int, load: Variable, tries: int) -> Push:
     area = bump.width * math.sqrt(2 * math.pi)
     impulse = bump.height * area
     spread = Z_90 * math.hypot(bump.deviation * area, SHAPE_ERROR * impulse)
     reach = EDGE * bump.width
     p_value = min(1.0, tries * math.erfc(bump.score / math.sqrt(2)))
     ends = max(0.0, bump.middle - reach), bump.middle + reach
-    return Push(episode, load, *ends, bump.height, unit, impulse, (impulse - spread, impulse + spread), p_value)
+    ci90 = impulse - spread, impulse + spread
+    return Push(episode, load.name, *ends, bump.height, load.unit, impulse, ci90, p_value)
 
 
 class _Fit:
@@ -218,12 +220,7 @@ class _Fit:
             )
             deviation = (0.5 * _log_power(basis, power)).exp()
             at_rest = torch.cat([track.at_rest[:, j] for track in self.tracks])
-            friction = torch.cat(
-                [
-                    (weights[track.dry[j]] * PRIOR * self.size * track.columns[track.dry[j], :, j]).abs().amax().expand(n)
-                    for track, weights, n in zip(self.tracks, self.weights, lengths, strict=True)
-                ]
-            )
+            friction = torch.cat([self._dry_friction(part, j).expand(n) for part, n in enumerate(lengths)])
             # At rest, dry friction is what holds the joint.
             deviations = torch.hypot(deviation, friction * at_rest).split(lengths)
             moments = torch.zeros(LAGS + 1, dtype=torch.float64)
@@ -239,6 +236,12 @@ class _Fit:
             lags = torch.arange(LAGS)
             self.autoregression[j] = torch.linalg.solve(moments[(lags[:, None] - lags).abs()], moments[1:])
             self.innovation[j] = (moments[0] - self.autoregression[j] @ moments[1:]).clamp(min=1e-9).sqrt()
+
+    def _dry_friction(self, part: int, joint: int) -> Tensor:
+        """() the size of a joint's dry friction."""
+        track = self.tracks[part]
+        column = track.dry[joint]
+        return PRIOR * self.size * self.weights[part][column].abs() * track.columns[column].abs().amax()
 
     def _highest(self, part: int) -> _Bump:
         """The bump on a part that stands out most beside what is fitted."""

@@ -48,7 +48,7 @@ class LoadTrack:
     load: Tensor  # (N, J)
     columns: Tensor  # (K, N, J) loads that state and command may explain, of unit root mean square over the recording
     reaction: Tensor
-    """(K, N, J, J) change of the columns per unit of load that nothing explains: they are those of the modelled motion"""
+    """(K, N, J, J) change of the columns per unit of load that nothing explains: they follow the motion modelled"""
     dry: tuple[int, ...]  # the column of each joint's dry friction
     at_rest: Tensor  # (N, J) from 0 to 1: whether a joint is so slow that it may stick
     activity: Tensor  # (N, F) logs of speeds, accelerations and changes of commands, with which errors grow
@@ -126,7 +126,7 @@ def _track(number: int, episode: Episode, world: World, measured: Sequence[int],
     state[:, velocities] = rate(state[:, positions])
     acceleration = rate(state[:, velocities])
     commanded = smooth(acting, 0.1 * smoothing)
-    load, columns, reaction, dry = _Motion(world, time, state, acting, acceleration).explainable(rate, commanded)
+    found = _Motion(world, time, state, acting, acceleration).loads(rate, commanded)
     largest = torch.tensor([action.largest for action in system.actions], dtype=torch.float64)
     fastest = torch.tensor([system.states[v].largest for v in velocities], dtype=torch.float64)
     stormy = smooth(acceleration.abs(), 2 * smoothing)
@@ -141,20 +141,30 @@ def _track(number: int, episode: Episode, world: World, measured: Sequence[int],
     at_rest = smooth((-(state[:, velocities] / (SLOW * fastest)).square()).exp())
     edge, stride = round(2 * smoothing / period), max(1, round(STEP / period))
     inner = slice(edge, len(time) - edge, stride)
-    both = torch.cat((load[:, None], columns), 1)
+    both = torch.cat((found.load[:, None], found.columns), 1)
     smoothed = _smoothed(both.flatten(1), smoothing / period, edge, stride).unflatten(1, both.shape[1:])
     whole = LoadTrack(
         number,
         time[inner],
         smoothed[:, 0],
         smoothed[:, 1:].movedim(1, 0),
-        reaction[inner].movedim(1, 0),
-        dry,
+        found.reaction[inner].movedim(1, 0),
+        found.dry,
         at_rest[inner],
         activity[inner],
         smoothing,
     )
     return whole.parts()
+
+
+@dataclass(frozen=True)
+class _Loads:
+    """What `LoadTrack` has, at T instants and not smoothed."""
+
+    load: Tensor  # (T, J)
+    columns: Tensor  # (T, K, J)
+    reaction: Tensor  # (T, K, J, J)
+    dry: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -183,8 +193,8 @@ class _Motion:
         pushed = [self.acceleration(self.state, self.acting, push=k, own=own) for k in joints]
         return free, torch.stack(pushed, -1) - free[..., None]
 
-    def explainable(self, rate: Callable[[Tensor], Tensor], commanded: Tensor) -> tuple[Tensor, Tensor, Tensor, tuple[int, ...]]:
-        """(T, J) the unexplained load, (T, K, J) columns, (T, K, J, J) reactions and the columns of dry friction.
+    def loads(self, rate: Callable[[Tensor], Tensor], commanded: Tensor) -> _Loads:
+        """The load in question and what may explain it.
 
         `rate` differentiates by time, `commanded` (T, n_action) are the commands that act, slightly smoothed.
         """
@@ -203,7 +213,7 @@ class _Motion:
         ]
         for by_unit, command in zip(response, commanded.unbind(1), strict=True):
             columns += [by_unit * command[:, None], by_unit * rate(command)[:, None]]
-        driven = sum(by_unit * command[:, None] for by_unit, command in zip(response, commanded.unbind(1), strict=True))
+        driven = (torch.stack(response, -1) * commanded[:, None]).sum(-1)
         largest = torch.tensor([action.largest for action in system.actions], dtype=state.dtype)
         slack = (commanded / (SLACK * largest)).tanh()
         for j, (position, velocity) in enumerate(system.coordinates):
@@ -227,12 +237,12 @@ class _Motion:
         for name in scalable(system):
             scaled = self.gain(replace(own, **{name: getattr(own, name) * math.exp(DIFFERENCE)}))
             loads = [torch.linalg.solve(g, (self.measured - f)[..., None])[..., 0] for f, g in (plain, scaled)]
-            reactions[len(columns)] = (torch.eye(len(joints)).to(state) - torch.linalg.solve(scaled[1], plain[1])) / DIFFERENCE
+            reactions[len(columns)] = (joints - torch.linalg.solve(scaled[1], plain[1])) / DIFFERENCE
             columns.append((loads[0] - loads[1]) / DIFFERENCE)
         reaction = state.new_zeros(len(state), len(columns), len(joints), len(joints))
         for k, each in reactions.items():
             reaction[:, k] = each
-        return load(self.measured - free), torch.stack(columns, 1), reaction, tuple(dry)
+        return _Loads(load(self.measured - free), torch.stack(columns, 1), reaction, tuple(dry))
 
 
 def _moved(state: Tensor, column: int) -> Tensor:
