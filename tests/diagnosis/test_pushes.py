@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.own_systems import DoublePendulum
-from visadapt.diagnosis.search.pushes import pushes_and_losses
+from visadapt.diagnosis.search.pushes import pushes
 from visadapt.effects.catalogue import catalogue
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole
@@ -49,7 +49,7 @@ def recorded(*given, name="run"):
 
 def found_in(recording):
     with torch.inference_mode():
-        return pushes_and_losses(recording, World(DoublePendulum(), period=PERIOD))[0]
+        return pushes(recording, World(DoublePendulum(), period=PERIOD))
 
 
 def test_pushes_are_found_with_joint_time_and_impulse():
@@ -100,7 +100,7 @@ def test_a_kick_of_the_cart_is_found():
         (Episode(time, command[:, None], state),), ("x", "x_dot", "theta", "theta_dot"), 0.02, ("run",)
     )
     with torch.inference_mode():
-        (push,), _ = pushes_and_losses(recording, world)
+        (push,) = pushes(recording, world)
     assert push.load == "cart_force"
     assert push.start == pytest.approx(2.5 - 0.245, abs=0.1)
     assert push.impulse == pytest.approx(4.0 * 0.1 * math.sqrt(2 * math.pi), rel=0.3)

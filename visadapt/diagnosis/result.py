@@ -56,26 +56,13 @@ class Push:
 
 
 @dataclass(frozen=True)
-class Loss:
-    """The torque or force that a joint loses in motion: mean power that friction takes and its drive does not deliver,
-    over the mean speed. A recording under a controller tells the sum far better than the two apart."""
-
-    load: str
-    size: float
-    unit: str
-    ci90: tuple[float, float]
-    speed: float  # the mean speed, in the unit of the joint's velocity
-
-
-@dataclass(frozen=True)
 class Where:
-    """Shares of the gap by stage and by state, the regions where it is concentrated, pushes and losses."""
+    """Shares of the gap by stage and by state, the regions where it is concentrated, and pushes."""
 
     stages: Mapping[str, float]  # of the explained gap: actuation, dynamics, sensing, camera
     states: Mapping[str, float]  # every state of the system; NaN where it was not measured
     regions: tuple[Region, ...] = ()  # fitted regions of causes first, then lowest p-value first
     pushes: tuple[Push, ...] = ()  # in the order of time
-    losses: tuple[Loss, ...] = ()  # of each joint whose position was measured
 
 
 @dataclass(frozen=True)

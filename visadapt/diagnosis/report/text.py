@@ -15,7 +15,6 @@ from visadapt.diagnosis.result import (
     Cause,
     Diagnosis,
     Estimate,
-    Loss,
     Push,
     Region,
     without_slight,
@@ -93,17 +92,6 @@ def push(one: Push) -> str:
     return (
         f"{plain(one.load)} pushed from {one.start:.2f} to {one.end:.2f} s of episode {one.episode}, up to "
         f"{with_unit(number(one.size, 2), one.unit)}, impulse {estimate(impulse)} (90 %: {interval(impulse)})"
-    )
-
-
-def loss(one: Loss, system: str) -> str:
-    """What a joint loses in words: "shoulder loses 0.19 N m (90 %: 0.18 to 0.20 N m) at a mean speed of 4.2 rad/s"."""
-    size = Estimate(one.size, one.unit, one.ci90)
-    kind = NAMED[system]
-    velocity = kind.states[kind.coordinates[[each.name for each in kind.loads].index(one.load)][1]]
-    return (
-        f"{plain(one.load)} loses {estimate(size)} (90 %: {interval(size)}) to friction and its drive together, "
-        f"at a mean speed of {number(one.speed, 2)} {velocity.unit}"
     )
 
 
@@ -209,7 +197,6 @@ def rendered(template: str, diagnosis: Diagnosis, **values: Any) -> str:
     for function in (plain, number, percent, estimate, interval, effects, shares, push):
         environment.filters[function.__name__] = function
     environment.filters["either"] = lambda names: listed(names, "or")
-    environment.filters["loss"] = lambda one: loss(one, diagnosis.system)
     environment.filters["region"] = lambda one: region(one, diagnosis.system)
     common = {"sentence": sentence(diagnosis), "corrected": corrected(diagnosis), "policy": policy_terms(diagnosis)}
     return environment.get_template(template).render(diagnosis=diagnosis, **common, **values)

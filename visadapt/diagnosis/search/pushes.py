@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool1d, pad
 
-from visadapt.diagnosis.result import Loss, Push
-from visadapt.diagnosis.search.unexplained_load import FRICTIONS, LoadTrack, load_tracks
+from visadapt.diagnosis.result import Push
+from visadapt.diagnosis.search.unexplained_load import LoadTrack, load_tracks
 from visadapt.recordings import Recording
 from visadapt.systems import Variable
 from visadapt.world import World
@@ -56,18 +56,16 @@ TALL = 10.0  # Prior deviation of a bump's height, over the size of the unexplai
 Z_90 = 1.6449  # Half-width of a normal distribution's 90 % interval, in standard deviations
 
 
-def pushes_and_losses(recording: Recording, world: World) -> tuple[tuple[Push, ...], tuple[Loss, ...]]:
-    """The pushes in a recording beyond what a world explains, in the order of time, and what each joint loses."""
+def pushes(recording: Recording, world: World) -> tuple[Push, ...]:
+    """The pushes in a recording beyond what a world explains, in the order of time."""
     tracks = load_tracks(recording, world)
     if not tracks:
-        return (), ()
-    fit = _Fit(tracks)
-    found = fit.pushes()
+        return ()
+    found = _Fit(tracks).pushes()
     tries = sum(len(track.time) for track in tracks) * tracks[0].load.shape[1]
     loads = world.system.loads
     named = [_named(one, tracks[one.part].episode, loads[one.joint], tries) for one in found]
-    losses = tuple(fit.loss(joint, load) for joint, load in enumerate(loads))
-    return tuple(sorted(named, key=lambda push: (push.episode, push.start))), losses
+    return tuple(sorted(named, key=lambda push: (push.episode, push.start)))
 
 
 @dataclass(frozen=True)
@@ -143,21 +141,6 @@ class _Fit:
             self.bumps = [one for one in self.bumps if one not in weakest.values()]
             self._fit(ROUNDS_AGAIN)
         return self.bumps
-
-    def loss(self, joint: int, load: Variable) -> Loss:
-        """What friction and the commands' gain and delay take of a joint's motion, over its mean speed."""
-        size, variance, path, count = 0.0, 0.0, 0.0, 0
-        for part, track in enumerate(self.tracks):
-            velocity = track.velocity[:, joint]
-            power = torch.zeros_like(self.weights[part])
-            for k in (*track.commands, *range(track.dry[joint], track.dry[joint] + FRICTIONS)):
-                power[k] = -(self._design(part)[k, :, joint] @ velocity)
-            size += float(power @ self.weights[part])
-            variance += float(power @ torch.cholesky_solve(power[:, None], self.roots[part])[:, 0])
-            path, count = path + float(velocity.abs().sum()), count + len(velocity)
-        spread = Z_90 * math.sqrt(variance)
-        path += 1e-300
-        return Loss(load.name, size / path, load.unit, ((size - spread) / path, (size + spread) / path), path / count)
 
     def _design(self, part: int) -> Tensor:
         """(K, N, J) loads of unit prior deviation: of the columns, and of the bumps on this part."""

@@ -32,8 +32,6 @@ SHORTEST = 25  # Length over the smoothing's deviation below which an episode te
 
 LONGEST = 300  # Instants in a part: what drifts is fitted part by part, and the work grows with its square
 
-FRICTIONS = 5  # Columns of a joint's friction: dry, more of it near rest, with the load, viscous and quadratic
-
 SLOW = 0.01  # Speed over the largest of its range below which a joint may stick
 
 SLACK = 0.1  # Command over the largest of its range at which the play of a drive is taken up
@@ -51,9 +49,7 @@ class LoadTrack:
     columns: Tensor  # (K, N, J) loads that state and command may explain, of unit root mean square over the recording
     reaction: Tensor
     """(K, N, J, J) change of the columns per unit of load that nothing explains: they follow the motion modelled"""
-    commands: tuple[int, ...]  # the columns of the commands' gains and delays
-    dry: tuple[int, ...]  # the column of each joint's dry friction, the first of the FRICTIONS of that joint
-    velocity: Tensor  # (N, J)
+    dry: tuple[int, ...]  # the column of each joint's dry friction
     at_rest: Tensor  # (N, J) from 0 to 1: whether a joint is so slow that it may stick
     activity: Tensor  # (N, F) logs of speeds, accelerations and changes of commands, with which errors grow
     smoothing: float  # s, deviation of the smoothing Gaussian
@@ -69,7 +65,6 @@ class LoadTrack:
                 load=self.load[a:b],
                 columns=self.columns[:, a:b],
                 reaction=self.reaction[:, a:b],
-                velocity=self.velocity[a:b],
                 at_rest=self.at_rest[a:b],
                 activity=self.activity[a:b],
             )
@@ -154,9 +149,7 @@ def _track(number: int, episode: Episode, world: World, measured: Sequence[int],
         smoothed[:, 0],
         smoothed[:, 1:].movedim(1, 0),
         found.reaction[inner].movedim(1, 0),
-        tuple(range(2 * len(system.actions))),
         found.dry,
-        state[inner][:, velocities],
         at_rest[inner],
         activity[inner],
         smoothing,
@@ -227,9 +220,9 @@ class _Motion:
             v = state[:, velocity]
             slip = v / (SLOW * system.states[velocity].largest)
             sign, near_rest = slip.tanh(), (-(0.2 * slip).square()).exp()
-            friction = (sign, sign * near_rest, sign * driven[:, j].abs(), v, v * v.abs())
+            friction = (sign, sign * near_rest, sign * driven[:, j].abs(), v, v * v.abs(), torch.ones_like(v))
             dry.append(len(columns))
-            columns += [each[:, None] * joints[j] for each in (*friction, torch.ones_like(v))]
+            columns += [each[:, None] * joints[j] for each in friction]
             # Added inertia; then errors of the position: of the sensor's zero, and of a drive that gives or has play.
             reactions[len(columns)] = joints[j][:, None] * gain[:, j, None, :]
             columns.append(self.measured[:, j, None] * joints[j])
