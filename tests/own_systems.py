@@ -40,8 +40,8 @@ class Pendulum(System):
 
 
 def page_code() -> tuple[str, str]:
-    """The class and the script of the page."""
-    one, other = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    """The class and the script of the page, before that of a real machine."""
+    one, other, _ = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     return one, other
 
 

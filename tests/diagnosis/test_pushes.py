@@ -1,4 +1,4 @@
-"""Pushes of a double pendulum and of a cart: found with their times and impulses, and none named where there is none."""
+"""Pushes of a double pendulum and of a cart: found with times and impulses, and none named where there is none."""
 
 import dataclasses
 import math
