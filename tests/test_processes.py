@@ -5,6 +5,8 @@ import os
 import pytest
 import torch
 
+from tests.own_systems import Pendulum
+from visadapt.effects.catalogue import catalogue
 from visadapt.processes import shared_out
 
 
@@ -34,3 +36,8 @@ def test_an_error_in_any_process_is_raised(bad):
 
 def test_nothing_to_do():
     assert shared_out(lambda indices: [], 0, 4) == []
+
+
+def test_effects_of_a_system_of_ones_own_come_back_from_another_process():
+    effects = catalogue(Pendulum())
+    assert shared_out(lambda indices: [effects[k] for k in indices], len(effects), 2) == effects

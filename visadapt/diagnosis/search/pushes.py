@@ -27,11 +27,11 @@ WIDTHS = (0.06, 0.085, 0.12, 0.17)  # s, deviations of the Gaussian bumps that a
 
 EDGE = 2.45  # Deviations of a bump from its middle where it has 5 % of its peak: there a push starts and ends
 
-CANDIDATE, CLEAR = 3.5, 5.0
-"""Height over its deviation from which a bump is fitted with all else, and from which it is then called a push: far
-more than chance, since errors of a model are not normally distributed."""
+FIRST, CANDIDATE, CLEAR = 3.5, 3.0, 5.0
+"""Height over its deviation from which the first bump on a part is fitted with all else, from which others are, and
+from which they are then called pushes: far more than chance, since errors of a model are not normally distributed."""
 
-SHAPE_ERROR = 0.1  # Deviation of an impulse, as a share of it, because a push need not have the shape of a bump
+SHAPE_ERROR = 0.15  # Deviation of an impulse, as a share of it, because a push need not have the shape of a bump
 
 MOST = 6  # Bumps on an episode at most
 
@@ -126,8 +126,9 @@ class _Fit:
         """The bumps that stand out clearly."""
         self._fit(ROUNDS)
         searched: Sequence[int] = range(len(self.tracks))
-        for _ in range(MOST):
-            found = [one for part in searched if (one := self._highest(part)).score > CANDIDATE]
+        for k in range(MOST):
+            needed = CANDIDATE if k else FIRST
+            found = [one for part in searched if (one := self._highest(part)).score > needed]
             if not found:
                 break
             self.bumps += found
