@@ -8,6 +8,8 @@ import sys
 import pytest
 import torch
 
+from tests.own_systems import Pendulum
+from visadapt.effects.catalogue import catalogue
 from visadapt.processes import shared_out
 
 
@@ -64,3 +66,8 @@ except KeyboardInterrupt:
     os.killpg(begun.pid, signal.SIGINT)
     _, told = begun.communicate(timeout=30)
     assert (begun.returncode, told) == (130, "")
+
+
+def test_effects_of_a_system_of_ones_own_come_back_from_another_process():
+    effects = catalogue(Pendulum())
+    assert shared_out(lambda indices: [effects[k] for k in indices], len(effects), 2) == effects

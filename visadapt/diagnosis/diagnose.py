@@ -30,6 +30,7 @@ from visadapt.diagnosis.search.causes import Alternative, alternatives, causes, 
 from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
 from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
 from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import ScoredModel, Search
 from visadapt.diagnosis.search.unexplained import smooth_functions
@@ -163,6 +164,7 @@ def diagnose(
             stage_shares(search, comparison, [cost for _, cost in repeats]),
             errors.by_state(system, rows.channels, bool(found)),
             regions,
+            pushes(recording, world),
         ),
         causes=found,
         ranking=ranking(comparison, effects, system, gap_closed, repeat_causes),
