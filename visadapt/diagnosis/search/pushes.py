@@ -83,6 +83,11 @@ class _Bump:
     def score(self) -> float:
         return abs(self.height) / self.deviation
 
+    def within(self, other: _Bump) -> bool:
+        """Whether its middle lies in a higher bump on the same joint."""
+        near = abs(self.middle - other.middle) < EDGE * other.width
+        return near and self.part == other.part and self.joint == other.joint and abs(self.height) < abs(other.height)
+
     def on(self, track: LoadTrack) -> Tensor:
         """(N, J) the bump with unit height, smoothed as the track is."""
         out = torch.zeros_like(track.load)
@@ -141,7 +146,8 @@ class _Fit:
                 break
             self.bumps = [one for one in self.bumps if one not in weakest.values()]
             self._fit(ROUNDS_AGAIN)
-        return self.bumps
+        # A smaller bump within another is no push of its own: it corrects the shape of that one.
+        return [one for one in self.bumps if not any(one.within(other) for other in self.bumps)]
 
     def _design(self, part: int) -> Tensor:
         """(K, N, J) loads of unit prior deviation: of the columns, and of the bumps on this part."""
