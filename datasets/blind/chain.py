@@ -104,8 +104,10 @@ class Sensing:
         position, angle = (parameters[f"{sensor}_delay.delay"] for sensor in ("position", "angle"))
         self.late = parameters["measurement_delay.delay"] + np.stack((position, position, angle, angle))  # s, (4, n)
         reach = int(np.ceil(self.late.max() / shortest)) + 2
-        self.past = np.repeat(start[None, :4], reach, 0)
         self.times = np.repeat(-shortest * np.arange(reach)[:, None], start.shape[1], 1)
+        # The log begins while the machine moves, each joint at its first speed.
+        self.past = np.repeat(start[None, :4], reach, 0)
+        self.past[:, ::2] += self.times[:, None] * start[1:4:2]
         self.delayed = bool(reach > 2)
         self.counted: tuple[Time, Array, Array] | None = None
         self.reading: Array | None = None

@@ -167,6 +167,7 @@ LATER: tuple[Kind, ...] = (
     ),
     Kind("pole_friction", "dynamics", 0.0002, 0.3, _plain("torque")),
     Kind("pole_spring", "dynamics", 0.001, 1.0, _plain("stiffness")),
+    Kind("load_dependent_friction", "dynamics", 0.005, 0.7, _plain("share")),
     Kind("position_delay", "sensing", 0.001, 0.1, _plain("delay")),
     Kind("angle_delay", "sensing", 0.0005, 0.1, _plain("delay")),
 )

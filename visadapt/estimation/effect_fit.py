@@ -92,6 +92,14 @@ def fit_effects(
     rows = cut(measured, holds.used, commands, stamps, channels, period, profile.window_rows)
     present = [float(getattr(effect, p.name)) for effect in effects if type(effect) in fitted for p in effect.table]
     found = _fitted(system, fitted, rows, present)
+    late = [kind for kind in fitted if issubclass(kind, LateSensors)]
+    if late:
+        # Until its first reading arrives, a simulated sensor reads the first state, whatever the motion.
+        used = rows.used.clone()
+        for kind in late:
+            used[..., kind.late] *= (rows.time >= found.theta[0, columns[kind]])[..., None]
+        rows = replace(rows, used=used)
+        found = _best(system, fitted, [found], rows, QUICK)
     covariance = torch.linalg.inv(posterior(fitted, found)[1]) if fitted else torch.zeros(0, 0)
     states = _by_episode(rows, found.state[0], measured)
     values = {kind: _within_a_turn(kind, found.theta[0, own]) for kind, own in columns.items()}

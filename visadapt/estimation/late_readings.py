@@ -40,8 +40,11 @@ def reading(world: World, state: Tensor, past: Past | None) -> Tensor:
 
 
 def _earlier(world: World, state: Tensor, past: Past, delay: Tensor) -> Tensor:
-    """The states (N, n_state) `delay` s, () or (N,), earlier, but not before the episode."""
-    left, time = torch.minimum(delay.expand_as(past.time), past.time), past.time
+    """The states (N, n_state) `delay` s, () or (N,), earlier.
+
+    Before the episode its first command is taken to have acted: a log begins while the machine moves.
+    """
+    left, time = delay.expand_as(past.time), past.time
     last = past.command.shape[1] - 1
     for k, (command, duration) in enumerate(zip(past.command.unbind(1), past.duration.unbind(1), strict=True)):
         back = left if k == last else torch.minimum(left, duration)
