@@ -32,6 +32,10 @@ LOG_LENGTH = math.log(2.0)  # Mean of a log length before anything is seen, in s
 
 LOG_SPREAD = 3.0  # Standard deviation of log lengths and log amplitudes before anything is seen
 
+LOG_REACH = 12.0
+"""Most by which log lengths and log amplitudes leave their mean: a line search that tries e^100 meets no matrix that is
+positive definite in float64."""
+
 MAX_DECADES = 4  # Decades at most by which process noise becomes less beside the black box
 
 MIN_GAIN = 3.0
@@ -138,19 +142,21 @@ class _Regression:
                 self.information[some].clone(),
                 self.gradient[some].clone(),
             )
-            prior, logs = self.start().clone(), start.clone().requires_grad_()
+            prior = self.start().clone()
+            free = (LOG_REACH * ((start.clone() - prior) / LOG_REACH).atanh()).requires_grad_()
             optimiser = torch.optim.LBFGS(
-                [logs], max_iter=iterations, tolerance_change=1e-3, line_search_fn="strong_wolfe"
+                [free], max_iter=iterations, tolerance_change=1e-3, line_search_fn="strong_wolfe"
             )
 
             def loss() -> Tensor:
                 optimiser.zero_grad()
+                logs = prior + LOG_REACH * (free / LOG_REACH).tanh()
                 value = 0.5 * ((logs - prior) / LOG_SPREAD).square().sum() - part.evidence(logs)[0]
                 value.backward()
                 return value
 
             optimiser.step(loss)
-        return logs.detach()
+        return prior + LOG_REACH * (free.detach() / LOG_REACH).tanh()
 
     def evidence(self, logs: Tensor) -> tuple[Tensor, Tensor]:
         """Log odds of the loads against none, for lengths and amplitudes, and the posterior mean weights (L M,)."""
