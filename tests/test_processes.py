@@ -43,8 +43,9 @@ def test_nothing_to_do():
 
 def test_an_interrupt_is_told_by_one_process_alone():
     code = """
-import os, time
+import os, signal, time
 from visadapt.processes import shared_out
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore interrupts
 def work(indices):
     os.write(1, b"at work\\n")
     time.sleep(60)
