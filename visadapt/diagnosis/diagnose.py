@@ -130,20 +130,21 @@ def diagnose(
     runners_up = [compared.model for compared in comparison.models[1 : 1 + RUNNERS_UP]]
     without = [search.without(best, effect) for effect in best.effects]
     noise = (best.fits.log_noise[0] / 2).exp()
-    sets = {frozenset(f.names): f for f in [*alone, *without, *runners_up] if f is not search.source}
     shown = {frozenset(f.names): f for f in [search.source, best]}
+    sets = {names: f for f in [*alone, *without, *runners_up] if (names := frozenset(f.names)) not in shown}
     rollouts = heldout.held_out(system, rows, _fitted(shown), lambda errors: errors, jobs)
     source, corrected = rollouts[0], rollouts[-1]
     rms = [errors.rms(noise) for errors in rollouts]
+    reached = rms[-1]
     rms += heldout.held_out(system, rows, _fitted(sets), lambda errors: errors.rms(noise), jobs)
     if repeats:
         source = errors_with_repeats(prepared, search)
-    errors = Errors(source.rms(noise), corrected.rms(noise), corrected.floor(noise), corrected.rms(noise), noise)
+    errors = Errors(source.rms(noise), reached, corrected.floor(noise), reached, noise)
     gap, improvable = errors.gap(), False
     if gap.closed < MIN_GAP_CLOSED:  # else a black box cannot close enough of what is left
         black_box = heldout.beside_black_box(system, rows, best.effects, best.fits, jobs)
-        reached = min((errors.after, black_box.rms(noise)), key=lambda error: float(heldout.overall(error)[-1]))
-        errors = replace(errors, black_box=reached)
+        best_reached = min((reached, black_box.rms(noise)), key=lambda error: float(heldout.overall(error)[-1]))
+        errors = replace(errors, black_box=best_reached)
         gap = errors.gap()
         left = heldout.closed(gap.before, gap.black_box, gap.floor) - gap.closed
         improvable = left > 1 - MIN_GAP_CLOSED and heldout.predicts_better(black_box, corrected, noise)

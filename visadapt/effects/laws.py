@@ -177,13 +177,10 @@ class LoadDependentLaw(DryFrictionLaw):
 
 
 def motor_loads(state: Tensor, command: Tensor, system: System) -> Tensor:
-    """The loads (B, n_load) that would move the system as the command (B, n_action) does."""
-    velocities = [velocity for _, velocity in system.coordinates]
-    idle, units = torch.zeros_like(command), torch.eye(len(velocities)).to(state)
+    """The loads (B, n_load) that would move the system as the command (B, n_action) does.
 
-    def rates(given: Tensor, load: Tensor) -> Tensor:
-        return system.derivative(state, given, load.expand(len(state), -1))[:, velocities]
-
-    free = rates(idle, torch.zeros_like(units[0]))
-    by_load = torch.stack([rates(idle, unit) - free for unit in units], -1)
-    return torch.linalg.solve(by_load, rates(command, torch.zeros_like(units[0])) - free)
+    They are not finite where the state is so far off, in a trial of a search, that no load changes its accelerations.
+    """
+    none = state.new_zeros(len(state), len(system.loads))
+    free, by_load = system.response_to_loads(state, torch.zeros_like(command), none)
+    return torch.linalg.solve_ex(by_load, system.accelerations(state, command, none) - free).result

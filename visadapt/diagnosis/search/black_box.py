@@ -144,19 +144,23 @@ class _Regression:
             )
             prior = self.start().clone()
             free = (LOG_REACH * ((start.clone() - prior) / LOG_REACH).atanh()).requires_grad_()
+
+            def bounded() -> Tensor:
+                return prior + LOG_REACH * (free / LOG_REACH).tanh()
+
             optimiser = torch.optim.LBFGS(
                 [free], max_iter=iterations, tolerance_change=1e-3, line_search_fn="strong_wolfe"
             )
 
             def loss() -> Tensor:
                 optimiser.zero_grad()
-                logs = prior + LOG_REACH * (free / LOG_REACH).tanh()
+                logs = bounded()
                 value = 0.5 * ((logs - prior) / LOG_SPREAD).square().sum() - part.evidence(logs)[0]
                 value.backward()
                 return value
 
             optimiser.step(loss)
-        return prior + LOG_REACH * (free.detach() / LOG_REACH).tanh()
+            return bounded().detach()
 
     def evidence(self, logs: Tensor) -> tuple[Tensor, Tensor]:
         """Log odds of the loads against none, for lengths and amplitudes, and the posterior mean weights (L M,)."""

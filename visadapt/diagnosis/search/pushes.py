@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d, pad
 
 from visadapt.diagnosis.result import Push
+from visadapt.diagnosis.search.causes import Z_90
 from visadapt.diagnosis.search.unexplained_load import LoadTrack, load_tracks
 from visadapt.recordings import Recording
 from visadapt.systems import Variable
@@ -52,8 +53,6 @@ WHITE = 0.03  # Share of the errors' variance that is taken as white, so that er
 DISTINCT = 0.15  # Least share of a bump's information that columns and other bumps leave to it
 
 TALL = 10.0  # Prior deviation of a bump's height, over the size of the unexplained load
-
-Z_90 = 1.6449  # Half-width of a normal distribution's 90 % interval, in standard deviations
 
 
 def pushes(recording: Recording, world: World) -> tuple[Push, ...]:

@@ -110,8 +110,7 @@ def _track(number: int, episode: Episode, world: World, measured: Sequence[int],
     after = torch.searchsorted(stamps, time, right=True).clamp(1, len(stamps) - 1)
     share = (time - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
     for k, column in enumerate(measured):
-        values = _unwrapped(readings[:, k]) if system.states[column].unit == "rad" else readings[:, k]
-        state[:, column] = torch.lerp(values[after - 1], values[after], share)
+        state[:, column] = torch.lerp(readings[after - 1, k], readings[after, k], share)
     held = torch.cat((stamps.diff(), stamps.new_tensor([period])))
     acting = world.actuate(given[None], held[None])[0].mean(1)[after - 1]
 
@@ -177,21 +176,17 @@ class _Motion:
     acting: Tensor  # (T, n_action)
     measured: Tensor  # (T, J)
 
-    def acceleration(self, state: Tensor, acting: Tensor, push: int | None = None, own: System | None = None) -> Tensor:
-        """(T, J) accelerations of the joints by the world, or by the bare system `own`; a unit load pushes a joint."""
+    def acceleration(self, state: Tensor, acting: Tensor) -> Tensor:
+        """(T, J) accelerations of the joints by the world."""
         at = WorldState(self.time, state, ())
-        load = self.world.load(at)
-        if push is not None:
-            load = load + torch.eye(load.shape[1], dtype=load.dtype)[push]
-        system = self.world.system_at(at) if own is None else own
-        return system.derivative(state, acting, load)[:, [velocity for _, velocity in system.coordinates]]
+        return self.world.system_at(at).accelerations(state, acting, self.world.load(at))
 
     def gain(self, own: System | None = None) -> tuple[Tensor, Tensor]:
-        """(T, J) accelerations without a push, and (T, J, J) their change per unit of each load."""
-        free = self.acceleration(self.state, self.acting, own=own)
-        joints = range(free.shape[1])
-        pushed = [self.acceleration(self.state, self.acting, push=k, own=own) for k in joints]
-        return free, torch.stack(pushed, -1) - free[..., None]
+        """(T, J) accelerations of the joints by the world, or by the bare system `own`, and (T, J, J) their change per
+        unit of each load."""
+        at = WorldState(self.time, self.state, ())
+        system, load = self.world.system_at(at) if own is None else own, self.world.load(at)
+        return system.response_to_loads(self.state, self.acting, load)
 
     def loads(self, rate: Callable[[Tensor], Tensor], commanded: Tensor) -> _Loads:
         """The load in question and what may explain it.
@@ -250,12 +245,6 @@ def _moved(state: Tensor, column: int) -> Tensor:
     out = state.clone()
     out[:, column] += DIFFERENCE
     return out
-
-
-def _unwrapped(angle: Tensor) -> Tensor:
-    """An angle (T,) that does not jump by turns."""
-    turns = (angle.diff() / (2 * math.pi)).round().cumsum(0)
-    return torch.cat((angle[:1], angle[1:] - 2 * math.pi * turns))
 
 
 def _smoothed(values: Tensor, deviation: float, edge: int = 0, stride: int = 1) -> Tensor:
