@@ -1,6 +1,7 @@
 """Linearisation against autograd and finite steps; fits against the truth."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -92,3 +93,15 @@ def test_a_large_effect_is_found_from_a_source_that_took_positions_as_free_of_no
     assert float(search.source.fits.log_noise[0, 0]) < math.log(1e-4**2)
     fits = search.single(CartMass).fits
     torch.testing.assert_close((fits.log_noise[0] / 2).exp(), torch.tensor(noise).double(), rtol=0.1, atol=0)
+
+
+def test_the_prior_of_first_states_favours_no_sensor_scale():
+    """Readings times k under a sensor scale of k are as likely as the readings, but for their density: k per reading."""
+    rows, scale = prepare(record([]), CartPole()).rows, 0.5
+    scaled = Search(CartPole(), replace(rows, measured=scale * rows.measured), [SensorScale])
+    found = scaled.single(SensorScale).fits
+    torch.testing.assert_close(found.theta[0], torch.tensor([scale, scale]).double(), rtol=0.01, atol=0)
+    density = float(rows.used.sum()) * math.log(1 / scale)
+    assert float(found.likelihood[0]) - density == pytest.approx(
+        float(Search(CartPole(), rows, []).source.fits.likelihood[0]), abs=3
+    )

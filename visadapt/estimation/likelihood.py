@@ -34,6 +34,9 @@ MIN_LOG_PROCESS = math.log(1e-4**2)
 MAX_LOG_PROCESS = math.log(3.0**2)
 """Bounds of the log process noise variance of the driven velocities, (m/s)^2 and (rad/s)^2."""
 
+MIN_READING_PER_STATE = 0.01
+"""Below it a reading says nothing of its state, as where a frozen sensor repeats."""
+
 
 @dataclass(frozen=True)
 class FitState(Batch):
@@ -70,12 +73,13 @@ def linear_problem(models: Sequence[CandidateModel], fits: FitState) -> Linear:
     """
     rows = models[0].rows
     origin = initial_states(rows, models[0].system)[:, 0]
+    variance = torch.tensor(models[0].profile.initial_variance, dtype=torch.float64)
     used = rows.used[..., None]
     inside = rows.inside[:, 1:, None, None]
     windows, length, n = fits.state.shape[1:]
     columns = 1 + fits.theta.shape[1]
     identity = torch.eye(n, dtype=torch.float64)
-    transition, sensing = [], []
+    transition, sensing, spread = [], [], []
     drive = torch.zeros(len(models), windows, length - 1, n, columns, dtype=torch.float64)
     reading = torch.zeros(len(models), windows, length, len(rows.channels), columns, dtype=torch.float64)
     start = torch.zeros(len(models), windows, n, columns, dtype=torch.float64)
@@ -86,19 +90,37 @@ def linear_problem(models: Sequence[CandidateModel], fits: FitState) -> Linear:
             model.slopes = lin.transition, lin.sensing
         transition.append(torch.where(inside > 0, lin.transition, identity))
         sensing.append(lin.sensing * used)
+        per_state = _reading_per_state(lin.sensing[:, 0], models[0])
+        spread.append(variance / per_state.square())
         drive[c, ..., 0] = lin.next_state - fits.state[c, :, 1:]
         drive[c, ..., 1 : 1 + count] = lin.by_parameter
         reading[c, ..., 0] = rows.measured - lin.measured
         reading[c, ..., 1 : 1 + count] = -lin.sensing_by_parameter
-        start[c, ..., 0] = origin - fits.state[c, :, 0]
+        start[c, ..., 0] = origin / per_state - fits.state[c, :, 0]
     return Linear(
         torch.cat(transition),
         (drive * inside).flatten(0, 1),
         torch.cat(sensing),
         (reading * used).flatten(0, 1),
         start.flatten(0, 1),
-        torch.tensor(models[0].profile.initial_variance, dtype=torch.float64),
+        torch.cat(spread),
     )
+
+
+def _reading_per_state(sensing: Tensor, model: CandidateModel) -> Tensor:
+    """(W, n) change of a state's reading per unit of the state, for derivatives `sensing` (W, m, n) of the readings; of
+    a velocity that is not measured, that of its position.
+
+    What is known of a window's first state is known of its reading: in the state's own units it would favour a sensor
+    that reads less than the state is.
+    """
+    out = torch.ones_like(sensing[:, 0])
+    for k, channel in enumerate(model.rows.channels):
+        out[:, channel] = sensing[:, k, channel]
+    for velocity, position in model.profile.position_of.items():
+        if velocity not in model.rows.channels:
+            out[:, velocity] = out[:, position]
+    return torch.where(out.abs() > MIN_READING_PER_STATE, out, 1.0)
 
 
 def variances(model: CandidateModel, log_process: Tensor, log_noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -168,8 +190,7 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState) -> Derivativ
     for first in range(0, count * windows, at_once):
         own = slice(first, first + at_once)
         parts.append(_of_systems(problem.of(own), process[own], noise[own], used[own], drawn[own], members))
-    whole = [torch.cat(each).unflatten(0, (count, windows)) for each in zip(*parts, strict=True)]
-    return Derivatives(whole[0], whole[1], whole[2], whole[3], whole[4], whole[5])
+    return Derivatives(*(torch.cat(each).unflatten(0, (count, windows)) for each in zip(*parts, strict=True)))
 
 
 def _of_systems(
