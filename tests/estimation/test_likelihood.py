@@ -96,7 +96,7 @@ def test_a_large_effect_is_found_from_a_source_that_took_positions_as_free_of_no
 
 
 def test_the_prior_of_first_states_favours_no_sensor_scale():
-    """Readings times k under a sensor scale of k are as likely as the readings, but for their density: k per reading."""
+    """Readings times k under a sensor scale of k are as likely as the readings, but for their density."""
     rows, scale = prepare(record([]), CartPole()).rows, 0.5
     scaled = Search(CartPole(), replace(rows, measured=scale * rows.measured), [SensorScale])
     found = scaled.single(SensorScale).fits
