@@ -40,8 +40,8 @@ class Pendulum(System):
 
 
 def page_code() -> tuple[str, str]:
-    """The class and the script of the page."""
-    one, other = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    """The class and the script of the page, before that of a real machine."""
+    one, other, _ = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     return one, other
 
 
@@ -51,3 +51,38 @@ def furuta() -> Any:
     module = sys.modules["furuta_of_the_page"] = ModuleType("furuta_of_the_page")
     exec(compile(page_code()[0], "furuta.py", "exec"), vars(module))
     return module.Furuta
+
+
+@dataclass(frozen=True)
+class DoublePendulum(System):
+    """Two uniform links on motors at shoulder and elbow; 0 hangs down, the second angle is relative to the first."""
+
+    mass: float | torch.Tensor = 0.6  # kg, of each link
+    length: float | torch.Tensor = 0.25  # m
+    gravity: float | torch.Tensor = 9.81
+
+    name = "double_pendulum"
+    states: ClassVar[tuple[Variable, ...]] = (
+        Variable("angle_1", "rad", -3.2, 3.2),
+        Variable("angle_2", "rad", -3.2, 3.2),
+        Variable("velocity_1", "rad/s", -20.0, 20.0),
+        Variable("velocity_2", "rad/s", -20.0, 20.0),
+    )
+    actions: ClassVar[tuple[Variable, ...]] = (
+        Variable("torque_1", "N m", -6.0, 6.0),
+        Variable("torque_2", "N m", -6.0, 6.0),
+    )
+    loads = (Variable("shoulder", "N m", -3.0, 3.0), Variable("elbow", "N m", -3.0, 3.0))
+    coordinates = ((0, 2), (1, 3))
+
+    def derivative(self, state, command, load):
+        q1, q2, v1, v2 = state.unbind(-1)
+        t1, t2 = (command + load).unbind(-1)
+        unit = self.mass * self.length**2
+        m22, m12, m11 = unit / 3, unit * (1 / 3 + q2.cos() / 2), unit * (5 / 3 + q2.cos())
+        weight = self.mass * self.gravity * self.length / 2
+        upper, lower = 3 * weight * q1.sin(), weight * (q1 + q2).sin()
+        f1 = t1 + unit / 2 * q2.sin() * (2 * v1 * v2 + v2**2) - upper - lower
+        f2 = t2 - unit / 2 * q2.sin() * v1**2 - lower
+        det = m11 * m22 - m12**2
+        return torch.stack((v1, v2, (m22 * f1 - m12 * f2) / det, (m11 * f2 - m12 * f1) / det), -1)

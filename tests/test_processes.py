@@ -1,10 +1,15 @@
 """Work shared out among processes gives what one process gives, in its order; errors come back."""
 
 import os
+import signal
+import subprocess
+import sys
 
 import pytest
 import torch
 
+from tests.own_systems import Pendulum
+from visadapt.effects.catalogue import catalogue
 from visadapt.processes import shared_out
 
 
@@ -34,3 +39,36 @@ def test_an_error_in_any_process_is_raised(bad):
 
 def test_nothing_to_do():
     assert shared_out(lambda indices: [], 0, 4) == []
+
+
+def test_an_interrupt_is_told_by_one_process_alone():
+    code = """
+import os, signal, time
+from visadapt.processes import shared_out
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore interrupts
+def work(indices):
+    os.write(1, b"at work\\n")
+    time.sleep(60)
+    return list(indices)
+try:
+    shared_out(work, 2, 2)
+except KeyboardInterrupt:
+    raise SystemExit(130)
+"""
+    begun = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert begun.stdout is not None
+    assert [begun.stdout.readline() for _ in range(2)] == ["at work\n"] * 2
+    os.killpg(begun.pid, signal.SIGINT)
+    _, told = begun.communicate(timeout=30)
+    assert (begun.returncode, told) == (130, "")
+
+
+def test_effects_of_a_system_of_ones_own_come_back_from_another_process():
+    effects = catalogue(Pendulum())
+    assert shared_out(lambda indices: [effects[k] for k in indices], len(effects), 2) == effects

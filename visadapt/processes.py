@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import multiprocessing
 import pickle
+import signal
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
-from typing import TypeVar
+from typing import Any, TypeVar
+
+from visadapt.effects.base import EFFECTS, Effect
 
 Result = TypeVar("Result")
 Work = Callable[[Sequence[int]], Sequence[Result]]
@@ -48,8 +52,25 @@ def shared_out(work: Work[Result], count: int, jobs: int) -> list[Result]:
 
 
 def _run(work: Work[Result], share: Sequence[int], sender: Connection) -> None:
+    # An interrupt from the keyboard reaches every process; the one that shares out the work ends the others.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         found: object = list(work(share))
     except Exception as error:
         found = error
-    sender.send_bytes(pickle.dumps(found))
+    stream = io.BytesIO()
+    _Pickler(stream).dump(found)
+    sender.send_bytes(stream.getvalue())
+
+
+class _Pickler(pickle.Pickler):
+    """Pickles effects by name: those of a system of one's own are in no module."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, type) and issubclass(obj, Effect) and EFFECTS.get(getattr(obj, "name", "")) is obj:
+            return _effect, (obj.name,)
+        return NotImplemented
+
+
+def _effect(name: str) -> type[Effect]:
+    return EFFECTS[name]

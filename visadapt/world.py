@@ -201,9 +201,11 @@ class World(nn.Module):
         return self._read(state, self._split(self._at_rest(state))[1], None)[0]
 
     def load(self, at: WorldState) -> Tensor:
-        """Sum of the loads (B, n_load) of all effects at an instant, with dry friction on what moves."""
+        """Sum of the loads (B, n_load) of all effects at an instant without a command, with dry friction on what
+        moves."""
         system = self.system_at(at)
-        load, limits = self._load(at.time, at.state, system), self._dry_friction(at.time, at.state, system)
+        idle = at.state.new_zeros(len(at.state), len(system.actions))
+        load, limits = self._load(at.time, at.state, system), self._dry_friction(at.time, at.state, idle, system)
         return load if limits is None else load + sliding(limits, at.state[:, self._velocities])
 
     def system_at(self, at: WorldState) -> System:
@@ -263,7 +265,7 @@ class World(nn.Module):
         integrate = INTEGRATORS[self.integrator]
         for k in range(self.substeps):
             command, here = commands[:, k], self._varied(system, time, state)
-            limits = self._dry_friction(time, state, here)
+            limits = self._dry_friction(time, state, command, here)
             friction = 0.0 if limits is None else sliding(limits, state[:, self._velocities])
 
             def derivative(t: Tensor, s: Tensor, u: Tensor = command, rub: float | Tensor = friction) -> Tensor:
@@ -294,9 +296,9 @@ class World(nn.Module):
     def _velocities(self) -> list[int]:
         return [velocity for _, velocity in self.system.coordinates]
 
-    def _dry_friction(self, time: Tensor, state: Tensor, system: System) -> Tensor | None:
+    def _dry_friction(self, time: Tensor, state: Tensor, command: Tensor, system: System) -> Tensor | None:
         """Sum over all effects of the largest dry friction; None without any."""
-        found = [effect.dry_friction(time, state, system) for effect in self._rubbing]
+        found = [effect.dry_friction(time, state, command, system) for effect in self._rubbing]
         limits = [each for each in found if each is not None]
         return sum(limits[1:], limits[0]) if limits else None
 

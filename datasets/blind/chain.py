@@ -26,6 +26,8 @@ NEUTRAL: dict[str, float] = {
     "angle_offset.offset": 0.0,
     "position_offset.offset": 0.0,
     "measurement_delay.delay": 0.0,
+    "position_delay.delay": 0.0,
+    "angle_delay.delay": 0.0,
     "sensor_scale.position": 1.0,
     "sensor_scale.angle": 1.0,
     "frozen_zone.start": np.inf,
@@ -99,9 +101,13 @@ class Sensing:
     def __init__(self, parameters: Parameters, start: Array, shortest: float) -> None:
         self.p = parameters
         # States over the longest delay, newest first, and their times; `shortest` is the shortest substep in s.
-        reach = int(np.ceil(parameters["measurement_delay.delay"].max() / shortest)) + 2
-        self.past = np.repeat(start[None, :4], reach, 0)
+        position, angle = (parameters[f"{sensor}_delay.delay"] for sensor in ("position", "angle"))
+        self.late = parameters["measurement_delay.delay"] + np.stack((position, position, angle, angle))  # s, (4, n)
+        reach = int(np.ceil(self.late.max() / shortest)) + 2
         self.times = np.repeat(-shortest * np.arange(reach)[:, None], start.shape[1], 1)
+        # The log begins while the machine moves, each joint at its first speed.
+        self.past = np.repeat(start[None, :4], reach, 0)
+        self.past[:, ::2] += self.times[:, None] * start[1:4:2]
         self.delayed = bool(reach > 2)
         self.counted: tuple[Time, Array, Array] | None = None
         self.reading: Array | None = None
@@ -118,12 +124,13 @@ class Sensing:
         p = self.p
         y = state[:4]
         if self.delayed:
-            seen, columns = t - p["measurement_delay.delay"], np.arange(y.shape[1])
-            older = np.clip((self.times > seen + 1e-10).sum(0), 1, len(self.times) - 1)
+            channels, columns = np.arange(4)[:, None], np.arange(y.shape[1])
+            seen = t - self.late
+            older = np.clip((self.times[:, None] > seen + 1e-10).sum(0), 1, len(self.times) - 1)
             newer = older - 1
             since = self.times[older, columns]
             part = (seen - since) / (self.times[newer, columns] - since)
-            y = (1 - part) * self.past[older, :, columns].T + part * self.past[newer, :, columns].T
+            y = (1 - part) * self.past[older, channels, columns] + part * self.past[newer, channels, columns]
         y = y.copy()
         y[:2] *= p["sensor_scale.position"]
         y[2:] *= p["sensor_scale.angle"]

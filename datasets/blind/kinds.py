@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -166,6 +167,9 @@ LATER: tuple[Kind, ...] = (
     ),
     Kind("pole_friction", "dynamics", 0.0002, 0.3, _plain("torque")),
     Kind("pole_spring", "dynamics", 0.001, 1.0, _plain("stiffness")),
+    Kind("load_dependent_friction", "dynamics", 0.005, 0.7, _plain("share")),
+    Kind("position_delay", "sensing", 0.001, 0.1, _plain("delay")),
+    Kind("angle_delay", "sensing", 0.0005, 0.1, _plain("delay")),
 )
 """effects that joined the catalogue after the sets 2028 and 2029 were made"""
 
@@ -268,7 +272,8 @@ def drawn(mixture: str, effects: Effects) -> tuple[Kind, ...]:
 
 INSEPARABLE: tuple[frozenset[str], ...] = (
     frozenset({"actuator_bias", "constant_force"}),
-    frozenset({"actuator_delay", "measurement_delay"}),
+    # Any two of these are the same as any other two.
+    *map(frozenset, combinations(("actuator_delay", "measurement_delay", "position_delay", "angle_delay"), 2)),
     frozenset({"actuator_gain", "cart_mass", "pole_mass"}),
     frozenset({"track_tilt", "angle_offset", "constant_force"}),
     frozenset({"track_tilt", "angle_offset", "actuator_bias"}),

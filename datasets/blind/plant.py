@@ -121,6 +121,8 @@ class Plant:
     """dry friction at the pivot"""
     turns_exactly: bool = False
     """whether dry friction turns round within a substep, where a velocity passes 0; the older sets do without"""
+    gear: Array | None = None
+    """dry friction on the cart as a share of the motor's force, (n,)"""
     slosh: tuple[Array, Array, Array] | None = None
     """mass (kg, zero where there is none), angular frequency (rad/s) and damping ratio of a mass hidden in the cart"""
 
@@ -158,17 +160,18 @@ class Plant:
         """States (4 or 6, n) after h seconds under a motor force (N) held constant; rows 4 and 5 are the slosh's."""
         middle = state + 0.5 * h * self._rates(t, state, force)
         after = state + h * self._rates(t + 0.5 * h, middle, force)
-        if self.dry_forces or self.dry_torques:
-            after = self._rub(t, state, after, h)
+        if self.dry_forces or self.dry_torques or self.gear is not None:
+            after = self._rub(t, state, after, force, h)
         return after
 
-    def _rub(self, t: Time, before: Array, after: Array, h: Time) -> Array:
+    def _rub(self, t: Time, before: Array, after: Array, force: Array, h: Time) -> Array:
         """Apply the impulse of dry friction, at most to a standstill, to velocities and positions."""
         zero = np.zeros_like(after[0])
-        for axis, table in ((1, self.dry_forces), (3, self.dry_torques)):
-            if not table:
+        geared = zero if self.gear is None else self.gear * np.abs(force)
+        for axis, table, more in ((1, self.dry_forces, geared), (3, self.dry_torques, zero)):
+            most = _total(table, t, before) + more
+            if not most.any():
                 continue
-            most = _total(table, t, before)
             unit = (np.ones_like(zero), zero) if axis == 1 else (zero, np.ones_like(zero))
             per_impulse = self._solve(before[2], *unit)  # m/s and rad/s for each N s or N m s
             own = per_impulse[0] if axis == 1 else per_impulse[1]

@@ -187,6 +187,9 @@ def _plant(cases: list[Case], spans: list[slice], n: int, seconds: float) -> Pla
                 getattr(plant, MASSES[effect])[span] *= parameters["scale"]
             elif effect == "track_tilt":
                 plant.tilt[span] = parameters["angle"]
+            elif effect == "load_dependent_friction":
+                plant.gear = np.zeros(n) if plant.gear is None else plant.gear
+                plant.gear[span] = parameters["share"]
             elif effect == "sloshing":
                 slosh[0][span], slosh[2][span] = parameters["mass"], parameters["damping"]
                 slosh[1][span] = 2 * np.pi * parameters["frequency"]

@@ -87,6 +87,10 @@ ROWS = (
     _lab("encoders alone, viscous friction", {"viscous_friction": {"coefficient": 3.0}}, late=None),
     _lab("encoders alone, dry friction", {"coulomb_friction": {"force": 3.0}}, late=None),
     replace(_lab("jitter alone, nothing", {}), noise=CLEAN, counts=(0.0, 0.0)),
+    _lab(
+        "lab's machine, two sensors' clocks apart",
+        {"angle_delay": {"delay": 0.02}, "viscous_friction": {"coefficient": 2.0}},
+    ),
     Row("a spring at the hinge, also a sensor scale and a pole length", {"pole_spring": {"stiffness": 0.3}}),
     Row("noisy, gain", {"actuator_gain": {"scale": 0.8}}, COARSE, "absent", rows=67, episodes=6),
     Row("noisy, pole mass", {"pole_mass": {"scale": 2.0}}, COARSE, "absent", rows=67, episodes=6),

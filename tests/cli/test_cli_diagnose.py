@@ -55,8 +55,9 @@ def stub(monkeypatch):
     """A diagnosis that is there at once, and what it was asked."""
     asked: dict = {}
 
-    def diagnose(recording, world, catalogue=None, seed=0, jobs=1, progress=None, policy=None):
+    def diagnose(recording, world, catalogue=None, seed=0, jobs=1, progress=None, policy=None, announce=None):
         asked.update(recording=recording, world=world, seed=seed, jobs=jobs, policy=policy)
+        announce("400 rows of 2 channels, 24 effects: about 9 s on 1 core")
         progress("fitting", 1, 1, 0.5)
         print("chatter")
         return a_diagnosis("identified", warnings=recording.warnings)
@@ -76,6 +77,7 @@ class TestCommand:
         assert printed.out.startswith("identified: Friction patch (start")
         assert "chatter" not in printed.out
         assert "fitting" in printed.err
+        assert "about 9 s on 1 core" in printed.err
 
     def test_what_the_diagnosis_is_asked(self, recording, stub):
         assert run(recording, recording.parent, "--seed", 3, "--jobs", 2) == 0

@@ -33,7 +33,10 @@ def rms(recording, effects, black_box):
         rows = prepare(recording, system, effects).rows
         search = Search(system, rows, effects)
         best = search.single(effects[0]) if effects else search.source
-        errors = heldout.held_out(system, rows, [(best.effects, best.fits)], black_box)[0]
+        if black_box:
+            errors = heldout.beside_black_box(system, rows, best.effects, best.fits)
+        else:
+            (errors,) = heldout.held_out(system, rows, [(best.effects, best.fits)], lambda errors: errors)
         noise = torch.tensor([NOISE[channel] for channel in rows.channels], dtype=torch.float64)
         return float(heldout.overall(errors.rms(noise))[-1])
 

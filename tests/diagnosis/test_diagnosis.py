@@ -11,6 +11,7 @@ from visadapt.diagnosis.search.preparation import prepare
 from visadapt.effects import (
     ActuatorBacklash,
     ActuatorGain,
+    AngleDelay,
     AngleOffset,
     CartMass,
     ConstantForce,
@@ -18,6 +19,7 @@ from visadapt.effects import (
     DynamicsEffect,
     FrictionPatch,
     Parameter,
+    PoleMass,
     ViscousFriction,
 )
 from visadapt.effects.forces import CartForce
@@ -135,6 +137,21 @@ def test_lost_rows_are_counted():
     rate = sum(marks.sum() for marks in lost) / sum(len(marks) - 1 for marks in lost)
     assert result.causes[0].parameters["rate"].value == pytest.approx(rate)
     assert result.causes[0].parameters["rate"].ci90[0] < rate < result.causes[0].parameters["rate"].ci90[1]
+
+
+def test_a_heavier_pole_is_named_with_what_else_moves_alike():
+    result = diagnose(record([PoleMass(scale=3.0)]), SOURCE, catalogue=[PoleMass, ViscousFriction])
+    assert names(result) == {"pole_mass"}
+    assert any("weigh the pole" in warning for warning in result.warnings)
+    other = diagnose(record([ViscousFriction(coefficient=0.8)]), SOURCE, catalogue=[PoleMass, ViscousFriction])
+    assert not any("weigh the pole" in warning for warning in other.warnings)
+
+
+def test_a_late_sensor_is_named_with_its_delay():
+    result = diagnose(record([AngleDelay(delay=0.02)]), SOURCE)
+    assert names(result) == {"angle_delay"}
+    low, high = result.causes[0].parameters["delay"].ci90
+    assert low < 0.02 < high < 0.03
 
 
 def test_a_sensor_that_stands_still_is_found_with_its_zone():

@@ -167,7 +167,7 @@ class TestResult:
             "schema", "system", "recording", "verdict", "where", "causes", "ranking", "gap", "next_experiment",
             "warnings",
         ]  # fmt: skip
-        assert list(content["where"]) == ["stages", "states", "regions", "pixels"]
+        assert list(content["where"]) == ["stages", "states", "regions", "pushes", "pixels"]
         assert content["where"]["regions"] == [
             {"variable": "x", "from": 0.1, "to": 0.4, "share": 0.8, "p_value": 0.0004}
         ]

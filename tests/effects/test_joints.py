@@ -10,6 +10,7 @@ from tests.own_systems import Pendulum, furuta
 from tests.worlds import columns
 from visadapt.effects import EFFECTS
 from visadapt.effects.catalogue import catalogue, catalogue_text, twins
+from visadapt.effects.laws import motor_loads
 from visadapt.systems import CartPole
 from visadapt.world import World
 
@@ -135,3 +136,29 @@ def test_effects_that_are_the_same_are_known_to_be():
     assert effects["inertia.scale"].indistinguishable_from == ()
     # With friction of the motor's voltage against its speed, the resistance is no gain.
     assert BY_NAME["resistance.scale"].indistinguishable_from == ()
+
+
+@pytest.mark.parametrize(("speed", "command"), [(0.8, 0.5), (0.8, -0.5), (-0.8, 0.5), (-0.8, -0.5)])
+def test_a_gear_rubs_with_a_share_of_the_motors_force_whichever_way_it_drives(speed, command):
+    rubbing = World(CartPole(), [EFFECTS["load_dependent_friction"](share=0.2)], 0.001).double()
+    slowed = World(CartPole(), [EFFECTS["coulomb_friction"](force=0.2 * 0.5 * CartPole().max_force)], 0.001).double()
+    state, commands = columns(0.1, speed, 0.2, 1.0), columns(command)[None]
+    time = torch.zeros(1).double()
+    found, expected, free = (
+        world.integrate(time, state, commands) for world in (rubbing, slowed, World(CartPole(), period=0.001).double())
+    )
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-8)
+    assert (found - free)[0, 1].item() * speed < 0, "against the motion"
+    idle = rubbing.integrate(time, state, 0 * commands)
+    torch.testing.assert_close(idle, World(CartPole(), period=0.001).double().integrate(time, state, 0 * commands))
+
+
+def test_what_a_gear_of_a_joint_passes_is_the_motors_torque():
+    loads = motor_loads(STATE, columns(2.0), FURUTA)[0]
+    assert loads.tolist() == pytest.approx([2.0 * FURUTA.motor_constant / FURUTA.resistance, 0.0], abs=1e-12)
+    rubbing = World(FURUTA, [BY_NAME["arm_axis.load_dependent_friction"](share=0.3)], 1e-4).double()
+    slowed = World(FURUTA, [BY_NAME["arm_axis.coulomb_friction"](torque=0.3 * float(loads[0]))], 1e-4).double()
+    found, expected = (
+        world.integrate(torch.zeros(1).double(), STATE, columns(2.0)[None]) for world in (rubbing, slowed)
+    )
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-9)

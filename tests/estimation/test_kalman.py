@@ -23,7 +23,7 @@ def problem():
         draw(N, T, CHANNELS, STATES),
         draw(N, T, CHANNELS, COLUMNS),
         draw(N, STATES, COLUMNS),
-        torch.tensor([1.0, 2.0, 0.5, 3.0], dtype=torch.float64),
+        torch.tensor([1.0, 2.0, 0.5, 3.0], dtype=torch.float64).expand(N, -1),
     )
 
 
@@ -35,7 +35,7 @@ def dense(problem, n, column):
     """Mean and covariance of all states, and the matrix, of system n, as one Gaussian."""
     mean = [problem.start[n, :, column]]
     maps = [torch.eye(STATES, dtype=torch.float64)]
-    sources = [torch.diag(problem.spread)]
+    sources = [torch.diag(problem.spread[n])]
     rows = [[maps[0]]]
     for t in range(T - 1):
         a = problem.transition[n, t]
@@ -133,7 +133,7 @@ def test_states_of_an_unstable_system_are_found_over_many_precise_readings():
         sensing.expand(1, rows, 2, 6),
         torch.zeros(1, rows, 2, 1, dtype=torch.float64),
         torch.tensor([0.1, 0.0, 0.1, 0.0, 0.0, 0.0], dtype=torch.float64)[None, :, None],
-        torch.tensor([2.25, 25.0, 0.1, 100.0, 100.0, 0.1], dtype=torch.float64),
+        torch.tensor([[2.25, 25.0, 0.1, 100.0, 100.0, 0.1]], dtype=torch.float64),
     )
     process = torch.diag(torch.tensor([0.0, 0, 0, 0, 1e-2, 1e-5], dtype=torch.float64))
     smoothed, _ = backward(forward(problem, process[None], torch.full((1, 2), 10.0).double()))

@@ -1,6 +1,7 @@
 """Linearisation against autograd and finite steps; fits against the truth."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from visadapt.diagnosis.search.search import Search
 from visadapt.effects import ActuatorDelay, CartMass, ConstantForce, SensorScale, ViscousFriction
 from visadapt.estimation.candidate import CandidateModel, linearise
 from visadapt.estimation.fit_states import CAREFUL
+from visadapt.estimation.fitting import fit, refitted
 from visadapt.systems import CartPole
 
 
@@ -53,12 +55,24 @@ def test_information_is_the_curvature_of_the_likelihood(viscous):
     for side in (-step, step):
         # A range of no width holds the parameter where it is while the states settle.
         model.low = model.high = best.theta[0] + side
-        from visadapt.estimation.likelihood import fit  # the one place that needs the bare fit
-
         held = best[torch.tensor([0])]
         object.__setattr__(held, "theta", best.theta + side)
-        losses.append(float(best.likelihood[0] - fit([model], held, torch.ones(1, viscous.shape[0]), 10).likelihood[0]))
+        losses.append(float(best.likelihood[0] - fit([model], held, 10).likelihood[0]))
     assert sum(losses) / 2 == pytest.approx(0.5, rel=0.1)
+
+
+def test_a_refit_without_some_windows_is_a_fit_of_the_others(viscous):
+    used = torch.ones(1, viscous.shape[0], dtype=torch.float64)
+    used[:, 2] = 0
+    found = []
+    for rows in (viscous, viscous.select(used[0].nonzero()[:, 0])):
+        search = Search(CartPole(), rows, [ViscousFriction])
+        found.append(search.fit([((ViscousFriction,), search.single(ViscousFriction).fits)], CAREFUL)[0].fits)
+    best, alone = found
+    with torch.inference_mode():
+        theta = refitted(CandidateModel(CartPole(), [ViscousFriction], viscous), best, used).theta
+    # One step goes most of the way.
+    assert abs(float(theta - alone.theta)) < 0.3 * abs(float(best.theta - alone.theta))
 
 
 def test_a_batch_of_sets_is_fitted_as_each_alone(viscous):
@@ -79,3 +93,15 @@ def test_a_large_effect_is_found_from_a_source_that_took_positions_as_free_of_no
     assert float(search.source.fits.log_noise[0, 0]) < math.log(1e-4**2)
     fits = search.single(CartMass).fits
     torch.testing.assert_close((fits.log_noise[0] / 2).exp(), torch.tensor(noise).double(), rtol=0.1, atol=0)
+
+
+def test_the_prior_of_first_states_favours_no_sensor_scale():
+    """Readings times k under a sensor scale of k are as likely as the readings, but for their density."""
+    rows, scale = prepare(record([]), CartPole()).rows, 0.5
+    scaled = Search(CartPole(), replace(rows, measured=scale * rows.measured), [SensorScale])
+    found = scaled.single(SensorScale).fits
+    torch.testing.assert_close(found.theta[0], torch.tensor([scale, scale]).double(), rtol=0.01, atol=0)
+    density = float(rows.used.sum()) * math.log(1 / scale)
+    assert float(found.likelihood[0]) - density == pytest.approx(
+        float(Search(CartPole(), rows, []).source.fits.likelihood[0]), abs=3
+    )

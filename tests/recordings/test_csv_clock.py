@@ -27,6 +27,11 @@ class TestClock:
         assert recording.episodes[1].time[0] == pytest.approx(31 * 0.05)
         assert recording.warnings == (f"{file}, row 31 (line 32): rows are missing here; the episode was split",)
 
+    def test_a_fast_loop_that_stalls_for_some_milliseconds_is_one_episode(self, file):
+        table = {name: np.delete(values, [300, 301]) for name, values in a_table(rows=600, period=0.002).items()}
+        (episode,) = load(write(file, table)).episodes
+        np.testing.assert_allclose(episode.time, table["time"], atol=1e-6)
+
     def test_rows_of_an_unsteady_clock_keep_their_stamps(self, file):
         time = np.cumsum(np.random.default_rng(0).uniform(0.04, 0.06, 400))
         table = {"time": time, "x": 0.3 * np.sin(2 * time), "theta": 0.1 * np.sin(3 * time), "command": np.sin(time)}

@@ -36,6 +36,7 @@ def run(options: argparse.Namespace) -> None:
             jobs=options.jobs,
             progress=report,
             policy=policy,
+            announce=print,
         )
     print(as_text(result))
     if options.json:

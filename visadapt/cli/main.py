@@ -21,6 +21,8 @@ COMMANDS = {
 }
 """Each subcommand's arguments, and what it does; it is carried out by `run` of the module of its name."""
 
+RESUMED = ("adapt", "train", "renderer")  # Subcommands that go on where an interrupted run ended
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command: 0 done; 2 bad input, described by one line on stderr; 130 interrupted."""
@@ -36,7 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         importlib.import_module(f"visadapt.cli.{command}").run(options)
         sys.stdout.flush()
     except KeyboardInterrupt:
-        print("visadapt: interrupted; run the same command to go on", file=sys.stderr)
+        resumes = "; run the same command to go on" if command in RESUMED else ""
+        print(f"visadapt: interrupted{resumes}", file=sys.stderr)
         return 130  # as of a shell
     except BrokenPipeError:
         # Whoever read the output has read enough, as `head` does; Python would complain once more at exit.

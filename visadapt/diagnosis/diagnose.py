@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import torch
 
@@ -23,18 +24,22 @@ from visadapt.diagnosis.result import (
     Where,
     without_slight,
 )
-from visadapt.diagnosis.search import heldout
+from visadapt.diagnosis.search import duration, heldout
+from visadapt.diagnosis.search.all_rows import on_all_rows
 from visadapt.diagnosis.search.causes import Alternative, alternatives, causes, ranking, stage_shares
 from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
 from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
 from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
-from visadapt.diagnosis.search.search import Search
+from visadapt.diagnosis.search.search import ScoredModel, Search
 from visadapt.diagnosis.search.unexplained import smooth_functions
 from visadapt.effects import EFFECTS, Effect
 from visadapt.effects.catalogue import catalogue as all_effects, twins
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.effect_fit import remembers
+from visadapt.estimation.fit_states import Effects
+from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
 from visadapt.progress import Report, staged
 from visadapt.recordings import Recording
@@ -66,6 +71,7 @@ def diagnose(
     jobs: int = 1,
     progress: Report | None = None,
     policy: policy_bound.StatesToActions | None = None,
+    announce: Callable[[str], object] | None = None,
 ) -> Diagnosis:
     """Find where a recording departs from the source, which effects cause it, and how far they close the gap.
 
@@ -78,6 +84,8 @@ def diagnose(
         progress: called with (stage, steps done, steps in all, loss).
         policy: a policy on states, in the units and signs of the source and at the rate of the recording; with it, the
             terms of the paper's Theorem 1 are computed (`Diagnosis.policy`).
+        announce: called, before the search begins, with a line that says how much there is to do and about how long it
+            will take.
 
     Raises:
         ValueError: the world has effects, its system cannot be diagnosed, or `policy` is not one on its states.
@@ -105,8 +113,12 @@ def diagnose(
     candidates = searched(effects, system)
     prepared = prepare(recording, system, candidates)
     rows = prepared.rows
-    search = Search(system, rows, candidates, prepared.source, jobs)
+    search = Search(system, rows.select(prepared.searched), candidates, prepared.source, jobs)
+    if announce is not None:
+        announce(duration.announcement(rows, len(candidates), duration.expected(search, rows), jobs))
     search.run(staged(progress, "search"))
+    if len(prepared.searched) < rows.shape[0]:
+        search = on_all_rows(search, rows)
     comparison = compare(search)
     best = comparison.best
     groups = alternatives(comparison, effects, system)
@@ -117,24 +129,32 @@ def diagnose(
     alone = [search.single(effect) for effect in dict.fromkeys(one.canonical for group in groups for one in group)]
     runners_up = [compared.model for compared in comparison.models[1 : 1 + RUNNERS_UP]]
     without = [search.without(best, effect) for effect in best.effects]
-    sets = {frozenset(f.names): f for f in [search.source, best, *alone, *without, *runners_up]}
-    rollouts = heldout.held_out(system, rows, [(f.effects, f.fits) for f in sets.values()], jobs=jobs)
-    predicted = dict(zip(sets, rollouts, strict=True))
-    source = errors_with_repeats(prepared, search) if repeats else predicted[frozenset()]
-    corrected = predicted[frozenset(best.names)]
-    black_box = heldout.held_out(system, rows, [(best.effects, best.fits)], black_box=True, jobs=jobs)[0]
     noise = (best.fits.log_noise[0] / 2).exp()
-    reached = min((corrected.rms(noise), black_box.rms(noise)), key=lambda error: float(heldout.overall(error)[-1]))
-    errors = Errors(source.rms(noise), corrected.rms(noise), corrected.floor(noise), reached, noise)
-    gap = errors.gap()
-    left = heldout.closed(gap.before, gap.black_box, gap.floor) - gap.closed
-    improvable = left > 1 - MIN_GAP_CLOSED and heldout.predicts_better(black_box, corrected, noise)
-    gap_closed = {names: errors.closed_by(each) for names, each in predicted.items()}
+    shown = {frozenset(f.names): f for f in [search.source, best]}
+    sets = {names: f for f in [*alone, *without, *runners_up] if (names := frozenset(f.names)) not in shown}
+    rollouts = heldout.held_out(system, rows, _fitted(shown), lambda errors: errors, jobs)
+    source, corrected = rollouts[0], rollouts[-1]
+    rms = [errors.rms(noise) for errors in rollouts]
+    reached = rms[-1]
+    rms += heldout.held_out(system, rows, _fitted(sets), lambda errors: errors.rms(noise), jobs)
+    if repeats:
+        source = errors_with_repeats(prepared, search)
+    errors = Errors(source.rms(noise), reached, corrected.floor(noise), reached, noise)
+    gap, improvable = errors.gap(), False
+    if gap.closed < MIN_GAP_CLOSED:  # else a black box cannot close enough of what is left
+        black_box = heldout.beside_black_box(system, rows, best.effects, best.fits, jobs)
+        best_reached = min((reached, black_box.rms(noise)), key=lambda error: float(heldout.overall(error)[-1]))
+        errors = replace(errors, black_box=best_reached)
+        gap = errors.gap()
+        left = heldout.closed(gap.before, gap.black_box, gap.floor) - gap.closed
+        improvable = left > 1 - MIN_GAP_CLOSED and heldout.predicts_better(black_box, corrected, noise)
+    gap_closed = {names: errors.closed_by(each) for names, each in zip([*shown, *sets], rms, strict=True)}
 
     explaining = (*repeat_causes, *causes(search, comparison, groups, gap_closed))
     unexplained = comparison.unexplained(improvable)
     verdict = _verdict(comparison, gap, unexplained, improvable, explaining, bool(repeats))
     found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
+    carrying = {cause.effect for cause in without_slight(found)}
     before, after = disturbances(search, comparison)
     regions = _regions(found, before if found else after, effects, profile.region_variables, seed)
     return Diagnosis(
@@ -145,6 +165,7 @@ def diagnose(
             stage_shares(search, comparison, [cost for _, cost in repeats]),
             errors.by_state(system, rows.channels, bool(found)),
             regions,
+            pushes(recording, world),
         ),
         causes=found,
         ranking=ranking(comparison, effects, system, gap_closed, repeat_causes),
@@ -155,6 +176,7 @@ def diagnose(
             *prepared.warnings,
             *_warnings(comparison, verdict, unexplained),
             *_at_bounds(comparison),
+            *(f"{one.name}: {one.caveat}" for one in best.effects if one.caveat and one.name in carrying),
         ),
         figures=figure_data(search, source, corrected, errors, before, after, regions),
         policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, best),
@@ -169,6 +191,10 @@ def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effec
         if not (twins(effect, out, system) or effect.repeats_readings or remembers(effect)):
             out.append(effect)
     return out
+
+
+def _fitted(sets: Mapping[frozenset[str], ScoredModel]) -> list[tuple[Effects, FitState]]:
+    return [(each.effects, each.fits) for each in sets.values()]
 
 
 def _verdict(

@@ -41,12 +41,28 @@ class Region:
 
 
 @dataclass(frozen=True)
+class Push:
+    """A passing load on one joint that no function of state and command explains; several may act in a recording."""
+
+    episode: int
+    load: str  # the load that it adds to
+    start: float  # the JSON's "from", s since the episode started, where it rises above 5 % of its peak
+    end: float  # the JSON's "to"
+    size: float  # its peak, signed
+    unit: str  # of the size; that of the impulse is this times s
+    impulse: float
+    ci90: tuple[float, float]  # 90 % confidence interval of the impulse
+    p_value: float  # probability that errors alone look as much like a push anywhere in the recording
+
+
+@dataclass(frozen=True)
 class Where:
-    """Shares of the gap by stage and by state, and the regions where it is concentrated."""
+    """Shares of the gap by stage and by state, the regions where it is concentrated, and pushes."""
 
     stages: Mapping[str, float]  # of the explained gap: actuation, dynamics, sensing, camera
     states: Mapping[str, float]  # every state of the system; NaN where it was not measured
     regions: tuple[Region, ...] = ()  # fitted regions of causes first, then lowest p-value first
+    pushes: tuple[Push, ...] = ()  # in the order of time
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from visadapt.effects.base import *
 from visadapt.effects.forces import *
 from visadapt.effects.friction import *
 from visadapt.effects.hinge import *
+from visadapt.effects.late_sensors import *
 from visadapt.effects.laws import *
 from visadapt.effects.parameters import *
 from visadapt.effects.residual import *

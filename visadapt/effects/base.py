@@ -94,6 +94,8 @@ class Effect(nn.Module):
     """Systems on which passive data do separate it from those effects."""
     settled_by: ClassVar[Mapping[str, str]] = {}
     """The experiment that tells this effect from another one, by the other's name; stated on one of the two."""
+    caveat: ClassVar[str] = ""
+    """What else may be meant where a recording shows this effect: a warning of the diagnosis."""
     order: ClassVar[int] = 1000
     """Position among the effects of its stage, which act in ascending order; without one, it acts last."""
     abrupt: ClassVar[bool] = False
@@ -219,10 +221,10 @@ class DynamicsEffect(Effect):
         """
         return torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)
 
-    def dry_friction(self, time: Tensor, state: Tensor, system: System) -> Tensor | None:
+    def dry_friction(self, time: Tensor, state: Tensor, command: Tensor, system: System) -> Tensor | None:
         """The largest dry friction (B, n_load, 2) against positive and against negative motion; None without any.
 
-        Constant over an integration step; arguments as those of `load`.
+        Constant over an integration step, in which `command` (B, n_action) acts; the others as in `load`.
         """
         return None
 

@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 from visadapt.effects.aerial import VEHICLES, Vehicle, airspeed
 from visadapt.effects.base import DynamicsEffect, Parameter, Role, inside
 from visadapt.effects.forces import CartForce
-from visadapt.effects.laws import CoulombLaw, DirectionalLaw, StribeckLaw, ViscousLaw
+from visadapt.effects.laws import CoulombLaw, DirectionalLaw, LoadDependentLaw, StribeckLaw, ViscousLaw
 from visadapt.systems import CartPole, System
 
 
@@ -66,6 +66,15 @@ class DirectionalFriction(DirectionalLaw):
     name = "directional_friction"
     equation = "F = -forward where x_dot > 0, backward where x_dot < 0; at rest, what holds the cart, up to these"
     table = (Parameter("forward", "N", 0.0, 15.0, 0.0), Parameter("backward", "N", 0.0, 15.0, 0.0))
+    systems = (CartPole,)
+
+
+class LoadDependentFriction(LoadDependentLaw):
+    """Dry friction of a gear between motor and cart, a share of the motor's force."""
+
+    name = "load_dependent_friction"
+    equation = "F = -share |motor force| sign(x_dot); at rest, what holds the cart, up to share |motor force|"
+    table = (Parameter("share", "1", 0.0, 0.8, 0.0),)
     systems = (CartPole,)
 
 

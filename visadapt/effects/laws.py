@@ -117,12 +117,12 @@ class DryFrictionLaw(JointEffect):
 
     abrupt = True
 
-    def limits(self, state: Tensor, system: System) -> tuple[Tensor, Tensor]:
+    def limits(self, state: Tensor, command: Tensor, system: System) -> tuple[Tensor, Tensor]:
         """The largest friction against positive and against negative motion, () or (B,) each."""
         raise NotImplementedError
 
-    def dry_friction(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        both = [limit.expand_as(time) for limit in self.limits(state, system)]
+    def dry_friction(self, time: Tensor, state: Tensor, command: Tensor, system: System) -> Tensor:
+        both = [limit.expand_as(time) for limit in self.limits(state, command, system)]
         return self._on_joint(torch.stack(both, -1), system)
 
 
@@ -131,7 +131,7 @@ class CoulombLaw(DryFrictionLaw):
 
     source = "Olsson et al. (1998), Friction models and friction compensation, section 2"
 
-    def limits(self, state: Tensor, system: System) -> tuple[Tensor, Tensor]:
+    def limits(self, state: Tensor, command: Tensor, system: System) -> tuple[Tensor, Tensor]:
         limit = self.value(self.table[0].name, state)
         return limit, limit
 
@@ -141,7 +141,7 @@ class StribeckLaw(DryFrictionLaw):
 
     source = "Armstrong-Helouvry, Dupont and Canudas de Wit (1994), Automatica 30(7), section 2.2"
 
-    def limits(self, state: Tensor, system: System) -> tuple[Tensor, Tensor]:
+    def limits(self, state: Tensor, command: Tensor, system: System) -> tuple[Tensor, Tensor]:
         at_speed, breakaway = self.value(self.table[0].name, state), self.value("breakaway", state)
         share = (-(self.joint_velocity(state, system) / self.value("velocity", state)).square()).exp()
         limit = at_speed + (breakaway - at_speed) * share
@@ -162,5 +162,25 @@ class DirectionalLaw(DryFrictionLaw):
 
     source = "Armstrong-Helouvry, Dupont and Canudas de Wit (1994), Automatica 30(7), section 2"
 
-    def limits(self, state: Tensor, system: System) -> tuple[Tensor, Tensor]:
+    def limits(self, state: Tensor, command: Tensor, system: System) -> tuple[Tensor, Tensor]:
         return self.value("forward", state), self.value("backward", state)
+
+
+class LoadDependentLaw(DryFrictionLaw):
+    """Dry friction of a gear, a share of what the motor passes through it; the joint's other loads add none."""
+
+    source = "Duclusaud et al. (2025), Extended friction models for the physics simulation of servo actuators, model M3"
+
+    def limits(self, state: Tensor, command: Tensor, system: System) -> tuple[Tensor, Tensor]:
+        limit = self.value("share", state) * motor_loads(state, command, system)[:, self.joint].abs()
+        return limit, limit
+
+
+def motor_loads(state: Tensor, command: Tensor, system: System) -> Tensor:
+    """The loads (B, n_load) that would move the system as the command (B, n_action) does.
+
+    They are not finite where the state is so far off, in a trial of a search, that no load changes its accelerations.
+    """
+    none = state.new_zeros(len(state), len(system.loads))
+    free, by_load = system.response_to_loads(state, torch.zeros_like(command), none)
+    return torch.linalg.solve_ex(by_load, system.accelerations(state, command, none) - free).result

@@ -51,6 +51,10 @@ class PoleMass(ParameterScale):
     table = (Parameter("scale", "1", 0.02, 20.0, 1.0),)
     systems = (CartPole,)
     scaled: ClassVar[dict[str, str]] = {"scale": "pole_mass"}
+    caveat = (
+        "motion shows the pole's mass only against the cart's mass and the forces: if the pole weighs what the source "
+        "says, the cart's mass, the motor's force and every friction are divided by this scale instead; weigh the pole"
+    )
 
 
 class PoleLength(ParameterScale):

@@ -11,62 +11,6 @@ from visadapt.effects.base import Parameter, Reading, Role, SensingEffect, insid
 from visadapt.systems import CartPole
 
 
-class MeasurementDelay(SensingEffect):
-    """Measurements that arrive late, by any delay.
-
-    Between two rows, positions are interpolated by the cubic with the rows' positions and velocities (Hermite), and
-    velocities are its slope; states without a velocity are interpolated linearly. Before the episode, its first state
-    is taken as measured.
-    """
-
-    name = "measurement_delay"
-    # First: it interpolates the true motion; the effects after it change the reading.
-    order = 10
-    systems = (CartPole,)
-    equation = "measured(t) = state(max(t - delay, 0))"
-    source = (
-        "Franklin, Powell and Workman (1998), section 4.3.3; de Boor (1978), A Practical Guide to Splines, chapter IV"
-    )
-    table = (Parameter("delay", "s", 0.0, 0.2, 0.0),)
-    indistinguishable_from = ("actuator_delay",)
-
-    positions: ClassVar[list[int]] = [CartPole.index("x"), CartPole.index("theta")]
-    velocities: ClassVar[list[int]] = [CartPole.index("x_dot"), CartPole.index("theta_dot")]
-
-    def memory(self, state: Tensor, period: float) -> Tensor:
-        shift = self._shift(state, period).detach()
-        if not bool((shift >= 0).all()):
-            raise ValueError(f"measurement_delay: delay must not be negative, got {float(shift.min()) * period:g} s")
-        # Each row carries its number, so that no row from before the episode is interpolated.
-        row = torch.cat((state, torch.full_like(state[:, :1], -1)), 1)
-        return row[:, None].expand(-1, int(shift.max().floor()) + 1, -1)
-
-    def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
-        number = memory[:, -1, -1] + 1
-        rows = torch.cat((memory, torch.cat((measured, number[:, None]), 1)[:, None]), 1)
-        shift = self._shift(measured, period)
-        # Not torch.minimum, which halves the gradient where both are equal: in every first row without a delay.
-        shift = torch.where(shift < number, shift, number)
-        whole = shift.detach().floor()
-        index = torch.arange(len(rows), device=rows.device), rows.shape[1] - 1 - whole.long()
-        later, earlier = rows[index], rows[index[0], index[1] - 1]
-        back = (shift - whole)[:, None]  # periods before the later row
-        end, start = later[:, self.positions], earlier[:, self.positions]
-        end_slope, start_slope = period * later[:, self.velocities], period * earlier[:, self.velocities]
-        # The cubic in `back`, which runs from the later row (0) to the earlier one (1).
-        bend = 3 * (start - end) + 2 * end_slope + start_slope
-        twist = 2 * (end - start) - end_slope - start_slope
-        position = end - back * (end_slope - back * (bend + back * twist))
-        velocity = (end_slope - back * (2 * bend + 3 * back * twist)) / period
-        out = (later + back * (earlier - later))[:, :-1]
-        out[:, self.positions], out[:, self.velocities] = position, velocity
-        return out, rows[:, 1:]
-
-    def _shift(self, state: Tensor, period: float) -> Tensor:
-        """The delay in rows, (B,), in the precision of the state."""
-        return (self.value("delay", state) / period).expand(len(state))
-
-
 class FrozenZone(SensingEffect):
     """A worn potentiometer: while the angle is between start and end, the reading holds its last value from outside.
 

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from visadapt.effects import ActuationEffect, Effect
+from visadapt.effects.late_sensors import LateSensors
+from visadapt.estimation.late_readings import Past, reading
 from visadapt.estimation.linearise import linearise_reading, linearise_step, parameter_steps, search_range
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
@@ -32,22 +34,25 @@ class CandidateModel:
         self.profile = profile_of(system)
         self.effects = tuple(effects)
         self.rows = rows
-        longest_step = math.inf if accuracy == COARSEST else self.profile.longest_step
+        smooth = math.inf if accuracy == COARSEST else self.profile.longest_step
+        longest_step = smooth
         if any(effect.abrupt for effect in effects):
             longest_step = min(longest_step, self.profile.longest_abrupt_steps[accuracy])
-        substeps = max(1, math.ceil(float(rows.held.max()) / longest_step - 1e-9))
         placeholders = [effect(**{parameter.name: 0.0 for parameter in effect.table}) for effect in effects]
-        self._world = World(system, placeholders, rows.period, substeps=substeps)
+        self._world, self._smooth = (
+            World(system, placeholders, rows.period, substeps=max(1, math.ceil(float(rows.held.max()) / step - 1e-9)))
+            for step in (longest_step, smooth)
+        )
+        self._only_commands_jump = not any(e.abrupt and not issubclass(e, ActuationEffect) for e in effects)
         self.table = self._world.table
         self.low, self.high = search_range(self.table)
         acting = [effect for effect in effects if issubclass(effect, ActuationEffect)]
         alone = all(effect.acting_on is ActuationEffect.acting_on for effect in acting)
-        self.acting_parameters = [
-            k
-            for k, effect in enumerate(effect for effect in effects for _ in effect.table)
-            if acting and (effect in acting or not alone)
-        ]
+        named = [effect for effect in effects for _ in effect.table]
+        self.acting_parameters = [k for k, effect in enumerate(named) if acting and (effect in acting or not alone)]
         """columns of the parameters that change what acts of the commands"""
+        self.delays = [k for k, effect in enumerate(named) if issubclass(effect, LateSensors)]
+        """columns of the delays of late sensors"""
         self.slopes: tuple[Tensor, Tensor] | None = None
         """transition (W, T - 1, n, n) and sensing (W, T, m, n) of an earlier linearisation, reused where given"""
 
@@ -57,12 +62,24 @@ class CandidateModel:
 
     def commands(self, theta: Tensor) -> Tensor:
         """Inputs after the actuation effects, (R, W, T, substeps, n_action), for R parameter vectors (R, P)."""
+        return self._acting(theta)[:, self.rows.episode[:, None], self.rows.index]
+
+    def _acting(self, theta: Tensor) -> Tensor:
+        """The same of whole episodes, (R, E, L, substeps, n_action)."""
         rows = self.rows
         episodes = len(rows.command)
         given, held = rows.command.repeat(len(theta), 1, 1), rows.held.repeat(len(theta), 1)
         acting = self.at(theta.repeat_interleave(episodes, 0)).actuate(given, held)
-        acting = acting.unflatten(0, (len(theta), episodes))
-        return acting[:, rows.episode[:, None], rows.index]
+        return acting.unflatten(0, (len(theta), episodes))
+
+    def stepping(self, theta: Tensor, acting: Tensor) -> tuple[World, Tensor]:
+        """The world with parameters (P,), and what acts (..., substeps, n_action), in no more substeps than it takes.
+
+        A command that an effect scales or limits is still held over its period, and smooth physics need no more.
+        """
+        if self._only_commands_jump and bool((acting == acting[..., :1, :]).all()):
+            return self._smooth.with_values(theta), acting[..., : self._smooth.substeps, :]
+        return self.at(theta), acting
 
     def started(self, theta: Tensor, state: Tensor) -> WorldState:
         """World states of all rows, flattened, for states (W, T, n): at the rows' times, with the memory of each effect
@@ -74,9 +91,28 @@ class CandidateModel:
         time = rows.time[:, :length].flatten()
         return WorldState(time, state.flatten(0, 1), tuple(m[episode, index] for m in memory))
 
-    def measure(self, theta: Tensor, state: Tensor) -> Tensor:
-        """Measurements (N, m) of states (N, n), without noise, for parameters (P,) or (N, P)."""
-        return self.at(theta).reading(state)[:, list(self.rows.channels)]
+    def measure(self, theta: Tensor, state: Tensor, first: int = 0, stride: int = 1) -> Tensor:
+        """Measurements, without noise, for parameters (P,) of states (W, T', n) of the windows' rows from the `first`
+        on, every `stride`-th; or for parameters (R, P) of states (R, W, T', n)."""
+        values, past = theta, self.past(theta, slice(first, first + stride * state.shape[-2], stride))
+        if theta.dim() > 1:
+            values = theta.repeat_interleave(math.prod(state.shape[1:-1]), 0)
+            past = None if past is None else past.repeat(len(theta))
+        seen = reading(self.at(values), state.flatten(0, -2), past)
+        return seen[:, list(self.rows.channels)].unflatten(0, state.shape[:-1])
+
+    def past(self, theta: Tensor, chosen: slice = slice(None)) -> Past | None:
+        """What led to the states of the `chosen` rows of every window, as far back as late sensors with parameters
+        (..., P) read; None without such sensors. The first of the parameters decide what acted."""
+        if not self.delays:
+            return None
+        rows, every = self.rows, theta.reshape(-1, theta.shape[-1])
+        count = 1 + math.ceil(float(every[:, self.delays].max()) / rows.period)
+        index = rows.index[:, chosen, None] - 1 - torch.arange(count)
+        episode, before = rows.episode[:, None, None], index.clamp_min(0)
+        acting = self._acting(every[:1])[0].mean(2)[episode, before]
+        time = rows.time[:, chosen]
+        return Past(time.flatten(), acting.flatten(0, 1), rows.held[episode, before].flatten(0, 1))
 
 
 @dataclass(frozen=True)
@@ -98,22 +134,22 @@ def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised
     shifted = torch.cat((theta[None], theta + torch.diag(parameter_steps(model.table, theta))))
     # What acts changes with the parameters of actuation effects alone: for the others it is computed once.
     variants = [0, *(1 + k for k in model.acting_parameters)]
-    acting = model.commands(shifted[variants])[:, :, :-1].flatten(1, 2)
+    world, acting = model.stepping(theta, model.commands(shifted[variants])[:, :, :-1].flatten(1, 2))
     commands = acting[[variants.index(k) if k in variants else 0 for k in range(len(shifted))]]
-    world = model.at(theta)
     time, duration = model.rows.time[:, :-1].flatten(), model.rows.duration[:, :-1].flatten()
     step = linearise_step(
         world, theta, time, state[:, :-1].flatten(0, 1), commands, by_state=known is None, duration=duration
     )
-    reading = linearise_reading(world, theta, state.flatten(0, 1), by_state=known is None)
+    past = model.past(theta)
+    read = linearise_reading(world, theta, state.flatten(0, 1), past, by_state=known is None)
     channels = list(model.rows.channels)
     steps, rows = (windows, length - 1), (windows, length)
     out = Linearised(
         step.value.unflatten(0, steps),
         step.by_state.unflatten(0, steps),
         step.by_parameter.unflatten(0, steps),
-        reading.value[:, channels].unflatten(0, rows),
-        reading.by_state[:, channels].unflatten(0, rows),
-        reading.by_parameter[:, channels].unflatten(0, rows),
+        read.value[:, channels].unflatten(0, rows),
+        read.by_state[:, channels].unflatten(0, rows),
+        read.by_parameter[:, channels].unflatten(0, rows),
     )
     return out if known is None else replace(out, transition=known[0], sensing=known[1])

@@ -1,10 +1,7 @@
 """Maximum likelihood of the parameters of given effects, from whole episodes whose states are known with noise.
 
-What a diagnosis computes for one set of effects, without its search. Effects that the likelihood does not hold:
-
-- a sensor with a memory is fitted as the effect that passive data cannot tell from it (measurement_delay as
-  actuator_delay, of the same delay);
-- dropout and frozen_zone are read off readings that repeat, which the fit leaves out.
+What a diagnosis computes for one set of effects, without its search. The likelihood does not hold dropout and
+frozen_zone: these are read off readings that repeat, which the fit leaves out.
 """
 
 from __future__ import annotations
@@ -16,7 +13,16 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from visadapt.effects import EFFECTS, Dropout, Effect, FrozenZone, MeasurementDelay, Role, SensingEffect
+from visadapt.effects import (
+    ActuatorDelay,
+    Dropout,
+    Effect,
+    FrozenZone,
+    LateSensors,
+    MeasurementDelay,
+    Role,
+    SensingEffect,
+)
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import (
     CAREFUL,
@@ -29,13 +35,13 @@ from visadapt.estimation.fit_states import (
     stacked,
     with_effect,
 )
-from visadapt.estimation.likelihood import FitState, fit
+from visadapt.estimation.fitting import fit
+from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.repeated_readings import SMOOTHING_RATIO, RepeatedReadings, find_repeats, zone
 from visadapt.estimation.screening import screen
 from visadapt.estimation.segments import Segments, cut
 from visadapt.systems import System
-from visadapt.world import World
 
 
 @dataclass(frozen=True)
@@ -64,15 +70,17 @@ def fit_effects(
         ValueError: an effect that can be neither fitted nor read off, or two effects that stand for each other.
     """
     kinds = [type(effect) for effect in effects]
-    fitted_as = {kind: stand_in(kind) for kind in kinds if not kind.repeats_readings}
-    fitted = tuple(dict.fromkeys(fitted_as.values()))
-    if len(fitted) < len(fitted_as) or len(set(kinds)) < len(kinds):
+    fitted = tuple(kind for kind in kinds if not kind.repeats_readings)
+    for kind in fitted:
+        if remembers(kind):
+            raise ValueError(f"{kind.name} cannot be fitted: what it measures depends on earlier rows")
+    if {ActuatorDelay, MeasurementDelay} <= set(kinds) or len(set(kinds)) < len(kinds):
         raise ValueError(
             f"passive data cannot tell apart some of the effects {', '.join(kind.name for kind in kinds)}: "
             "leave out those that do the same as another"
         )
     columns, first = {}, 0
-    for kind in fitted_as:
+    for kind in fitted:
         columns[kind] = slice(first, first + len(kind.table))
         first += len(kind.table)
     measured = [values.double() for values in measured]
@@ -82,12 +90,15 @@ def fit_effects(
     holds = find_repeats(measured, channels, profile.angle_sensor)
     stamps = [period * torch.arange(len(values)).double() for values in measured]
     rows = cut(measured, holds.used, commands, stamps, channels, period, profile.window_rows)
-    present = [float(getattr(effect, p.name)) for effect in effects if type(effect) in fitted_as for p in effect.table]
+    present = [float(getattr(effect, p.name)) for effect in effects if type(effect) in fitted for p in effect.table]
     found = _fitted(system, fitted, rows, present)
-    if MeasurementDelay in fitted_as:
-        # Until the first reading of the episode arrives, its first state is read, whatever the motion.
-        arrived = rows.time >= found.theta[0, columns[MeasurementDelay]]
-        rows = replace(rows, used=rows.used * arrived[..., None])
+    late = [kind for kind in fitted if issubclass(kind, LateSensors)]
+    if late:
+        # Until its first reading arrives, a simulated sensor reads the first state, whatever the motion.
+        used = rows.used.clone()
+        for kind in late:
+            used[..., kind.late] *= (rows.time >= found.theta[0, columns[kind]])[..., None]
+        rows = replace(rows, used=used)
         found = _best(system, fitted, [found], rows, QUICK)
     covariance = torch.linalg.inv(posterior(fitted, found)[1]) if fitted else torch.zeros(0, 0)
     states = _by_episode(rows, found.state[0], measured)
@@ -97,30 +108,12 @@ def fit_effects(
         values[Dropout], spreads[Dropout] = _lost(holds)
     if FrozenZone in kinds:
         values[FrozenZone], spreads[FrozenZone] = _frozen(holds, states, found, profile.angle_sensor[0])
-    if MeasurementDelay in fitted_as:
-        world = CandidateModel(system, fitted, rows).at(found.theta[0])
-        delay = float(values[MeasurementDelay][0])
-        states = [_on_time(world, delay, state, command) for state, command in zip(states, commands, strict=True)]
     return EffectFit(values, spreads, states)
 
 
-def stand_in(effect: type[Effect]) -> type[Effect]:
-    """The effect that is fitted in the place of one: itself, or its twin where the likelihood does not hold it.
-
-    Raises:
-        ValueError: the likelihood does not hold it, and it has no twin with the same parameters.
-    """
-    if not remembers(effect):
-        return effect
-    for name in effect.indistinguishable_from:
-        if [(p.name, p.unit) for p in EFFECTS[name].table] == [(p.name, p.unit) for p in effect.table]:
-            return EFFECTS[name]
-    raise ValueError(f"{effect.name} cannot be fitted: what it measures depends on earlier rows")
-
-
 def remembers(effect: type[Effect]) -> bool:
-    """Whether it is a sensor whose reading depends on earlier rows."""
-    if not issubclass(effect, SensingEffect):
+    """Whether it is a sensor whose reading depends on earlier rows in another way than by being late."""
+    if not issubclass(effect, SensingEffect) or issubclass(effect, LateSensors):
         return False
     return effect(**dict.fromkeys((p.name for p in effect.table), 0.0)).memory(torch.zeros(1, 4), 1.0).numel() > 0
 
@@ -149,7 +142,7 @@ def _best(
     """The likeliest fit of one set of effects from several starts."""
     iterations, care = effort
     models = [CandidateModel(system, effects, rows, care) for _ in starts]
-    out = fit(models, stacked(starts), torch.ones(len(starts), rows.shape[0], dtype=torch.float64), iterations)
+    out = fit(models, stacked(starts), iterations)
     return single_fit(out, int(out.likelihood.argmax()), len(models[0].table))
 
 
@@ -186,27 +179,3 @@ def _frozen(holds: RepeatedReadings, states: Sequence[Tensor], found: FitState, 
     noise = SMOOTHING_RATIO * float((found.log_noise[0, angle] / 2).exp())
     edges, deviations = zone(held, torch.cat([state[1:, angle] for state in states])[seen], noise)
     return edges, torch.diag(deviations.square())
-
-
-def _on_time(world: World, delay: float, late: Tensor, commands: Tensor) -> Tensor:
-    """The states (T, n) of an episode whose measurements are `delay` s late.
-
-    Args:
-        world: where commands act `delay` s late instead: there the states are `late` (T, n).
-        commands: (T, n_action).
-    """
-    period = world.period
-    count = math.ceil(delay / period)
-    time = period * torch.tensor([len(late) - 1], dtype=late.dtype)
-    at = world.start(late[-1:], time, commands[None], late[None])
-    rows = [late]
-    for _ in range(count):
-        at = world.step(at, torch.zeros_like(commands[:1]))
-        rows.append(at.state)
-    # As late as needed for the delay to be a whole number of rows in all; these rows are then left out.
-    sensor = MeasurementDelay(delay=max(0.0, count * period - delay))
-    memory, out = sensor.memory(late[:1], period), []
-    for row in torch.cat(rows):
-        seen, memory = sensor.apply_to(row[None], memory, period, None)
-        out.append(seen)
-    return torch.cat(out[count:])

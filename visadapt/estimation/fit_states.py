@@ -18,8 +18,9 @@ from visadapt.systems import System
 
 Effects = tuple[type[Effect], ...]
 
-QUICK, CAREFUL = (12, COARSE), (20, FINE)
-"""Iterations and integration accuracy of a fit in the search, and of one whose result is reported."""
+QUICK, CAREFUL, FINAL = (12, COARSE), (20, FINE), (7, FINE)
+"""Iterations and integration accuracy of a fit in the search, of one whose result is reported, and of one to all rows
+that starts from such a one to some of them."""
 
 
 def initial_fit(system: System, rows: Segments) -> FitState:

@@ -32,16 +32,20 @@ class Linear:
     sensing: Tensor  # (N, T, m, n) H; zero where nothing was measured
     reading: Tensor  # (N, T, m, M) r; zero where nothing was measured
     start: Tensor  # (N, n, M) the mean of x_0
-    spread: Tensor  # (n,) p
+    spread: Tensor  # (N, n) p
 
     def data(self) -> Linear:
         """The same systems with the first column, the data, alone."""
         return replace(self, drive=self.drive[..., :1], reading=self.reading[..., :1], start=self.start[..., :1])
 
+    def of(self, systems: slice) -> Linear:
+        """Some of the systems."""
+        return Linear(*(getattr(self, f.name)[systems] for f in fields(self)))
+
     def repeat(self, count: int) -> Linear:
         """`count` copies of the N systems."""
-        tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "spread"}
-        return replace(self, **{name: x.repeat(count, *(1,) * (x.dim() - 1)) for name, x in tensors.items()})
+        tensors = [getattr(self, f.name) for f in fields(self)]
+        return Linear(*(x.repeat(count, *(1,) * (x.dim() - 1)) for x in tensors))
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,7 @@ class Filtered:
 
 def forward(problem: Linear, process: Tensor, noise: Tensor) -> Filtered:
     """Filter with process covariances Q (N, n, n) and measurement variances s (N, m)."""
-    covariance = torch.diag_embed(problem.spread.expand(len(problem.start), -1))
+    covariance = torch.diag_embed(problem.spread)
     disturbed = torch.diag_embed(noise)
     transitions, sensings = problem.transition.unbind(1), problem.sensing.unbind(1)
     covariances, roots, crosses, failures = [], [], [], []

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from visadapt.effects import DynamicsEffect, Effect, Parameter, Role, SensingEffect
+from visadapt.estimation.late_readings import Past, reading
 from visadapt.systems import System
 from visadapt.world import World
 
@@ -114,11 +115,14 @@ def linearise_step(
     return _tangent(step, world, values, state, by_state, columns, width if by_command else 0, width)
 
 
-def linearise_reading(world: World, values: Tensor, state: Tensor, by_state: bool = True) -> Tangent:
-    """Sensor readings (N, n) of N states, with derivatives; arguments as in `linearise_step`."""
+def linearise_reading(world: World, values: Tensor, state: Tensor, past: Past | None, by_state: bool = True) -> Tangent:
+    """Sensor readings (N, n) of N states, whose `past` late sensors read, with derivatives.
+
+    The other arguments are those of `linearise_step`.
+    """
 
     def read(rows: Tensor, states: Tensor, moved: Sequence[int], pushed: Tensor) -> Tensor:
-        return world.with_values(rows).reading(states)
+        return reading(world.with_values(rows), states, None if past is None else past.repeat(len(moved)))
 
     if not any(isinstance(effect, SensingEffect) for effect in world.effects):
         count, n = state.shape

@@ -40,7 +40,9 @@ class SystemProfile:
     residual_name: str  # the first load in words, as the report's figures label it
     smooth_function_factors: Mapping[str, tuple[str | None, ...]]
     """load to the variables that multiply a smooth function on it (None: no factor); (None,) for loads not listed"""
-    max_rows: int = 1600  # rows that a search uses; of a longer recording, windows spread evenly over it
+    search_rows: int = 1200
+    """rows that the search uses: of a longer recording, windows spread evenly over it, before the best sets are fitted
+    to every row"""
     is_aircraft: bool = False  # whether experiments are advised as flights instead of motions on a track
     window_rows: int = 120
     """rows of a window; longer episodes are cut, which loses little since states far apart hardly inform each other"""
@@ -64,7 +66,7 @@ class SystemProfile:
     compared_models: int = 8  # models, the most probable ones, that are compared
     folds: int = 4  # folds of the cross-validation
     beam_width: int = 3  # models of each size to which the search adds another effect
-    screening_rows: float = float("inf")
+    screening_rows: float = 4e5
     """rows times parameter points per effect; above it the screening uses every 2nd, 4th, ... window"""
 
     @property
@@ -107,7 +109,7 @@ _VEHICLE = SystemProfile(
     plotted_variables=("x_dot", "thrust", "time", "z"),
     residual_name="force along x",
     smooth_function_factors={},
-    max_rows=650,
+    search_rows=650,
     is_aircraft=True,
     window_rows=25,
     longest_abrupt_steps=(0.05, 0.034, 0.0125),

@@ -49,6 +49,13 @@ class Segments:
         every = ("measured", "used", "inside", "time", "first", "episode")
         return replace(self, **{name: getattr(self, name)[windows] for name in every})
 
+    def spread(self, most: int) -> Tensor:
+        """Indices of windows spread evenly over the recording, with about `most` rows in all; at least four, or all."""
+        count = max(4, int(most / float(self.inside.sum(1).mean())))
+        if self.shape[0] <= count:
+            return torch.arange(self.shape[0])
+        return torch.linspace(0, self.shape[0] - 1, count).round().long()
+
     def with_channels(self, kept: Sequence[int]) -> Segments:
         """With these of the measured channels, by position in `channels`."""
         return replace(

@@ -115,17 +115,14 @@ class Sensitivity:
         def spread(x: Tensor) -> Tensor:
             return x[None].expand(count, *x.shape).reshape(-1, *x.shape[2:])
 
-        def per_row(used: int) -> Tensor:
-            return theta[:, None].expand(-1, windows * used, -1).flatten(0, 1)
-
         if issubclass(effect, SensingEffect):
-            read = model.measure(per_row(length), spread(state)).reshape(count, windows, length, -1)
+            read = model.measure(theta, state.expand(count, *state.shape))
             reading = -(read[1:] - read[:1]).movedim(0, -1) * rows.used[..., None]
             return self.innovations.response(torch.zeros_like(state[:, 1:, :, None]), reading)
         acted = model.commands(theta if model.acting_parameters else theta[:1])[:, :, :-1]
         after = integrate(
             model.at(theta[0]),
-            per_row(length - 1),
+            theta.repeat_interleave(windows * (length - 1), 0),
             spread(rows.time[:, :-1]),
             spread(state[:, :-1]),
             acted.expand(count, *acted.shape[1:]).flatten(0, 2),

@@ -25,6 +25,8 @@ UNSTEADY_PERIODS = 0.1
 """Difference between the longest and the shortest step above which the clock is reported as unsteady."""
 LONGEST_STEP_PERIODS = 3.0
 """Longest step of an irregular clock; at longer ones the episode is split."""
+HARMLESS_GAP_S = 0.01
+"""Step up to which an episode is never split: a loop of a few ms that stalls for as long holds its command."""
 PERIOD_RATIO = 1.5
 """Ratio that the periods of two episodes of one recording may have."""
 
@@ -97,7 +99,8 @@ def uninterrupted(raw: RawEpisode, note: Note) -> list[RawEpisode]:
     period = float(np.median(steps))
     gaps = steps > GAP_PERIODS * period
     irregular = gaps.mean() > MOST_GAPS and gaps.sum() > 1
-    cuts = np.flatnonzero(steps > (LONGEST_STEP_PERIODS if irregular else GAP_PERIODS) * period)
+    longest = max(HARMLESS_GAP_S, (LONGEST_STEP_PERIODS if irregular else GAP_PERIODS) * period)
+    cuts = np.flatnonzero(steps > longest)
     for cut in cuts:
         note("rows are missing here; the episode was split", f"{raw.source}, {raw.place(int(cut) + 1)}")
     edges = [0, *(int(cut) + 1 for cut in cuts), len(raw.time)]

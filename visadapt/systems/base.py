@@ -66,6 +66,16 @@ class System(ABC):
     def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:
         """Time derivative (B, n_state) of a state (B, n_state) under a command (B, n_action) and a load (B, n_load)."""
 
+    def accelerations(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:
+        """Accelerations (B, J) of the joints; arguments as in `derivative`."""
+        return self.derivative(state, command, load)[:, [velocity for _, velocity in self.coordinates]]
+
+    def response_to_loads(self, state: Tensor, command: Tensor, load: Tensor) -> tuple[Tensor, Tensor]:
+        """Accelerations (B, J) of the joints, and their change (B, J, J) per unit of each load, the last axis."""
+        free = self.accelerations(state, command, load)
+        units = torch.eye(load.shape[1]).to(load)
+        return free, torch.stack([self.accelerations(state, command, load + unit) - free for unit in units], -1)
+
     def __post_init__(self) -> None:
         self.check_parameters()
 

@@ -36,9 +36,9 @@ class Errors:
     black_box: Tensor  # the best that a black box reaches beside the causes
     deviation: Tensor  # (m,) standard deviations of the measurement noise, in the states' units
 
-    def closed_by(self, rollouts: RolloutErrors) -> float:
-        """Share of the gap that the set with these predictions closes."""
-        reached = heldout.overall(rollouts.rms(self.deviation))[-1]
+    def closed_by(self, rms: Tensor) -> float:
+        """Share of the gap that the set with these errors (H, m) closes."""
+        reached = heldout.overall(rms)[-1]
         return heldout.closed(_last(self.before), float(reached), _last(self.floor))
 
     def gap(self) -> Gap:
@@ -114,10 +114,11 @@ def _predictions(search: Search, source: RolloutErrors, corrected: RolloutErrors
     size = source.error[-1].square().sum(-1) * source.valid[-1].prod(-1)
     out = []
     for window in size.max(1).values.argsort(descending=True)[:MAX_PREDICTIONS].tolist():
-        end = int(size[window].argmax())
-        start = end - horizon
-        if start < 0 or float(size[window, end]) == 0:
+        best = int(size[window].argmax())
+        if float(size[window, best]) == 0:
             continue
+        start = best * source.stride
+        end = start + horizon
         measured = np.full((horizon + 1, source.predicted.shape[-1]), np.nan)
         measured[:, list(rows.channels)] = rows.measured[window, start : end + 1].numpy()
         out.append(
@@ -125,8 +126,8 @@ def _predictions(search: Search, source: RolloutErrors, corrected: RolloutErrors
                 int(rows.episode[window]),
                 rows.time[window, start : end + 1].numpy(),
                 measured,
-                source.predicted[window, start].numpy(),
-                corrected.predicted[window, start].numpy(),
+                source.predicted[window, best].numpy(),
+                corrected.predicted[window, best].numpy(),
             )
         )
     return tuple(out)

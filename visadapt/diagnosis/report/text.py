@@ -15,6 +15,7 @@ from visadapt.diagnosis.result import (
     Cause,
     Diagnosis,
     Estimate,
+    Push,
     Region,
     without_slight,
 )
@@ -83,6 +84,15 @@ def region(one: Region, system: str) -> str:
         return f"episodes {one.start:.0f} to {one.end:.0f}" if one.end > one.start else f"episode {one.start:.0f}"
     span = with_unit(f"{number(one.start, 2)} to {number(one.end, 2)}", unit_of(one.variable, system))
     return f"{one.variable} from {span}"
+
+
+def push(one: Push) -> str:
+    """A push in words: "shoulder pushed from 0.91 to 1.20 s, up to 0.46 N m, impulse 0.069 N m s (...)"."""
+    impulse = Estimate(one.impulse, f"{one.unit} s", one.ci90)
+    return (
+        f"{plain(one.load)} pushed from {one.start:.2f} to {one.end:.2f} s of episode {one.episode}, up to "
+        f"{with_unit(number(one.size, 2), one.unit)}, impulse {estimate(impulse)} (90 %: {interval(impulse)})"
+    )
 
 
 def listed(words: Sequence[str], last: str = "and") -> str:
@@ -184,7 +194,7 @@ def rendered(template: str, diagnosis: Diagnosis, **values: Any) -> str:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    for function in (plain, number, percent, estimate, interval, effects, shares):
+    for function in (plain, number, percent, estimate, interval, effects, shares, push):
         environment.filters[function.__name__] = function
     environment.filters["either"] = lambda names: listed(names, "or")
     environment.filters["region"] = lambda one: region(one, diagnosis.system)

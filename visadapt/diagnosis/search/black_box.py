@@ -32,6 +32,10 @@ LOG_LENGTH = math.log(2.0)  # Mean of a log length before anything is seen, in s
 
 LOG_SPREAD = 3.0  # Standard deviation of log lengths and log amplitudes before anything is seen
 
+LOG_REACH = 12.0
+"""Most by which log lengths and log amplitudes leave their mean: a line search that tries e^100 meets no matrix that is
+positive definite in float64."""
+
 MAX_DECADES = 4  # Decades at most by which process noise becomes less beside the black box
 
 MIN_GAIN = 3.0
@@ -67,21 +71,21 @@ def inputs(model: CandidateModel, state: Tensor) -> Tensor:
     return torch.stack(list(variables_of(model, state).values()), -1)
 
 
-def fit_black_box(model: CandidateModel, fits: FitState, window_used: Tensor) -> BlackBox:
-    """The black box of a fitted set, fitted to the windows where `window_used` (W,) is 1."""
-    here = model.rows.inside[:, 1:] * window_used[:, None]
+def fit_black_box(model: CandidateModel, fits: FitState) -> BlackBox:
+    """The black box of a fitted set, fitted to the model's rows."""
+    here = model.rows.inside[:, 1:]
     values = inputs(model, fits.state[0])[:, :-1]
     centre, scale = values[here > 0].mean(0), values[here > 0].std(0).clamp(min=1e-9)
     values = (values - centre) / scale
     gains = loads_of(model, fits) * here[..., None, None]
     values = values * here[..., None]
-    first = regression = _Regression.of(model, fits, window_used, gains, values, here)
+    first = regression = _Regression.of(model, fits, gains, values, here)
     logs = regression.optimised(regression.start(), ITERATIONS)
     best = nominal = first.validated(regression, logs), fits, logs, regression
     for decade in range(1, 1 + MAX_DECADES):
         # What the black box explains is process noise no more.
         tried = replace(fits, log_process=(fits.log_process - decade * math.log(10)).clamp(min=MIN_LOG_PROCESS))
-        regression = _Regression.of(model, tried, window_used, gains, values, here)
+        regression = _Regression.of(model, tried, gains, values, here)
         logs = regression.optimised(logs, REFINING_ITERATIONS)
         gain = first.validated(regression, logs)
         if gain <= best[0]:
@@ -97,15 +101,13 @@ class _Regression:
     """Linear regression of the whitened innovations by the loads at every row of W windows of T rows."""
 
     values: Tensor  # (W, T - 1, D) variables, in standard deviations from their means
-    here: Tensor  # (W, T - 1) 1 where a load acts in the windows used
+    here: Tensor  # (W, T - 1) 1 where a load acts
     points: Tensor  # (M, D)
     information: Tensor  # (W, L, L, T - 1, T - 1) of the loads
     gradient: Tensor  # (W, L, T - 1) of the log likelihood by the loads, at zero
 
     @classmethod
-    def of(
-        cls, model: CandidateModel, fits: FitState, window_used: Tensor, gains: Tensor, values: Tensor, here: Tensor
-    ) -> _Regression:
+    def of(cls, model: CandidateModel, fits: FitState, gains: Tensor, values: Tensor, here: Tensor) -> _Regression:
         """The regression with the filter of `fits`.
 
         `gains` (W, T - 1, n, L) is the change of the states per unit of each load.
@@ -113,7 +115,7 @@ class _Regression:
         windows, steps, _, loads = gains.shape
         problem = linear_problem([model], fits).data()
         filtered = forward(problem, *variances(model, fits.log_process, fits.log_noise))
-        used = (model.rows.used * window_used[:, None, None])[..., None]
+        used = model.rows.used[..., None]
         drive = torch.diag_embed(gains.permute(0, 2, 3, 1)).permute(0, 4, 1, 2, 3).flatten(3)
         response = respond(filtered, drive, torch.zeros_like(used))
         response, error = (response * used).flatten(1, 2), (filtered.white * used).flatten(1, 2)
@@ -140,19 +142,25 @@ class _Regression:
                 self.information[some].clone(),
                 self.gradient[some].clone(),
             )
-            prior, logs = self.start().clone(), start.clone().requires_grad_()
+            prior = self.start().clone()
+            free = (LOG_REACH * ((start.clone() - prior) / LOG_REACH).atanh()).requires_grad_()
+
+            def bounded() -> Tensor:
+                return prior + LOG_REACH * (free / LOG_REACH).tanh()
+
             optimiser = torch.optim.LBFGS(
-                [logs], max_iter=iterations, tolerance_change=1e-3, line_search_fn="strong_wolfe"
+                [free], max_iter=iterations, tolerance_change=1e-3, line_search_fn="strong_wolfe"
             )
 
             def loss() -> Tensor:
                 optimiser.zero_grad()
+                logs = bounded()
                 value = 0.5 * ((logs - prior) / LOG_SPREAD).square().sum() - part.evidence(logs)[0]
                 value.backward()
                 return value
 
             optimiser.step(loss)
-        return logs.detach()
+            return bounded().detach()
 
     def evidence(self, logs: Tensor) -> tuple[Tensor, Tensor]:
         """Log odds of the loads against none, for lengths and amplitudes, and the posterior mean weights (L M,)."""

@@ -1,17 +1,18 @@
 """How far a set of effects closes the gap: errors of predictions several steps ahead on held-out episodes.
 
-Every set is fitted again without the episodes that it then predicts. A prediction starts from the state that the
-fitted model's smoother estimates in the held-out episode, and simulates with the recorded commands, without using
-measurements (simulation error with estimated initial state; Ljung 1999, System Identification, section 16.5). Errors
-are in standard deviations of the measurement noise; the floor is the error of the smoothed states against the same
-measurements, which is noise if the model is right.
+Every set is refitted, by one Gauss-Newton step, without the episodes that it then predicts. A prediction starts from
+the state that the fitted model's smoother estimates in the held-out episode, and simulates with the recorded commands,
+without using measurements (simulation error with estimated initial state; Ljung 1999, System Identification, section
+16.5). Errors are in standard deviations of the measurement noise; the floor is the error of the smoothed states against
+the same measurements, which is noise if the model is right.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -20,9 +21,10 @@ from torch.nn.functional import pad
 from visadapt.diagnosis.search.black_box import BlackBox, fit_black_box, inputs
 from visadapt.diagnosis.search.unexplained import loads_of
 from visadapt.estimation.candidate import COARSE, CandidateModel
-from visadapt.estimation.fit_states import Effects, single_fit, stacked
+from visadapt.estimation.fit_states import Effects
+from visadapt.estimation.fitting import refitted
 from visadapt.estimation.kalman import backward, forward
-from visadapt.estimation.likelihood import FitState, fit, linear_problem, variances
+from visadapt.estimation.likelihood import FitState, linear_problem, variances
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.processes import shared_out
@@ -30,7 +32,10 @@ from visadapt.systems import System
 
 PREDICTION_TIME = 0.5  # s; the horizon at which the gap is measured
 
-REFIT_ITERATIONS = 5  # Iterations of a fit without a fold, which starts from the fit to all episodes
+START_TIME = 0.02
+"""s between the starts of predictions, where rows follow each other faster; they then hardly differ."""
+
+BLACK_BOX_ROWS = 1600  # Rows to which a black box is fitted: windows spread evenly over the recording
 
 STATE_LIMIT = 1e3
 """Bound on predicted states, in their units, so that an unstable prediction gives a large but finite error."""
@@ -38,29 +43,32 @@ STATE_LIMIT = 1e3
 
 @dataclass(frozen=True)
 class RolloutErrors:
-    """Errors of predictions 0 to H rows ahead from every row of W held-out windows of T rows."""
+    """Errors of predictions 0 to H rows ahead from S rows of each of W held-out windows of T rows."""
 
-    error: Tensor
-    """(H + 1, W, T, m) prediction minus measurement, at the row where the prediction ends; 0 where not `valid`"""
-    valid: Tensor  # (H + 1, W, T, m) 1 where there are both a prediction and a measurement
-    predicted: Tensor  # (W, T, H + 1, n) states predicted from each row
+    error: Tensor  # (H + 1, W, S, m) prediction minus measurement; 0 where not `valid`
+    valid: Tensor  # (H + 1, W, S, m) 1 where there are both a prediction and a measurement
+    predicted: Tensor  # (W, S, H + 1, n) states predicted from each of these rows
+    left: Tensor  # (H + 1, W, S, m) errors of the states estimated at the rows where the predictions end
+    stride: int  # rows from one start to the next
 
     def rms(self, deviation: Tensor) -> Tensor:
         """(H, m) root mean square errors 1 to H rows ahead, in units of `deviation` (m,)."""
-        count = self.valid[1:].sum((1, 2)).clamp(min=1)
-        return (self.error[1:].square().sum((1, 2)) / count).sqrt() / deviation
+        return self._rms(self.error) / deviation
 
     def floor(self, deviation: Tensor) -> Tensor:
         """(H, m) root mean square errors of the estimated states at the rows where these predictions end."""
+        return self._rms(self.left) / deviation
+
+    def _rms(self, error: Tensor) -> Tensor:
         count = self.valid[1:].sum((1, 2)).clamp(min=1)
-        return ((self.error[0].square() * self.valid[1:]).sum((1, 2)) / count).sqrt() / deviation
+        return ((error[1:].square() * self.valid[1:]).sum((1, 2)) / count).sqrt()
 
     def by_stretch(self, deviation: Tensor) -> Tensor:
-        """(S,) mean square errors H rows ahead in stretches of H rows, in units of `deviation` (m,)."""
-        horizon = len(self.error) - 1
+        """Mean square errors H rows ahead in stretches of H rows, in units of `deviation` (m,)."""
+        length = max(1, (len(self.error) - 1) // self.stride)
         parts = ((self.error[-1] / deviation).square().sum(-1), self.valid[-1].sum(-1))
-        padding = -parts[0].shape[1] % horizon
-        square, count = (pad(each, (0, padding)).unflatten(1, (-1, horizon)).sum(-1).flatten() for each in parts)
+        padding = -parts[0].shape[1] % length
+        square, count = (pad(each, (0, padding)).unflatten(1, (-1, length)).sum(-1).flatten() for each in parts)
         return square[count > 0] / count[count > 0]
 
 
@@ -96,56 +104,97 @@ def folds(rows: Segments, most: int) -> Tensor:
     return torch.stack([(units % count == k).double() for k in range(count)])
 
 
+Result = TypeVar("Result")
+
+
 def held_out(
-    system: System, rows: Segments, sets: Sequence[tuple[Effects, FitState]], black_box: bool = False, jobs: int = 1
-) -> list[RolloutErrors]:
-    """Cross-validated predictions of each set of effects, given its fit to all rows, perhaps with a black box added.
+    system: System,
+    rows: Segments,
+    sets: Sequence[tuple[Effects, FitState]],
+    of: Callable[[RolloutErrors], Result],
+    jobs: int = 1,
+) -> list[Result]:
+    """Something of the cross-validated predictions of each set of effects, given its fit to all rows.
 
     `jobs` processes share the work.
     """
+    every = range(_count(system, rows))
+
+    def predicted(indices: Sequence[int]) -> list[Result]:
+        return [of(_merged(_of_folds(system, rows, *sets[k], every))) for k in indices]
+
+    return shared_out(predicted, len(sets), jobs)
+
+
+def beside_black_box(system: System, rows: Segments, effects: Effects, fits: FitState, jobs: int = 1) -> RolloutErrors:
+    """Cross-validated predictions of a set of effects with a black box, fitted for each fold to the other episodes."""
+
+    def predicted(indices: Sequence[int]) -> list[tuple[Tensor, RolloutErrors]]:
+        return _of_folds(system, rows, effects, fits, indices, black_box=True)
+
+    return _merged(shared_out(predicted, _count(system, rows), jobs))
+
+
+def _count(system: System, rows: Segments) -> int:
+    return len(folds(rows, profile_of(system).folds))
+
+
+def _of_folds(
+    system: System, rows: Segments, effects: Effects, fits: FitState, indices: Sequence[int], black_box: bool = False
+) -> list[tuple[Tensor, RolloutErrors]]:
+    """The windows of some folds, and their predictions by a set that is refitted without them."""
     out = folds(rows, profile_of(system).folds)
-    count = len(out)
-    used = 1 - out if count > 1 else torch.ones_like(out)
+    used = 1 - out if len(out) > 1 else torch.ones_like(out)
+    without = refitted(CandidateModel(system, effects, rows, COARSE), fits, used)
 
-    def predicted(indices: Sequence[int]) -> list[RolloutErrors]:
-        chosen = [(*sets[k // count], used[k % count]) for k in indices]
-        models = [CandidateModel(system, effects, rows, COARSE) for effects, _, _ in chosen]
-        windows = torch.stack([windows for *_, windows in chosen])
-        fitted = fit(models, stacked([fits for _, fits, _ in chosen]), windows, REFIT_ITERATIONS)
-        parts = []
-        for k, model in enumerate(models):
-            one = single_fit(fitted, k, len(model.table))
-            parts.append(rollout_errors(model, one, fit_black_box(model, one, windows[k]) if black_box else None))
-        return parts
+    def on(fold: int, windows: Tensor) -> tuple[CandidateModel, FitState]:
+        one = without[torch.tensor([fold])]
+        model = CandidateModel(system, effects, rows.select(windows), COARSE)
+        return model, replace(one, state=one.state[:, windows])
 
-    parts = shared_out(predicted, len(sets) * count, jobs)
-    return [_merged(parts[k * count : (k + 1) * count], out.argmax(0)) for k in range(len(sets))]
+    parts = []
+    for k in indices:
+        box = None
+        if black_box:
+            others = used[k].nonzero()[:, 0]
+            box = fit_black_box(*on(k, others[rows.select(others).spread(BLACK_BOX_ROWS)]))
+        held = out[k].nonzero()[:, 0]
+        parts.append((held, rollout_errors(*on(k, held), box)))
+    return parts
 
 
 def rollout_errors(model: CandidateModel, fits: FitState, black_box: BlackBox | None = None) -> RolloutErrors:
-    """Errors of one fitted set from every row, perhaps with a black box, whose loads follow the predicted states."""
+    """Errors of one fitted set, perhaps with a black box, whose loads follow the predicted states."""
     rows = model.rows
-    windows, length = rows.shape
+    length = rows.shape[1]
     horizon = max(1, round(PREDICTION_TIME / rows.period))
-    fits = fits if black_box is None else black_box.fits
+    stride = max(1, int(START_TIME / rows.period + 1e-9))
+    if black_box is not None:
+        fits = replace(fits, log_process=black_box.fits.log_process)
     problem = linear_problem([model], fits).data()
     if black_box is not None:
         loads = black_box.loads(inputs(model, fits.state[0])[:, :-1, None]) * rows.inside[:, 1:, None, None]
         problem = replace(problem, drive=problem.drive + (loads_of(model, fits) * loads).sum(-1, keepdim=True))
     smoothed, _ = backward(forward(problem, *variances(model, fits.log_process, fits.log_noise)))
-    predicted = _rollouts(model, fits.theta[0], fits.state[0] + smoothed[..., 0], horizon, black_box)
-    shape = (horizon + 1, windows, length, len(rows.channels))
-    error, valid = torch.zeros(shape, dtype=torch.float64), torch.zeros(shape, dtype=torch.float64)
+    estimated = fits.state[0] + smoothed[..., 0]
+    predicted = _rollouts(model, fits.theta[0], estimated, horizon, stride, black_box)
+
+    left = model.measure(fits.theta[0], estimated) - rows.measured
+    parts = []
     for h in range(horizon + 1):
-        ends = predicted[:, : length - h, h]
-        read = model.measure(fits.theta[0], ends.flatten(0, 1))
-        error[h, :, h:] = read.reshape(windows, length - h, -1) - rows.measured[:, h:]
-        valid[h, :, h:] = rows.used[:, h:]
-    return RolloutErrors(error * valid, valid, predicted)
+        ends = slice(h, None, stride)
+        used, found = rows.used[:, ends], predicted[:, : len(range(h, length, stride)), h]
+        error = (model.measure(fits.theta[0], found, h, stride) - rows.measured[:, ends]) * used
+        # Predictions that would end beyond the window are not valid.
+        parts.append([pad(x, (0, 0, 0, predicted.shape[1] - x.shape[1])) for x in (error, used, left[:, ends] * used)])
+    error, valid, left = (torch.stack(each) for each in zip(*parts, strict=True))
+    return RolloutErrors(error, valid, predicted, left, stride)
 
 
-def _rollouts(model: CandidateModel, theta: Tensor, state: Tensor, horizon: int, black_box: BlackBox | None) -> Tensor:
-    """(W, T, horizon + 1, n) states simulated from every row with the recorded commands."""
+def _rollouts(
+    model: CandidateModel, theta: Tensor, state: Tensor, horizon: int, stride: int, black_box: BlackBox | None
+) -> Tensor:
+    """(W, S, horizon + 1, n) states simulated from every `stride`-th row with the recorded commands."""
     rows = model.rows
     length = rows.shape[1]
 
@@ -156,26 +205,30 @@ def _rollouts(model: CandidateModel, theta: Tensor, state: Tensor, horizon: int,
     commands, duration = padded(model.commands(theta[None])[0]), padded(rows.duration)
     commanded = padded(inputs(model, state)[..., state.shape[-1] : -1])
     world = model.at(theta)
-    time, out = rows.time, [state]
+    if black_box is None:
+        world, commands = model.stepping(theta, commands)
+    time, out = rows.time[:, ::stride], [state[:, ::stride]]
     for h in range(horizon):
-        now = slice(h, h + length)
+        now = slice(h, h + length, stride)
         if black_box is not None:
             variables = torch.cat((out[-1], commanded[:, now], time[..., None]), -1)
             world = black_box.at(variables.flatten(0, 1))
         after = world.integrate(
             time.flatten(), out[-1].flatten(0, 1), commands[:, now].flatten(0, 1), duration[:, now].flatten()
         )
-        time, after = time + duration[:, now], after.reshape(state.shape)
+        time, after = time + duration[:, now], after.reshape(out[-1].shape)
         out.append(after.nan_to_num(STATE_LIMIT, STATE_LIMIT, -STATE_LIMIT).clamp(-STATE_LIMIT, STATE_LIMIT))
     return torch.stack(out, 2)
 
 
-def _merged(parts: Sequence[RolloutErrors], fold: Tensor) -> RolloutErrors:
-    """Every window as predicted by the fit of the `fold` (W,) that holds it out."""
-    windows = torch.arange(len(fold))
+def _merged(parts: Sequence[tuple[Tensor, RolloutErrors]]) -> RolloutErrors:
+    """The predictions of all windows, from those of the windows of each fold."""
+    order = torch.cat([windows for windows, _ in parts]).argsort()
 
-    def pick(name: str, axis: int) -> Tensor:
-        every = torch.stack([getattr(part, name).movedim(axis, 0) for part in parts])
-        return every[fold, windows].movedim(0, axis)
+    def joined(name: str, axis: int) -> Tensor:
+        return torch.cat([getattr(errors, name) for _, errors in parts], axis).index_select(axis, order)
 
-    return RolloutErrors(pick("error", 1), pick("valid", 1), pick("predicted", 0))
+    first = parts[0][1]
+    return RolloutErrors(
+        joined("error", 1), joined("valid", 1), joined("predicted", 0), joined("left", 1), first.stride
+    )

@@ -73,9 +73,11 @@ def compare(search: Search) -> ModelComparison:
     """Compare the best models that a search has fitted, and the source."""
     close = [f for f in search.ranked if f.log_odds > search.best.log_odds - COMPARE_WITHIN]
     close = close[: search.profile.compared_models]
-    if all(f is not search.source for f in close):
-        close.append(search.source)
     leftover = search.leftover(close)
+    if all(f is not search.source for f in close):
+        # So far behind that what process noise adds to it makes no difference.
+        close.append(search.source)
+        leftover.append(0.0)
     scores = [f.log_odds - min(rest, MIN_LEFTOVER) for f, rest in zip(close, leftover, strict=True)]
     probabilities = torch.tensor(scores, dtype=torch.float64).softmax(0).tolist()
     order = sorted(range(len(close)), key=lambda k: -scores[k])

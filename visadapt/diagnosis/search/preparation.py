@@ -27,21 +27,15 @@ class PreparedRecording:
 
     rows: Segments  # without repeated or defective readings
     raw: Segments  # the same windows with repeated readings as they were read
+    searched: Tensor  # indices of the windows that the search uses, spread evenly where there are many
     repeats: RepeatedReadings
     defect: tuple[float, float] | None  # rad, between which the angle sensor is defective
     warnings: tuple[str, ...]
-    source: FitState | None = None  # the fit of the source to `rows`, if a check needed it
+    source: FitState | None = None  # the fit of the source to the windows searched, if a check needed it
 
 
 MIN_JITTER = 1e-3
 """Deviation of stamps from even spacing, in periods, above which it is decided whether it is that of the readings."""
-
-
-def _likelihood(system: System, rows: Segments) -> float:
-    """Log likelihood of the source's fit; without velocities whose positions are measured, which may be derived."""
-    position_of = profile_of(system).position_of
-    kept = [k for k, channel in enumerate(rows.channels) if position_of.get(channel) not in rows.channels]
-    return float(Search(system, rows.with_channels(kept), ()).source.fits.likelihood[0])
 
 
 def _evenly_spaced(stamps: Tensor) -> Tensor:
@@ -67,33 +61,38 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
 
     def windows(
         measured: Sequence[Tensor], clock: Sequence[Tensor], stretches: Sequence[tuple[int, int, int]] | None = None
-    ) -> tuple[Segments, Segments, list[str]]:
-        """`rows` and `raw` of episodes or stretches of these, and a warning if not all windows are used."""
+    ) -> tuple[Segments, Segments]:
+        """`rows` and `raw` of episodes or stretches of these."""
         all_used = [torch.ones_like(m) for m in measured]
         rows, raw = (
             cut(measured, valid, commands, clock, channels, recording.period, longest, stretches)
             for valid in (repeats.used, all_used)
         )
-        count, length = rows.shape
-        most = max(4, int(profile.max_rows / float(rows.inside.sum(1).mean())))
-        if count <= most:
-            return rows, raw, []
-        chosen = torch.linspace(0, count - 1, most).round().long()
-        warning = f"of {count} windows of up to {length} rows, {most}, spread evenly over the recording, were used"
-        return rows.select(chosen), raw.select(chosen), [warning]
+        return rows, raw
 
-    rows, raw, thinning = windows(states, stamps)
+    def searched(rows: Segments) -> Tensor:
+        return rows.spread(profile.search_rows)
+
+    def source_fit(rows: Segments) -> FitState:
+        return Search(system, rows.select(searched(rows)), ()).source.fits
+
+    rows, raw = windows(states, stamps)
+    source: FitState | None = None
     warnings: list[str] = []
     even = [_evenly_spaced(each) for each in stamps]
     if any(float((a - b).abs().max()) > MIN_JITTER * recording.period for a, b in zip(stamps, even, strict=True)):
-        steady, steady_raw, _ = windows(states, even)
-        if _likelihood(system, steady) > _likelihood(system, rows):
-            rows, raw, stamps = steady, steady_raw, even
+        # Without velocities whose positions are measured: they may be derived.
+        kept = [k for k, channel in enumerate(channels) if profile.position_of.get(channel) not in channels]
+        steady, steady_raw = windows(states, even)
+        fitted, other = (source_fit(each.with_channels(kept)) for each in (rows, steady))
+        if other.likelihood[0] > fitted.likelihood[0]:
+            rows, raw, stamps, fitted = steady, steady_raw, even, other
             warnings.append("the stamps jitter, the readings do not: they were taken to be evenly spaced")
+        source = fitted if len(kept) == len(channels) else None
     if not profile.check_sensors:
-        return PreparedRecording(rows, raw, repeats, None, (*warnings, *thinning))
-    unchecked, source = rows, Search(system, rows, ()).source.fits
-    defect = sensor_checks.angle_defect(system, rows, source)
+        return PreparedRecording(rows, raw, searched(rows), repeats, None, tuple(warnings), source)
+    unchecked, first = rows, source or source_fit(rows)
+    defect = sensor_checks.angle_defect(system, rows.select(searched(rows)), first)
     band = None
     if defect is not None:
         band, full_turns = defect
@@ -103,14 +102,13 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
             # A potentiometer's dead zone has an unknown width, so windows end at it, and the angle runs from one of its
             # edges to the other, so that an error of the sensor's scale is symmetric about upright.
             states = [sensor_checks.on_one_turn(values, angle, 0.5 * (band[0] + band[1])) for values in states]
-            rows, raw, thinning = windows(states, stamps, sensor_checks.stretches_without(bad))
+            rows, raw = windows(states, stamps, sensor_checks.stretches_without(bad))
         else:
             rows = sensor_checks.without_angles(rows, profile.angle_sensor, *band)
         warnings.append(
             f"{sum(int(b.sum()) for b in bad)} readings of theta between {band[0]:.2f} and {band[1]:.2f} rad "
             "contradict those around them and the physics: the sensor is defective there; they were set aside"
         )
-    warnings += thinning
     derived = sensor_checks.derived_velocities(system, rows)
     if derived:
         kept = [k for k, channel in enumerate(channels) if system.states[channel].name not in derived]
@@ -120,12 +118,12 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
         ]
         rows, raw = rows.with_channels(kept), raw.with_channels(kept)
     # After the velocities, since those that lag make the wrong sign likelier.
-    fitted = source if rows is unchecked else None
-    convention = sensor_checks.opposite_signs(system, rows, catalogue, source, fitted)
+    source = first if rows is unchecked else None
+    convention = sensor_checks.opposite_signs(system, rows.select(searched(rows)), catalogue, first, source)
     if convention is not None:
         rows, raw = (sensor_checks.to_source(each, convention, profile.angle_sensor) for each in (rows, raw))
-        fitted = None
+        source = None
         if band is not None and convention.angle < 0:
             band = (-band[1], -band[0])
         warnings.append(f"{convention.name} has the opposite sign of the source's; it was inverted")
-    return PreparedRecording(rows, raw, repeats, band, tuple(warnings), fitted)
+    return PreparedRecording(rows, raw, searched(rows), repeats, band, tuple(warnings), source)

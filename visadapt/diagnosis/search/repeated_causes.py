@@ -56,7 +56,7 @@ def repeated_reading_causes(
 def errors_with_repeats(recording: PreparedRecording, search: Search) -> RolloutErrors:
     """Prediction errors of the source fitted with repeated readings taken for measurements."""
     source = Search(search.system, recording.raw, ()).source
-    return heldout.held_out(search.system, recording.raw, [((), source.fits)])[0]
+    return heldout.held_out(search.system, recording.raw, [((), source.fits)], lambda errors: errors)[0]
 
 
 def _in_windows(rows: Segments, marks: Sequence[Tensor]) -> Tensor:
@@ -76,7 +76,7 @@ def _cost(
     model = CandidateModel(search.system, best.effects, recording.raw)
     state = best.fits.state[0]
     measured = recording.raw.measured
-    error = measured - model.measure(best.fits.theta[0], state.flatten(0, 1)).reshape(measured.shape)
+    error = measured - model.measure(best.fits.theta[0], state)
     square = (error.square() / best.fits.log_noise[0].exp()).sum(-1)
     return float(0.5 * square[_in_windows(recording.rows, repeated)].sum())
 

@@ -20,6 +20,7 @@ from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import (
     CAREFUL,
+    FINAL,
     QUICK,
     Effects,
     initial_fit,
@@ -28,7 +29,8 @@ from visadapt.estimation.fit_states import (
     stacked,
     with_effect,
 )
-from visadapt.estimation.likelihood import OUT_OF_REACH, FitState, fit
+from visadapt.estimation.fitting import OUT_OF_REACH, fit
+from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.screening import Candidate, screen
 from visadapt.estimation.segments import Segments
@@ -37,6 +39,8 @@ from visadapt.progress import Progress
 from visadapt.systems import System
 
 MAX_EFFECTS = 6  # Effects in a set at most
+
+ROWS_AT_ONCE = 100_000  # Rows times sets that are fitted together, so that memory is bounded
 
 MAX_CANDIDATES, MAX_EXCHANGES = 8, 5
 """Effects that are fitted in addition to each set when sets grow, and when effects are exchanged."""
@@ -78,8 +82,9 @@ class Search:
     """The sets of effects of a catalogue fitted so far to one recording, and how to fit more.
 
     Args:
-        source: the fit of the source to these rows, if it is already known.
+        source: the fit of the source to these rows, if it is already known, or to some of them, where it then starts.
         jobs: processes that share the work.
+        rival: log likelihood of a fit to the same readings; fits that cannot come near it stop early.
     """
 
     def __init__(
@@ -89,18 +94,22 @@ class Search:
         catalogue: Sequence[type[Effect]],
         source: FitState | None = None,
         jobs: int = 1,
+        rival: float = -math.inf,
     ) -> None:
         self.system = system
         self.profile = profile_of(system)
         self.rows = rows
         self.catalogue = tuple(catalogue)
         self.jobs = jobs
+        self._rival = rival
         self.fitted: dict[frozenset[str], ScoredModel] = {}
         self._slopes: tuple[Tensor, Tensor] | None = None
         self._screened: dict[tuple[str, ...], tuple[FitState, list[Candidate]]] = {}
         self._exchanged: set[tuple[frozenset[str], frozenset[str]]] = set()
         if source is None:
             self.fit([((), initial_fit(system, rows))], CAREFUL)
+        elif source.state.shape[1] < rows.shape[0]:
+            self.fit([((), replace(source, state=initial_fit(system, rows).state))], FINAL)
         else:
             self.fitted[frozenset()] = ScoredModel((), source, float(source.likelihood[0]))
 
@@ -126,6 +135,10 @@ class Search:
             self._settle()
         if progress is not None:
             progress(MAX_EFFECTS, MAX_EFFECTS, -self.best.log_odds)
+
+    def promised(self) -> float:
+        """Log likelihood that the best effect adds to the source, by the screening."""
+        return max((one.gain for one in self._screening(self.source)), default=0.0)
 
     def _alone(self) -> list[ScoredModel]:
         """Every effect alone, where effects are so large that the screening, a linear response, may mislead."""
@@ -166,7 +179,7 @@ class Search:
 
     def extend(self, bases: Sequence[ScoredModel], most: int = MAX_CANDIDATES) -> list[ScoredModel]:
         """Every base with one more effect, fitted unless it was, for the `most` best candidates of its screening."""
-        leads = [(base, candidate) for base in bases for candidate in self._candidates(base)[:most]]
+        leads = [(base, candidate) for base in bases for candidate in self.candidates(base)[:most]]
         promised = [float(base.fits.likelihood[0]) + candidate.gain for base, candidate in leads]
         known, starts = [], {}
         for k in sorted(range(len(leads)), key=lambda k: -promised[k]):
@@ -181,7 +194,7 @@ class Search:
         every = list(starts.values())
         return known + (self._in_turn(every) if far_behind else self.fit(every, QUICK))
 
-    def _candidates(self, base: ScoredModel) -> list[Candidate]:
+    def candidates(self, base: ScoredModel) -> list[Candidate]:
         """Effects whose screening promises enough to fit them in addition to a set, the largest gain first."""
         return self._promising(self._screening(base))
 
@@ -224,14 +237,17 @@ class Search:
 
     def polish(self) -> None:
         """Fit carefully the sets close to the best, and the best set less each effect, with which it is compared."""
+        self.fit([(f.effects, f.fits) for f in self.close()], CAREFUL)
+
+    def close(self) -> list[ScoredModel]:
+        """The sets close to the best, and the best set less each effect, where these were fitted."""
         best = self.best
         fewer = [f.fits.theta.shape[1] < best.fits.theta.shape[1] for f in self.ranked]
         within = [POLISH_SIMPLER_WITHIN if simpler else POLISH_WITHIN for simpler in fewer]
         close = [f for f, most in zip(self.ranked, within, strict=True) if f.log_odds > best.log_odds - most]
         close = close[:POLISH_MODELS]
         smaller = [self.fitted.get(frozenset(best.names) - {name}) for name in best.names]
-        close += [f for f in smaller if f is not None and all(f is not other for other in close)]
-        self.fit([(f.effects, f.fits) for f in close], CAREFUL)
+        return close + [f for f in smaller if f is not None and all(f is not other for other in close)]
 
     def single(self, effect: type[Effect]) -> ScoredModel:
         """The set of one effect alone."""
@@ -257,24 +273,33 @@ class Search:
 
     def leftover(self, sets: Sequence[ScoredModel]) -> list[float]:
         """Log likelihood that process noise adds to each set: a measure of what it leaves unexplained."""
-        models = [CandidateModel(self.system, f.effects, self.rows) for f in sets]
-        start = stacked([f.fits for f in sets])
-        without = fit(models, start, self._all_windows(len(sets)), QUICK[0], process_noise=False).likelihood
-        return [max(0.0, float(f.fits.likelihood[0] - other)) for f, other in zip(sets, without, strict=True)]
+
+        def of_share(indices: Sequence[int]) -> list[float]:
+            models = [CandidateModel(self.system, sets[k].effects, self.rows) for k in indices]
+            start = stacked([sets[k].fits for k in indices])
+            without = fit(models, start, QUICK[0], process_noise=False).likelihood
+            return without.tolist()
+
+        without = shared_out(of_share, len(sets), self.jobs)
+        return [max(0.0, float(f.fits.likelihood[0]) - other) for f, other in zip(sets, without, strict=True)]
 
     def fit(self, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int]) -> list[ScoredModel]:
         """Fit sets of effects, each from a start, with effort QUICK or CAREFUL; return the best fit so far of each."""
         if not starts:
             return []
         iterations, accuracy = effort
-        rival = max((float(each.fits.likelihood[0]) for each in self.fitted.values()), default=-math.inf)
+        rival = max((float(each.fits.likelihood[0]) for each in self.fitted.values()), default=self._rival)
 
         def fitted_share(indices: Sequence[int]) -> list[FitState]:
+            at_once = max(1, ROWS_AT_ONCE // self.rows.used[..., 0].numel())
+            groups = [indices[first : first + at_once] for first in range(0, len(indices), at_once)]
+            return [one for group in groups for one in fitted_together(group)]
+
+        def fitted_together(indices: Sequence[int]) -> list[FitState]:
             models = [CandidateModel(self.system, starts[k][0], self.rows, accuracy) for k in indices]
             for model in models:
                 model.slopes = self._slopes
-            windows = self._all_windows(len(indices))
-            out = fit(models, stacked([starts[k][1] for k in indices]), windows, iterations, rival=rival)
+            out = fit(models, stacked([starts[k][1] for k in indices]), iterations, rival=rival)
             if self._slopes is None:
                 self._slopes = models[0].slopes
             return [single_fit(out, k, len(model.table)) for k, model in enumerate(models)]
@@ -287,9 +312,6 @@ class Search:
                 self.fitted[key] = fitted
             results.append(self.fitted[key])
         return results
-
-    def _all_windows(self, count: int) -> Tensor:
-        return torch.ones(count, self.rows.shape[0], dtype=torch.float64)
 
 
 def _key(effects: Effects) -> frozenset[str]:

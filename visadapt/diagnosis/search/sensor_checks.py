@@ -55,7 +55,8 @@ def opposite_signs(
         return None
     required = MIN_GAIN_PER_READING * float(rows.used.sum())
     own = Search(system, rows, catalogue, fitted)
-    others = [Search(system, to_source(rows, c, profile.angle_sensor), catalogue) for c in profile.sign_conventions]
+    conventions = [to_source(rows, convention, profile.angle_sensor) for convention in profile.sign_conventions]
+    others = [Search(system, each, catalogue, rival=_likelihood(own)) for each in conventions]
     best = max(range(len(others)), key=lambda k: _likelihood(others[k]))
     if _likelihood(others[best]) - _likelihood(own) <= required:
         return None

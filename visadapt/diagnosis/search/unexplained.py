@@ -9,7 +9,7 @@ Bayesian interpolation, Neural Computation 4(3)).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -49,27 +49,22 @@ class Block:
 
 def smooth_functions(model: CandidateModel, fits: FitState) -> list[SmoothFunction]:
     """Every function added alone to a fitted set, the largest log odds first."""
-    blocks = _blocks(model, fits)
     innovations = Innovations(model, fits)
     out = []
-    for block, response in zip(blocks, _responses(innovations, blocks), strict=True):
+    # One after the other: together they would need much memory.
+    for block in _blocks(model, fits):
+        response = innovations.response(block.drive, block.reading)
         out.append(SmoothFunction(block.port, block.variable, _regression(response, innovations.error)[1]))
     return sorted(out, key=lambda function: -function.log_odds)
 
 
-def _responses(innovations: Innovations, blocks: Sequence[Block]) -> tuple[Tensor, ...]:
-    drive, reading = (torch.cat([getattr(block, name) for block in blocks], -1) for name in ("drive", "reading"))
-    return innovations.response(drive, reading).split(BUMPS, 1)
-
-
-def _blocks(model: CandidateModel, fits: FitState) -> list[Block]:
+def _blocks(model: CandidateModel, fits: FitState) -> Iterator[Block]:
     rows, system = model.rows, model.system
     state = fits.state[0]
     loads = loads_of(model, fits)
     variables = variables_of(model, state)
     no_drive = torch.zeros(*state[:, 1:].shape, BUMPS, dtype=torch.float64)
     no_reading = torch.zeros(*rows.used.shape, BUMPS, dtype=torch.float64)
-    out = []
     for name, values in variables.items():
         bumps = _bumps(values, rows.inside > 0)
         inner = bumps[:, :-1] * rows.inside[:, 1:, None]
@@ -77,14 +72,13 @@ def _blocks(model: CandidateModel, fits: FitState) -> list[Block]:
             for factor in model.profile.smooth_function_factors.get(load.name, (None,)):
                 factors = 1.0 if factor is None else variables[factor][:, :-1, None]
                 drive = loads[..., k, None] * (factors * inner)[:, :, None]
-                out.append(Block(load.name, name, drive, no_reading))
+                yield Block(load.name, name, drive, no_reading)
         for k, channel in enumerate(rows.channels):
             state_name = system.states[channel].name
             if name in (state_name, "time"):
                 reading = no_reading.clone()
                 reading[:, :, k] = -bumps * rows.used[:, :, k, None]
-                out.append(Block(state_name, name, no_drive, reading))
-    return out
+                yield Block(state_name, name, no_drive, reading)
 
 
 def variables_of(model: CandidateModel, state: Tensor) -> dict[str, Tensor]:

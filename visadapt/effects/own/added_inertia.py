@@ -65,6 +65,5 @@ def inertia_of(system: System, joint: int) -> float:
         torch.tensor([[(one.low + one.high) / 2 for one in variables]], dtype=torch.float64)
         for variables in (system.states, system.actions, system.loads)
     )
-    unit = torch.eye(load.shape[1], dtype=torch.float64)[joint, None]
-    gain = system.derivative(state, command, load + unit) - system.derivative(state, command, load)
-    return 1 / float(gain[0, system.coordinates[joint][1]])
+    _, gain = system.response_to_loads(state, command, load)
+    return 1 / float(gain[0, joint, joint])

@@ -81,6 +81,11 @@ def _laws(
             f"Q = -forward where {v} > 0, backward where {v} < 0; at rest, what holds the joint, up to these",
             friction("forward", "backward"),
         ),
+        "load_dependent_friction": (
+            laws.LoadDependentLaw,
+            f"Q = -share |motor {size}| sign({v}); at rest, what holds the joint, up to share |motor {size}|",
+            (Parameter("share", "1", 0.0, 0.8, 0.0),),
+        ),
         "spring": (
             laws.SpringLaw,
             f"Q = -stiffness ({q} - rest)",

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from visadapt.effects import sensing
+from visadapt.effects import late_sensors, sensing
 from visadapt.effects.base import Parameter
 from visadapt.effects.own.statement import ALL_SENSORS, Made, delay_of_all
 from visadapt.systems import System
 
 
 def on_sensors(system: type[System]) -> Iterator[Made]:
-    """Offset and scale of each sensor, and a delay of all."""
+    """Offset, scale and delay of each sensor, a velocity's with its position's, and one of all."""
     rates = dict(system.coordinates)
+    moving = {"positions": list(rates), "velocities": list(rates.values())}
     yield (
         f"{ALL_SENSORS}.measurement_delay",
-        sensing.MeasurementDelay,
-        {
-            "positions": list(rates),
-            "velocities": list(rates.values()),
-            "indistinguishable_from": (delay_of_all(system),),
-        },
+        late_sensors.MeasurementDelay,
+        {**moving, "late": list(range(len(system.states))), "indistinguishable_from": (delay_of_all(system),)},
     )
     for column, state in enumerate(system.states):
         name, unit = state.name, state.unit
@@ -39,6 +36,17 @@ def on_sensors(system: type[System]) -> Iterator[Made]:
             continue
         scaled = [column, rates[column]] if column in rates else [column]
         both = ", ".join(system.states[one].name for one in scaled)
+        if len(scaled) < len(system.states):
+            yield (
+                f"{name}.sensor_delay",
+                late_sensors.LateSensors,
+                {
+                    **moving,
+                    "__doc__": f"A sensor of {name} that is late against the others, as when its clock is another.",
+                    "equation": f"({both}) measured(t) = ({both})(max(t - delay, 0))",
+                    "late": scaled,
+                },
+            )
         yield (
             f"{name}.sensor_scale",
             sensing.SensorGain,

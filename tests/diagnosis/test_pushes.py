@@ -1,0 +1,107 @@
+"""Pushes of a double pendulum and of a cart: found with times and impulses, and none named where there is none."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tests.own_systems import DoublePendulum
+from visadapt.diagnosis.search.pushes import pushes
+from visadapt.effects.catalogue import catalogue
+from visadapt.recordings import Episode, Recording
+from visadapt.systems import CartPole
+from visadapt.world import World, WorldState
+
+PERIOD, WIDTH = 0.004, 0.08
+SHOULDER, ELBOW = (0, 1.5, 0.4), (1, 3.2, -0.35)
+"""A push: on which joint, its middle in s, its peak in N m."""
+
+
+def recorded(*given, name="run"):
+    """5 s of a double pendulum with friction and a weaker motor than the source's, under torques, and pushes."""
+    effects = {effect.name: effect for effect in catalogue(DoublePendulum())}
+    machine = World(
+        DoublePendulum(),
+        [
+            effects["shoulder.coulomb_friction"](torque=0.15),
+            effects["elbow.viscous_friction"](coefficient=0.02),
+            effects["torque_1.actuator_gain"](scale=0.85),
+        ],
+        PERIOD,
+    ).double()
+    time = PERIOD * np.arange(1250)
+    torque = np.stack((1.6 * np.sin(4 * time) + 0.9 * np.sin(9.5 * time + 1), 0.3 * np.sin(6 * time)), 1)
+    push = np.zeros_like(torque)
+    for joint, middle, peak in given:
+        push[:, joint] += peak * np.exp(-0.5 * ((time - middle) / WIDTH) ** 2)
+    push[:, 0] /= 0.85  # it acts whole, whatever the motor makes of its command
+    at = machine.start(torch.zeros(1, 4, dtype=torch.float64))
+    states = []
+    for command in torch.from_numpy(torque + push)[:, None]:
+        states.append(at.state[0])
+        at = machine.step(at, command)
+    noise = np.random.default_rng(0).normal(size=(len(time), 4)) * [2e-4, 2e-4, 0.05, 0.05]
+    state = torch.stack(states).detach().numpy() + noise
+    return Recording((Episode(time, torque, state),), tuple(s.name for s in DoublePendulum.states), PERIOD, (name,))
+
+
+def found_in(recording):
+    with torch.inference_mode():
+        return pushes(recording, World(DoublePendulum(), period=PERIOD))
+
+
+def test_pushes_are_found_with_joint_time_and_impulse():
+    found = found_in(recorded(SHOULDER, ELBOW))
+    assert [push.load for push in found] == ["shoulder", "elbow"]
+    for push, (_, middle, peak) in zip(found, (SHOULDER, ELBOW), strict=True):
+        assert push.start == pytest.approx(middle - 2.45 * WIDTH, abs=0.1)
+        assert push.end == pytest.approx(middle + 2.45 * WIDTH, abs=0.1)
+        assert push.impulse == pytest.approx(peak * WIDTH * math.sqrt(2 * math.pi), rel=0.3)
+        assert push.ci90[0] < push.impulse < push.ci90[1]
+        assert push.unit == "N m"
+        assert push.p_value < 1e-3
+
+
+def test_none_is_named_where_there_is_none():
+    assert found_in(recorded()) == ()
+
+
+def test_each_episode_has_its_own():
+    first, second = recorded(), recorded(ELBOW)
+    both = dataclasses.replace(first, episodes=first.episodes + second.episodes, sources=("one", "two"))
+    assert [(push.episode, push.load) for push in found_in(both)] == [(1, "elbow")]
+
+
+def test_without_a_joints_position_none_are_looked_for():
+    whole = recorded(ELBOW)
+    episode = dataclasses.replace(whole.episodes[0], state=whole.episodes[0].state[:, [0, 2, 3]])
+    assert (
+        found_in(dataclasses.replace(whole, episodes=(episode,), measured=("angle_1", "velocity_1", "velocity_2")))
+        == ()
+    )
+
+
+def test_a_kick_of_the_cart_is_found():
+    system = CartPole()
+    world = World(system, period=0.02)
+    time = 0.02 * np.arange(250)
+    generator = np.random.default_rng(1)
+    command = 0.5 * np.sin(5 * time) + 0.3 * np.sin(11 * time)
+    kick = 4.0 * np.exp(-0.5 * ((time - 2.5) / 0.1) ** 2) / system.max_force
+    at = WorldState(torch.zeros(1), torch.tensor([[0.0, 0.0, math.pi, 0.0]]).double())
+    states = []
+    for acting in torch.from_numpy(command + kick)[:, None, None]:
+        states.append(at.state[0].numpy())
+        with torch.no_grad():
+            at = world.step(at, acting)
+    state = np.stack(states) + generator.normal(size=(len(time), 4)) * [1e-3, 1e-2, 1e-3, 1e-2]
+    recording = Recording(
+        (Episode(time, command[:, None], state),), ("x", "x_dot", "theta", "theta_dot"), 0.02, ("run",)
+    )
+    with torch.inference_mode():
+        (push,) = pushes(recording, world)
+    assert push.load == "cart_force"
+    assert push.start == pytest.approx(2.5 - 0.245, abs=0.1)
+    assert push.impulse == pytest.approx(4.0 * 0.1 * math.sqrt(2 * math.pi), rel=0.3)

@@ -1,0 +1,38 @@
+"""A search on some of the rows of a long recording, continued on all of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from visadapt.diagnosis.search.search import MAX_EFFECTS, Search
+from visadapt.estimation.fit_states import FINAL
+from visadapt.estimation.segments import Segments
+
+FINALISTS = 4  # Sets at most that are fitted to all rows
+
+MAX_ADDED, TRIED = 2, 2
+MIN_GAIN = 6.0
+"""Effects at most that are then added to the best set, how many are tried for each, and the log likelihood that they
+must promise: less would not outweigh the prior odds."""
+
+
+def on_all_rows(search: Search, rows: Segments) -> Search:
+    """The best sets of a search, and what they promise there, fitted to all rows.
+
+    With more rows weaker effects show, which the rows searched do not hold.
+    """
+    whole = Search(search.system, rows, search.catalogue, search.source.fits, search.jobs)
+    close = [each for each in search.close() if each.effects][:FINALISTS]
+    for group in (close[:1], close[1:]):
+        # From the states of the best set so far, which a start from the readings would first have to find.
+        whole.fit([(each.effects, replace(each.fits, state=whole.best.fits.state)) for each in group], FINAL)
+    for _ in range(MAX_ADDED):
+        before = whole.best
+        promising = [one for one in whole.candidates(before) if one.gain > MIN_GAIN]
+        if not promising or len(before.effects) >= MAX_EFFECTS:
+            break
+        whole.extend([before], min(len(promising), TRIED))
+        if whole.best is before:
+            break
+        whole.fit([(whole.best.effects, whole.best.fits)], FINAL)
+    return whole

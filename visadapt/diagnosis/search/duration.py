@@ -1,0 +1,53 @@
+"""How long a diagnosis will take, said before it begins."""
+
+from __future__ import annotations
+
+import time
+
+from visadapt.diagnosis.search.search import FIT_ALL_ABOVE, Search
+from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.likelihood import differentiate
+from visadapt.estimation.segments import Segments
+
+SEARCH_STEPS = {0.0: 5, 10.0: 26, FIT_ALL_ABOVE: 38}
+"""By the log likelihood that the best effect promises: a search, for each effect of the catalogue, in steps of a fit of
+the source to the rows searched. Measured on recordings with hidden effects of many sizes."""
+
+FINAL_STEPS = {0.0: 60, 10.0: 130}  # The same of the fits to every row, and the predictions
+
+SHARED = 0.6  # Share of the work that each process beyond the first takes off the first
+
+
+def expected(search: Search, rows: Segments) -> float:
+    """Seconds, within a factor of about two, from a step of a fit that is made here, and from how much is to be found.
+
+    Args:
+        search: before it has run; it may be on some of the rows.
+        rows: all rows.
+    """
+    model, fits = CandidateModel(search.system, (), search.rows), search.source.fits
+    began = time.perf_counter()
+    differentiate([model], fits)
+    step = time.perf_counter() - began
+    promised = search.promised()
+    searching, final = (
+        max(steps for least, steps in table.items() if promised >= least) for table in (SEARCH_STEPS, FINAL_STEPS)
+    )
+    effort = searching * len(search.catalogue) + final * rows.shape[0] / search.rows.shape[0]
+    return step * effort / (1 + SHARED * (search.jobs - 1))
+
+
+def announcement(rows: Segments, effects: int, seconds: float, jobs: int) -> str:
+    """The line that says it.
+
+    >>> import torch
+    >>> from visadapt.estimation.segments import cut
+    >>> ones = [torch.ones(120, 2).double()]
+    >>> rows = cut(ones, ones, ones, [torch.arange(120.0)], (0, 2), 1.0, 120)
+    >>> announcement(rows, 24, 87.0, 2)
+    '120 rows of 2 channels, 24 effects: about 90 s on 2 cores'
+    """
+    count, channels = int(rows.inside.sum()), len(rows.channels)
+    rounded = float(f"{seconds:.1g}") if seconds < 100 else float(f"{seconds:.2g}")
+    cores = "1 core" if jobs == 1 else f"{jobs} cores"
+    return f"{count:,} rows of {channels} channels, {effects} effects: about {rounded:g} s on {cores}"

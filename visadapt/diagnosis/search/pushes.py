@@ -1,0 +1,303 @@
+"""Pushes: passing loads on one joint that no function of state and command explains; when, where and how hard.
+
+The unexplained load is a sum of columns that state and command explain, of errors, and of pushes: bumps in time. Errors
+grow with speed, acceleration and changes of the command, and neighbouring ones are alike; how much, the recording shows
+itself. A bump is tried at every instant, in several widths, on every joint: a matched filter, by generalised least
+squares (Kay 1998, Fundamentals of Statistical Signal Processing II, section 4.4). Those that stand out are fitted
+together with all else, and those that then do not stand out clearly are dropped, the weakest first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool1d, pad
+
+from visadapt.diagnosis.result import Push
+from visadapt.diagnosis.search.causes import Z_90
+from visadapt.diagnosis.search.unexplained_load import LoadTrack, load_tracks
+from visadapt.recordings import Recording
+from visadapt.systems import Variable
+from visadapt.world import World
+
+WIDTHS = (0.06, 0.085, 0.12, 0.17)  # s, deviations of the Gaussian bumps that are tried
+
+EDGE = 2.45  # Deviations of a bump from its middle where it has 5 % of its peak: there a push starts and ends
+
+FIRST, CANDIDATE, CLEAR = 3.5, 3.0, 5.0
+"""Height over its deviation from which the first bump on a part is fitted with all else, from which others are, and
+from which they are then called pushes: far more than chance, since errors of a model are not normally distributed."""
+
+SHAPE_ERROR = 0.15  # Deviation of an impulse, as a share of it, because a push need not have the shape of a bump
+
+MOST = 6  # Bumps on an episode at most
+
+PRIOR = 0.3  # Deviation of the load that a column explains, over the size of the unexplained load
+
+OWN = 0.5  # Deviation of an episode's weights of columns from those of all episodes, over that of these
+
+LAGS = 8  # Order of the autoregression of errors
+
+ROUNDS, ROUNDS_AGAIN = 6, 3  # Rounds in which columns and errors are fitted in turn, at first and with another bump
+
+OUTLIER = 2.5  # Errors, in deviations, above which they count less (Huber)
+
+CUT = 9.0  # Squared errors over their median, at which they are cut off when the size of errors is fitted
+
+WHITE = 0.03  # Share of the errors' variance that is taken as white, so that errors can be whitened
+
+DISTINCT = 0.15  # Least share of a bump's information that columns and other bumps leave to it
+
+TALL = 10.0  # Prior deviation of a bump's height, over the size of the unexplained load
+
+
+def pushes(recording: Recording, world: World) -> tuple[Push, ...]:
+    """The pushes in a recording beyond what a world explains, in the order of time."""
+    tracks = load_tracks(recording, world)
+    if not tracks:
+        return ()
+    found = _Fit(tracks).pushes()
+    tries = sum(len(track.time) for track in tracks) * tracks[0].load.shape[1]
+    loads = world.system.loads
+    named = [_named(one, tracks[one.part].episode, loads[one.joint], tries) for one in found]
+    return tuple(sorted(named, key=lambda push: (push.episode, push.start)))
+
+
+@dataclass(frozen=True)
+class _Bump:
+    """A Gaussian bump of load on a joint."""
+
+    part: int
+    joint: int
+    middle: float  # s
+    width: float  # s, deviation
+    height: float = 0.0  # in the load's unit
+    deviation: float = math.inf  # of the height
+
+    @property
+    def score(self) -> float:
+        return abs(self.height) / self.deviation
+
+    def within(self, other: _Bump) -> bool:
+        """Whether its middle lies in a higher bump on the same joint."""
+        near = abs(self.middle - other.middle) < EDGE * other.width
+        return near and self.part == other.part and self.joint == other.joint and abs(self.height) < abs(other.height)
+
+    def on(self, track: LoadTrack) -> Tensor:
+        """(N, J) the bump with unit height, smoothed as the track is."""
+        out = torch.zeros_like(track.load)
+        out[:, self.joint] = _bumps(track, torch.tensor([self.middle], dtype=torch.float64), self.width)[0]
+        return out
+
+
+def _bumps(track: LoadTrack, middles: Tensor, width: float) -> Tensor:
+    """(M, N) bumps of unit height at M instants, smoothed as the track is."""
+    whole = math.hypot(width, track.smoothing)
+    return width / whole * torch.exp(-0.5 * ((track.time - middles[:, None]) / whole).square())
+
+
+def _named(bump: _Bump, episode: int, load: Variable, tries: int) -> Push:
+    area = bump.width * math.sqrt(2 * math.pi)
+    impulse = bump.height * area
+    spread = Z_90 * math.hypot(bump.deviation * area, SHAPE_ERROR * impulse)
+    reach = EDGE * bump.width
+    p_value = min(1.0, tries * math.erfc(bump.score / math.sqrt(2)))
+    ends = max(0.0, bump.middle - reach), bump.middle + reach
+    ci90 = impulse - spread, impulse + spread
+    return Push(episode, load.name, *ends, bump.height, load.unit, impulse, ci90, p_value)
+
+
+class _Fit:
+    """Columns, errors and bumps, fitted to all parts of a recording together."""
+
+    def __init__(self, tracks: Sequence[LoadTrack]) -> None:
+        self.tracks = tracks
+        self.bumps: list[_Bump] = []
+        joints = tracks[0].load.shape[1]
+        self.size = torch.cat([track.load for track in tracks]).square().mean().sqrt() + 1e-300
+        self.left = [torch.zeros_like(track.load) for track in tracks]
+        self.weights = [torch.zeros(0, dtype=torch.float64) for _ in tracks]
+        self.roots = [torch.zeros(0, 0, dtype=torch.float64) for _ in tracks]
+        self.spread = [self.size.expand_as(track.load) for track in tracks]
+        self.autoregression = torch.zeros(joints, LAGS, dtype=torch.float64)
+        self.innovation = torch.ones(joints, dtype=torch.float64)
+
+    def pushes(self) -> list[_Bump]:
+        """The bumps that stand out clearly."""
+        self._fit(ROUNDS)
+        searched: Sequence[int] = range(len(self.tracks))
+        for k in range(MOST):
+            needed = CANDIDATE if k else FIRST
+            found = [one for part in searched if (one := self._highest(part)).score > needed]
+            if not found:
+                break
+            self.bumps += found
+            searched = [one.part for one in found]
+            self._fit(ROUNDS_AGAIN)
+        while self.bumps:
+            self.bumps = self._measured()
+            weakest = {one.part: one for one in sorted(self.bumps, key=lambda one: -one.score) if one.score < CLEAR}
+            if not weakest:
+                break
+            self.bumps = [one for one in self.bumps if one not in weakest.values()]
+            self._fit(ROUNDS_AGAIN)
+        # A smaller bump within another is no push of its own: it corrects the shape of that one.
+        return [one for one in self.bumps if not any(one.within(other) for other in self.bumps)]
+
+    def _design(self, part: int) -> Tensor:
+        """(K, N, J) loads of unit prior deviation: of the columns, and of the bumps on this part."""
+        track = self.tracks[part]
+        columns = track.columns - torch.einsum("knij,nj->kni", track.reaction, self.left[part])
+        bumps = [TALL * self.size * one.on(track) for one in self.bumps if one.part == part]
+        return torch.cat((PRIOR * self.size * columns, *(one[None] for one in bumps)))
+
+    def _whitened(self, part: int, values: Tensor) -> Tensor:
+        """Loads (..., N, J) over the errors' deviation, less what the errors before foretell; (..., N J)."""
+        values = values / self.spread[part]
+        out = values.clone()
+        for lag, factor in enumerate(self.autoregression.unbind(1), 1):
+            out[..., lag:, :] -= factor * values[..., :-lag, :]
+        return (out / self.innovation).flatten(-2)
+
+    def _fit(self, rounds: int) -> None:
+        for k in range(rounds):
+            self._weigh(robust=bool(self.weights[0].numel()) and k > 0)
+            self._size_errors()
+        self._weigh(robust=True)
+
+    def _weigh(self, robust: bool) -> None:
+        """The weights of columns and bumps, given the errors: those of each part around those of all."""
+        count = len(self.tracks[0].columns)
+        identity = torch.eye(count, dtype=torch.float64)
+        several = len(self.tracks) > 1
+        total, along = identity.clone(), torch.zeros(count, dtype=torch.float64)
+        problems = []
+        for part, track in enumerate(self.tracks):
+            design, target = self._whitened(part, self._design(part)), self._whitened(part, track.load)
+            weighted = design
+            if robust:
+                error = self._whitened(part, self.left[part]).abs()
+                weighted = design * (OUTLIER / error.clamp(min=1e-9)).clamp(max=1)
+            normal, gradient = weighted @ design.T, weighted @ target
+            problems.append((normal, gradient))
+            if several:
+                # Without the bumps, and given that the part's own weights differ from those of all.
+                bumps = normal[count:, count:] + torch.eye(len(normal) - count, dtype=torch.float64)
+                gone = torch.linalg.solve(bumps, normal[count:, :count]).mT
+                normal = normal[:count, :count] - gone @ normal[count:, :count]
+                gradient = gradient[:count] - gone @ gradient[count:]
+                inner = identity + OWN**2 * normal
+                total, along = total + torch.linalg.solve(inner, normal), along + torch.linalg.solve(inner, gradient)
+        common = torch.linalg.solve(total, along)
+        for part, (normal, gradient) in enumerate(problems):
+            precision = torch.ones(len(normal), dtype=torch.float64)
+            if several:
+                precision[:count] = OWN**-2
+                gradient = gradient + pad(OWN**-2 * common, (0, len(normal) - count))
+            self.roots[part] = torch.linalg.cholesky(normal + torch.diag(precision))
+            self.weights[part] = torch.cholesky_solve(gradient[:, None], self.roots[part])[:, 0]
+            explained = torch.einsum("k,knj->nj", self.weights[part], self._design(part))
+            self.left[part] = self.tracks[part].load - explained
+
+    def _size_errors(self) -> None:
+        """How errors grow with activity, and their autoregression (Yule-Walker), joint by joint.
+
+        What is left is smaller than the errors, by what the weights took of them: their covariance is added.
+        """
+        taken = [
+            torch.linalg.solve_triangular(root, self._design(part).flatten(1), upper=False).unflatten(
+                1, self.left[part].shape
+            )
+            for part, root in enumerate(self.roots)
+        ]
+        activity = torch.cat([track.activity for track in self.tracks])
+        basis = pad(activity - activity.mean(0), (1, 0), value=1.0)
+        lengths = [len(track.time) for track in self.tracks]
+        for j in range(len(self.innovation)):
+            left = [each[:, j] for each in self.left]
+            own = [each[..., j] for each in taken]
+            most = CUT * torch.cat(left).square().median()
+            power = torch.cat(
+                [_local_mean(e.square().clamp(max=most) + v.square().sum(0)) for e, v in zip(left, own, strict=True)]
+            )
+            deviation = (0.5 * _log_power(basis, power)).exp()
+            at_rest = torch.cat([track.at_rest[:, j] for track in self.tracks])
+            friction = torch.cat([self._dry_friction(part, j).expand(n) for part, n in enumerate(lengths)])
+            # At rest, dry friction is what holds the joint.
+            deviations = torch.hypot(deviation, friction * at_rest).split(lengths)
+            moments = torch.zeros(LAGS + 1, dtype=torch.float64)
+            for part, each in enumerate(deviations):
+                self.spread[part] = self.spread[part].clone()
+                self.spread[part][:, j] = each
+                white, more = (left[part] / each).clamp(-3, 3), own[part] / each
+                for lag in range(LAGS + 1):
+                    end = len(each) - lag
+                    moments[lag] += white[lag:] @ white[:end] + (more[:, lag:] * more[:, :end]).sum()
+            moments = moments / sum(lengths)
+            moments[0] *= 1 + WHITE
+            lags = torch.arange(LAGS)
+            self.autoregression[j] = torch.linalg.solve(moments[(lags[:, None] - lags).abs()], moments[1:])
+            self.innovation[j] = (moments[0] - self.autoregression[j] @ moments[1:]).clamp(min=1e-9).sqrt()
+
+    def _dry_friction(self, part: int, joint: int) -> Tensor:
+        """() the size of a joint's dry friction."""
+        track = self.tracks[part]
+        column = track.dry[joint]
+        return PRIOR * self.size * self.weights[part][column].abs() * track.columns[column].abs().amax()
+
+    def _highest(self, part: int) -> _Bump:
+        """The bump on a part that stands out most beside what is fitted."""
+        time, joints = self.tracks[part].time, self.tracks[part].load.shape[1]
+        shape = (-1, len(time), joints)
+        design = self._whitened(part, self._design(part)).unflatten(1, shape[1:])
+        left = self._whitened(part, self.left[part]).unflatten(0, shape[1:])
+
+        def best(joint: int, middles: Tensor, width: float) -> _Bump:
+            tried = _bumps(self.tracks[part], middles, width)[..., None]
+            shapes = self._whitened(part, pad(tried, (joint, joints - 1 - joint)))[:, joint::joints]
+            shared = torch.linalg.solve_triangular(self.roots[part], design[..., joint] @ shapes.mT, upper=False)
+            alone = shapes.square().sum(1)
+            information = (alone - shared.square().sum(0)).clamp(min=DISTINCT * alone)
+            height = shapes @ left[:, joint] / information
+            k = int((height.abs() * information.sqrt()).argmax())
+            return _Bump(part, joint, float(middles[k]), width, float(height[k]), float(information[k] ** -0.5))
+
+        tried = (
+            best(joint, torch.arange(float(time[0]) + width, float(time[-1]) - width, 0.3 * width).double(), width)
+            for width in WIDTHS
+            for joint in range(joints)
+        )
+        return max(tried, key=lambda one: one.score)
+
+    def _measured(self) -> list[_Bump]:
+        """The bumps with their heights as fitted together."""
+        out = []
+        for part in range(len(self.tracks)):
+            own = [one for one in self.bumps if one.part == part]
+            if not own:
+                continue
+            unit = TALL * float(self.size)
+            deviation = unit * torch.cholesky_inverse(self.roots[part]).diagonal().sqrt()
+            heights = unit * self.weights[part]
+            for k, one in enumerate(own, len(heights) - len(own)):
+                out.append(replace(one, height=float(heights[k]), deviation=float(deviation[k])))
+        return out
+
+
+def _log_power(basis: Tensor, power: Tensor) -> Tensor:
+    """Logs (N,) of an expected power that grows with the columns of `basis` (N, F), the first of which is 1."""
+    logs = (power + 1e-4 * power.mean()).log()
+    ridge = torch.full((basis.shape[1],), 24.0, dtype=torch.float64)
+    ridge[0] = 0.0
+    slopes = torch.linalg.solve(basis.T @ basis + torch.diag(ridge), basis.T @ logs)
+    expected = basis @ torch.cat((slopes[:1], slopes[1:].clamp(min=0)))
+    return expected + (power / expected.exp()).clamp(max=CUT).mean().log()
+
+
+def _local_mean(values: Tensor, reach: int = 4) -> Tensor:
+    """Values (N,) averaged over so many neighbours on either side."""
+    return avg_pool1d(pad(values[None], (reach, reach), mode="replicate"), 2 * reach + 1, 1)[0]

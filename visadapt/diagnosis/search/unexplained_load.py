@@ -1,0 +1,261 @@
+"""The load that a motion takes beyond what a world explains, over whole episodes, and what else may explain it.
+
+Readings of positions are smoothed and differentiated twice; the accelerations less those of the world, over their gain
+by the loads, are the load in question (inverse dynamics; Khalil and Dombre 2002, chapter 12). It is linear in what a
+world may have wrong: friction, the commands' gain and delay, the parameters, the zero of a sensor, a drive that gives.
+Those columns are taken along the world's own accelerations, not the measured ones: then no factor common to all of
+them explains anything.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv1d
+
+from visadapt.effects.own.dynamics import scalable
+from visadapt.recordings import Episode, Recording
+from visadapt.systems import System
+from visadapt.world import World, WorldState
+
+SMOOTHING = 0.065  # s, deviation of the Gaussian that smooths the load, or one period if that is longer
+
+STEP = 0.04  # s between the instants at which the load is given, or one period if that is longer
+
+SHORTEST = 25  # Length over the smoothing's deviation below which an episode tells nothing of pushes
+
+LONGEST = 300  # Instants in a part: what drifts is fitted part by part, and the work grows with its square
+
+SLOW = 0.01  # Speed over the largest of its range below which a joint may stick
+
+SLACK = 0.1  # Command over the largest of its range at which the play of a drive is taken up
+
+DIFFERENCE = 1e-4  # Finite difference of a state in its unit, and of the log of a parameter
+
+
+@dataclass(frozen=True)
+class LoadTrack:
+    """The unexplained loads on J joints over an episode or a part of it, at N instants; all smoothed alike."""
+
+    episode: int
+    time: Tensor  # (N,) s since the episode began
+    load: Tensor  # (N, J)
+    columns: Tensor  # (K, N, J) loads that state and command may explain, of unit root mean square over the recording
+    reaction: Tensor
+    """(K, N, J, J) change of the columns per unit of load that nothing explains: they follow the motion modelled"""
+    dry: tuple[int, ...]  # the column of each joint's dry friction
+    at_rest: Tensor  # (N, J) from 0 to 1: whether a joint is so slow that it may stick
+    activity: Tensor  # (N, F) logs of speeds, accelerations and changes of commands, with which errors grow
+    smoothing: float  # s, deviation of the smoothing Gaussian
+
+    def parts(self) -> list[LoadTrack]:
+        """In parts of about LONGEST instants."""
+        count = max(1, round(len(self.time) / LONGEST))
+        edges = [round(k * len(self.time) / count) for k in range(count + 1)]
+        return [
+            replace(
+                self,
+                time=self.time[a:b],
+                load=self.load[a:b],
+                columns=self.columns[:, a:b],
+                reaction=self.reaction[:, a:b],
+                at_rest=self.at_rest[a:b],
+                activity=self.activity[a:b],
+            )
+            for a, b in pairwise(edges)
+        ]
+
+
+def load_tracks(recording: Recording, world: World) -> list[LoadTrack]:
+    """The unexplained loads in each episode that is long enough; none where a joint's position was not measured."""
+    system = world.system
+    measured = [system.index(name) for name in recording.measured]
+    in_pairs = {column for pair in system.coordinates for column in pair}
+    if not system.coordinates or len(system.coordinates) < len(system.loads):
+        return []
+    if any(position not in measured for position, _ in system.coordinates):
+        return []
+    if any(column not in measured for column in range(len(system.states)) if column not in in_pairs):
+        return []
+    found = [
+        part
+        for number, episode in enumerate(recording.episodes)
+        for part in _track(number, episode, world, measured, recording.period)
+    ]
+    if not found:
+        return []
+    size = torch.cat([track.columns.square().flatten(1) for track in found], 1).mean(1).sqrt() + 1e-300
+    return [
+        replace(t, columns=t.columns / size[:, None, None], reaction=t.reaction / size[:, None, None, None])
+        for t in found
+    ]
+
+
+def _track(number: int, episode: Episode, world: World, measured: Sequence[int], period: float) -> list[LoadTrack]:
+    system = world.system
+    stamps, readings, given = (
+        torch.as_tensor(values, dtype=torch.float64) for values in (episode.time, episode.state, episode.action)
+    )
+    smoothing = max(SMOOTHING, period)
+    time = torch.arange(float(stamps[0]), float(stamps[-1]), period, dtype=torch.float64)
+    if len(time) * period < SHORTEST * smoothing:
+        return []
+    state = torch.zeros(len(time), len(system.states), dtype=torch.float64)
+    after = torch.searchsorted(stamps, time, right=True).clamp(1, len(stamps) - 1)
+    share = (time - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
+    for k, column in enumerate(measured):
+        state[:, column] = torch.lerp(readings[after - 1, k], readings[after, k], share)
+    held = torch.cat((stamps.diff(), stamps.new_tensor([period])))
+    acting = world.actuate(given[None], held[None])[0].mean(1)[after - 1]
+
+    def smooth(values: Tensor, deviation: float = smoothing) -> Tensor:
+        return _smoothed(values, deviation / period)
+
+    def rate(values: Tensor) -> Tensor:
+        return torch.gradient(values, spacing=period, dim=0)[0]
+
+    positions, velocities = (list(columns) for columns in zip(*system.coordinates, strict=True))
+    state[:, positions] = smooth(state[:, positions], 0.1 * smoothing)
+    state[:, velocities] = rate(state[:, positions])
+    acceleration = rate(state[:, velocities])
+    commanded = smooth(acting, 0.1 * smoothing)
+    found = _Motion(world, time, state, acting, acceleration).loads(rate, commanded)
+    largest = torch.tensor([action.largest for action in system.actions], dtype=torch.float64)
+    fastest = torch.tensor([system.states[v].largest for v in velocities], dtype=torch.float64)
+    stormy = smooth(acceleration.abs(), 2 * smoothing)
+    activity = torch.cat(
+        (
+            (stormy / stormy.mean(0) + 0.1).log(),
+            (smooth(state[:, velocities].abs(), 2 * smoothing) / fastest + 0.03).log(),
+            (smooth(rate(commanded).abs(), 2 * smoothing) / largest + 0.3).log(),
+        ),
+        1,
+    )
+    at_rest = smooth((-(state[:, velocities] / (SLOW * fastest)).square()).exp())
+    edge, stride = round(2 * smoothing / period), max(1, round(STEP / period))
+    inner = slice(edge, len(time) - edge, stride)
+    both = torch.cat((found.load[:, None], found.columns), 1)
+    smoothed = _smoothed(both.flatten(1), smoothing / period, edge, stride).unflatten(1, both.shape[1:])
+    whole = LoadTrack(
+        number,
+        time[inner],
+        smoothed[:, 0],
+        smoothed[:, 1:].movedim(1, 0),
+        found.reaction[inner].movedim(1, 0),
+        found.dry,
+        at_rest[inner],
+        activity[inner],
+        smoothing,
+    )
+    return whole.parts()
+
+
+@dataclass(frozen=True)
+class _Loads:
+    """What `LoadTrack` has, at T instants and not smoothed."""
+
+    load: Tensor  # (T, J)
+    columns: Tensor  # (T, K, J)
+    reaction: Tensor  # (T, K, J, J)
+    dry: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """A world along the T instants of an episode, and the accelerations of the joints that were measured."""
+
+    world: World
+    time: Tensor  # (T,)
+    state: Tensor  # (T, n)
+    acting: Tensor  # (T, n_action)
+    measured: Tensor  # (T, J)
+
+    def acceleration(self, state: Tensor, acting: Tensor) -> Tensor:
+        """(T, J) accelerations of the joints by the world."""
+        at = WorldState(self.time, state, ())
+        return self.world.system_at(at).accelerations(state, acting, self.world.load(at))
+
+    def gain(self, own: System | None = None) -> tuple[Tensor, Tensor]:
+        """(T, J) accelerations of the joints by the world, or by the bare system `own`, and (T, J, J) their change per
+        unit of each load."""
+        at = WorldState(self.time, self.state, ())
+        system, load = self.world.system_at(at) if own is None else own, self.world.load(at)
+        return system.response_to_loads(self.state, self.acting, load)
+
+    def loads(self, rate: Callable[[Tensor], Tensor], commanded: Tensor) -> _Loads:
+        """The load in question and what may explain it.
+
+        `rate` differentiates by time, `commanded` (T, n_action) are the commands that act, slightly smoothed.
+        """
+        system, state, acting = self.world.system, self.state, self.acting
+        free, gain = self.gain()
+
+        def load(acceleration: Tensor) -> Tensor:
+            return torch.linalg.solve(gain, acceleration[..., None])[..., 0]
+
+        joints = torch.eye(gain.shape[-1], dtype=state.dtype)
+        columns: list[Tensor] = []
+        reactions: dict[int, Tensor] = {}
+        dry: list[int] = []
+        response = [
+            load(self.acceleration(state, acting + unit) - free) for unit in torch.eye(acting.shape[1]).to(acting)
+        ]
+        for by_unit, command in zip(response, commanded.unbind(1), strict=True):
+            columns += [by_unit * command[:, None], by_unit * rate(command)[:, None]]
+        driven = (torch.stack(response, -1) * commanded[:, None]).sum(-1)
+        largest = torch.tensor([action.largest for action in system.actions], dtype=state.dtype)
+        slack = (commanded / (SLACK * largest)).tanh()
+        for j, (position, velocity) in enumerate(system.coordinates):
+            v = state[:, velocity]
+            slip = v / (SLOW * system.states[velocity].largest)
+            sign, near_rest = slip.tanh(), (-(0.2 * slip).square()).exp()
+            friction = (sign, sign * near_rest, sign * driven[:, j].abs(), v, v * v.abs(), torch.ones_like(v))
+            dry.append(len(columns))
+            columns += [each[:, None] * joints[j] for each in friction]
+            # Added inertia; then errors of the position: of the sensor's zero, and of a drive that gives or has play.
+            reactions[len(columns)] = joints[j][:, None] * gain[:, j, None, :]
+            columns.append(self.measured[:, j, None] * joints[j])
+            moved = [_moved(state, column) for column in (position, velocity)]
+            slopes = [(self.acceleration(each, acting) - free) / DIFFERENCE for each in moved]
+            for error in (torch.ones_like(v), *commanded.unbind(1), *slack.unbind(1)):
+                first = rate(error)
+                change = -slopes[0] * error[:, None] - slopes[1] * first[:, None] + rate(first)[:, None] * joints[j]
+                columns.append(load(change))
+        own: Any = system
+        plain = self.gain(own)
+        for name in scalable(system):
+            scaled = self.gain(replace(own, **{name: getattr(own, name) * math.exp(DIFFERENCE)}))
+            loads = [torch.linalg.solve(g, (self.measured - f)[..., None])[..., 0] for f, g in (plain, scaled)]
+            reactions[len(columns)] = (joints - torch.linalg.solve(scaled[1], plain[1])) / DIFFERENCE
+            columns.append((loads[0] - loads[1]) / DIFFERENCE)
+        reaction = state.new_zeros(len(state), len(columns), len(joints), len(joints))
+        for k, each in reactions.items():
+            reaction[:, k] = each
+        return _Loads(load(self.measured - free), torch.stack(columns, 1), reaction, tuple(dry))
+
+
+def _moved(state: Tensor, column: int) -> Tensor:
+    """States (T, n) with one column a little larger."""
+    out = state.clone()
+    out[:, column] += DIFFERENCE
+    return out
+
+
+def _smoothed(values: Tensor, deviation: float, edge: int = 0, stride: int = 1) -> Tensor:
+    """Values (T, M) smoothed by a Gaussian of this deviation in rows; beyond the ends they go on as they came.
+
+    Of the rows, every `stride`-th from `edge` on, up to as far from the end.
+    """
+    reach = math.ceil(4 * deviation)
+    lags = torch.arange(-reach, reach + 1, dtype=values.dtype)
+    kernel = torch.exp(-0.5 * (lags / max(deviation, 1e-6)).square())
+    first, last = values[:1], values[-1:]
+    before, beyond = 2 * first - values[1 : reach + 1].flip(0), 2 * last - values[-reach - 1 : -1].flip(0)
+    padded = torch.cat((before, values, beyond))[edge : len(values) + 2 * reach - edge].T[:, None]
+    return conv1d(padded, (kernel / kernel.sum())[None, None], stride=stride)[:, 0].T

@@ -1,0 +1,158 @@
+"""Fits of several sets of effects in one batch, by damped Gauss-Newton steps on the likelihood of `likelihood.py`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.likelihood import (
+    MAX_LOG_PROCESS,
+    MIN_LOG_PROCESS,
+    Derivatives,
+    FitState,
+    differentiate,
+    noise_members,
+)
+
+MIN_ITERATION_GAIN = 0.05  # Log likelihood; a fit stops after two iterations in a row that gain, or lose, less
+
+MIN_MEASUREMENT_VARIANCE = 1e-12  # Lower bound of a measurement's variance, in its unit squared
+
+MIN_DAMPING = 1e-3  # Damping of a first step, as a share of the information
+
+MAX_DAMPING = 100.0  # Damping at which a fit stops, since its steps have become too short to gain anything
+
+OUT_OF_REACH = 100.0
+STEPS_TO_COME = 4
+"""Log likelihood short of its rival's at which a fit stops: where it would end if it gained what it gained in the last
+iteration in every one that is left, but as many of them as STEPS_TO_COME, since gains dwindle."""
+
+MAX_LOG_VARIANCE_CHANGE = 1.5  # Largest change of a log variance in one iteration
+
+
+Batched = TypeVar("Batched", "FitState", "Derivatives")
+
+
+def fit(
+    models: Sequence[CandidateModel],
+    start: FitState,
+    iterations: int,
+    process_noise: bool = True,
+    rival: float = -math.inf,
+) -> FitState:
+    """The best fits of C models of the same rows in at most `iterations` damped Gauss-Newton steps from `start`.
+
+    Args:
+        process_noise: without it, process noise stays at its lower bound.
+        rival: log likelihood of another fit; fits that cannot come near it stop early.
+    """
+    if not process_noise:
+        start = replace(start, log_process=torch.full_like(start.log_process, MIN_LOG_PROCESS))
+    bounds = _bounds(models, start)
+    every = torch.ones(start.state.shape[:2], dtype=torch.float64)
+    damping = torch.full((len(models),), MIN_DAMPING, dtype=torch.float64)
+    stalled = torch.zeros(len(models), dtype=torch.long)
+    gained = torch.full_like(damping, math.inf)  # by the last step that gained something
+    active = torch.arange(len(models))
+    here = best = start
+    at: Derivatives | None = None
+    period = models[0].profile.relinearise_every
+    for iteration in range(iterations):
+        if (iteration + 1) % period == 0:
+            for model in models:
+                model.slopes = None
+        now = differentiate([models[k] for k in active.tolist()], here[active]).summed(every[active])
+        tried = replace(here[active], likelihood=now.likelihood, information=now.information)
+        if at is None:
+            best, at = tried, now
+        else:
+            gain = tried.likelihood - best.likelihood[active]
+            better = gain > 0
+            damping[active] = torch.where(better, damping[active] / 4, (8 * damping[active]).clamp(min=0.1))
+            stalled[active] = torch.where(gain.abs() < MIN_ITERATION_GAIN, stalled[active] + 1, 0)
+            best = _replaced(best, active[better], tried, better)
+            at = _replaced(at, active[better], now, better)
+            gained[active] = torch.where(better, gain, gained[active])
+            to_come = min(STEPS_TO_COME, iterations - 1 - iteration)
+            in_reach = best.likelihood + to_come * gained > rival - OUT_OF_REACH
+            # Fits that have converged leave the batch.
+            active = active[(stalled[active] < 2) & (damping[active] < MAX_DAMPING) & in_reach[active]]
+            if not len(active):
+                break
+        here = _step(best, at, damping, bounds, models[0])
+        if not process_noise:
+            here = replace(here, log_process=start.log_process)
+    return best
+
+
+def _bounds(models: Sequence[CandidateModel], fits: FitState) -> tuple[Tensor, Tensor]:
+    """Lowest and highest parameters (C, K); those of padding are 0."""
+    low, high = torch.zeros_like(fits.theta), torch.zeros_like(fits.theta)
+    for c, model in enumerate(models):
+        low[c, : len(model.table)], high[c, : len(model.table)] = model.low, model.high
+    return low, high
+
+
+MAX_REFIT_CHANGE = 2.0
+"""Largest change of a parameter without some windows, in its standard deviations: where these alone inform about it, a
+step from what the others hold would have no bounds."""
+
+
+def refitted(model: CandidateModel, fits: FitState, window_used: Tensor) -> FitState:
+    """One fit (C = 1) to all windows, refitted to those where each row of `window_used` (C, W) is 1, by one step.
+
+    The windows that are left out pull the optimum a little, to which one Gauss-Newton step is close, at the cost of one
+    step for all (Beirami, Razaviyayn, Shahrampour and Tarokh 2017, On optimal generalizability, NeurIPS).
+    """
+    every = torch.zeros(len(window_used), dtype=torch.long)
+    whole = differentiate([model], fits)
+    at, copies = whole.summed(window_used), fits[every]
+    low, high = (end[every] for end in _bounds([model], fits))
+    widths = (high - low).clamp(min=1e-300)
+    information = whole.summed(torch.ones_like(window_used)).information + torch.diag_embed((2 / widths).square())
+    most = MAX_REFIT_CHANGE * torch.linalg.inv(information).diagonal(dim1=1, dim2=2).sqrt()
+    bounds = torch.maximum(low, copies.theta - most), torch.minimum(high, copies.theta + most)
+    damping = torch.full((len(every),), MIN_DAMPING, dtype=torch.float64)
+    return replace(_step(copies, at, damping, bounds, model), likelihood=at.likelihood)
+
+
+def _step(
+    fits: FitState, at: Derivatives, damping: Tensor, bounds: tuple[Tensor, Tensor], model: CandidateModel
+) -> FitState:
+    """The damped Gauss-Newton step from `fits`, with parameters within the bounds (C, K)."""
+    low, high = bounds
+    # A prior weak enough to matter only where the data hold no information; the 1.0 is for padding, which stays 0.
+    prior = torch.where(high > low, (2 / (high - low)).square(), 1.0)
+    diagonal = torch.diagonal(at.information, dim1=1, dim2=2)
+    matrix = at.information + torch.diag_embed(prior + damping[:, None] * diagonal)
+    change = torch.linalg.solve(matrix, at.gradient[..., None])[..., 0]
+    theta = (fits.theta + change).clamp(low, high)
+    change = theta - fits.theta
+    moves = torch.cat((torch.ones(len(change), 1, dtype=change.dtype), change), 1)
+    share = 1 / (1 + damping)[:, None]
+    matrix = at.noise_information + 0.3 * torch.eye(at.noise_gradient.shape[1], dtype=change.dtype)
+    move = torch.linalg.solve(matrix, at.noise_gradient[..., None])[..., 0]
+    log_change = move.clamp(-MAX_LOG_VARIANCE_CHANGE, MAX_LOG_VARIANCE_CHANGE) * share
+    groups = fits.log_process.shape[1]
+    noise_change = log_change @ noise_members(model)[1]
+    # Rounding to a resolution is noise with a deviation of resolution / sqrt(12).
+    resolution = torch.tensor(model.rows.step, dtype=torch.float64)
+    lowest_noise = (resolution.square() / 12 + MIN_MEASUREMENT_VARIANCE).log()
+    return replace(
+        fits,
+        theta=theta,
+        state=fits.state + (at.smoothed * moves[:, None, None, None]).sum(-1),
+        log_process=(fits.log_process + log_change[:, :groups]).clamp(MIN_LOG_PROCESS, MAX_LOG_PROCESS),
+        log_noise=torch.maximum(fits.log_noise + noise_change, lowest_noise),
+    )
+
+
+def _replaced(into: Batched, indices: Tensor, values: Batched, chosen: Tensor) -> Batched:
+    """`into` with its members at `indices` replaced by the `chosen` members of `values`."""
+    return into.map(lambda old, new: old.index_put((indices,), new[chosen]), values)
