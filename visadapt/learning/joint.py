@@ -53,8 +53,20 @@ class SetupSettings:
     """steps of an episode of the target while data are collected"""
     feedforward: bool = True
     """begin with a policy that opposes what the residual expects; False where one command cannot undo it in a period"""
+    trust: float = 1.0
+    """share of the way to the tuned weights that the policy goes from those before the first round, where each round
+    begins anew; 1: all of it, from those of the round before. The imagined target is not the real one"""
+    refinement: TuneSettings | None = None
+    """the policy in the source once more, after `source`: near rest, say, where what counts is decided"""
     perception: PerceptionSettings | None = None
     """how an encoder learns to see, where the policy is shown frames"""
+
+    def shortened(self, iterations: int) -> SetupSettings:
+        """The same with so many iterations of the source policy, and at most as many of its refinement."""
+        finer = self.refinement
+        if finer is not None:
+            finer = replace(finer, iterations=min(iterations, finer.iterations))
+        return replace(self, source=replace(self.source, iterations=iterations), refinement=finer)
 
     def numbers(self) -> dict[str, Any]:
         """All of them as JSON takes them, for a run's folder; a task's tensors, such as references, are left out."""
@@ -171,9 +183,18 @@ def adapt(
             windows = replace(windows, states=tree["states"])
         if number == 0 and settings.feedforward:
             initialise_feedforward(policy, source, residual.scale)
+        if number == 0:
+            own = policy.state_dict().items()
+            start = {key: value.clone() for key, value in own if not key.startswith("residual.")}
         if not tuned.exists():
             partial, progress = tuned.with_suffix(".partial.safetensors"), staged(report, f"{name}: tune")
+            if settings.trust < 1:
+                policy.load_state_dict(start, strict=False)
             found = tune(policy, grounded, observe, settings.tuning, drawn[2], windows, progress, partial)
+            if settings.trust < 1:
+                reached = policy.state_dict()
+                way = {key: torch.lerp(start[key], reached[key], settings.trust) for key in start}
+                policy.load_state_dict(way, strict=False)
             save_tree(tuned, {"weights": policy.state_dict(), "losses": found})
             partial.unlink(missing_ok=True)
         tree = load_tree(tuned)

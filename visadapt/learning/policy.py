@@ -6,7 +6,8 @@ Then every stream takes the first planned step. A stream further than delta_div 
 delta_div grows as training goes on, so the policy learns to recover from ever further off.
 
 Where what streams pass through is kept (`TuneSettings.streams`), the gradient flows through physics and effects alone:
-the residual's correction is held over a plan, and no frame is rendered along it.
+the residual's correction is held over a plan, and no frame is rendered along it. The feed-forward stays as it is: what
+is tuned sees a noisy correction beside the one that acts, and would learn to oppose less than all of it.
 """
 
 from __future__ import annotations
@@ -45,8 +46,8 @@ class TuneSettings:
     longest: int = 150  # steps after which a stream starts anew
     streams: int | None = None
     """number of streams where that is not `batch`: what they pass through is then kept, and each batch is drawn from
-    all of it, so that few steps are simulated and few frames rendered; a policy's encoder stays as it is, and the
-    residual's correction is constant over a plan"""
+    all of it, so that few steps are simulated and few frames rendered; a policy's encoder and feed-forward stay as they
+    are, and the residual's correction is constant over a plan"""
     every: int = 1  # iterations between two steps of the streams
     curriculum: bool = True
     """whether streams start, and are kept, closer to the reference at first; not for a trained policy"""
@@ -88,7 +89,10 @@ def tune(
     Raises:
         DivergedError: the loss is not finite.
     """
+    if not settings.iterations:
+        return []
     world.requires_grad_(False)
+    policy.feedforward.requires_grad_(settings.streams is None)
     optimiser = torch.optim.Adam(policy.parameters())
     steps = settings.iterations
     training = TrainingState(policy, optimiser, generator, settings.learning_rate, steps, progress, checkpoint)

@@ -20,9 +20,9 @@ from visadapt.history import HORIZON, History
 class Policy(nn.Module):
     """Base of policies; subclasses give the layers that turn a history into a plan.
 
-    The correction enters in two ways, both of no weight at first: beside the history, and straight into the plan as
-    a feed-forward, since what is known to push can be pushed against. `learning.policy.initialise_feedforward` gives
-    the feed-forward its weights once there is a residual; tuning changes all of them.
+    The correction enters straight into the plan as a feed-forward, since what is known to push can be pushed against,
+    and in some policies beside the history too; both are of no weight at first.
+    `learning.policy.initialise_feedforward` gives the feed-forward its weights once there is a residual.
 
     >>> import torch, visadapt as va
     >>> from visadapt.history import History

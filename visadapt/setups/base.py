@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -67,11 +68,16 @@ class Setup:
             self.prepare(policy, path.parent, seed, report)
         numbers = self.settings.numbers()["source"]
         about = {"arguments": policy.arguments, "source": describe(self.source), "seed": seed, **numbers}
+        rough, fine = path.with_suffix(".rough.safetensors"), self.settings.refinement
+        stages = [(path, self.settings.source)] if fine is None else [(rough, self.settings.source), (path, fine)]
         # Preparing draws from a generator of the seed itself.
-        generator = torch.Generator().manual_seed(seed if self.prepare is None else seed + 1)
-        progress = staged(report, f"{self.source.system.name}: source policy")
-        args = (policy, self.source, self.observe, self.settings.source, generator, None, progress)
-        train_or_load(path, policy, about, lambda partial: tune(*args, partial))
+        for draws, (made, settings) in enumerate(stages, seed if self.prepare is None else seed + 1):
+            if made == path or not path.exists():
+                generator = torch.Generator().manual_seed(draws)
+                progress = staged(report, f"{self.source.system.name}: source policy")
+                args = (policy, self.source, self.observe, settings, generator, None, progress)
+                train_or_load(made, policy, about, partial(tune, *args))
+        rough.unlink(missing_ok=True)
         return policy.eval()
 
     def load(self, path: Path) -> Policy:

@@ -61,25 +61,27 @@ REST_WEIGHTS = (1.0, 6.0, 1.0, 0.1)
 def from_frames(source: World) -> SetupSettings:
     """How the cart-pole that is shown frames learns, tuned for a source."""
     to_go = cost_to_go(source, REST_WEIGHTS, Cost.action)
+    refinement = TuneSettings(
+        Balance(
+            RegulatorCost(REST_WEIGHTS, to_go=to_go),
+            start_spread=(0.3, 0.1, 0.1, 0.1),
+            # A kick would look like a force to the residual, which would go on pushing.
+            kick=(0.0, 0.0, 0.0, 0.0),
+            divergence=(1.2, 2.0, 0.25, 3.0),
+        ),
+        iterations=2000,
+        batch=512,
+        learning_rate=1.5e-3,
+        longest=60,
+        streams=64,
+        every=5,
+        curriculum=False,
+    )
     return SetupSettings(
         source=TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500),
-        tuning=TuneSettings(
-            Balance(
-                RegulatorCost(REST_WEIGHTS, to_go=to_go),
-                start_spread=(0.3, 0.1, 0.1, 0.1),
-                # A kick would look like a force to the residual, which would go on pushing.
-                kick=(0.0, 0.0, 0.0, 0.0),
-                divergence=(1.2, 2.0, 0.25, 3.0),
-            ),
-            iterations=600,
-            batch=512,
-            learning_rate=1.5e-3,
-            longest=60,
-            streams=32,
-            every=5,
-            curriculum=False,
-            recorded=0.8,
-        ),
+        refinement=refinement,
+        tuning=replace(refinement, iterations=300, streams=32, recorded=0.8),
+        trust=0.5,
         observations="camera",
         perception=PerceptionSettings(),
     )
@@ -175,7 +177,13 @@ def _narrowed(settings: SetupSettings, renderer: LayeredRenderer) -> SetupSettin
 
     own = settings.perception or PerceptionSettings()
     perception = replace(own, cart=replace(own.cart, reach=share * own.cart.reach))
-    return replace(settings, source=narrowed(settings.source), tuning=narrowed(settings.tuning), perception=perception)
+    return replace(
+        settings,
+        source=narrowed(settings.source),
+        refinement=narrowed(settings.refinement) if settings.refinement else None,
+        tuning=narrowed(settings.tuning),
+        perception=perception,
+    )
 
 
 def _load(path: Path) -> LayeredRenderer:

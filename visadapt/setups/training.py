@@ -97,8 +97,7 @@ def train(
     """
     setup = setup_for(world, None, renderer, references, with_history)
     if iterations is not None:
-        settings = replace(setup.settings, source=replace(setup.settings.source, iterations=iterations))
-        setup = replace(setup, settings=settings)
+        setup = replace(setup, settings=setup.settings.shortened(iterations))
     with tempfile.TemporaryDirectory() as temporary:
         return setup.pretrain(Path(path or Path(temporary, "policy.safetensors")), seed, report)
 
