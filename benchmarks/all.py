@@ -89,6 +89,13 @@ COMMANDS = (
         work="--work",
     ),
     Command(
+        "ablations",
+        "ablations.csv",
+        ("benchmarks.ablations", "--variants", "as shipped", "no tuning"),
+        25,
+        work="--work",
+    ),
+    Command(
         "inverted_pendulum",
         "inverted_pendulum.csv",
         ("train.inverted_pendulum", "--seeds", "0", "1", "2"),

@@ -69,6 +69,17 @@ def grounding(pixels: Rows) -> Lines:
     return lines + [[method, *_speed(pixels, PIXELS, method, "adapted", 200)] for method in methods]
 
 
+def ablations(rows: Rows) -> Lines:
+    """What each part of adapting from frames is worth, one target a line, in m/s."""
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    lines = [["mean cart speed in m/s (episodes up)", *methods]]
+    for experiment in dict.fromkeys(row["experiment"] for row in rows):
+        found = {row["method"]: _speed_cells(row) for row in rows if row["experiment"] == experiment}
+        cells = [f"{found[method][0]} ({found[method][1]})" for method in methods]
+        lines.append([experiment.removeprefix("CartPole, pixels, "), *cells])
+    return lines
+
+
 def pendulum(rows: Rows) -> Lines:
     """InvertedPendulum-v5."""
     lines = [["InvertedPendulum-v5, mean cart speed in m/s", "counted samples", "here", "episodes up", "seeds"]]
