@@ -58,8 +58,8 @@ def run(options: argparse.Namespace) -> None:
         {"samples": each.samples, "policy_loss": each.policy[-1] if each.policy else None} for each in adapted.rounds
     ]
     write_json(folder / "ledger.json", {**asdict(adapted.ledger), "used": adapted.ledger.used, "rounds": rounds})
-    if (explanation := adapted.rounds[-1].explanation) is not None:
-        print(_in_words(explanation))
+    if options.diagnose:
+        print(_in_words(adapted.rounds[-1].explanation))
     print(f"{adapted.ledger.used} samples of {target.name} used; the policy is {folder / 'policy.safetensors'}")
 
 

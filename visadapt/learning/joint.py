@@ -47,6 +47,8 @@ class Explanation:
     """whether they leave nothing for a residual to learn"""
 
 
+NOT_DIAGNOSED = Explanation("", (), complete=False)
+
 Explain = Callable[[Sequence[Episode], Path], Explanation]
 """Diagnoses episodes of the target, or reads the diagnosis that is in the file."""
 
@@ -84,7 +86,7 @@ class Round:
     samples: int
     grounding: Sequence[tuple[int, float, float]]  # (step, training loss, held-out loss)
     policy: list[float]  # loss by iteration; empty where the policy was left as it is, since there is no gap
-    explanation: Explanation | None = None  # where a diagnosis was asked for
+    explanation: Explanation = NOT_DIAGNOSED
 
 
 @dataclass(frozen=True)
@@ -178,15 +180,14 @@ def adapt(
             ledger.count(f"{name}: data", episode.samples)
         episodes += new if label is None else label(new)
         windows = Windows.cut(episodes, settings.observations, observe)
-        explained = None if explain is None else explain(episodes, recording.with_name("diagnosis.json"))
-        named = () if explained is None else explained.effects
-        known, complete = _with(source, named), explained is not None and explained.complete
+        found = explain(episodes, recording.with_name("diagnosis.json")) if explain else NOT_DIAGNOSED
+        known = _with(source, found.effects)
         grounded = _with(known, [residual])
-        first, learnt = not (learnt or complete), learnt or not complete
+        first, learnt = not (learnt or found.complete), learnt or not found.complete
         if not fitted.exists():
             true = fit_named(known, windows)
             losses: list[GroundLoss] = []
-            if complete:
+            if found.complete:
                 residual.network.load_state_dict(untrained)
             else:
                 if first:
@@ -203,14 +204,14 @@ def adapt(
             initialise_feedforward(policy, source, residual.scale)
         if not tuned.exists():
             partial, progress = tuned.with_suffix(".partial.safetensors"), staged(report, f"{name}: tune")
-            no_gap = complete and not len(known.effects)
+            no_gap = found.complete and not len(known.effects)
             args = (policy, grounded, observe, settings.tuning, drawn[2], windows, progress, partial)
-            found = [] if no_gap else tune(*args)
-            save_tree(tuned, {"weights": policy.state_dict(), "losses": found})
+            tuning = [] if no_gap else tune(*args)
+            save_tree(tuned, {"weights": policy.state_dict(), "losses": tuning})
             partial.unlink(missing_ok=True)
         tree = load_tree(tuned)
         load_weights(policy, tree["weights"], tuned)
-        rounds.append(Round(ledger.used, grounding, tree["losses"], explained))
+        rounds.append(Round(ledger.used, grounding, tree["losses"], found))
     return Adapted(policy, ledger, rounds, episodes, folder, known)
 
 
