@@ -52,7 +52,7 @@ def _inputs(options: argparse.Namespace) -> Iterator[tuple[str, str]]:
         value = vars(options).get(name) or []
         for path in value if isinstance(value, list) else [value]:
             yield _flag(name), path
-            if os.path.isdir(path):
+            if Path(path).is_dir():
                 yield from ((_flag(name), str(file)) for file in Path(path).iterdir())
     module, colon, _ = (vars(options).get("target") or "").rpartition(":")
     if colon:
@@ -64,9 +64,9 @@ def _inputs(options: argparse.Namespace) -> Iterator[tuple[str, str]]:
 
 def _overwrites(output: str, other: str, is_folder: bool) -> bool:
     """Whether writing `output` would overwrite the file `other`."""
-    here, there = os.path.realpath(output), os.path.realpath(other)
+    here, there = Path(os.path.realpath(output)), Path(os.path.realpath(other))
     if is_folder:
-        return there.startswith(os.path.join(here, ""))
+        return here in there.parents
     with suppress(OSError):
-        return here == there or os.path.samefile(here, there)
+        return here == there or here.samefile(there)
     return False

@@ -49,7 +49,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         folder.mkdir(parents=True, exist_ok=True)
         yield temporary
         if through:
-            with open(path, "ab") as device:  # appended: standard output may be a file that holds more
+            with Path(path).open("ab") as device:  # appended: standard output may be a file that holds more
                 device.write(temporary.read_bytes())
             temporary.unlink()
             return
@@ -94,8 +94,9 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 def _is_device(path: str | os.PathLike[str]) -> bool:
     """Whether it is no regular file, or one by which the system names an open one, as `/dev/stdout`."""
-    exists = os.path.exists(path) and not os.path.isdir(path)
-    return exists and (not os.path.isfile(path) or os.path.abspath(path).startswith("/dev/"))
+    place = Path(path)
+    exists = place.exists() and not place.is_dir()
+    return exists and (not place.is_file() or Path("/dev") in place.absolute().parents)
 
 
 def _is_full(error: BaseException, folder: Path) -> bool:
