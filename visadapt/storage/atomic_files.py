@@ -66,11 +66,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
         if full:
             raise DiskFullError(f"{path} was not written: disk full; free some space and run again") from error
-        if (
-            isinstance(error, OSError)
-            and error.strerror
-            and error.filename in map(str, (path, temporary, final, *final.parents))
-        ):
+        own = map(str, (path, temporary, final, *final.parents))
+        if isinstance(error, OSError) and error.strerror and error.filename in own:
             raise NotWrittenError(f"{path} was not written: {error.strerror}") from error
         raise
 
@@ -95,8 +92,10 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 def _is_device(path: str | os.PathLike[str]) -> bool:
     """Whether it is no regular file, or one by which the system names an open one, as `/dev/stdout`."""
     place = Path(path)
-    exists = place.exists() and not place.is_dir()
-    return exists and (not place.is_file() or Path("/dev") in place.absolute().parents)
+    with suppress(OSError):
+        exists = place.exists() and not place.is_dir()
+        return exists and (not place.is_file() or Path("/dev") in place.absolute().parents)
+    return False
 
 
 def _is_full(error: BaseException, folder: Path) -> bool:
