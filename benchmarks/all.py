@@ -113,7 +113,7 @@ COMMANDS = (
         reads=(("--current", "flight"),),
     ),
     Command("named_effects", "named_effects.csv", ("benchmarks.named_effects",), 30, work="--work"),
-    Command("named_control", "named_control.csv", ("benchmarks.named_control",), 15, work="--work"),
+    Command("named_control", "named_control.csv", ("benchmarks.named_control",), 60, work="--work"),
     Command(
         "rotorpy",
         "rotorpy.csv",

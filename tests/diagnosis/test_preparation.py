@@ -7,6 +7,7 @@ import pytest
 
 from tests.diagnosed import record
 from visadapt.diagnosis.search.preparation import prepare
+from visadapt.effects import ViscousFriction
 from visadapt.recordings import Episode
 from visadapt.systems import CartPole
 
@@ -45,3 +46,18 @@ def test_it_is_decided_whether_the_readings_or_the_log_were_late(read_late, filt
     assert any("evenly spaced" in warning for warning in prepared.warnings) != read_late
     steps = prepared.rows.time[0].diff()
     assert bool((steps - steps.mean()).abs().max() < 1e-9) != read_late
+
+
+def test_whole_episodes_are_in_the_sources_signs_with_lost_readings_filled_in():
+    recording = record([ViscousFriction(coefficient=0.8)])
+    episodes = []
+    for episode in recording.episodes:
+        state = episode.state * np.array([1.0, -1.0])
+        state[20] = state[19]
+        episodes.append(Episode(episode.time, episode.action, state))
+    whole = prepare(dataclasses.replace(recording, episodes=tuple(episodes)), CartPole()).whole
+    for found, episode in zip(whole.episodes, recording.episodes, strict=True):
+        expected = episode.state.copy()
+        expected[20] = (expected[19] + expected[21]) / 2
+        np.testing.assert_allclose(found.state, expected)
+        np.testing.assert_array_equal(found.action, episode.action)

@@ -10,7 +10,6 @@ from tests.own_systems import Pendulum, furuta
 from tests.worlds import columns
 from visadapt.effects import EFFECTS
 from visadapt.effects.catalogue import catalogue, catalogue_text, twins
-from visadapt.effects.laws import motor_loads
 from visadapt.systems import CartPole
 from visadapt.world import World
 
@@ -154,7 +153,7 @@ def test_a_gear_rubs_with_a_share_of_the_motors_force_whichever_way_it_drives(sp
 
 
 def test_what_a_gear_of_a_joint_passes_is_the_motors_torque():
-    loads = motor_loads(STATE, columns(2.0), FURUTA)[0]
+    loads = FURUTA.motor_loads(STATE, columns(2.0))[0]
     assert loads.tolist() == pytest.approx([2.0 * FURUTA.motor_constant / FURUTA.resistance, 0.0], abs=1e-12)
     rubbing = World(FURUTA, [BY_NAME["arm_axis.load_dependent_friction"](share=0.3)], 1e-4).double()
     slowed = World(FURUTA, [BY_NAME["arm_axis.coulomb_friction"](torque=0.3 * float(loads[0]))], 1e-4).double()

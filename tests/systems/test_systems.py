@@ -6,7 +6,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from tests.worlds import energy_of
-from visadapt.systems import SYSTEMS, CartPole
+from visadapt.systems import SYSTEMS, CartPole, System
 from visadapt.systems.integrators import rk4
 from visadapt.world import World
 
@@ -109,6 +109,16 @@ def test_gradients_agree_with_finite_differences(system):
     generator = torch.Generator().manual_seed(0)
     inputs = [torch.randn(3, n, generator=generator, dtype=torch.float64) for n in (4, 1, 2)]
     assert torch.autograd.gradcheck(system.derivative, [value.requires_grad_() for value in inputs])
+
+
+def test_the_motors_load_moves_the_system_as_the_command_does():
+    generator = torch.Generator().manual_seed(0)
+    system = CartPole(max_force=torch.tensor([5.0, 30.0, 12.0], dtype=torch.float64))
+    state, command, none = (torch.randn(3, n, generator=generator, dtype=torch.float64) for n in (4, 1, 2))
+    none *= 0
+    load = system.motor_loads(state, command)
+    torch.testing.assert_close(system.derivative(state, 0 * command, load), system.derivative(state, command, none))
+    torch.testing.assert_close(load, System.motor_loads(system, state, command))
 
 
 @pytest.mark.parametrize("name", ["cart_mass", "pole_mass", "pole_half_length", "max_force", "gravity"])

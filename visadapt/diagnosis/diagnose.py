@@ -165,7 +165,7 @@ def diagnose(
             stage_shares(search, comparison, [cost for _, cost in repeats]),
             errors.by_state(system, rows.channels, bool(found)),
             regions,
-            pushes(recording, world),
+            () if prepared.whole is None else pushes(prepared.whole, world),
         ),
         causes=found,
         ranking=ranking(comparison, effects, system, gap_closed, repeat_causes),

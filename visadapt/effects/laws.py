@@ -172,15 +172,5 @@ class LoadDependentLaw(DryFrictionLaw):
     source = "Duclusaud et al. (2025), Extended friction models for the physics simulation of servo actuators, model M3"
 
     def limits(self, state: Tensor, command: Tensor, system: System) -> tuple[Tensor, Tensor]:
-        limit = self.value("share", state) * motor_loads(state, command, system)[:, self.joint].abs()
+        limit = self.value("share", state) * system.motor_loads(state, command)[:, self.joint].abs()
         return limit, limit
-
-
-def motor_loads(state: Tensor, command: Tensor, system: System) -> Tensor:
-    """The loads (B, n_load) that would move the system as the command (B, n_action) does.
-
-    They are not finite where the state is so far off, in a trial of a search, that no load changes its accelerations.
-    """
-    none = state.new_zeros(len(state), len(system.loads))
-    free, by_load = system.response_to_loads(state, torch.zeros_like(command), none)
-    return torch.linalg.solve_ex(by_load, system.accelerations(state, command, none) - free).result

@@ -16,6 +16,7 @@ from visadapt.learning.training_state import train_or_load
 from visadapt.learning.windows import Observe
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
+from visadapt.setups.explained import explained
 from visadapt.setups.policy_file import describe
 from visadapt.storage.checkpoints import load_network
 from visadapt.targets import Target
@@ -107,11 +108,13 @@ class Setup:
         seed: int,
         report: Report | None = None,
         explorer: Policy | None = None,
+        diagnose: bool = False,
     ) -> Adapted:
         """Adapt `policy`, in place, to `target` with at most `budget` counted samples: Algorithm 1 in `folder`.
 
         Args:
             explorer: collects the data in place of `policy`.
+            diagnose: name the causes of the gap in each round: `explained`.
 
         Raises:
             ValueError: a policy of another kind, a target of another period or with other actions, or a budget that
@@ -123,8 +126,11 @@ class Setup:
         torch.manual_seed(seed)
         residual = self.residual(policy, self.source)
         args = (policy, residual, self.source, target, self.settings, folder, budget, round_samples, seed)
-        adapted = adapt(*args, self.observe, self.label, report, explorer)
-        policy.grounded_in = describe(self.source)
+        if diagnose and self.observe is not None:
+            raise ValueError("the causes of a gap are named from states: a policy that is shown frames has none")
+        explain = explained(self.source, report) if diagnose else None
+        adapted = adapt(*args, self.observe, self.label, report, explorer, explain)
+        policy.grounded_in = describe(adapted.source)
         return adapted
 
     def check_policy(self, policy: Policy) -> None:

@@ -76,6 +76,15 @@ class System(ABC):
         units = torch.eye(load.shape[1]).to(load)
         return free, torch.stack([self.accelerations(state, command, load + unit) - free for unit in units], -1)
 
+    def motor_loads(self, state: Tensor, command: Tensor) -> Tensor:
+        """The loads (B, J) that would move the system as the command does.
+
+        They are not finite where the state is so far off, in a trial of a search, that no load changes accelerations.
+        """
+        none = state.new_zeros(len(state), len(self.loads))
+        free, by_load = self.response_to_loads(state, torch.zeros_like(command), none)
+        return torch.linalg.solve_ex(by_load, self.accelerations(state, command, none) - free).result
+
     def __post_init__(self) -> None:
         self.check_parameters()
 

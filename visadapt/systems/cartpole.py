@@ -50,6 +50,11 @@ class CartPole(System):
     def __post_init__(self) -> None:
         self.check_parameters()
 
+    def motor_loads(self, state: Tensor, command: Tensor) -> Tensor:
+        """The loads (B, 2) that would move the system as the command does: a force on the cart alone."""
+        force = self.max_force * command[:, 0]
+        return torch.stack((force, torch.zeros_like(force)), -1)
+
     def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:
         """Equations of Barto et al. with a force on the cart (N) and a torque at the pivot (N m) as loads."""
         _, velocity, angle, angular_velocity = state.unbind(-1)

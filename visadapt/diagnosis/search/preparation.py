@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -27,6 +27,8 @@ class PreparedRecording:
 
     rows: Segments  # without repeated or defective readings
     raw: Segments  # the same windows with repeated readings as they were read
+    whole: Recording | None
+    """episodes from end to end, repeated readings filled in from those around; None where the angle is defective"""
     searched: Tensor  # indices of the windows that the search uses, spread evenly where there are many
     repeats: RepeatedReadings
     defect: tuple[float, float] | None  # rad, between which the angle sensor is defective
@@ -43,6 +45,15 @@ def _evenly_spaced(stamps: Tensor) -> Tensor:
     index = torch.arange(len(stamps), dtype=stamps.dtype)
     index = index - index.mean()
     return stamps.mean() + index * (index @ stamps) / (index @ index)
+
+
+def _filled(values: Tensor, used: Tensor, stamps: Tensor) -> Tensor:
+    """Readings (T, m), those that are not used on a line between those around them."""
+    columns = [
+        np.interp(stamps, stamps[kept], column[kept]) if kept.any() else column
+        for column, kept in zip(values.numpy().T, used.numpy().T > 0, strict=True)
+    ]
+    return torch.tensor(np.stack(columns, 1))
 
 
 def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effect]] = ()) -> PreparedRecording:
@@ -89,8 +100,18 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
             rows, raw, stamps, fitted = steady, steady_raw, even, other
             warnings.append("the stamps jitter, the readings do not: they were taken to be evenly spaced")
         source = fitted if len(kept) == len(channels) else None
+
+    def whole(angle: float = 1.0, command: float = 1.0) -> Recording:
+        signs = torch.tensor([angle if channel in profile.angle_sensor else 1.0 for channel in channels]).double()
+        parts = zip(recording.episodes, stamps, commands, states, repeats.used, strict=True)
+        episodes = [
+            replace(e, time=time.numpy(), action=(command * u).numpy(), state=(signs * _filled(x, used, time)).numpy())
+            for e, time, u, x, used in parts
+        ]
+        return replace(recording, episodes=tuple(episodes))
+
     if not profile.check_sensors:
-        return PreparedRecording(rows, raw, searched(rows), repeats, None, tuple(warnings), source)
+        return PreparedRecording(rows, raw, whole(), searched(rows), repeats, None, tuple(warnings), source)
     unchecked, first = rows, source or source_fit(rows)
     defect = sensor_checks.angle_defect(system, rows.select(searched(rows)), first)
     band = None
@@ -126,4 +147,6 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
         if band is not None and convention.angle < 0:
             band = (-band[1], -band[0])
         warnings.append(f"{convention.name} has the opposite sign of the source's; it was inverted")
-    return PreparedRecording(rows, raw, searched(rows), repeats, band, tuple(warnings), source)
+    signs = (1.0, 1.0) if convention is None else (convention.angle, convention.command)
+    intact = None if defect is not None else whole(*signs)
+    return PreparedRecording(rows, raw, intact, searched(rows), repeats, band, tuple(warnings), source)
