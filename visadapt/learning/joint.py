@@ -221,10 +221,13 @@ def adapt(
         if not tuned.exists():
             partial, progress = tuned.with_suffix(".partial.safetensors"), staged(report, f"{name}: tune")
             no_gap = found.complete and not len(known.effects)
-            args = (policy, grounded, observe, settings.tuning, drawn[2], windows, progress, partial)
+            world, how, starts = grounded, settings.tuning, windows
+            if found.complete:
+                # What has a name holds in every state, not near the recorded ones alone, as a residual does.
+                world, how, starts = known, replace(settings.tuning, recorded=0.0), None
             if settings.trust < 1:
                 policy.load_state_dict(start, strict=False)
-            tuning = [] if no_gap else tune(*args)
+            tuning = [] if no_gap else tune(policy, world, observe, how, drawn[2], starts, progress, partial)
             if settings.trust < 1:
                 reached = policy.state_dict()
                 way = {key: torch.lerp(start[key], reached[key], settings.trust) for key in start}
