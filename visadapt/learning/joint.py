@@ -221,7 +221,8 @@ def adapt(
         if not tuned.exists():
             partial, progress = tuned.with_suffix(".partial.safetensors"), staged(report, f"{name}: tune")
             no_gap = found.complete and not len(known.effects)
-            world, how, starts = grounded, settings.tuning, windows
+            world, how = grounded, settings.tuning
+            starts: Windows | None = windows
             if found.complete:
                 # What has a name holds in every state, not near the recorded ones alone, as a residual does.
                 world, how, starts = known, replace(settings.tuning, recorded=0.0), None
