@@ -7,8 +7,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import torch
+from torch import nn
 
 from visadapt.diagnosis import policy_bound
+from visadapt.diagnosis.frames import FramesError, check_frames, pose_finder, positions
 from visadapt.diagnosis.report import next_experiment
 from visadapt.diagnosis.report.figures_data import Errors, disturbances, figure_data
 from visadapt.diagnosis.result import (
@@ -72,11 +74,12 @@ def diagnose(
     progress: Report | None = None,
     policy: policy_bound.StatesToActions | None = None,
     announce: Callable[[str], object] | None = None,
+    renderer: nn.Module | None = None,
 ) -> Diagnosis:
     """Find where a recording departs from the source, which effects cause it, and how far they close the gap.
 
     Args:
-        recording: some or all states, and commands.
+        recording: some or all states, or frames, and commands.
         world: the source, without effects; the parameters of its system are taken as known.
         catalogue: the effects that may be causes; by default all that are registered for the system.
         seed: of the random shifts that give the p-values of regions; nothing else is random.
@@ -86,8 +89,10 @@ def diagnose(
             terms of the paper's Theorem 1 are computed (`Diagnosis.policy`).
         announce: called, before the search begins, with a line that says how much there is to do and about how long it
             will take.
+        renderer: of a recording of frames: x (B,) in m and theta (B,) in rad to frames (B, H, W) in [0, 1].
 
     Raises:
+        FramesError: there are frames and no renderer, or this one does not explain them.
         ValueError: the world has effects, its system cannot be diagnosed, or `policy` is not one on its states.
 
     >>> import pathlib, tempfile, torch, visadapt as va
@@ -108,6 +113,12 @@ def diagnose(
     profile = profile_of(system)
     torch.set_num_threads(1)  # operations are too small for threads; processes share the work
     effects = list(all_effects(system) if catalogue is None else catalogue)
+    if not recording.measured:
+        if renderer is None:
+            raise FramesError(f"{recording.sources[0]}: frames are diagnosed with the renderer that draws the scene")
+        finder = pose_finder(renderer, system)
+        check_frames(recording, finder.size)
+        recording = positions(recording, finder, staged(progress, "poses"))
     if policy is not None:
         policy_bound.check(policy, system)
     candidates = searched(effects, system)
