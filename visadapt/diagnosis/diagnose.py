@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from visadapt.diagnosis import policy_bound
-from visadapt.diagnosis.frames import FramesError, check_frames, pose_finder, positions
+from visadapt.diagnosis.frames import UNSEEN, FramesError, check_frames, pose_finder, positions
 from visadapt.diagnosis.report import next_experiment
 from visadapt.diagnosis.report.figures_data import Errors, disturbances, figure_data
 from visadapt.diagnosis.result import (
@@ -36,7 +36,7 @@ from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import ScoredModel, Search
 from visadapt.diagnosis.search.unexplained import smooth_functions
-from visadapt.effects import EFFECTS, Effect
+from visadapt.effects import EFFECTS, Effect, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, twins
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.effect_fit import remembers
@@ -113,7 +113,9 @@ def diagnose(
     profile = profile_of(system)
     torch.set_num_threads(1)  # operations are too small for threads; processes share the work
     effects = list(all_effects(system) if catalogue is None else catalogue)
-    if not recording.measured:
+    films = not recording.measured
+    effects = [effect for effect in effects if (effect not in UNSEEN if films else effect.stage is not Stage.CAMERA)]
+    if films:
         if renderer is None:
             raise FramesError(f"{recording.sources[0]}: frames are diagnosed with the renderer that draws the scene")
         finder = pose_finder(renderer, system)
@@ -196,10 +198,13 @@ def diagnose(
 
 def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:
     """The first effect of each group of twins; without effects that repeat readings, which are found by another method,
-    and without sensors with memory, which candidate models cannot linearise by the present state."""
+    without sensors with memory, which candidate models cannot linearise by the present state, and without a camera's,
+    which are fitted to pixels."""
     out: list[type[Effect]] = []
     for effect in effects:
-        if not (twins(effect, out, system) or effect.repeats_readings or remembers(effect)):
+        if not (
+            twins(effect, out, system) or effect.repeats_readings or remembers(effect) or effect.stage is Stage.CAMERA
+        ):
             out.append(effect)
     return out
 

@@ -10,12 +10,16 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from visadapt.effects import AngleDelay, Dropout, FrozenZone, MeasurementDelay, PositionDelay
 from visadapt.estimation.poses import PoseFinder
 from visadapt.progress import Progress
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import System
 
 POSE = ("x", "theta")  # What a frame shows of a cart-pole
+
+UNSEEN = (Dropout, FrozenZone, MeasurementDelay, PositionDelay, AngleDelay)
+"""Faults of sensors that a camera cannot have: it shows cart and pole in one frame. A late camera is a camera's."""
 
 LEAN = 0.5  # rad, largest |theta| at which the pole is looked for
 

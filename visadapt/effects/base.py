@@ -26,6 +26,7 @@ class Stage(StrEnum):
     ACTUATION = "actuation"
     DYNAMICS = "dynamics"
     SENSING = "sensing"
+    CAMERA = "camera"
     ANY = "any"
 
 
@@ -229,7 +230,7 @@ class DynamicsEffect(Effect):
         return None
 
 
-Reading: TypeAlias = tuple[Tensor, Tensor]  # what a sensor reads of a row (B, n_state), and its new memory
+Reading: TypeAlias = tuple[Tensor, Tensor]  # what is read of a row, states (B, n_state) or a frame, and the new memory
 
 
 class SensingEffect(Effect):
@@ -257,6 +258,41 @@ class SensingEffect(Effect):
         Only random effects need the `generator`.
         """
         raise NotImplementedError
+
+
+class CameraEffect(Effect):
+    """Changes what a camera shows: which scene, from where, and in which greys.
+
+    Grey levels are in [0, 1], pixel centres lie at whole numbers, rows count downwards.
+
+    >>> import torch, visadapt as va
+    >>> world = va.World(va.CartPole(), [va.effects.Brightness(gain=0.5, offset=0.1)])
+    >>> frame, _ = world.show(world.start(torch.zeros(1, 4)), lambda state: torch.ones(len(state), 4, 6))
+    >>> frame.shape, round(float(frame[0, 0, 0]), 3)
+    (torch.Size([1, 4, 6]), 0.6)
+    """
+
+    stage = Stage.CAMERA
+
+    def memory(self, state: Tensor, period: float) -> Tensor:
+        """The effect's memory (B, any, any) before the first frame of an episode that begins in `state`."""
+        return state[:, None, :0]
+
+    def scene(self, state: Tensor, memory: Tensor, period: float) -> Reading:
+        """The state (B, n_state) that is shown in the row of `state`, and the new memory; rows are `period` s apart."""
+        return state, memory
+
+    def motion(self, like: Tensor) -> Tensor | None:
+        """The affine map (3, 3) or (B, 3, 3) of (column, row, 1) in px from the frame's centre; None where none is
+        moved."""
+        return None
+
+    def apply_to(self, frame: Tensor, memory: Tensor, generator: torch.Generator | None) -> Reading:
+        """The changed frame (B, H, W) of one row, once it is moved, and the new memory.
+
+        Only random effects need the `generator`.
+        """
+        return frame, memory
 
 
 def expect(system: System, effect: Effect | type[Effect]) -> Any:
