@@ -200,7 +200,8 @@ class World(nn.Module):
         """
         acting, sensing, seeing = self._split(at.memory)
         state, seeing = self._scene(at.state, seeing)
-        frame = moved(draw(state), self._camera)
+        frame = draw(state)
+        frame = moved(frame, [motion for e in self._camera if (motion := e.motion(frame)) is not None])
         remembered = []
         for effect, own in zip(self._camera, seeing, strict=True):
             frame, own = effect.apply_to(frame, own, generator)
@@ -250,7 +251,8 @@ class World(nn.Module):
         """What effects remember at the start of an episode in the state (B, n_state)."""
         commands = state.new_zeros(len(state), self.substeps, len(self.system.actions))
         acting = tuple(effect.memory(commands, self.period / self.substeps) for effect in self._actuation)
-        return acting + tuple(effect.memory(state, self.period) for effect in (*self._sensing, *self._camera))
+        sensing = tuple(effect.memory(state, self.period) for effect in self._sensing)
+        return acting + sensing + tuple(effect.memory(state, self.period) for effect in self._camera)
 
     def _split(self, memory: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...], tuple[Tensor, ...]]:
         """What the effects on commands, on readings and on frames remember."""

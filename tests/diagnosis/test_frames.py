@@ -2,14 +2,19 @@
 
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 import torch
 
 import visadapt as va
 from renderers import DrawnCartPole, load_renderer
+from tests.diagnosis.test_report import SCHEMA
 from visadapt.cli import main as cli
-from visadapt.effects import ViscousFriction
+from visadapt.diagnosis.search.camera import find_camera
+from visadapt.effects import Blur, Brightness, CameraRotation, CameraShift, Occlusion, ViscousFriction
+from visadapt.estimation.camera_fit import through
+from visadapt.estimation.poses import PoseFinder
 
 RENDERER = va.shipped("renderer")
 
@@ -74,9 +79,76 @@ class TestMotion:
             return frame
 
         found = diagnosed(rewritten(still, frame=flash))
-        assert any("does not explain 3 of" in line and "row 8 " in line for line in found.warnings)
+        assert any("no pose was found in 3 of" in line and "row 8 of" in line for line in found.warnings)
         assert found.verdict == "no_gap"
         assert np.isnan(found.where.states["x_dot"])
+
+
+@pytest.fixture(scope="module")
+def poses():
+    """A renderer, the finder of poses in its frames, and drawn frames in [0, 1] of cart-poles anywhere."""
+    renderer = load_renderer(Path(RENDERER)).requires_grad_(False)
+    places = np.random.default_rng(0).uniform((-0.8, -0.2), (0.8, 0.2), (16, 2))
+    drawn = torch.from_numpy(DrawnCartPole()(*places.T)).float() / 255
+    return renderer, PoseFinder(renderer, 1.5, 0.5), drawn
+
+
+def camera_of(poses, *effects):
+    """The camera found in frames with effects and noise."""
+    renderer, finder, drawn = poses
+    frames = 255 * through(drawn, effects).detach()
+    noise = 2 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
+    with torch.inference_mode():
+        return find_camera(renderer, finder, (frames + noise).round().clamp(0, 255).to(torch.uint8))
+
+
+def values(cause):
+    return {name: estimate.value for name, estimate in cause.parameters.items()}
+
+
+class TestCamera:
+    def test_a_camera_that_is_as_it_should_be_has_no_fault(self, poses):
+        assert camera_of(poses).causes() == []
+
+    def test_a_turned_darker_picture(self, poses):
+        found = camera_of(poses, CameraRotation(angle=0.1), Brightness(gain=0.8, offset=0.1))
+        assert {cause.effect: values(cause) for cause in found.causes()} == {
+            "camera_rotation": {"angle": pytest.approx(0.1, abs=1e-3)},
+            "brightness": {"gain": pytest.approx(0.8, abs=5e-3), "offset": pytest.approx(0.1, abs=5e-3)},
+        }
+
+    def test_a_box_in_front(self, poses):
+        box = {"left": 20.0, "top": 30.0, "right": 45.0, "bottom": 60.0, "grey": 0.35}
+        (cause,) = camera_of(poses, Occlusion(**box)).causes()
+        assert values(cause) == pytest.approx(box, abs=0.1)
+
+    def test_a_camera_moved_along_a_featureless_track_is_a_cart_elsewhere(self, poses):
+        (cause,) = camera_of(poses, CameraShift(dx=4.0, dy=-3.0)).causes()
+        assert cause.parameters["dy"].value == pytest.approx(-3.0, abs=0.05)
+        assert cause.parameters["dx"].ci90 == (-20.0, 20.0)
+
+    def test_it_is_a_cause_beside_that_of_the_motion(self, tmp_path):
+        def blurred(frames):
+            return through(frames.float(), [Blur(sigma=1.0)]).detach()
+
+        path = film(tmp_path / "run.h5", [ViscousFriction(coefficient=3.0)], blurred, episodes=3)
+        found = diagnosed(path)
+        assert (found.verdict, [cause.effect for cause in found.causes]) == ("identified", ["blur", "viscous_friction"])
+        assert found.where.stages["camera"] > 0
+        assert found.where.stages["dynamics"] > 0
+        assert [effect.name for effect in found.effects()] == ["blur", "viscous_friction"]
+        jsonschema.Draft202012Validator(SCHEMA).validate(found.to_json())
+
+    def test_lost_frames(self, tmp_path):
+        path = rewritten(film(tmp_path / "run.h5", episodes=1), frame=repeat_every_fifth)
+        (cause,) = diagnosed(path).causes
+        assert cause.effect == "frame_drop"
+        assert values(cause)["rate"] == pytest.approx(0.2, abs=0.03)
+
+
+def repeat_every_fifth(frame):
+    frame[5::5] = frame[4:-1:5]
+    return frame
 
 
 class TestBadInput:

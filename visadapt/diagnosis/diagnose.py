@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from visadapt.diagnosis import policy_bound
-from visadapt.diagnosis.frames import UNSEEN, FramesError, check_frames, pose_finder, positions
+from visadapt.diagnosis.frames import UNSEEN, FramesError, watch, with_camera
 from visadapt.diagnosis.report import next_experiment
 from visadapt.diagnosis.report.figures_data import Errors, disturbances, figure_data
 from visadapt.diagnosis.result import (
@@ -36,7 +36,7 @@ from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import ScoredModel, Search
 from visadapt.diagnosis.search.unexplained import smooth_functions
-from visadapt.effects import EFFECTS, Effect, Stage
+from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, twins
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.effect_fit import remembers
@@ -115,12 +115,12 @@ def diagnose(
     effects = list(all_effects(system) if catalogue is None else catalogue)
     films = not recording.measured
     effects = [effect for effect in effects if (effect not in UNSEEN if films else effect.stage is not Stage.CAMERA)]
+    film = None
     if films:
         if renderer is None:
             raise FramesError(f"{recording.sources[0]}: frames are diagnosed with the renderer that draws the scene")
-        finder = pose_finder(renderer, system)
-        check_frames(recording, finder.size)
-        recording = positions(recording, finder, staged(progress, "poses"))
+        film = watch(recording, system, renderer, progress)
+        recording = film.positions
     if policy is not None:
         policy_bound.check(policy, system)
     candidates = searched(effects, system)
@@ -135,8 +135,11 @@ def diagnose(
     comparison = compare(search)
     best = comparison.best
     groups = alternatives(comparison, effects, system)
-    repeats = repeated_reading_causes(prepared, search, comparison)
+    repeats = repeated_reading_causes(prepared, search, comparison, FrameDrop if film else Dropout)
     repeat_causes = [cause for cause, _ in repeats]
+    found_before = [(EFFECTS[cause.effect].stage, cost) for cause, cost in repeats]
+    if film is not None and film.camera.best.camera:
+        found_before.append((Stage.CAMERA, film.camera.lost))
 
     # Predictions of the source, the best set, each cause alone and the runners-up, on held-out episodes.
     alone = [search.single(effect) for effect in dict.fromkeys(one.canonical for group in groups for one in group)]
@@ -170,12 +173,12 @@ def diagnose(
     carrying = {cause.effect for cause in without_slight(found)}
     before, after = disturbances(search, comparison)
     regions = _regions(found, before if found else after, effects, profile.region_variables, seed)
-    return Diagnosis(
+    found_in_motion = Diagnosis(
         system=system.name,
         recording=RecordingSummary(len(recording.episodes), recording.samples, float(f"{recording.period:.9g}")),
         verdict=verdict,
         where=Where(
-            stage_shares(search, comparison, [cost for _, cost in repeats]),
+            stage_shares(search, comparison, found_before),
             errors.by_state(system, rows.channels, bool(found)),
             regions,
             () if prepared.whole is None else pushes(prepared.whole, world),
@@ -194,6 +197,7 @@ def diagnose(
         figures=figure_data(search, source, corrected, errors, before, after, regions),
         policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, best),
     )
+    return found_in_motion if film is None else with_camera(found_in_motion, film.camera, system)
 
 
 def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:

@@ -41,8 +41,8 @@ class ActuatorDelay(ActuationEffect):
             "late motion is the actuator's delay, a late reading of it the sensor's"
         ),
         "camera_delay": (
-            "let a lamp in the picture light with the command: if it lights late in the film the camera is late, if the "
-            "cart alone moves late the actuator is"
+            "let a lamp in the picture light with the command: if it lights late in the film, the camera is late; if "
+            "the cart alone moves late, the actuator is"
         ),
         "actuator_lag": (
             "record steps of the command, large and held for half a second, at the highest rate that the sensors have: "

@@ -260,41 +260,6 @@ class SensingEffect(Effect):
         raise NotImplementedError
 
 
-class CameraEffect(Effect):
-    """Changes what a camera shows: which scene, from where, and in which greys.
-
-    Grey levels are in [0, 1], pixel centres lie at whole numbers, rows count downwards.
-
-    >>> import torch, visadapt as va
-    >>> world = va.World(va.CartPole(), [va.effects.Brightness(gain=0.5, offset=0.1)])
-    >>> frame, _ = world.show(world.start(torch.zeros(1, 4)), lambda state: torch.ones(len(state), 4, 6))
-    >>> frame.shape, round(float(frame[0, 0, 0]), 3)
-    (torch.Size([1, 4, 6]), 0.6)
-    """
-
-    stage = Stage.CAMERA
-
-    def memory(self, state: Tensor, period: float) -> Tensor:
-        """The effect's memory (B, any, any) before the first frame of an episode that begins in `state`."""
-        return state[:, None, :0]
-
-    def scene(self, state: Tensor, memory: Tensor, period: float) -> Reading:
-        """The state (B, n_state) that is shown in the row of `state`, and the new memory; rows are `period` s apart."""
-        return state, memory
-
-    def motion(self, like: Tensor) -> Tensor | None:
-        """The affine map (3, 3) or (B, 3, 3) of (column, row, 1) in px from the frame's centre; None where none is
-        moved."""
-        return None
-
-    def apply_to(self, frame: Tensor, memory: Tensor, generator: torch.Generator | None) -> Reading:
-        """The changed frame (B, H, W) of one row, once it is moved, and the new memory.
-
-        Only random effects need the `generator`.
-        """
-        return frame, memory
-
-
 def expect(system: System, effect: Effect | type[Effect]) -> Any:
     """The system, which has the parameters of those that the effect acts on.
 

@@ -6,14 +6,14 @@ al. 2020, WACV, 3674), with the extra `camera`: both are exact where nothing is 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from visadapt.effects.base import CameraEffect, Parameter, Reading
+from visadapt.effects.base import Effect, Parameter, Reading, Stage
 from visadapt.systems import CartPole
 
 FAINTEST = 1e-12  # Grey level below which a power is not taken, whose slope has no limit at 0
@@ -24,17 +24,51 @@ BLUR_REACH = 4.0
 """Largest blur in px; its kernel reaches three times as far."""
 
 
+class CameraEffect(Effect):
+    """Changes what a camera shows: which scene, from where, and in which greys.
+
+    Grey levels are in [0, 1], pixel centres lie at whole numbers, rows count downwards.
+
+    >>> import torch, visadapt as va
+    >>> world = va.World(va.CartPole(), [va.effects.Brightness(gain=0.5, offset=0.1)])
+    >>> frame, _ = world.show(world.start(torch.zeros(1, 4)), lambda state: torch.ones(len(state), 4, 6))
+    >>> frame.shape, round(float(frame[0, 0, 0]), 3)
+    (torch.Size([1, 4, 6]), 0.6)
+    """
+
+    stage = Stage.CAMERA
+
+    def memory(self, state: Tensor, period: float) -> Tensor:
+        """The effect's memory (B, any, any) before the first frame of an episode that begins in `state`."""
+        return state[:, None, :0]
+
+    def scene(self, state: Tensor, memory: Tensor, period: float) -> Reading:
+        """The state (B, n_state) that is shown in the row of `state`, and the new memory; rows are `period` s apart."""
+        return state, memory
+
+    def motion(self, like: Tensor) -> Tensor | None:
+        """The affine map (3, 3) or (B, 3, 3) of (column, row, 1) in px from the frame's centre; None where none is
+        moved."""
+        return None
+
+    def apply_to(self, frame: Tensor, memory: Tensor, generator: torch.Generator | None) -> Reading:
+        """The changed frame (B, H, W) of one row, once it is moved, and the new memory.
+
+        Only random effects need the `generator`.
+        """
+        return frame, memory
+
+
 class CameraError(ImportError):
     """The package that camera effects need is missing; the message is one line."""
 
 
-def moved(frame: Tensor, effects: Iterable[CameraEffect]) -> Tensor:
-    """The frames (B, H, W) as rotation, zoom and shift move them, in one warp.
+def moved(frame: Tensor, motions: Sequence[Tensor]) -> Tensor:
+    """The frames (B, H, W) moved by one `CameraEffect.motion` after the other, in one warp.
 
     Raises:
         CameraError: kornia is missing.
     """
-    motions = [motion for effect in effects if (motion := effect.motion(frame)) is not None]
     if not motions:
         return frame
     height, width = frame.shape[1:]

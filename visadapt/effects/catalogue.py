@@ -8,12 +8,12 @@ from collections.abc import Iterable
 from visadapt.effects.base import (
     EFFECTS,
     ActuationEffect,
-    CameraEffect,
     DynamicsEffect,
     Effect,
     Parameter,
     SensingEffect,
 )
+from visadapt.effects.camera import CameraEffect
 from visadapt.effects.own import is_own, own_effects
 from visadapt.systems import SYSTEMS, System
 

@@ -7,7 +7,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from visadapt.effects.base import CameraEffect, Effect, Parameter, Reading, SensingEffect
+from visadapt.effects.base import Effect, Parameter, Reading, SensingEffect
+from visadapt.effects.camera import CameraEffect
 from visadapt.systems import CartPole
 
 

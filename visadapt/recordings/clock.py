@@ -77,8 +77,8 @@ class RawEpisode:
         rows = slice(start, end)
         time, action, state = self.time[rows], self.action[rows], self.state[rows]
         frame = None if self.frame is None else self.frame[rows]
-        parts = {"time": time, "action": action, "state": state, "frame": frame}
-        return replace(self, **parts, place=lambda row: self.place(start + row))
+        place = lambda row: self.place(start + row)  # noqa: E731
+        return replace(self, time=time, action=action, state=state, frame=frame, place=place)
 
 
 def check_forward(raw: RawEpisode) -> None:

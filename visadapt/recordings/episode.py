@@ -94,6 +94,8 @@ class Recording:
     """what was changed or left out, a line each"""
     usable: tuple[NDArray[np.bool_], ...] = ()
     """(T,) of each episode, which rows are measurements; without it, all are"""
+    resolution: tuple[float, ...] = ()
+    """smallest differences of the measured states that mean anything; without it, those between their numbers"""
 
     @property
     def samples(self) -> int:

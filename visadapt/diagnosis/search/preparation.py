@@ -70,7 +70,8 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
     if recording.usable:
         usable = [every * torch.tensor(rows)[:, None] for every, rows in zip(usable, recording.usable, strict=True)]
         used = [a * b for a, b in zip(repeats.used, usable, strict=True)]
-        repeats = replace(repeats, used=used)
+        lost = [rows & torch.tensor(kept) for rows, kept in zip(repeats.lost, recording.usable, strict=True)]
+        repeats = replace(repeats, used=used, lost=lost)
 
     # A window holds predictions from half of its rows, however fast these follow each other.
     longest = max(profile.window_rows, round(2 * PREDICTION_TIME / recording.period))
@@ -83,6 +84,8 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
             cut(measured, valid, commands, clock, channels, recording.period, longest, stretches)
             for valid in (repeats.used, usable)
         )
+        if recording.resolution:
+            rows, raw = replace(rows, step=recording.resolution), replace(raw, step=recording.resolution)
         return rows, raw
 
     def searched(rows: Segments) -> Tensor:
