@@ -89,6 +89,13 @@ COMMANDS = (
         work="--work",
     ),
     Command(
+        "ablations",
+        "ablations.csv",
+        ("benchmarks.ablations", "--variants", "as shipped", "no tuning"),
+        25,
+        work="--work",
+    ),
+    Command(
         "inverted_pendulum",
         "inverted_pendulum.csv",
         ("train.inverted_pendulum", "--seeds", "0", "1", "2"),
@@ -106,7 +113,7 @@ COMMANDS = (
         reads=(("--current", "flight"),),
     ),
     Command("named_effects", "named_effects.csv", ("benchmarks.named_effects",), 30, work="--work"),
-    Command("named_control", "named_control.csv", ("benchmarks.named_control",), 15, work="--work"),
+    Command("named_control", "named_control.csv", ("benchmarks.named_control",), 60, work="--work"),
     Command(
         "rotorpy",
         "rotorpy.csv",

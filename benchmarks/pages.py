@@ -50,6 +50,7 @@ TABLES = {
     "cartpole": Table(adaptation.cartpole, ("cartpole_pixels", "cartpole_states")),
     "curve": Table(adaptation.curve, ("cartpole_pixels", "cartpole_states")),
     "grounding": Table(adaptation.grounding, ("cartpole_pixels",)),
+    "ablations": Table(adaptation.ablations, ("ablations",)),
     "pendulum": Table(adaptation.pendulum, ("inverted_pendulum",)),
     "vehicles": Table(adaptation.vehicles, ("flight",)),
     "residual": Table(adaptation.residual, ("residual_samples",)),

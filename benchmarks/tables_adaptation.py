@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 
 from benchmarks.cartpole_pixels import EXPERIMENT as PIXELS, OURS as FRAMES_ALONE
 from benchmarks.cartpole_states import CONSTANT, OURS, SINE
-from benchmarks.named_control import FOUND, NONE, TRUE
+from benchmarks.named_control import METHODS
 
 Rows = list[dict[str, str]]
 Lines = list[list[str]]
@@ -69,6 +69,17 @@ def grounding(pixels: Rows) -> Lines:
     return lines + [[method, *_speed(pixels, PIXELS, method, "adapted", 200)] for method in methods]
 
 
+def ablations(rows: Rows) -> Lines:
+    """What each part of adapting from frames is worth, one target a line, in m/s."""
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    lines = [["mean cart speed in m/s (episodes up)", *methods]]
+    for experiment in dict.fromkeys(row["experiment"] for row in rows):
+        found = {row["method"]: _speed_cells(row) for row in rows if row["experiment"] == experiment}
+        cells = [f"{found[method][0]} ({found[method][1]})" for method in methods]
+        lines.append([experiment.removeprefix("CartPole, pixels, "), *cells])
+    return lines
+
+
 def pendulum(rows: Rows) -> Lines:
     """InvertedPendulum-v5."""
     lines = [["InvertedPendulum-v5, mean cart speed in m/s", "counted samples", "here", "episodes up", "seeds"]]
@@ -121,12 +132,11 @@ def named(rows: Rows) -> Lines:
 
 
 def named_control(rows: Rows) -> Lines:
-    """Policies tuned without the hidden effect, with it as found, and with the true one, in m/s."""
-    methods = (NONE, FOUND, TRUE)
-    lines = [["mean cart speed in m/s (episodes up)", *methods]]
+    """Policies adapted by a residual, by what a diagnosis names, and with the true effect, in m/s."""
+    lines = [["mean cart speed in m/s (episodes up)", *METHODS]]
     for experiment in dict.fromkeys(row["experiment"] for row in rows):
         own = {row["method"]: _speed_cells(row) for row in rows if row["experiment"] == experiment}
-        cells = [f"{own[method][0]} ({own[method][1]})" for method in methods]
+        cells = [f"{own[method][0]} ({own[method][1]})" for method in METHODS]
         lines.append([experiment.removeprefix("CartPole, states, ").replace("_", " "), *cells])
     return lines
 

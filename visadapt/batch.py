@@ -30,6 +30,10 @@ class Batch:
         """The rows of this batch and, after them, those of another."""
         return self.map(lambda *pair: torch.cat(pair), other)
 
+    def replaced(self, rows: Tensor, others: Self) -> Self:
+        """The same with `others` in the place of `rows` (N,)."""
+        return self.map(lambda a, b: a.index_copy(0, rows, b), others)
+
     def where(self, keep: Tensor, other: Self) -> Self:
         """The rows of this batch where `keep` (B,) holds, those of `other` in the rest."""
         return self.map(lambda a, b: torch.where(keep.reshape(-1, *[1] * (a.dim() - 1)), a, b), other)

@@ -158,20 +158,30 @@ class World(nn.Module):
         acting, _ = self._act(commands, self._split(self._at_rest(like))[0], self.altered(like), held)
         return acting.reshape(episodes, length, self.substeps, width)
 
-    def step(self, at: WorldState, action: Tensor, history: History | None = None) -> WorldState:
+    def step(
+        self, at: WorldState, action: Tensor, history: History | None = None, correction: Tensor | None = None
+    ) -> WorldState:
         """One period on, with `action` (B, n_action), limited to its range, held over it.
 
-        `history` is what the observer has seen up to now; a world with a residual needs it, and no other reads it.
+        A world with a residual needs the `history`, what the observer has seen up to now, or the `correction`
+        (B, n_state) that is to stand for the residual's; no other reads them.
         """
         acting, *others = self._split(at.memory)
         system = self.altered(at.state)
         commands, acting = self._act(action[:, None], acting, system)
         state = self._integrate(system, at.time, at.state, commands)
-        for residual in self._residuals:
-            if history is None:
-                raise ValueError("a world with a residual needs the history of observations and actions")
-            state = state + residual.delta(history.acting(action)).to(state)
+        if self._residuals:
+            state = state + (self.correction(action, history) if correction is None else correction)
         return WorldState(at.time + self.period, state, (*acting, *chain(*others)))
+
+    def correction(self, action: Tensor, history: History | None) -> Tensor:
+        """What the residuals add (B, n_state) to the state after a period with `action` (B, n_action)."""
+        if history is None:
+            raise ValueError("a world with a residual needs the history of observations and actions")
+        added = action.new_zeros(len(action), len(self.system.states))
+        for residual in self._residuals:
+            added = added + residual.delta(history.acting(action)).to(added)
+        return added
 
     def integrate(self, time: Tensor, state: Tensor, commands: Tensor, duration: Tensor | None = None) -> Tensor:
         """The state (B, n_state) a period, or `duration` (B,) s, after `time` (B,) where `commands` act.

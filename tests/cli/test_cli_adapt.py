@@ -7,6 +7,7 @@ import visadapt as va
 from tests.cli.commands import refused, run, write_frames
 from visadapt import progress
 
+SHIPPED = va.shipped("cartpole_states")
 SMALL = ("--samples", 40, "--round", 20, "--iterations", 2, "--out", "run")
 
 
@@ -55,6 +56,30 @@ def test_effects_of_a_diagnosis_are_fitted_to_the_target(here, trained, diagnosi
     (force,) = va.load_source("run/policy.safetensors").effects
     assert force.name == "constant_force"
     assert float(force.get_parameter("force").detach()) == pytest.approx(1.0, abs=0.2)
+
+
+def test_the_causes_of_the_gap_are_named_and_put_into_the_simulator(here, capsys):
+    policy = ("--policy", SHIPPED, "--target", "rig:states", "--diagnose")
+    assert run("adapt", *policy, *SMALL) == 0
+    # A bias of the command is the same as the target's force of 1 N.
+    assert "ambiguous: actuator_bias (offset 0.0333)" in capsys.readouterr().out
+    (bias,) = va.load_source("run/policy.safetensors").effects
+    assert bias.name == "actuator_bias"
+    assert json.loads((here / "run" / "round-02" / "diagnosis.json").read_text())["recording"]["samples"] == 40
+    effect = ("--effect", "viscous_friction:coefficient=1")
+    assert "leave --diagnosis and --effect out" in refused(capsys, "adapt", *policy, *effect, *SMALL)
+    again = ("adapt", "--policy", "run/policy.safetensors", "--target", "rig:states", "--diagnose")
+    assert "starts from the bare system" in refused(capsys, *again, *SMALL)
+
+
+def test_without_a_gap_the_policy_is_left_as_it_is(here, capsys):
+    (here / "same.py").write_text("import visadapt as va\n\n\ndef target():\n    return va.SyntheticTarget()\n")
+    policy = ("--policy", SHIPPED, "--target", "same:target", "--diagnose")
+    assert run("adapt", *policy, *SMALL) == 0
+    assert "no_gap: the policy is left as it was" in capsys.readouterr().out
+    before, after = va.load_policy(SHIPPED), va.load_policy("run/policy.safetensors")
+    assert torch.equal(before.state_dict()["first.weight"], after.state_dict()["first.weight"])
+    assert json.loads((here / "run" / "ledger.json").read_text())["rounds"][0]["policy_loss"] is None
 
 
 def test_interrupted_it_goes_on(here, trained, monkeypatch, capsys):

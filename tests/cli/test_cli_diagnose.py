@@ -82,7 +82,9 @@ class TestCommand:
         assert "about 9 s on 1 core" in printed.err
 
     def test_what_the_diagnosis_is_asked(self, recording, stub):
-        assert run(recording, recording.parent, "--seed", 3, "--jobs", 2) == 0
+        other = recording.with_name("other.csv")
+        other.write_text("\n".join(recording.read_text().splitlines()[:-1]))
+        assert run(recording, other, "--seed", 3, "--jobs", 2) == 0
         assert (stub["seed"], stub["jobs"]) == (3, 2)
         assert len(stub["recording"].episodes) == 2
         assert stub["world"].period == pytest.approx(0.05)

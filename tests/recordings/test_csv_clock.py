@@ -55,13 +55,15 @@ class TestClock:
         assert [source[-9:] for source in recording.sources] == ["episode 0", "episode 2"]
         assert "left out, since its rows are not 0.05 s apart" in " ".join(recording.warnings)
 
-    def test_a_file_of_another_period(self, tmp_path):
-        for number, scale in enumerate((1, 1000, 1)):
-            table = a_table()
-            write(tmp_path / f"{number}.csv", {**table, "time": scale * table["time"]})
-        refuses(
-            "1.csv: column 'time': rows are 50 s apart, those of .*0.csv 0.05 s; .* in seconds, are right", tmp_path
-        )
+    @pytest.mark.parametrize(
+        ("scale", "says"),
+        [(3, "0.15 s apart, those of .*0.csv 0.05 s; .* in seconds, are"), (1000, "50 s apart; .*milliseconds")],
+    )
+    def test_a_file_of_another_period(self, tmp_path, scale, says):
+        for number, factor in enumerate((1, scale, 1)):
+            table = a_table(seed=number)
+            write(tmp_path / f"{number}.csv", {**table, "time": factor * table["time"]})
+        refuses(f"1.csv: column 'time': rows are {says}", tmp_path)
 
 
 class TestEpisodes:
@@ -95,7 +97,7 @@ class TestEpisodes:
 
     def test_warnings_of_one_kind_are_one_line(self, tmp_path):
         write(tmp_path / "a.csv", a_table())
-        for name in "bcde":
-            write(tmp_path / f"{name}.csv", a_table(rows=10))
+        for seed, name in enumerate("bcde"):
+            write(tmp_path / f"{name}.csv", a_table(rows=10, seed=seed))
         (warning,) = load(tmp_path).warnings
         assert "b.csv, from row 1 (line 2) on and 3 more: " in warning

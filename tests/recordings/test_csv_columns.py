@@ -1,3 +1,5 @@
+import os
+
 import numpy as np
 import pytest
 
@@ -93,11 +95,26 @@ class TestColumns:
 
 class TestPaths:
     def test_a_folder_several_files_and_one(self, tmp_path):
-        for name in "cab":
-            write(tmp_path / f"{name}.csv", a_table())
+        for seed, name in enumerate("cab"):
+            write(tmp_path / f"{name}.csv", a_table(seed=seed))
         (tmp_path / "README.md").write_text("not a recording")
         assert [source[-5:] for source in load(tmp_path).sources] == ["a.csv", "b.csv", "c.csv"]
         assert [s[-5:] for s in load(tmp_path / "b.csv", tmp_path / "a.csv").sources] == ["b.csv", "a.csv"]
+
+    def test_hidden_files_of_a_folder_are_left_alone(self, tmp_path):
+        write(tmp_path / "a.csv", a_table())
+        (tmp_path / "._a.csv").write_bytes(b"\0\1\2")
+        assert len(load(tmp_path).sources) == 1
+
+    def test_a_file_is_used_once(self, tmp_path):
+        path, copy = write(tmp_path / "a.csv", a_table()), write(tmp_path / "b.csv", a_table())
+        recording = load(path, tmp_path / "." / "a.csv", copy, tmp_path)
+        assert recording.sources == (str(path),)
+        assert f"{path} and 3 more: holds the same as {path}, so it is not used twice" in recording.warnings
+
+    def test_a_pipe_is_no_recording(self, tmp_path):
+        os.mkfifo(tmp_path / "pipe")
+        refuses("pipe: no regular file; a CSV or HDF5 file is right", tmp_path / "pipe")
 
     def test_a_folder_without_recordings(self, tmp_path):
         refuses("a folder without recordings; files that end in .csv", tmp_path)

@@ -12,6 +12,8 @@ from visadapt.learning.policy import TuneSettings
 from visadapt.policies import StatePolicy
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import read_recording
+from visadapt.setups.base import Setup
+from visadapt.setups.policy_file import residual_for
 from visadapt.storage.checkpoints import CheckpointError, load_tree
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, TargetError
@@ -207,6 +209,25 @@ class TestLearning:
         policy, _ = run(tmp_path, dataclasses.replace(settings, feedforward=feedforward))
         assert bool(policy.feedforward.weight.any()) == feedforward
 
+    def test_with_half_a_trust_the_policy_goes_half_of_the_way_from_the_first_one_in_each_round(self, tmp_path):
+        def weights(name, trust, iterations):
+            settings = dataclasses.replace(QUICK, trust=trust, tuning=dataclasses.replace(TUNE, iterations=iterations))
+            run(tmp_path / name, settings, budget=60)
+            return [
+                load_tree(tmp_path / name / f"round-0{number}" / "policy.safetensors")["weights"] for number in (1, 2)
+            ]
+
+        (first, _), (whole, _), (half, second) = (
+            weights("none", 1.0, 0),
+            weights("all", 1.0, 3),
+            weights("half", 0.5, 3),
+        )
+        for key in ("rest.0.weight", "feedforward.weight"):
+            torch.testing.assert_close(half[key], (first[key] + whole[key]) / 2)
+            moved = (half[key] - first[key]).norm()
+            assert moved > 0
+            assert (second[key] - first[key]).norm() < 1.5 * moved
+
     def test_each_round_and_each_seed_meets_the_target_in_other_states(self, whole, tmp_path):
         _, adapted, _ = whole
         _, other = run(tmp_path, QUICK, seed=2)
@@ -247,3 +268,32 @@ class TestTargets:
     def test_one_whose_episodes_are_over_before_they_begin(self, tmp_path):
         with pytest.raises(TargetError, match="over before its first step"):
             run(tmp_path, QUICK, Counted(angle_limit=0.0))
+
+
+class TestPretraining:
+    def setup(self, refinement):
+        settings = dataclasses.replace(SMALL, refinement=refinement)
+        return Setup(World(CartPole(), integrator="euler"), lambda: StatePolicy(4), residual_for, settings)
+
+    def test_a_refined_policy_is_trained_on_from_the_rough_one_which_is_left_out_of_the_folder(self, tmp_path):
+        fine = dataclasses.replace(TUNE, iterations=4, recorded=0.0)
+        rough = self.setup(None).pretrain(tmp_path / "rough" / "policy.safetensors", 0).state_dict()
+        path = tmp_path / "fine" / "policy.safetensors"
+        refined = self.setup(fine).pretrain(path, 0).state_dict()
+        moved = max(float((refined[key] - rough[key]).abs().max()) for key in rough)
+        assert 0 < moved < 4.5 * fine.learning_rate
+        assert list(path.parent.iterdir()) == [path]
+
+    def test_interrupted_between_both_it_ends_with_the_same_weights(self, tmp_path):
+        def interrupt(stage, done, total, loss):
+            if total == 4 and done == 2:
+                raise KeyboardInterrupt
+
+        fine = dataclasses.replace(TUNE, iterations=4, recorded=0.0)
+        whole = self.setup(fine).pretrain(tmp_path / "whole" / "policy.safetensors", 0).state_dict()
+        path = tmp_path / "again" / "policy.safetensors"
+        with pytest.raises(KeyboardInterrupt):
+            self.setup(fine).pretrain(path, 0, interrupt)
+        again = self.setup(fine).pretrain(path, 0).state_dict()
+        for key, value in whole.items():
+            assert torch.equal(value, again[key]), key

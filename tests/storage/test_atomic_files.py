@@ -1,8 +1,9 @@
+import os
 from pathlib import Path
 
 import pytest
 
-from visadapt.storage.atomic_files import DiskFullError, replacing
+from visadapt.storage.atomic_files import DiskFullError, NotWrittenError, check_writable, replacing
 
 
 def names(folder):
@@ -55,4 +56,61 @@ def test_a_full_disk_is_one_line_that_names_the_file(tmp_path, quoted):
         write()
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+    assert names(tmp_path) == []
+
+
+def write(path, text="new"):
+    with replacing(path) as temporary:
+        temporary.write_text(text)
+
+
+def test_a_link_is_followed_and_a_mode_is_kept(tmp_path):
+    path, link = tmp_path / "a" / "private.json", tmp_path / "link.json"
+    path.parent.mkdir()
+    path.write_text("old")
+    path.chmod(0o600)
+    link.symlink_to(path)
+    write(link)
+    assert link.is_symlink()
+    assert path.read_text() == "new"
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_pipe_is_written_to_and_not_replaced(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        write(pipe)
+        assert os.read(reader, 100) == b"new"
+    finally:
+        os.close(reader)
+    assert pipe.is_fifo()
+    assert names(tmp_path) == ["pipe"]
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("folder", "it is a folder"),
+        ("file/a.json", "Not a directory"),
+        ("file/b/a.json", "Not a directory"),
+        ("a" * 300, "File name too long"),
+    ],
+)
+def test_what_cannot_be_written_is_told_before_and_by_its_cause(tmp_path, name, says):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("old")
+    before = names(tmp_path)
+    with pytest.raises(NotWrittenError, match=f"cannot be written: {says}"):
+        check_writable(tmp_path / name)
+    with pytest.raises(NotWrittenError, match="was not written: ") as caught:
+        write(tmp_path / name)
+    assert "disk full" not in str(caught.value)
+    assert names(tmp_path) == before
+
+
+def test_a_check_leaves_nothing_behind(tmp_path):
+    check_writable(tmp_path / "new" / "a.json")
+    check_writable(tmp_path / "b.json")
     assert names(tmp_path) == []

@@ -1,10 +1,11 @@
 import dataclasses
 
 import pytest
+import scipy.linalg
 import torch
 
 from visadapt.systems import CartPole
-from visadapt.tasks.balance import CENTRED_CARTPOLE, PAPER_CARTPOLE, Cost, SettlingCost
+from visadapt.tasks.balance import CENTRED_CARTPOLE, PAPER_CARTPOLE, Cost, RegulatorCost, SettlingCost, cost_to_go
 from visadapt.world import World
 
 
@@ -93,3 +94,32 @@ def test_the_end_of_a_plan_costs_as_much_again():
     more = SettlingCost(weights, end=3.0)(states, actions, now) - Cost(weights)(states, actions, now)
     wanted = [3 * sum(w * float(s) ** 2 for w, s in zip(weights, row, strict=True)) for row in states[:, -1]]
     assert more.tolist() == pytest.approx(wanted, rel=1e-4)
+
+
+class TestRegulatorCost:
+    WEIGHTS = (1.0, 6.0, 1.0, 0.1)
+    TO_GO = cost_to_go(World(CartPole()), WEIGHTS, Cost.action)
+
+    def moves(self):
+        """A and B of the cart-pole, linearised upright."""
+        world = World(CartPole())
+        rest, still = torch.zeros(4, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
+        step = torch.autograd.functional.jacobian(
+            lambda s, a: world.step(world.start(s[None]), a[None]).state[0], (rest, still)
+        )
+        return [part.numpy() for part in step]
+
+    def test_what_is_left_to_pay_solves_the_riccati_equation(self):
+        a, b = self.moves()
+        weights = torch.diag(torch.tensor(self.WEIGHTS)).double().numpy()
+        wanted = scipy.linalg.solve_discrete_are(a, b, weights, [[Cost.action]]) - weights  # that of now is not to pay
+        assert torch.tensor(self.TO_GO).numpy() == pytest.approx(wanted, rel=1e-5)
+
+    def test_a_plan_of_half_a_second_begins_like_one_without_end(self):
+        a, b = self.moves()
+        weights = torch.diag(torch.tensor(self.WEIGHTS)).double().numpy()
+        price = scipy.linalg.solve_discrete_are(a, b, weights, [[Cost.action]])
+        gain = scipy.linalg.solve(Cost.action + b.T @ price @ b, b.T @ price @ a)
+        endless = abs(scipy.linalg.eigvals(a - b @ gain))
+        found = least(RegulatorCost(self.WEIGHTS, to_go=self.TO_GO))
+        assert sorted(found.tolist()) == pytest.approx(sorted(endless), abs=1e-4)

@@ -12,6 +12,9 @@ import torch
 from renderers import load_renderer
 from visadapt.cli.inputs import InputError, checked, fingerprint, given_effects, import_effects, progress
 from visadapt.cli.target import load_both
+from visadapt.diagnosis.report.text import number, with_unit
+from visadapt.effects import Effect, Parameter
+from visadapt.learning.joint import Explanation
 from visadapt.policies import ImagePolicy, Policy
 from visadapt.setups.training import adapt, setup_for
 from visadapt.storage.run_folder import open_run, write_json
@@ -24,7 +27,14 @@ def run(options: argparse.Namespace) -> None:
     """Adapt the policy in the folder of the run."""
     import_effects(options)
     policy, source, target = load_both(options)
-    if effects := given_effects(options, source.system):
+    effects = given_effects(options, source.system)
+    if options.diagnose and effects:
+        raise InputError("--diagnose names the effects itself: leave --diagnosis and --effect out")
+    if options.diagnose and len(source.effects):
+        raise InputError(f"{options.policy}: was made in a world with effects; --diagnose starts from the bare system")
+    if options.diagnose and isinstance(policy, ImagePolicy):
+        raise InputError(f"{options.policy}: is shown frames; --diagnose needs a policy that is shown states")
+    if effects:
         source = World(source.system, effects, source.period, source.integrator, source.substeps)
     _check_renderer(options, policy)
     references = read_reference(options.references, source.period) if options.references else None
@@ -39,12 +49,33 @@ def run(options: argparse.Namespace) -> None:
         settings[f"{name} SHA-256"] = fingerprint(settings[name])
     open_run(folder, settings)
     with progress() as report:
-        asked = {name: getattr(options, name) for name in ("seed", "iterations", "renderer", "with_history")}
+        asked = {
+            name: getattr(options, name) for name in ("seed", "iterations", "renderer", "with_history", "diagnose")
+        }
         own: dict[str, Any] = {"references": references, "report": report, **asked}
         adapted = adapt(policy, source, target, options.samples, folder, round_samples=options.round, **own)
-    rounds = [{"samples": each.samples, "policy_loss": each.policy[-1]} for each in adapted.rounds]
+    rounds = [
+        {"samples": each.samples, "policy_loss": each.policy[-1] if each.policy else None} for each in adapted.rounds
+    ]
     write_json(folder / "ledger.json", {**asdict(adapted.ledger), "used": adapted.ledger.used, "rounds": rounds})
+    if options.diagnose:
+        print(_in_words(adapted.rounds[-1].explanation))
     print(f"{adapted.ledger.used} samples of {target.name} used; the policy is {folder / 'policy.safetensors'}")
+
+
+def _in_words(explanation: Explanation) -> str:
+    """The last diagnosis, and what followed from it."""
+    causes = ", ".join(
+        f"{effect.name} ({', '.join(f'{p.name} {_value(effect, p)}' for p in effect.table)})"
+        for effect in explanation.effects
+    )
+    if not explanation.complete:
+        return f"{explanation.verdict}: a residual learnt the gap"
+    return f"{explanation.verdict}: {causes}" if causes else f"{explanation.verdict}: the policy is left as it was"
+
+
+def _value(effect: Effect, parameter: Parameter) -> str:
+    return with_unit(number(float(effect.get_parameter(parameter.name).detach())), parameter.unit)
 
 
 def _check_renderer(options: argparse.Namespace, policy: Policy) -> None:

@@ -133,6 +133,8 @@ def adapt(parser: argparse.ArgumentParser) -> None:
     add("--renderer", metavar="R.safetensors", help=renderer_help)
     add("--references", metavar="F.csv", help="what a quadrotor is to follow, if the target has none")
     add("--with-history", action="store_true", help="let a vehicle's residual read the last periods too")
+    diagnose_help = "name the causes of the gap in each round; a residual learns it only where they do not explain it"
+    add("--diagnose", action="store_true", help=diagnose_help)
     _add_effects(parser)
     add("--iterations", metavar="N", type=_positive, help="of tuning in a round (default: the system's)")
     _add_seed(parser)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 
 from visadapt.cli.inputs import InputError
 from visadapt.effects.catalogue import catalogue
@@ -13,7 +14,10 @@ def run(options: argparse.Namespace) -> None:
     """Print what the class states; or what is wrong with it, a line each."""
     system = options.system
     if wrong := complaints(system):
-        raise InputError("\nvisadapt: ".join(f"{system.__name__}: {line}" for line in wrong))
+        *others, last = (f"{system.__name__}: {line}" for line in wrong)
+        for line in others:
+            print(f"visadapt: {line}", file=sys.stderr)
+        raise InputError(last)
     for kind in ("states", "actions", "loads"):
         shown = (f"{one.name} {one.unit} ({one.low:g} to {one.high:g})" for one in getattr(system, kind))
         print(f"{kind:8} {', '.join(shown)}")

@@ -7,6 +7,7 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from visadapt.cli import arguments as asked
 
@@ -21,20 +22,19 @@ COMMANDS = {
 }
 """Each subcommand's arguments, and what it does; it is carried out by `run` of the module of its name."""
 
+LONGEST_MESSAGE = 1000  # Characters
+
 RESUMED = ("adapt", "train", "renderer")  # Subcommands that go on where an interrupted run ended
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command: 0 done; 2 bad input, described by one line on stderr; 130 interrupted."""
-    parser = argparse.ArgumentParser(
-        prog="visadapt", description=(sys.modules["visadapt"].__doc__ or "").partition("\n")[0]
-    )
-    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
-    for add_arguments, does in COMMANDS.items():
-        add_arguments(commands.add_parser(add_arguments.__name__, help=does))
-    options = parser.parse_args(arguments)
-    command = vars(options).pop("command")  # what is left are the settings of a run
+    command = ""
     try:
+        options = _parser().parse_args(arguments)
+        command = options.command
+        importlib.import_module("visadapt.cli.files").check_files(options)
+        del options.command  # what is left are the settings of a run
         importlib.import_module(f"visadapt.cli.{command}").run(options)
         sys.stdout.flush()
     except KeyboardInterrupt:
@@ -48,6 +48,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The messages of our own exceptions and of the system's are for whoever runs the command.
         if not isinstance(error, OSError) and type(error).__module__.partition(".")[0] not in ("visadapt", "renderers"):
             raise
-        print(f"visadapt: {error}", file=sys.stderr)
+        print(f"visadapt: {printable(error)}", file=sys.stderr)
         return 2  # argparse's own
     return 0
+
+
+class _Parser(argparse.ArgumentParser):
+    """Refuses arguments as ever, but sends no terminal what an argument may hold of control characters."""
+
+    def error(self, message: str) -> NoReturn:
+        super().error(printable(message))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="visadapt", description=(sys.modules["visadapt"].__doc__ or "").partition("\n")[0])
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
+    for add_arguments, does in COMMANDS.items():
+        add_arguments(commands.add_parser(add_arguments.__name__, help=does))
+    return parser
+
+
+def printable(message: object) -> str:
+    """A message in one line without control characters, which a name or a cell may hold; in the middle of a very long
+    one something is left out."""
+    text = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in str(message))
+    return (
+        text if len(text) <= LONGEST_MESSAGE else f"{text[: LONGEST_MESSAGE // 2]} ... {text[-LONGEST_MESSAGE // 2 :]}"
+    )

@@ -62,7 +62,8 @@ def _setup(options: argparse.Namespace) -> Setup:
     with checked():
         setup = setup_for(world, None, renderer, references, options.with_history)
     own = setup.settings
-    own = replace(own, source=replace(own.source, iterations=options.iterations or own.source.iterations))
+    if options.iterations:
+        own = own.shortened(options.iterations)
     if not options.seeing:
         return replace(setup, settings=own)
     perception = replace(own.perception or PerceptionSettings(), iterations=options.seeing)

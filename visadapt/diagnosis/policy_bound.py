@@ -104,7 +104,7 @@ def _estimated_steps(model: CandidateModel, best: ScoredModel) -> tuple[Tensor, 
     """
     fits = best.fits
     problem = linear_problem([model], fits)
-    process, noise = variances(model, fits.log_process, fits.log_noise)
+    process, noise = variances(model, fits, problem)
     smoothed, adjoint = backward(forward(problem.data(), process, noise))
     disturbance = -(adjoint[..., 0] @ process)[:, 1:]
     by_parameter = problem.drive[..., 1:]

@@ -26,7 +26,8 @@ def deviations(model: CandidateModel, fits: FitState) -> Tensor:
     """
     rows = model.rows
     covariance = torch.linalg.inv(posterior(model.effects, fits)[1])
-    filtered = forward(linear_problem([model], fits), *variances(model, fits.log_process, fits.log_noise))
+    problem = linear_problem([model], fits)
+    filtered = forward(problem, *variances(model, fits, problem))
     white = filtered.white * rows.used[..., None]
     score = (white[..., :1] * white[..., 1:]).sum(2)
     length = score.shape[1]

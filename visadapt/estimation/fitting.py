@@ -22,7 +22,9 @@ from visadapt.estimation.likelihood import (
 
 MIN_ITERATION_GAIN = 0.05  # Log likelihood; a fit stops after two iterations in a row that gain, or lose, less
 
-MIN_MEASUREMENT_VARIANCE = 1e-12  # Lower bound of a measurement's variance, in its unit squared
+LEAST_NOISE = 2e-5
+"""Least standard deviation of a measurement, as a share of the largest size in its state's range: below it, as in
+simulated recordings without noise, errors of the integration would be taken for physics."""
 
 MIN_DAMPING = 1e-3  # Damping of a first step, as a share of the information
 
@@ -143,7 +145,8 @@ def _step(
     noise_change = log_change @ noise_members(model)[1]
     # Rounding to a resolution is noise with a deviation of resolution / sqrt(12).
     resolution = torch.tensor(model.rows.step, dtype=torch.float64)
-    lowest_noise = (resolution.square() / 12 + MIN_MEASUREMENT_VARIANCE).log()
+    least = torch.tensor([LEAST_NOISE * model.system.states[k].largest for k in model.rows.channels]).double()
+    lowest_noise = (resolution.square() / 12 + least.square()).log()
     return replace(
         fits,
         theta=theta,

@@ -123,13 +123,18 @@ def _reading_per_state(sensing: Tensor, model: CandidateModel) -> Tensor:
     return torch.where(out.abs() > MIN_READING_PER_STATE, out, 1.0)
 
 
-def variances(model: CandidateModel, log_process: Tensor, log_noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Process noise covariances (C W, n, n) and measurement variances (C W, m) for the filter."""
+def variances(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[Tensor, Tensor]:
+    """Process noise covariances (C W, n, n) and measurement variances (C W, m) for the filter of `problem`.
+
+    Process noise too is what it is in the readings: its lower bound would else favour a sensor that reads too little.
+    """
     windows = model.rows.shape[0]
-    process = torch.full((len(log_process), len(model.system.states)), POSITION_PROCESS_NOISE**2, dtype=torch.float64)
+    process = torch.full((len(fits.log_process), len(model.system.states)), POSITION_PROCESS_NOISE**2).double()
     for k, group in enumerate(model.profile.driven):
-        process[:, list(group)] = log_process[:, k, None].exp()
-    return torch.diag_embed(process).repeat_interleave(windows, 0), log_noise.exp().repeat_interleave(windows, 0)
+        process[:, list(group)] = fits.log_process[:, k, None].exp()
+    per_reading = problem.spread / problem.spread.new_tensor(model.profile.initial_variance)
+    process = process.repeat_interleave(windows, 0) * per_reading
+    return torch.diag_embed(process), fits.log_noise.exp().repeat_interleave(windows, 0)
 
 
 def noise_members(model: CandidateModel) -> tuple[Tensor, Tensor]:
@@ -180,7 +185,7 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState) -> Derivativ
     """Likelihood, gradient and Fisher information of every window at `fits`."""
     count, windows = fits.state.shape[:2]
     problem = linear_problem(models, fits)
-    process, noise = variances(models[0], fits.log_process, fits.log_noise)
+    process, noise = variances(models[0], fits, problem)
     # The same draws for every fit.
     drawn = torch.randn(models[0].rows.used.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     used, drawn = models[0].rows.used.repeat(count, 1, 1), drawn.repeat(count, 1, 1)

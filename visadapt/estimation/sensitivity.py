@@ -25,7 +25,7 @@ class Innovations:
         rows = model.rows
         self.rows = rows
         problem = linear_problem([model], fits)
-        self._filtered = forward(problem, *variances(model, fits.log_process, fits.log_noise))
+        self._filtered = forward(problem, *variances(model, fits, problem))
         white = self._readings(self._filtered.white)
         self._known, _ = torch.linalg.qr(white[:, 1:])
         self.error: Tensor = self._projected(white[:, :1])[:, 0]

@@ -7,6 +7,7 @@ under its final name only once it is whole; an interrupted run goes on after the
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -16,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from visadapt.effects import Residual
+from visadapt.effects import Effect, Residual
 from visadapt.learning.grounding import GroundLoss, GroundSettings, fit_named, ground, rescale
 from visadapt.learning.ledger import Ledger
 from visadapt.learning.perception import PerceptionSettings
@@ -33,6 +34,23 @@ from visadapt.world import World
 EXPLORATION = 0.05  # Standard deviation of white noise on the commands while data are collected
 
 FILES = ("recording.h5", "residual.safetensors", "policy.safetensors")  # What the stages of a round leave in its folder
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What a diagnosis says of the gap between source and target."""
+
+    verdict: str
+    effects: Sequence[Effect]
+    """the causes that it names, at their found values"""
+    complete: bool
+    """whether they leave nothing for a residual to learn"""
+
+
+NOT_DIAGNOSED = Explanation("", (), complete=False)
+
+Explain = Callable[[Sequence[Episode], Path], Explanation]
+"""Diagnoses episodes of the target, or reads the diagnosis that is in the file."""
 
 Label = Callable[[list[Episode]], list[Episode]]  # Gives the episodes of a round the states that grounding learns from
 
@@ -53,8 +71,20 @@ class SetupSettings:
     """steps of an episode of the target while data are collected"""
     feedforward: bool = True
     """begin with a policy that opposes what the residual expects; False where one command cannot undo it in a period"""
+    trust: float = 1.0
+    """share of the way to the tuned weights that the policy goes from those before the first round, where each round
+    begins anew; 1: all of it, from those of the round before. The imagined target is not the real one"""
+    refinement: TuneSettings | None = None
+    """the policy in the source once more, after `source`: near rest, say, where what counts is decided"""
     perception: PerceptionSettings | None = None
     """how an encoder learns to see, where the policy is shown frames"""
+
+    def shortened(self, iterations: int) -> SetupSettings:
+        """The same with so many iterations of the source policy, and at most as many of its refinement."""
+        finer = self.refinement
+        if finer is not None:
+            finer = replace(finer, iterations=min(iterations, finer.iterations))
+        return replace(self, source=replace(self.source, iterations=iterations), refinement=finer)
 
     def numbers(self) -> dict[str, Any]:
         """All of them as JSON takes them, for a run's folder; a task's tensors, such as references, are left out."""
@@ -67,7 +97,8 @@ class Round:
 
     samples: int
     grounding: Sequence[tuple[int, float, float]]  # (step, training loss, held-out loss)
-    policy: list[float]  # loss by iteration
+    policy: list[float]  # loss by iteration; empty where the policy was left as it is, since there is no gap
+    explanation: Explanation = NOT_DIAGNOSED
 
 
 @dataclass(frozen=True)
@@ -87,6 +118,8 @@ class Adapted:
     rounds: list[Round]
     episodes: list[Episode]
     folder: Path
+    source: World
+    """the source, with the effects that were fitted, and those that the last diagnosis named"""
 
     def restore(self, policy: Policy, samples: int) -> None:
         """Give `policy`, and the residual it listens to, the weights they had after `samples` counted samples.
@@ -115,6 +148,7 @@ def adapt(
     label: Label | None = None,
     report: Report | None = None,
     explorer: Policy | None = None,
+    explain: Explain | None = None,
 ) -> Adapted:
     """Run Algorithm 1 in `folder`, going on from what is there.
 
@@ -125,6 +159,8 @@ def adapt(
         observe: the camera of simulated states, a learnt renderer; None where the policy sees what sensors measure.
         label: estimates the states from the camera's frames; without it, the target's own states are used.
         explorer: the policy that collects the target's data, in place of the one that is tuned (Algorithm 1).
+        explain: names the causes of the gap, which then join the source; the residual learns the gap only where they do
+            not explain it, and where there is no gap the policy is left as it is.
 
     Raises:
         ValueError: an empty round, or a budget that is smaller than a round.
@@ -137,9 +173,8 @@ def adapt(
         raise ValueError(
             f"the budget N = {budget} is smaller than a round of B = {round_samples} samples: raise N or lower B"
         )
-    effects = [*source.effects, residual]
-    grounded = World(source.system, effects, source.period, source.integrator, source.substeps)
-    policy.residual = residual
+    policy.residual, untrained = residual, copy.deepcopy(residual.network.state_dict())
+    known, learnt = source, False
     ledger = Ledger(budget)
     episodes: list[Episode] = []
     rounds: list[Round] = []
@@ -157,11 +192,19 @@ def adapt(
             ledger.count(f"{name}: data", episode.samples)
         episodes += new if label is None else label(new)
         windows = Windows.cut(episodes, settings.observations, observe)
+        found = explain(episodes, recording.with_name("diagnosis.json")) if explain else NOT_DIAGNOSED
+        known = _with(source, found.effects)
+        grounded = _with(known, [residual])
+        first, learnt = not (learnt or found.complete), learnt or not found.complete
         if not fitted.exists():
-            true = fit_named(source, windows)
-            if number == 0:
-                rescale(residual, source, true, settings.ground.negligible)
-            losses = ground(residual, source, true, settings.ground, drawn[1], staged(report, f"{name}: ground"))
+            true = fit_named(known, windows)
+            losses: list[GroundLoss] = []
+            if found.complete:
+                residual.network.load_state_dict(untrained)
+            else:
+                if first:
+                    rescale(residual, known, true, settings.ground.negligible)
+                losses = ground(residual, known, true, settings.ground, drawn[1], staged(report, f"{name}: ground"))
             states = None if true is windows else true.states
             save_tree(fitted, {"weights": grounded.state_dict(), "losses": losses, "states": states})
         tree = load_tree(fitted)
@@ -169,17 +212,37 @@ def adapt(
         grounding = [GroundLoss(*each) for each in tree["losses"]]
         if tree.get("states") is not None:
             windows = replace(windows, states=tree["states"])
-        if number == 0 and settings.feedforward:
+        if number == 0:
+            own = policy.state_dict().items()
+            start = {key: value.clone() for key, value in own if not key.startswith("residual.")}
+        if first and settings.feedforward:
             initialise_feedforward(policy, source, residual.scale)
+            start["feedforward.weight"] = policy.feedforward.weight.detach().clone()
         if not tuned.exists():
             partial, progress = tuned.with_suffix(".partial.safetensors"), staged(report, f"{name}: tune")
-            found = tune(policy, grounded, observe, settings.tuning, drawn[2], windows, progress, partial)
-            save_tree(tuned, {"weights": policy.state_dict(), "losses": found})
+            no_gap = found.complete and not len(known.effects)
+            world, how, starts = grounded, settings.tuning, windows
+            if found.complete:
+                # What has a name holds in every state, not near the recorded ones alone, as a residual does.
+                world, how, starts = known, replace(settings.tuning, recorded=0.0), None
+            if settings.trust < 1:
+                policy.load_state_dict(start, strict=False)
+            tuning = [] if no_gap else tune(policy, world, observe, how, drawn[2], starts, progress, partial)
+            if settings.trust < 1:
+                reached = policy.state_dict()
+                way = {key: torch.lerp(start[key], reached[key], settings.trust) for key in start}
+                policy.load_state_dict(way, strict=False)
+            save_tree(tuned, {"weights": policy.state_dict(), "losses": tuning})
             partial.unlink(missing_ok=True)
         tree = load_tree(tuned)
         load_weights(policy, tree["weights"], tuned)
-        rounds.append(Round(ledger.used, grounding, tree["losses"]))
-    return Adapted(policy, ledger, rounds, episodes, folder)
+        rounds.append(Round(ledger.used, grounding, tree["losses"], found))
+    return Adapted(policy, ledger, rounds, episodes, folder, known)
+
+
+def _with(world: World, effects: Sequence[Effect]) -> World:
+    """The world with more effects."""
+    return World(world.system, [*world.effects, *effects], world.period, world.integrator, world.substeps)
 
 
 def _weights(folder: Path, number: int) -> Path:

@@ -47,6 +47,30 @@ class StreamState(Batch):
         return cls(at, History(tree["observations"], tree["actions"]), tree["task_state"])
 
 
+@dataclass(frozen=True)
+class Visited(Batch):
+    """What streams passed through: all that plans from there need, without the frames that were seen there."""
+
+    at: WorldState
+    task_state: Tensor  # (B, ...) the task's
+    inputs: Tensor  # (B, inputs) of the policy's plan, `Policy.embed`
+    expected: Tensor  # (B, n_state) the correction that the policy expects, in units of the residual's scale
+    correction: Tensor  # (B, n_state) that the residual made
+
+    def tree(self) -> dict[str, Any]:
+        """All of it as a tree of tensors, for a checkpoint."""
+        return {
+            "world": [self.at.time, self.at.state, *self.at.memory],
+            "rest": [self.task_state, self.inputs, self.expected, self.correction],
+        }
+
+    @classmethod
+    def of(cls, tree: dict[str, Any]) -> Self:
+        """The inverse of `tree`."""
+        time, state, *memory = tree["world"]
+        return cls(WorldState(time, state, tuple(memory)), *tree["rest"])
+
+
 @dataclass
 class Streams:
     """A batch of simulated episodes in progress."""
@@ -75,7 +99,7 @@ class Streams:
     @torch.no_grad()
     def start(self, progress: float, generator: torch.Generator) -> None:
         """Start all streams, at random ages, so that they do not end together."""
-        self.now = self._fresh(progress, generator)
+        self.now = self._fresh(torch.arange(self.count), progress, generator)
         self.age = torch.randint(self.longest, (self.count,), generator=generator)
 
     @torch.no_grad()
@@ -91,19 +115,22 @@ class Streams:
         self.now = StreamState(at.detach(), history, task_state)
         self.age += 1
         keep = (self.age < self.longest) & ~self.task.diverged(at.state, task_state, progress)
-        if not bool(keep.all()):
-            self.now = self.now.where(keep, self._fresh(progress, generator))
-            self.age = torch.where(keep, self.age, 0)
+        ended = (~keep).nonzero()[:, 0]
+        if len(ended):
+            self.now = self.now.replaced(ended, self._fresh(ended, progress, generator))
+            self.age[ended] = 0
 
-    def _fresh(self, progress: float, generator: torch.Generator) -> StreamState:
+    def _fresh(self, ended: Tensor, progress: float, generator: torch.Generator) -> StreamState:
+        """New starts for the streams `ended`: drawn for all streams, but only these are rendered."""
         count, windows = self.count, self.windows
-        state, task_state = self.task.training_start(count, progress, generator)
+        state, task_state = (each[ended] for each in self.task.training_start(count, progress, generator))
         at = self.world.start(state)
         if self._times is not None:
             # Streams are shorter than episodes: those that all began at time 0 would never meet a gust that comes
             # late, or all phases of a slow force. So they begin at the times of recorded samples, or, without a
             # recording, at any time of an episode.
-            at = replace(at, time=self._times[torch.randint(len(self._times), (count,), generator=generator)].to(state))
+            times = self._times[torch.randint(len(self._times), (count,), generator=generator)]
+            at = replace(at, time=times[ended].to(state))
         seen, at = look(self.world, self.observe, at, generator)
         history = History.start(self.task.show(seen, task_state), len(self.world.system.actions))
         fresh = StreamState(at, history, task_state)
@@ -114,8 +141,8 @@ class Streams:
         near = (~self.task.diverged(windows.state, task_states[:, -1], progress)).nonzero()[:, 0]
         if not len(near):
             return fresh
-        from_record = torch.rand(count, generator=generator) < self.recorded
-        rows = near[torch.randint(len(near), (count,), generator=generator)]
+        from_record = torch.rand(count, generator=generator)[ended] < self.recorded
+        rows = near[torch.randint(len(near), (count,), generator=generator)][ended]
         past = windows.history(rows)
         seen, now, where = self.task.augment(past.observations, windows.state[rows], task_states[rows], generator)
         shown = self.task.show(seen.flatten(0, 1), where.flatten(0, 1)).unflatten(0, seen.shape[:2])

@@ -20,9 +20,9 @@ from visadapt.history import HORIZON, History
 class Policy(nn.Module):
     """Base of policies; subclasses give the layers that turn a history into a plan.
 
-    The correction enters in two ways, both of no weight at first: beside the history, and straight into the plan as
-    a feed-forward, since what is known to push can be pushed against. `learning.policy.initialise_feedforward` gives
-    the feed-forward its weights once there is a residual; tuning changes all of them.
+    The correction enters straight into the plan as a feed-forward, since what is known to push can be pushed against,
+    and in some policies beside the history too; both are of no weight at first.
+    `learning.policy.initialise_feedforward` gives the feed-forward its weights once there is a residual.
 
     >>> import torch, visadapt as va
     >>> from visadapt.history import History
@@ -46,15 +46,22 @@ class Policy(nn.Module):
         nn.init.zeros_(self.feedforward.weight)
         self.residual: Residual | None = None
 
-    def plan(self, history: History, correction: Tensor) -> Tensor:
-        """Commands (B, HORIZON * n_action) before the last tanh, from a history and the correction (B, n_state)."""
+    def embed(self, history: History) -> Tensor:
+        """What a plan is made of beside the correction, (B, inputs): the features of frames, or the history itself."""
         raise NotImplementedError
+
+    def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:
+        """Commands (B, HORIZON * n_action) before the last tanh, from the inputs and the correction (B, n_state)."""
+        raise NotImplementedError
+
+    def decide(self, inputs: Tensor, correction: Tensor) -> Tensor:
+        """Planned actions (B, HORIZON, n_action)."""
+        out = (self.plan(inputs, correction) + self.feedforward(correction)).tanh()
+        return out.unflatten(-1, (HORIZON, self.n_action))
 
     def forward(self, history: History) -> Tensor:
         """Planned actions (B, HORIZON, n_action)."""
-        correction = self.correction(history)
-        out = (self.plan(history, correction) + self.feedforward(correction)).tanh()
-        return out.unflatten(-1, (HORIZON, self.n_action))
+        return self.decide(self.embed(history), self.correction(history))
 
     def act(self, history: History) -> Tensor:
         """The action (B, n_action) to execute now."""

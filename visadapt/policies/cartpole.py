@@ -11,7 +11,8 @@ from visadapt.policies.networks import N_FEATURES, FrameEncoder, mlp
 
 
 class ImagePolicy(Policy):
-    """A 4-layer CNN on the last 5 frames and 5 actions (the paper, section 3.2.3).
+    """A 4-layer CNN on the last 5 frames and 5 actions (the paper, section 3.2.3); the feed-forward alone hears the
+    correction.
 
     It carries the encoder as it was when it had learnt to see (`learning.perception`), before the policy was trained:
     the residual begins with that one. No training of the policy changes it.
@@ -26,12 +27,15 @@ class ImagePolicy(Policy):
         super().__init__(n_state, n_action, given)
         self.perception = perception
         self.encoder = FrameEncoder(background, contrast, n_action)
-        self.hidden = nn.Linear(N_FEATURES + n_state, 64)
+        self.hidden = nn.Linear(N_FEATURES, 64)
         self.out = nn.Linear(64, HORIZON * n_action)
-        ignore_correction(self.hidden, n_state)
 
-    def plan(self, history: History, correction: Tensor) -> Tensor:
-        out: Tensor = self.out(self.hidden(torch.cat((self.encoder(history), correction), 1)).relu())
+    def embed(self, history: History) -> Tensor:
+        features: Tensor = self.encoder(history)
+        return features
+
+    def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:
+        out: Tensor = self.out(self.hidden(inputs).relu())
         return out
 
 
@@ -47,8 +51,10 @@ class StatePolicy(Policy):
         self.rest = mlp(32, 64, 64, 32, HORIZON * n_action)
         ignore_correction(self.first, n_state)
 
-    def plan(self, history: History, correction: Tensor) -> Tensor:
+    def embed(self, history: History) -> Tensor:
         states, actions = history.observations, history.actions
-        seen = (states.flatten(1), actions.flatten(1)) if self.with_history else (states[:, -1],)
-        out: Tensor = self.rest(self.first(torch.cat((*seen, correction), 1)).tanh())
+        return torch.cat((states.flatten(1), actions.flatten(1)), 1) if self.with_history else states[:, -1]
+
+    def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:
+        out: Tensor = self.rest(self.first(torch.cat((inputs, correction), 1)).tanh())
         return out

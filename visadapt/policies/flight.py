@@ -43,12 +43,15 @@ class FlightPolicy(Policy):
         """What the goal (B, n_goal) is to a vehicle in a state (B, 13): (B, n_aim)."""
         raise NotImplementedError
 
-    def plan(self, history: History, correction: Tensor) -> Tensor:
+    def embed(self, history: History) -> Tensor:
         shown = history.observations[:, -1]
         state, goal = shown[:, : self.n_state], shown[:, self.n_state :]
         velocity, turned = state[:, VELOCITY], rotation(state[:, ATTITUDE])
         moving = (velocity, times(turned.mT, velocity), turned[:, :, :2].flatten(1), state[:, RATES])
-        own, disturbance = torch.cat((*moving, self.aim(state, goal)), 1), self.disturbance(history)
+        return torch.cat((*moving, self.aim(state, goal), self.disturbance(history)), 1)
+
+    def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:
+        own, disturbance = inputs[:, :-N_DISTURBANCE], inputs[:, -N_DISTURBANCE:]
         hidden = self.rest((self.first(torch.cat((own, correction), 1)) + self.hearing(disturbance)).tanh()).tanh()
         out: Tensor = self.out(hidden) + self.straight(own) + self.answer(disturbance)
         return out

@@ -12,9 +12,10 @@ from itertools import combinations, product
 import numpy as np
 from numpy.typing import NDArray
 
-from visadapt.recordings.clock import Note, RawEpisode
+from visadapt.recordings.clock import UNITS_S, Note, RawEpisode
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.physics import DEGREE, DIFFERENCE_S, are_degrees, correlation, exchanged
+from visadapt.recordings.sensors import differences
 from visadapt.systems import System, Variable
 
 TURN = 2 * math.pi
@@ -83,6 +84,7 @@ def check_units(raw: RawEpisode, system: System) -> None:
                 f"{raw.cell(row, name)} jumps from {columns[name][row - 1]:g} to {columns[name][row]:g}; radians are "
                 "right (these look like degrees)"
             )
+    _check_clock(raw, system)
     _check_exchanged(raw, variables, {name: rate for name in columns if (rate := system.rate_of(name))})
     for name in columns:
         if (rate := system.rate_of(name)) is not None:
@@ -104,10 +106,24 @@ def check_units(raw: RawEpisode, system: System) -> None:
 
 def _rates(time: NDArray[np.float64], values: NDArray[np.float64], angle: bool) -> NDArray[np.float64]:
     """Rates of change (T - 1,) between rows; jumps of an angle by a turn are removed."""
-    steps = np.diff(values)
-    if angle:
-        steps = np.where(np.abs(np.abs(steps) - TURN) < 0.5 * math.pi, steps - np.sign(steps) * TURN, steps)
-    return steps / np.diff(time)
+    return differences(values, angle) / np.diff(time)
+
+
+def _check_clock(raw: RawEpisode, system: System) -> None:
+    """Raises RecordingError where all positions change as many times as fast as their rates say, as in another unit."""
+    ratios = {}
+    for name, values in raw.states.items():
+        rate = raw.states.get(system.rate_of(name) or "")
+        if rate is not None and rate.any():
+            change = _rates(raw.time, values, system.states[system.index(name)].unit == "rad")
+            ratios[name] = float(np.abs(change).mean() / np.abs(rate).mean())
+    for unit, seconds in UNITS_S.items():
+        # One alone may be in another unit itself.
+        if len(ratios) > 1 and all(0.8 < ratio / seconds < 1.25 for ratio in ratios.values()):
+            raise RecordingError(
+                f"{raw.source}: column 'time': by it {', '.join(ratios)} change {seconds:g} times as fast as their "
+                f"rates say: the clock is in {unit}; seconds are right"
+            )
 
 
 def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable) -> None:
@@ -127,7 +143,7 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable) -> None:
         row = int(np.abs(values).argmax())
         raise RecordingError(
             f"{raw.cell(row, variable.name)} is {values[row]:g} {variable.unit}, and it changes by up to "
-            f"{np.abs(coarse).max():.3g} {rate.unit}; {right}"
+            f"{np.abs(coarse).max():.3g} {rate.unit}; {right}, and seconds for the clock"
         )
     if measured is None:
         return

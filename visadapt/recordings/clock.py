@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -27,6 +27,12 @@ LONGEST_STEP_PERIODS = 3.0
 """Longest step of an irregular clock; at longer ones the episode is split."""
 HARMLESS_GAP_S = 0.01
 """Step up to which an episode is never split: a loop of a few ms that stalls for as long holds its command."""
+SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-4, 0.5 / 3
+"""s between rows: the least, and the most, at which the shortest episode, of 0.5 s, has three."""
+LEAST_STEP_PERIODS = 1e-3
+"""Step between two rows, in periods, below which the stamps are not those of the readings."""
+UNITS_S = {"nanoseconds": 1e-9, "microseconds": 1e-6, "milliseconds": 1e-3, "minutes": 60, "hours": 3600, "days": 86400}
+"""Units that stamps come in by mistake."""
 PERIOD_RATIO = 1.5
 """Ratio that the periods of two episodes of one recording may have."""
 
@@ -92,6 +98,32 @@ def check_forward(raw: RawEpisode) -> None:
             f"{raw.cell(row + 1, 'time')}: the clock {problem} (from {before:.9g} s to {after:.9g} s); each row must "
             "be later than the one before; mark several episodes by a column 'episode'"
         )
+
+
+def check_steps(episodes: Sequence[RawEpisode]) -> None:
+    """Check that the stamps of a file's episodes are in s.
+
+    Raises:
+        RecordingError: rows follow each other faster or slower than a machine is controlled, or two as good as at once.
+    """
+    steps = [np.diff(raw.time) for raw in episodes]
+    every = np.concatenate(steps)
+    if not len(every):
+        return
+    raw, period = episodes[0], float(np.median(every))
+    if not SHORTEST_PERIOD_S <= period <= LONGEST_PERIOD_S:
+        units = [name for name, unit in UNITS_S.items() if SHORTEST_PERIOD_S <= unit * period <= LONGEST_PERIOD_S]
+        raise RecordingError(
+            f"{raw.source}: column 'time': rows are {period:.4g} s apart; {SHORTEST_PERIOD_S:g} to "
+            f"{LONGEST_PERIOD_S:.2g} s are right" + (f" (is the clock in {' or '.join(units)}?)" if units else "")
+        )
+    for raw, own in zip(episodes, steps, strict=True):
+        if len(own) and own.min() < LEAST_STEP_PERIODS * period:
+            row = int(own.argmin()) + 1
+            raise RecordingError(
+                f"{raw.cell(row, 'time')}: only {own.min():.3g} s after the row before, where most are {period:.4g} s "
+                "apart; stamps of the readings, not of when a log wrote them, are right"
+            )
 
 
 def uninterrupted(raw: RawEpisode, note: Note) -> list[RawEpisode]:

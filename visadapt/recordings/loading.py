@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from visadapt.recordings.checks import check_commands, check_finite, check_units
-from visadapt.recordings.clock import Note, RawEpisode, alike, check_forward, uninterrupted
+from visadapt.recordings.clock import Note, RawEpisode, alike, check_forward, check_steps, uninterrupted
 from visadapt.recordings.csv import needed, read_rows
 from visadapt.recordings.episode import Episode, Recording, RecordingError
 from visadapt.recordings.hdf5 import read_names, read_recording
+from visadapt.recordings.sensors import check_sensors, without_outliers
 from visadapt.systems import System
 
 SHORTEST_EPISODE_S = 0.5
 """s; shorter episodes hold too few predictions several steps ahead and are left out."""
-FEWEST_ROWS = 3
-"""Rows that an episode of the shortest length must have."""
 UPRIGHT_RAD = 1.0
 """rad from 0 up to which an angle counts as upright when it is unwrapped."""
 
@@ -61,23 +62,22 @@ def load_recording(
         places.setdefault(text, []).append(where)
 
     whole: list[RawEpisode] = []
-    for path in _files([paths] if isinstance(paths, str | os.PathLike) else paths):
-        for raw in _read(path, system, columns or {}, frames):
+    for path in _files([paths] if isinstance(paths, str | os.PathLike) else paths, note):
+        episodes = _read(path, system, columns or {}, frames)
+        for raw in episodes:
             check_finite(raw, system.actions)
             check_forward(raw)
-            whole.append(raw)
+        check_steps(episodes)
+        whole += [without_outliers(raw, system, note) for raw in episodes]
     whole = _commands(_shared(whole, system, note), system, note)
     check_commands(whole, system.actions, note)
-    for raw in whole:
-        if raw.frame is None:
-            check_units(raw, system)
+    if not frames:
+        with np.errstate(over="ignore", invalid="ignore"):  # of absurd readings, which are refused here or below
+            for raw in whole:
+                check_units(raw, system)
+        whole = check_sensors(whole, system, note)
     parts = [part for raw in whole for part in uninterrupted(_unwrapped(raw, system), note)]
     parts, period = alike(_long_enough(parts, note), note)
-    if period * FEWEST_ROWS > SHORTEST_EPISODE_S:
-        raise RecordingError(
-            f"{parts[0].source}: column 'time': rows are {period:.4g} s apart; at most "
-            f"{SHORTEST_EPISODE_S / FEWEST_ROWS:.2g} s is right (is the clock in milliseconds?)"
-        )
     return Recording(
         episodes=tuple(Episode(part.time, part.action, None if frames else part.state, part.frame) for part in parts),
         measured=whole[0].measured,
@@ -90,22 +90,35 @@ def load_recording(
     )
 
 
-def _files(paths: Sequence[str | os.PathLike[str]]) -> list[Path]:
-    files = []
+def _files(paths: Sequence[str | os.PathLike[str]], note: Note) -> list[Path]:
+    """The files that are given, each once; of a folder those that are not hidden."""
+    files: list[Path] = []
     for path in map(Path, paths):
+        found = [path]
         if path.is_dir():
             suffixes = (".csv", ".h5", ".hdf5")
-            found = sorted(file for file in path.iterdir() if file.suffix.lower() in suffixes and file.is_file())
+            inside = (file for file in path.iterdir() if not file.name.startswith(".") and file.is_file())
+            found = sorted(file for file in inside if file.suffix.lower() in suffixes)
             if not found:
                 raise RecordingError(f"{path}: a folder without recordings; files that end in .csv or .h5 are right")
-            files += found
-        elif path.exists():
-            files.append(path)
-        else:
+        elif not path.exists():
             raise RecordingError(f"{path}: there is no such file or folder")
+        elif not path.is_file():
+            raise RecordingError(f"{path}: no regular file; a CSV or HDF5 file is right")
+        for file in found:
+            if twin := next((other for other in files if _is_the_same(file, other)), None):
+                note(f"holds the same as {twin}, so it is not used twice", str(file))
+            else:
+                files.append(file)
     if not files:
         raise RecordingError("no recording was given")
     return files
+
+
+def _is_the_same(one: Path, other: Path) -> bool:
+    with suppress(OSError):
+        return one.samefile(other) or filecmp.cmp(one, other, shallow=False)
+    return False
 
 
 def _read(path: Path, system: System, given: Mapping[str, str], frames: bool) -> list[RawEpisode]:
@@ -204,7 +217,7 @@ def _long_enough(parts: Sequence[RawEpisode], note: Note) -> list[RawEpisode]:
     if max(durations) < least:
         raise RecordingError(
             f"{longest.source}: too short: {len(longest.time)} rows, {max(durations):.3g} s; "
-            f"an uninterrupted run of at least {SHORTEST_EPISODE_S:g} s is right"
+            f"an uninterrupted run of at least {SHORTEST_EPISODE_S:g} s, with a clock in seconds, is right"
         )
     for part, duration in zip(parts, durations, strict=True):
         if duration < least:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -15,6 +16,7 @@ from visadapt.learning.training_state import train_or_load
 from visadapt.learning.windows import Observe
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
+from visadapt.setups.explained import explained
 from visadapt.setups.policy_file import describe
 from visadapt.storage.checkpoints import load_network
 from visadapt.targets import Target
@@ -67,11 +69,16 @@ class Setup:
             self.prepare(policy, path.parent, seed, report)
         numbers = self.settings.numbers()["source"]
         about = {"arguments": policy.arguments, "source": describe(self.source), "seed": seed, **numbers}
+        rough, fine = path.with_suffix(".rough.safetensors"), self.settings.refinement
+        stages = [(path, self.settings.source)] if fine is None else [(rough, self.settings.source), (path, fine)]
         # Preparing draws from a generator of the seed itself.
-        generator = torch.Generator().manual_seed(seed if self.prepare is None else seed + 1)
-        progress = staged(report, f"{self.source.system.name}: source policy")
-        args = (policy, self.source, self.observe, self.settings.source, generator, None, progress)
-        train_or_load(path, policy, about, lambda partial: tune(*args, partial))
+        for draws, (made, settings) in enumerate(stages, seed if self.prepare is None else seed + 1):
+            if made == path or not path.exists():
+                generator = torch.Generator().manual_seed(draws)
+                progress = staged(report, f"{self.source.system.name}: source policy")
+                args = (policy, self.source, self.observe, settings, generator, None, progress)
+                train_or_load(made, policy, about, partial(tune, *args))
+        rough.unlink(missing_ok=True)
         return policy.eval()
 
     def load(self, path: Path) -> Policy:
@@ -101,11 +108,13 @@ class Setup:
         seed: int,
         report: Report | None = None,
         explorer: Policy | None = None,
+        diagnose: bool = False,
     ) -> Adapted:
         """Adapt `policy`, in place, to `target` with at most `budget` counted samples: Algorithm 1 in `folder`.
 
         Args:
             explorer: collects the data in place of `policy`.
+            diagnose: name the causes of the gap in each round: `explained`.
 
         Raises:
             ValueError: a policy of another kind, a target of another period or with other actions, or a budget that
@@ -117,8 +126,11 @@ class Setup:
         torch.manual_seed(seed)
         residual = self.residual(policy, self.source)
         args = (policy, residual, self.source, target, self.settings, folder, budget, round_samples, seed)
-        adapted = adapt(*args, self.observe, self.label, report, explorer)
-        policy.grounded_in = describe(self.source)
+        if diagnose and self.observe is not None:
+            raise ValueError("the causes of a gap are named from states: a policy that is shown frames has none")
+        explain = explained(self.source, report) if diagnose else None
+        adapted = adapt(*args, self.observe, self.label, report, explorer, explain)
+        policy.grounded_in = describe(adapted.source)
         return adapted
 
     def check_policy(self, policy: Policy) -> None:

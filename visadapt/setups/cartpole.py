@@ -21,7 +21,7 @@ from visadapt.recordings import Episode
 from visadapt.setups.base import Setup
 from visadapt.setups.policy_file import residual_for
 from visadapt.systems import CartPole
-from visadapt.tasks.balance import CENTRED_CARTPOLE, PAPER_CARTPOLE, Balance
+from visadapt.tasks.balance import CENTRED_CARTPOLE, PAPER_CARTPOLE, Balance, Cost, RegulatorCost, cost_to_go
 from visadapt.weights import shipped
 from visadapt.world import World
 
@@ -52,28 +52,39 @@ FROM_STATES = SetupSettings(
 
 CONTRAST = 0.2  # Grey levels, of 1, that frames are divided by before the networks see them
 
-REACH = 1.45  # m to either side that a camera has to see for `FROM_FRAMES`, of the drawn cart-pole, which sees 1.5 m
+REACH = 1.45  # m to either side that a camera has to see for `from_frames`, of the drawn cart-pole, which sees 1.5 m
 
-FROM_FRAMES = SetupSettings(
-    source=TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500),
-    tuning=TuneSettings(
+REST_WEIGHTS = (1.0, 6.0, 1.0, 0.1)
+"""of the squared distances from rest in tuning: above all the cart, which is scored by its speed, is not to move"""
+
+
+def from_frames(source: World) -> SetupSettings:
+    """How the cart-pole that is shown frames learns, tuned for a source."""
+    to_go = cost_to_go(source, REST_WEIGHTS, Cost.action)
+    refinement = TuneSettings(
         Balance(
-            CENTRED_CARTPOLE,
+            RegulatorCost(REST_WEIGHTS, to_go=to_go),
             start_spread=(0.3, 0.1, 0.1, 0.1),
             # A kick would look like a force to the residual, which would go on pushing.
             kick=(0.0, 0.0, 0.0, 0.0),
             divergence=(1.2, 2.0, 0.25, 3.0),
-            first_divergence=0.4,
         ),
-        iterations=50,
-        batch=32,
-        learning_rate=2e-4,
-        longest=25,
-        recorded=0.8,
-    ),
-    observations="camera",
-    perception=PerceptionSettings(),
-)
+        iterations=2000,
+        batch=512,
+        learning_rate=1.5e-3,
+        longest=60,
+        streams=64,
+        every=5,
+        curriculum=False,
+    )
+    return SetupSettings(
+        source=TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500),
+        refinement=refinement,
+        tuning=replace(refinement, iterations=300, streams=32, recorded=0.8),
+        trust=0.5,
+        observations="camera",
+        perception=PerceptionSettings(),
+    )
 
 
 def cartpole_states(
@@ -104,7 +115,7 @@ def cartpole_frames(
         source: the physics known beforehand, whose states begin with x, x_dot, theta, theta_dot; without it, the
             paper's CartPole, 0.05 s between commands.
         renderer: states to frames, trained, or the file of one; without it, that of the drawn cart-pole.
-        settings: how the policy learns; without it, `FROM_FRAMES`, narrowed to what the renderer's camera sees.
+        settings: how the policy learns; without it, `from_frames`, narrowed to what the renderer's camera sees.
 
     Raises:
         RendererError: the file holds no layered renderer.
@@ -113,7 +124,7 @@ def cartpole_frames(
     seen = renderer if isinstance(renderer, LayeredRenderer) else _load(Path(renderer or shipped("renderer")))
     seen.requires_grad_(False).eval()
     tracker = Tracker(seen, source)
-    settings = settings or _narrowed(FROM_FRAMES, seen)
+    settings = settings or _narrowed(from_frames(source), seen)
     perception = settings.perception or PerceptionSettings()
 
     def observe(state: Tensor) -> Tensor:
@@ -166,7 +177,13 @@ def _narrowed(settings: SetupSettings, renderer: LayeredRenderer) -> SetupSettin
 
     own = settings.perception or PerceptionSettings()
     perception = replace(own, cart=replace(own.cart, reach=share * own.cart.reach))
-    return replace(settings, source=narrowed(settings.source), tuning=narrowed(settings.tuning), perception=perception)
+    return replace(
+        settings,
+        source=narrowed(settings.source),
+        refinement=narrowed(settings.refinement) if settings.refinement else None,
+        tuning=narrowed(settings.tuning),
+        perception=perception,
+    )
 
 
 def _load(path: Path) -> LayeredRenderer:

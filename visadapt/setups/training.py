@@ -97,8 +97,7 @@ def train(
     """
     setup = setup_for(world, None, renderer, references, with_history)
     if iterations is not None:
-        settings = replace(setup.settings, source=replace(setup.settings.source, iterations=iterations))
-        setup = replace(setup, settings=settings)
+        setup = replace(setup, settings=setup.settings.shortened(iterations))
     with tempfile.TemporaryDirectory() as temporary:
         return setup.pretrain(Path(path or Path(temporary, "policy.safetensors")), seed, report)
 
@@ -128,6 +127,7 @@ def adapt(
     renderer: Renderer | None = ...,
     references: Reference | None = ...,
     with_history: bool = ...,
+    diagnose: bool = ...,
     report: Report | None = ...,
 ) -> Adapted: ...
 def adapt(
@@ -142,6 +142,7 @@ def adapt(
     renderer: Renderer | None = None,
     references: Reference | None = None,
     with_history: bool = False,
+    diagnose: bool = False,
     report: Report | None = None,
 ) -> Policy | Adapted:
     """Tune a copy of `policy` in the world `source`; or, with a target, adapt it by the paper's Algorithm 1.
@@ -156,9 +157,12 @@ def adapt(
         round_samples: steps in a round; a fifth of `samples` without it, and at least 20.
         iterations: of tuning (in each round), instead of the setup's own; the residual is fitted in as many at most.
         renderer, references, with_history: as for `setup_for`.
+        diagnose: name the causes of the gap in each round and put them into `source`, which must have no effects; a
+            residual then learns the gap only where they do not explain it.
 
     Returns:
-        The tuned policy; with a target, the run: its `policy`, `ledger`, `rounds` and `episodes`.
+        The tuned policy; with a target, the run: its `policy`, `ledger`, `rounds` and `episodes`, and the `source` with
+        the effects that were found.
 
     Raises:
         ValueError: a policy of another system, a target of another period or with other actions, or too few samples.
@@ -187,7 +191,7 @@ def adapt(
     in_round = round_samples or min(samples, max(20, samples // 5))
     with tempfile.TemporaryDirectory() as temporary:
         place = Path(folder or temporary)
-        adapted = setup.adapt(policy, target, place, samples, in_round, seed, report)
+        adapted = setup.adapt(policy, target, place, samples, in_round, seed, report, diagnose=diagnose)
         if folder is not None:
             save_policy(place / "policy.safetensors", policy)
     return adapted

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import stat
+import tempfile
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -14,7 +16,11 @@ FULL_DISK_BYTES = 2**18
 """With fewer bytes free than this, a write that failed without naming its cause is taken to have filled the disk."""
 
 
-class DiskFullError(OSError):
+class NotWrittenError(OSError):
+    """A file cannot be written; the message is one line that names it and says why."""
+
+
+class DiskFullError(NotWrittenError):
     """The disk has no room for a file; the message is one line that names it."""
 
 
@@ -27,28 +33,69 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     The temporary file is hidden and keeps the suffix, since many writers choose a format by it. Missing folders are
     made. If the block raises or is interrupted, the temporary file is removed and a file at `path` stays as it was.
+    Links are followed, and a file that is replaced keeps its mode. What is no regular file, such as a pipe or a device,
+    is never replaced: the content is written to it.
 
     Raises:
         DiskFullError: the disk, or the user's quota on it, is full.
+        NotWrittenError: the file cannot be written for another reason of the system's.
         Exception: whatever else the block raised.
     """
-    final = Path(path)
-    temporary = final.with_name(f".{final.stem[:100]}.{uuid.uuid4().hex[:12]}{final.suffix}")
+    final = Path(os.path.realpath(path))
+    through = _is_device(path)
+    folder = Path(tempfile.gettempdir()) if through else final.parent
+    temporary = folder / f".{final.stem[:100]}.{uuid.uuid4().hex[:12]}{final.suffix}"
     try:
-        final.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         yield temporary
+        if through:
+            with Path(path).open("ab") as device:  # appended: standard output may be a file that holds more
+                device.write(temporary.read_bytes())
+            temporary.unlink()
+            return
         # Onto the disk first, so that a full disk or a power cut cannot cost the old file.
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
+        if final.exists():
+            temporary.chmod(stat.S_IMODE(final.stat().st_mode))
         temporary.replace(final)
     except BaseException as error:
         # Before the temporary file, which may be what fills the disk, is removed.
-        full = isinstance(error, Exception) and _is_full(error, final.parent)
+        full = isinstance(error, Exception) and _is_full(error, folder)
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
         if full:
-            raise DiskFullError(f"{final} was not written: disk full; free some space and run again") from error
+            raise DiskFullError(f"{path} was not written: disk full; free some space and run again") from error
+        own = map(str, (path, temporary, final, *final.parents))
+        if isinstance(error, OSError) and error.strerror and error.filename in own:
+            raise NotWrittenError(f"{path} was not written: {error.strerror}") from error
         raise
+
+
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Raises NotWrittenError where `replacing` could not write: before long work whose result is to stand there."""
+    final = Path(os.path.realpath(path))
+    try:
+        if final.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "it is a folder; the name of a file is right")
+        if _is_device(path):
+            return  # to open one may already change it
+        with suppress(FileNotFoundError):
+            final.lstat()  # raises where the name is too long, or a file stands where a folder is needed
+        folder = next(parent for parent in final.parents if parent.exists())
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise NotWrittenError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _is_device(path: str | os.PathLike[str]) -> bool:
+    """Whether it is no regular file, or one by which the system names an open one, as `/dev/stdout`."""
+    place = Path(path)
+    with suppress(OSError):
+        exists = place.exists() and not place.is_dir()
+        return exists and (not place.is_file() or Path("/dev") in place.absolute().parents)
+    return False
 
 
 def _is_full(error: BaseException, folder: Path) -> bool:
@@ -59,8 +106,8 @@ def _is_full(error: BaseException, folder: Path) -> bool:
         if getattr(link, "errno", None) in codes or any(os.strerror(code) in str(link) for code in codes):
             return True
         link = link.__cause__ or link.__context__
-    # torch.save reports "unexpected pos", ffmpeg a broken pipe.
-    if isinstance(error, OSError | RuntimeError):
+    # torch.save reports "unexpected pos", ffmpeg a broken pipe. An error with another number has another cause.
+    if isinstance(error, OSError | RuntimeError) and not getattr(error, "errno", None):
         with suppress(OSError):
             return shutil.disk_usage(folder).free < FULL_DISK_BYTES
     return False

@@ -13,7 +13,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from visadapt.estimation.linearise import linearise_step
 from visadapt.tasks.base import Task, curriculum
+from visadapt.world import World
+
+RICCATI_STEPS = 1000  # 50 s of 0.05 s: what is further ahead costs next to nothing
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,42 @@ class SettlingCost(Cost):
         weights = torch.tensor(self.state, device=now.device, dtype=now.dtype)
         settled = (weights * states[:, -1].square()).sum(1)
         return super().__call__(states, actions, now) + self.end * settled
+
+
+@dataclass(frozen=True)
+class RegulatorCost(Cost):
+    """The distances to the goal itself, and what coming to rest from the last planned state costs: s_{t+K}' V s_{t+K}.
+
+    With the V of `cost_to_go` the plan of K steps that costs least begins like one without end, as K had no end. A
+    plan of half a second that leaves off where it likes lets a force push the cart instead.
+    """
+
+    to_go: tuple[tuple[float, ...], ...] = ()
+    """V, (n_state, n_state)"""
+
+    def __call__(self, states: Tensor, actions: Tensor, now: Tensor) -> Tensor:
+        weights, to_go = (torch.tensor(each, device=now.device, dtype=now.dtype) for each in (self.state, self.to_go))
+        last = states[:, -1]
+        tracking = (weights * states.square()).sum((1, 2)) + ((last @ to_go) * last).sum(1)
+        return tracking + self.action * actions.square().sum((1, 2))
+
+
+def cost_to_go(source: World, state: tuple[float, ...], action: float) -> tuple[tuple[float, ...], ...]:
+    """V of `RegulatorCost` with these weights, for the source without effects, linearised at rest.
+
+    s' V s is the least sum of the costs of all states and commands that follow a state s, by the discrete algebraic
+    Riccati equation, iterated from V = 0.
+    """
+    bare = World(source.system, (), source.period, source.integrator, source.substeps)
+    rest = torch.zeros(1, len(state), dtype=torch.float64)
+    still = rest.new_zeros(1, bare.substeps, len(bare.system.actions))
+    step = linearise_step(bare, bare.values.to(rest), rest[:, 0], rest, still, by_command=True)
+    a, b, weights = step.by_state[0], step.by_command[0], torch.diag(rest.new_tensor(state))
+    price, to_go = action * torch.eye(b.shape[1]).to(b), torch.zeros_like(weights)
+    for _ in range(RICCATI_STEPS):
+        after = weights + to_go
+        to_go = a.T @ after @ (a - b @ torch.linalg.solve(price + b.T @ after @ b, b.T @ after @ a))
+    return tuple(tuple(row) for row in to_go.tolist())
 
 
 PAPER_CARTPOLE = Cost(state=(0.0, 3.0, 10.0, 1.0))

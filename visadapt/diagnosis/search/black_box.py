@@ -114,7 +114,7 @@ class _Regression:
         """
         windows, steps, _, loads = gains.shape
         problem = linear_problem([model], fits).data()
-        filtered = forward(problem, *variances(model, fits.log_process, fits.log_noise))
+        filtered = forward(problem, *variances(model, fits, problem))
         used = model.rows.used[..., None]
         drive = torch.diag_embed(gains.permute(0, 2, 3, 1)).permute(0, 4, 1, 2, 3).flatten(3)
         response = respond(filtered, drive, torch.zeros_like(used))

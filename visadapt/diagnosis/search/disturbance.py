@@ -38,7 +38,7 @@ def disturbance(model: CandidateModel, fits: FitState, log_process: Tensor) -> D
     driven = model.profile.driven_columns
     rows = model.rows
     problem = linear_problem([model], fits)
-    process, noise = variances(model, fits.log_process, fits.log_noise)
+    process, noise = variances(model, fits, problem)
     _, adjoint = backward(forward(problem, process, noise))
     added = -(adjoint[..., 0] @ process)[:, 1:, driven]
     by_load = loads_of(model, fits)[:, :, driven]

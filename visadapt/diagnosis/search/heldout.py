@@ -41,6 +41,9 @@ STATE_LIMIT = 1e3
 """Bound on predicted states, in their units, so that an unstable prediction gives a large but finite error."""
 
 
+LEAST_FLOOR = 0.5  # Least noise floor, in standard deviations of the measurement noise
+
+
 @dataclass(frozen=True)
 class RolloutErrors:
     """Errors of predictions 0 to H rows ahead from S rows of each of W held-out windows of T rows."""
@@ -56,8 +59,12 @@ class RolloutErrors:
         return self._rms(self.error) / deviation
 
     def floor(self, deviation: Tensor) -> Tensor:
-        """(H, m) root mean square errors of the estimated states at the rows where these predictions end."""
-        return self._rms(self.left) / deviation
+        """(H, m) root mean square errors of the estimated states at the rows where these predictions end.
+
+        At least LEAST_FLOOR: readings without noise have the least that a fit takes to be there, and follow the states
+        far closer.
+        """
+        return (self._rms(self.left) / deviation).clamp(min=LEAST_FLOOR)
 
     def _rms(self, error: Tensor) -> Tensor:
         count = self.valid[1:].sum((1, 2)).clamp(min=1)
@@ -175,7 +182,7 @@ def rollout_errors(model: CandidateModel, fits: FitState, black_box: BlackBox | 
     if black_box is not None:
         loads = black_box.loads(inputs(model, fits.state[0])[:, :-1, None]) * rows.inside[:, 1:, None, None]
         problem = replace(problem, drive=problem.drive + (loads_of(model, fits) * loads).sum(-1, keepdim=True))
-    smoothed, _ = backward(forward(problem, *variances(model, fits.log_process, fits.log_noise)))
+    smoothed, _ = backward(forward(problem, *variances(model, fits, problem)))
     estimated = fits.state[0] + smoothed[..., 0]
     predicted = _rollouts(model, fits.theta[0], estimated, horizon, stride, black_box)
 

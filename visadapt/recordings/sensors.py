@@ -1,0 +1,173 @@
+"""Checks of sensors: single outliers are set aside, dead, frozen and absurd ones are refused.
+
+What cannot have been measured must not be diagnosed: an effect would be found that imitates a broken sensor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from visadapt.recordings.clock import Note, RawEpisode
+from visadapt.recordings.episode import RecordingError
+from visadapt.systems import System, Variable
+
+OUTLIER_SCALES = 50.0
+"""Departure of a reading from the mean of its neighbours, over the usual one, above which it may be an outlier."""
+MOST_OUTLIERS = 0.05
+"""Share of outliers among the rows of an episode above which the sensor is refused."""
+ABSURD_RANGES, ABSURD_TURNS = 100.0, 1e5
+"""Multiples of the range that the system states, and turns of an angle, beyond which a reading is absurd."""
+STILL_RANGES = 1e-9
+"""Share of the range that the system states within which a column stands still."""
+MOVING_RANGES = 1e-3
+"""Rate of change, in ranges per s, by the source, above which a state must be seen to move."""
+FROZEN_ROWS = 20
+"""Equal readings in a row from which a position is compared with its measured rate."""
+
+
+def differences(values: NDArray[np.float64], angle: bool) -> NDArray[np.float64]:
+    """Changes (T - 1,) from row to row; jumps of an angle by a turn are removed."""
+    steps = np.diff(values)
+    if angle:
+        turn = 2 * math.pi
+        steps = np.where(np.abs(np.abs(steps) - turn) < 0.5 * math.pi, steps - np.sign(steps) * turn, steps)
+    return steps
+
+
+def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
+    """The episode without rows in which a single reading lies where nothing moves to and back from within a row.
+
+    Raises:
+        RecordingError: these are so many that the sensor is not to be believed.
+    """
+    if len(raw.time) < 4:
+        return raw
+    bad = np.zeros(len(raw.time), bool)
+    period = float(np.median(np.diff(raw.time)))
+    for name, values in raw.states.items():
+        variable = system.states[system.index(name)]
+        if variable.unit == "1":  # as a quaternion's, whose sign may change
+            continue
+        rate = system.rate_of(name)
+        reach = variable.largest
+        if rate is not None:
+            reach = min(reach, 2 * period * system.states[system.index(rate)].largest)
+        outliers = _outliers(differences(values, variable.unit == "rad"), values, reach)
+        if outliers.mean() > MOST_OUTLIERS:
+            row = int(outliers.argmax())
+            raise RecordingError(
+                f"{raw.cell(row, name)} is {values[row]:g}, between {values[row - 1]:g} and {values[row + 1]:g}, and "
+                f"{outliers.mean():.0%} of the column lie as far off: a sensor that follows the motion is right"
+            )
+        for row in np.flatnonzero(outliers & ~bad).tolist():
+            note(
+                "lies far off the rows before and after: an outlier; the row was set aside",
+                f"{raw.cell(row, name)}: {values[row]:g}",
+            )
+        bad |= outliers
+    if not bad.any():
+        return raw
+    kept = np.flatnonzero(~bad)
+    time, action, state = raw.time[kept], raw.action[kept], raw.state[kept]
+    return replace(raw, time=time, action=action, state=state, place=lambda row: raw.place(int(kept[row])))
+
+
+def _outliers(steps: NDArray[np.float64], values: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
+    """Which rows (T,) lie further than `reach` off the mean of their neighbours, which lie close together."""
+    off = np.full(len(values), np.nan)
+    off[1:-1] = (steps[:-1] - steps[1:]) / 2
+    apart = np.diff(np.unique(values))
+    scale = max(1.4826 * float(np.nanmedian(np.abs(off))), float(apart.min()) if len(apart) else 0.0)
+    # A lone outlier pulls the mean of its neighbours' neighbours half as far to the other side.
+    alone = np.ones(len(values), bool)
+    for neighbour in (np.r_[np.nan, off[:-1]], np.r_[off[1:], np.nan]):
+        alone &= ~(np.abs(neighbour + off / 2) > 0.2 * np.abs(off))
+    return alone & (np.abs(off) > max(reach, OUTLIER_SCALES * scale))
+
+
+def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) -> list[RawEpisode]:
+    """The episodes without rates that never change where they must.
+
+    Raises:
+        RecordingError: a reading is absurd, or a state that must change stands still.
+    """
+    for raw in episodes:
+        for name, values in raw.states.items():
+            variable, row = system.states[system.index(name)], int(np.abs(values).argmax())
+            limit = ABSURD_RANGES * variable.largest
+            if abs(values[row]) > (ABSURD_TURNS * 2 * math.pi if variable.unit == "rad" else limit):
+                raise RecordingError(
+                    f"{raw.cell(row, name)} is {values[row]:g} {variable.unit}; "
+                    f"within about [{variable.low:g}, {variable.high:g}] is right"
+                )
+        _check_not_frozen(raw, system)
+    measured = episodes[0].measured
+    still = [name for name in measured if all(_is_still(raw.states[name], system, name) for raw in episodes)]
+    if len(still) == len(measured):
+        raise RecordingError(
+            f"{episodes[0].source}: no state ever changes; a recording of something that moves is right"
+        )
+    rates = {system.rate_of(name) for name in measured}
+    dead = [name for name in still if any(_must_move(raw, system, name) for raw in episodes)]
+    for name in dead:
+        raw = episodes[0]
+        if name not in rates:
+            raise RecordingError(
+                f"{raw.cell(0, name)} is {raw.states[name][0]:g}, as in every row, although what is commanded and "
+                "measured moves it: is the sensor dead or frozen? a column that changes is right"
+            )
+        note(f"{name} never changes although its position does: a dead sensor; it was left out", raw.source)
+    kept = [column for column, name in enumerate(measured) if name not in dead]
+    return [replace(raw, measured=tuple(measured[k] for k in kept), state=raw.state[:, kept]) for raw in episodes]
+
+
+def _is_still(values: NDArray[np.float64], system: System, name: str) -> bool:
+    return float(np.ptp(values)) <= STILL_RANGES * system.states[system.index(name)].largest
+
+
+def _must_move(raw: RawEpisode, system: System, name: str) -> bool:
+    """Whether the source says that a state that is measured does not stand still."""
+    columns = {
+        name: np.unwrap(values) if _unit(system, name) == "rad" else values for name, values in raw.states.items()
+    }
+    for position in raw.measured:
+        if (rate := system.rate_of(position)) and len(raw.time) > 1:
+            columns.setdefault(rate, np.gradient(columns[position], raw.time))
+    state = np.column_stack([columns.get(one.name, np.zeros(len(raw.time))) for one in system.states])
+    load = torch.zeros(len(state), len(system.loads), dtype=torch.float64)
+    change = system.derivative(torch.from_numpy(state), torch.from_numpy(raw.action), load).numpy()
+    moved = system.rate_of(name) or name
+    largest = system.states[system.index(moved)].largest
+    return float(np.abs(change[:, system.index(moved)]).max()) > MOVING_RANGES * largest
+
+
+def _unit(system: System, name: str) -> str:
+    return system.states[system.index(name)].unit
+
+
+def _check_not_frozen(raw: RawEpisode, system: System) -> None:
+    """Raises RecordingError where a position stands still while its rate, which is measured, says that it moves."""
+    for name, values in raw.states.items():
+        variable: Variable = system.states[system.index(name)]
+        rate = raw.states.get(system.rate_of(name) or "")
+        # An angle that stands still in places is an effect of the catalogue.
+        if rate is None or variable.unit == "rad":
+            continue
+        edges = [0, *(np.flatnonzero(np.diff(values) != 0) + 1).tolist(), len(values)]
+        for start, end in pairwise(edges):
+            if end - start < FROZEN_ROWS:
+                continue
+            travelled = float(np.abs(rate[start : end - 1] @ np.diff(raw.time[start:end])))
+            if travelled > 0.1 * variable.largest:
+                raise RecordingError(
+                    f"{raw.cell(start, name)} is {values[start]:g}, as in the {end - start - 1} rows after it, in "
+                    f"which {system.rate_of(name)} says that it moves by {travelled:.3g} {variable.unit}: the sensor "
+                    "was frozen; leave these rows out"
+                )

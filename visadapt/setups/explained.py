@@ -1,0 +1,48 @@
+"""The gap explained by a diagnosis, round by round of an adaptation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from visadapt.diagnosis import diagnose
+from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED
+from visadapt.diagnosis.saved import load_effects
+from visadapt.learning.joint import Explain, Explanation
+from visadapt.progress import Report
+from visadapt.recordings import Episode, Recording
+from visadapt.recordings.loading import SHORTEST_EPISODE_S
+from visadapt.storage.run_folder import read_json, write_json
+from visadapt.world import World
+
+
+def explained(source: World, report: Report | None = None) -> Explain:
+    """Diagnoses episodes with all states; each diagnosis is kept as `visadapt diagnose --json` writes it.
+
+    Episodes too short for a diagnosis are left out. Of causes that the episodes cannot tell apart the likeliest is
+    taken. Where no cause is named the whole gap is left to a residual.
+
+    Raises:
+        ValueError: the source has effects, which a diagnosis would have to know.
+    """
+    if len(source.effects):
+        raise ValueError("a diagnosis starts from the bare system: give the source without effects")
+    names = tuple(state.name for state in source.system.states)
+
+    def explain(episodes: Sequence[Episode], path: Path) -> Explanation:
+        long = tuple(e for e in episodes if e.time[-1] - e.time[0] >= SHORTEST_EPISODE_S)
+        if not long:
+            return Explanation(UNEXPLAINED, [], complete=False)
+        if not path.exists():
+            sources = tuple(f"episode {number}" for number in range(len(long)))
+            recording = Recording(long, names, source.period, sources)
+            threads = torch.get_num_threads()
+            write_json(path, diagnose(recording, source, progress=report).to_json())
+            torch.set_num_threads(threads)  # a diagnosis takes one, tuning is faster with more
+        verdict = read_json(path)["verdict"]
+        effects = load_effects(path)[1] if verdict in (IDENTIFIED, AMBIGUOUS) else []
+        return Explanation(verdict, effects, verdict != UNEXPLAINED)
+
+    return explain
