@@ -8,6 +8,7 @@ from .effects.base import (
     Parameter as Parameter,
     SensingEffect as SensingEffect,
 )
+from .effects.camera import CameraEffect as CameraEffect
 from .effects.catalogue import catalogue as catalogue
 from .effects.residual import Residual as Residual
 from .evaluation.scoring import score as score

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import torch
 from torch import Tensor, nn
 
 from visadapt.batch import Batch
-from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, Parameter, Residual, SensingEffect
+from visadapt.effects import ActuationEffect, CameraEffect, DynamicsEffect, Effect, Parameter, Residual, SensingEffect
 from visadapt.effects.base import expect
+from visadapt.effects.camera import moved
 from visadapt.history import History
 from visadapt.systems import SYSTEMS, System
 from visadapt.systems.dry_friction import sliding, stopped
@@ -24,7 +26,7 @@ class WorldState(Batch):
     time: Tensor
     state: Tensor
     memory: tuple[Tensor, ...] = ()
-    """what each actuation effect remembers, then what each sensing effect does, (B, any, any) each"""
+    """what each actuation effect remembers, then each sensing effect, then each camera effect, (B, any, any) each"""
 
 
 class World(nn.Module):
@@ -131,8 +133,8 @@ class World(nn.Module):
         long each command was, where the clock is unsteady.
         """
         first = state if states is None else states[:, 0]
-        acting, sensing = self._split(self._at_rest(first))
-        rows = [(*acting, *sensing)]
+        acting, sensing, seeing = self._split(self._at_rest(first))
+        rows = [(*acting, *sensing, *seeing)]
         if not any(memory.numel() for memory in rows[0]):
             return tuple(memory[:, None].expand(-1, commands.shape[1] + 1, -1, -1) for memory in rows[0])
         generator = torch.Generator(first.device).manual_seed(0)  # which readings were lost is not known
@@ -140,8 +142,10 @@ class World(nn.Module):
         for t in range(commands.shape[1]):
             _, acting = self._act(commands[:, t, None], acting, system, None if held is None else held[:, t, None])
             if states is not None:
-                _, sensing = self._read(states[:, min(t, states.shape[1] - 1)], sensing, generator)
-            rows.append((*acting, *sensing))
+                row = states[:, min(t, states.shape[1] - 1)]
+                _, sensing = self._read(row, sensing, generator)
+                _, seeing = self._scene(row, seeing)
+            rows.append((*acting, *sensing, *seeing))
         return tuple(torch.stack(memory, 1) for memory in zip(*rows, strict=True))
 
     def actuate(self, commands: Tensor, held: Tensor | None = None) -> Tensor:
@@ -162,13 +166,13 @@ class World(nn.Module):
         A world with a residual needs the `history`, what the observer has seen up to now, or the `correction`
         (B, n_state) that is to stand for the residual's; no other reads them.
         """
-        acting, sensing = self._split(at.memory)
+        acting, *others = self._split(at.memory)
         system = self.altered(at.state)
         commands, acting = self._act(action[:, None], acting, system)
         state = self._integrate(system, at.time, at.state, commands)
         if self._residuals:
             state = state + (self.correction(action, history) if correction is None else correction)
-        return WorldState(at.time + self.period, state, (*acting, *sensing))
+        return WorldState(at.time + self.period, state, (*acting, *chain(*others)))
 
     def correction(self, action: Tensor, history: History | None) -> Tensor:
         """What the residuals add (B, n_state) to the state after a period with `action` (B, n_action)."""
@@ -192,9 +196,27 @@ class World(nn.Module):
         A row is read once: after `start`, then after each `step`. Without sensing effects the reading is the state.
         `generator` is needed by random effects alone.
         """
-        acting, sensing = self._split(at.memory)
+        acting, sensing, seeing = self._split(at.memory)
         measured, sensing = self._read(at.state, sensing, generator)
-        return measured, replace(at, memory=(*acting, *sensing))
+        return measured, replace(at, memory=(*acting, *sensing, *seeing))
+
+    def show(
+        self, at: WorldState, draw: Callable[[Tensor], Tensor], generator: torch.Generator | None = None
+    ) -> tuple[Tensor, WorldState]:
+        """What the camera shows (B, H, W) of the row `at`, and the world with that row shown.
+
+        `draw` makes frames of states (B, n_state). A row is shown once: after `start`, then after each `step`. Without
+        camera effects the frame is what is drawn.
+        """
+        acting, sensing, seeing = self._split(at.memory)
+        state, seeing = self._scene(at.state, seeing)
+        frame = draw(state)
+        frame = moved(frame, [motion for e in self._camera if (motion := e.motion(frame)) is not None])
+        remembered = []
+        for effect, own in zip(self._camera, seeing, strict=True):
+            frame, own = effect.apply_to(frame, own, generator)
+            remembered.append(own)
+        return frame, replace(at, memory=(*acting, *sensing, *remembered))
 
     def reading(self, state: Tensor) -> Tensor:
         """What sensors read (B, n_state) of states, each as if it were the first row of an episode."""
@@ -227,6 +249,7 @@ class World(nn.Module):
             (e for e in effects if isinstance(e, ActuationEffect)), key=lambda effect: effect.order
         )
         self._sensing = sorted((e for e in effects if isinstance(e, SensingEffect)), key=lambda effect: effect.order)
+        self._camera = sorted((e for e in effects if isinstance(e, CameraEffect)), key=lambda effect: effect.order)
         self._dynamics = [effect for effect in effects if isinstance(effect, DynamicsEffect)]
         self._residuals = [effect for effect in effects if isinstance(effect, Residual)]
         # Most effects do one of these three alone, and a step asks for them at every derivative.
@@ -238,11 +261,13 @@ class World(nn.Module):
         """What effects remember at the start of an episode in the state (B, n_state)."""
         commands = state.new_zeros(len(state), self.substeps, len(self.system.actions))
         acting = tuple(effect.memory(commands, self.period / self.substeps) for effect in self._actuation)
-        return acting + tuple(effect.memory(state, self.period) for effect in self._sensing)
+        sensing = tuple(effect.memory(state, self.period) for effect in self._sensing)
+        return acting + sensing + tuple(effect.memory(state, self.period) for effect in self._camera)
 
-    def _split(self, memory: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-        """What the actuation effects remember, and what the sensing effects do."""
-        return memory[: len(self._actuation)], memory[len(self._actuation) :]
+    def _split(self, memory: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """What the effects on commands, on readings and on frames remember."""
+        acting, sensing = len(self._actuation), len(self._actuation) + len(self._sensing)
+        return memory[:acting], memory[acting:sensing], memory[sensing:]
 
     def _act(
         self, commands: Tensor, memory: tuple[Tensor, ...], system: System, held: Tensor | None = None
@@ -284,6 +309,14 @@ class World(nn.Module):
         remembered = []
         for effect, own in zip(self._sensing, memory, strict=True):
             state, own = effect.apply_to(state, own, self.period, generator)
+            remembered.append(own)
+        return state, tuple(remembered)
+
+    def _scene(self, state: Tensor, memory: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """The states (B, n_state) that a frame shows in the row of these, and the new memory."""
+        remembered = []
+        for effect, own in zip(self._camera, memory, strict=True):
+            state, own = effect.scene(state, own, self.period)
             remembered.append(own)
         return state, tuple(remembered)
 

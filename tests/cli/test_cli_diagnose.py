@@ -55,7 +55,9 @@ def stub(monkeypatch):
     """A diagnosis that is there at once, and what it was asked."""
     asked: dict = {}
 
-    def diagnose(recording, world, catalogue=None, seed=0, jobs=1, progress=None, policy=None, announce=None):
+    def diagnose(
+        recording, world, catalogue=None, seed=0, jobs=1, progress=None, policy=None, announce=None, renderer=None
+    ):
         asked.update(recording=recording, world=world, seed=seed, jobs=jobs, policy=policy)
         announce("400 rows of 2 channels, 24 effects: about 9 s on 1 core")
         progress("fitting", 1, 1, 0.5)

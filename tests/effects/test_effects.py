@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 
 import visadapt.effects
 from tests.effects.registry import LIBRARY
-from visadapt.effects import EFFECTS, ConstantForce, Effect, Role, Stage
+from visadapt.effects import EFFECTS, CameraEffect, ConstantForce, Effect, Role, Stage
 from visadapt.systems import SYSTEMS, CartPole
 from visadapt.world import World
 
@@ -35,6 +35,7 @@ STRONG = {
     "gust": {"start": 0.02, "end": 0.1, "force": 5.0},
     "friction_patch": {"start": -1.0, "end": 1.0, "coefficient": 10.0},
     "frozen_zone": {"start": -0.3, "end": 0.4},
+    "occlusion": {"left": 1.0, "top": 2.0, "right": 7.5, "bottom": 6.0, "grey": 0.2},
     "ground_effect": {"radius": 0.5, "ground": 0.0},
 }
 """Parameters that show in a few steps, where 80 % of every range do not."""
@@ -83,15 +84,35 @@ def inputs(batch, system=CART_POLE, seed=0):
     return state, 1.8 * actions - 0.9
 
 
+def draw(state):
+    """Smooth frames (B, 8, 10) of states, so that differences meet no kinks of bilinear interpolation alone."""
+    column, row = torch.arange(10).to(state) - 4.5, torch.arange(8).to(state)[:, None] - 3.5
+    x, theta = state[:, 0, None, None], state[:, 2, None, None]
+    return 0.5 + 0.3 * torch.sin(0.3 * column - x) * torch.cos(0.4 * row + theta)
+
+
 def readings(world, state, actions):
-    """What is measured (STEPS + 1, B, n_state) of a run."""
+    """What is measured (STEPS + 1, B, n_state) of a run, or what is seen of it (STEPS + 1, B, pixels)."""
     generator = torch.Generator().manual_seed(1)
-    measured, at = world.measure(world.start(state), generator)
+    camera = any(effect.stage is Stage.CAMERA for effect in world.effects)
+
+    def read(at):
+        if not camera:
+            return world.measure(at, generator)
+        frame, at = world.show(at, draw, generator)
+        return frame.flatten(1), at
+
+    measured, at = read(world.start(state))
     seen = [measured]
     for action in actions:
-        measured, at = world.measure(world.step(at, action), generator)
+        measured, at = read(world.step(at, action))
         seen.append(measured)
     return torch.stack(seen)
+
+
+def source_of(name):
+    """Nothing; for an effect on frames a camera that changes none, so that frames are what is read."""
+    return [CameraEffect()] if EFFECTS[name].stage is Stage.CAMERA else []
 
 
 def assert_gradients_agree(function, point, limits):
@@ -173,7 +194,7 @@ class TestContract:
 
     def test_neutral_parameters_change_nothing(self, name, system):
         state, actions = inputs(4, system)
-        without = readings(world_of(system=system), state, actions)
+        without = readings(world_of(*source_of(name), system=system), state, actions)
 
         def test(values):
             values = values | {p.name: p.neutral for p in EFFECTS[name].table if p.neutral is not None}
@@ -186,7 +207,7 @@ class TestContract:
         values = STRONG.get(name, {p.name: p.low + 0.8 * (p.high - p.low) for p in EFFECTS[name].table})
         state, actions = inputs(4, system)
         with_it = readings(world_of(build(name, values), system=system), state, actions)
-        assert (with_it - readings(world_of(system=system), state, actions)).abs().max() > 1e-4
+        assert (with_it - readings(world_of(*source_of(name), system=system), state, actions)).abs().max() > 1e-4
 
     def test_it_pickles(self, name, system):
         state, actions = inputs(2, system)
@@ -222,6 +243,8 @@ class TestContract:
             if effect.stage is Stage.ACTUATION:
                 commands = actions.transpose(0, 1)
                 return effect.apply_to(commands, effect.memory(commands, h), h)[0] - commands
+            if effect.stage is Stage.CAMERA:
+                return effect.apply_to(draw(state), effect.memory(state, h), torch.Generator())[0] - draw(state)
             return effect.apply_to(state, effect.memory(state, h), h, torch.Generator())[0] - state
 
         if linear:
@@ -239,7 +262,8 @@ class TestSmoothContract:
         table = EFFECTS[name].table
         n, m = len(system.states), len(system.actions)
         # Every reading counts, each with its own weight.
-        weights = torch.linspace(-1, 1, n * (STEPS + 1), dtype=torch.float64).reshape(STEPS + 1, 1, n)
+        size = 80 if EFFECTS[name].stage is Stage.CAMERA else n
+        weights = torch.linspace(-1, 1, size * (STEPS + 1), dtype=torch.float64).reshape(STEPS + 1, 1, size)
 
         def total(point):
             state, actions, values = point.split((n, STEPS * m, len(table)), 1)
@@ -281,7 +305,8 @@ class TestSmoothContract:
 
 def test_an_effect_without_gradient_says_why():
     assert {name: EFFECTS[name].no_gradient for name in NAMED if EFFECTS[name].no_gradient} == {
-        "dropout": "whether a row is lost is a random yes or no"
+        "dropout": "whether a row is lost is a random yes or no",
+        "frame_drop": "whether a frame is lost is a random yes or no",
     }
 
 

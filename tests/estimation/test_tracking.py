@@ -7,7 +7,7 @@ import torch
 from renderers import Camera, DrawnCartPole
 from renderers.drawn import AXLE_GREY, CART_GREY, POLE_GREY, SKY_GREY, TRACK_GREY
 from visadapt.effects import EFFECTS, ConstantForce
-from visadapt.learning.poses import PoseFinder
+from visadapt.estimation.poses import PoseFinder
 from visadapt.learning.tracking import Tracker, TrackingError, TrackingWarning
 from visadapt.recordings import Episode
 from visadapt.systems import CartPole

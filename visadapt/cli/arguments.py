@@ -28,6 +28,8 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     columns_help = "our name=the file's, as in x=position,theta=phi"
     add("--columns", metavar="A=B,...", type=_columns, default={}, help=columns_help)
     add("--effects", metavar="FILE.py", help="a file that defines effects of your own")
+    renderer_help = "of a film without states: draws the scene from cart position and pole angle (`visadapt renderer`)"
+    add("--renderer", metavar="R.safetensors", help=renderer_help)
     add(
         "--policy",
         metavar="P.safetensors",

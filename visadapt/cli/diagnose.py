@@ -7,6 +7,9 @@ import json
 import time
 from pathlib import Path
 
+from torch import nn
+
+from renderers import load_renderer
 from visadapt import diagnosis
 from visadapt.cli.inputs import InputError, import_effects, progress, the_system
 from visadapt.diagnosis.report.html import write_report
@@ -17,7 +20,7 @@ from visadapt.recordings import load_recording
 from visadapt.setups.policy_file import load_policy
 from visadapt.storage.atomic_files import replacing
 from visadapt.storage.run_folder import versions
-from visadapt.systems import SYSTEMS, System
+from visadapt.systems import SYSTEMS, CartPole, System
 from visadapt.world import World
 
 
@@ -27,7 +30,8 @@ def run(options: argparse.Namespace) -> None:
     system = the_system(options)
     import_effects(options)
     policy = _state_policy(Path(options.policy), system) if options.policy else None
-    recording = load_recording(options.recording, system, options.columns)
+    renderer = _renderer(Path(options.renderer), system) if options.renderer else None
+    recording = load_recording(options.recording, system, options.columns, frames=renderer is not None)
     with progress() as report:
         result = diagnosis.diagnose(
             recording,
@@ -37,6 +41,7 @@ def run(options: argparse.Namespace) -> None:
             progress=report,
             policy=policy,
             announce=print,
+            renderer=renderer,
         )
     print(as_text(result))
     if options.json:
@@ -56,11 +61,18 @@ def _settings(options: argparse.Namespace, system: System, seconds: float) -> di
         "columns": ", ".join(f"{ours}={theirs}" for ours, theirs in options.columns.items()),
         "effects from": options.effects or "",
         "policy from": options.policy or "",
+        "renderer from": options.renderer or "",
         "seed": str(options.seed),
         "time": f"{seconds:.1f} s on {options.jobs} core{'s' if options.jobs > 1 else ''}",
         "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
     }
     return {name: value for name, value in settings.items() if value}
+
+
+def _renderer(path: Path, system: System) -> nn.Module:
+    if not isinstance(system, CartPole):
+        raise InputError(f"--renderer: renderers draw a cart-pole, not a {system.name}")
+    return load_renderer(path)
 
 
 def _state_policy(path: Path, system: System) -> StatePolicy:

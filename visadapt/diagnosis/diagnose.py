@@ -7,8 +7,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import torch
+from torch import nn
 
 from visadapt.diagnosis import policy_bound
+from visadapt.diagnosis.frames import UNSEEN, FramesError, watch, with_camera
 from visadapt.diagnosis.report import next_experiment
 from visadapt.diagnosis.report.figures_data import Errors, disturbances, figure_data
 from visadapt.diagnosis.result import (
@@ -34,7 +36,7 @@ from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import ScoredModel, Search
 from visadapt.diagnosis.search.unexplained import smooth_functions
-from visadapt.effects import EFFECTS, Effect
+from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, twins
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.effect_fit import remembers
@@ -72,11 +74,12 @@ def diagnose(
     progress: Report | None = None,
     policy: policy_bound.StatesToActions | None = None,
     announce: Callable[[str], object] | None = None,
+    renderer: nn.Module | None = None,
 ) -> Diagnosis:
     """Find where a recording departs from the source, which effects cause it, and how far they close the gap.
 
     Args:
-        recording: some or all states, and commands.
+        recording: some or all states, or frames, and commands.
         world: the source, without effects; the parameters of its system are taken as known.
         catalogue: the effects that may be causes; by default all that are registered for the system.
         seed: of the random shifts that give the p-values of regions; nothing else is random.
@@ -86,8 +89,10 @@ def diagnose(
             terms of the paper's Theorem 1 are computed (`Diagnosis.policy`).
         announce: called, before the search begins, with a line that says how much there is to do and about how long it
             will take.
+        renderer: of a recording of frames: x (B,) in m and theta (B,) in rad to frames (B, H, W) in [0, 1].
 
     Raises:
+        FramesError: there are frames and no renderer, or this one does not explain them.
         ValueError: the world has effects, its system cannot be diagnosed, or `policy` is not one on its states.
 
     >>> import pathlib, tempfile, torch, visadapt as va
@@ -108,6 +113,14 @@ def diagnose(
     profile = profile_of(system)
     torch.set_num_threads(1)  # operations are too small for threads; processes share the work
     effects = list(all_effects(system) if catalogue is None else catalogue)
+    films = not recording.measured
+    effects = [effect for effect in effects if (effect not in UNSEEN if films else effect.stage is not Stage.CAMERA)]
+    film = None
+    if films:
+        if renderer is None:
+            raise FramesError(f"{recording.sources[0]}: frames are diagnosed with the renderer that draws the scene")
+        film = watch(recording, system, renderer, progress)
+        recording = film.positions
     if policy is not None:
         policy_bound.check(policy, system)
     candidates = searched(effects, system)
@@ -122,8 +135,11 @@ def diagnose(
     comparison = compare(search)
     best = comparison.best
     groups = alternatives(comparison, effects, system)
-    repeats = repeated_reading_causes(prepared, search, comparison)
+    repeats = repeated_reading_causes(prepared, search, comparison, FrameDrop if film else Dropout)
     repeat_causes = [cause for cause, _ in repeats]
+    found_before = [(EFFECTS[cause.effect].stage, cost) for cause, cost in repeats]
+    if film is not None and film.camera.best.camera:
+        found_before.append((Stage.CAMERA, film.camera.lost))
 
     # Predictions of the source, the best set, each cause alone and the runners-up, on held-out episodes.
     alone = [search.single(effect) for effect in dict.fromkeys(one.canonical for group in groups for one in group)]
@@ -157,12 +173,12 @@ def diagnose(
     carrying = {cause.effect for cause in without_slight(found)}
     before, after = disturbances(search, comparison)
     regions = _regions(found, before if found else after, effects, profile.region_variables, seed)
-    return Diagnosis(
+    found_in_motion = Diagnosis(
         system=system.name,
         recording=RecordingSummary(len(recording.episodes), recording.samples, float(f"{recording.period:.9g}")),
         verdict=verdict,
         where=Where(
-            stage_shares(search, comparison, [cost for _, cost in repeats]),
+            stage_shares(search, comparison, found_before),
             errors.by_state(system, rows.channels, bool(found)),
             regions,
             () if prepared.whole is None else pushes(prepared.whole, world),
@@ -181,14 +197,18 @@ def diagnose(
         figures=figure_data(search, source, corrected, errors, before, after, regions),
         policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, best),
     )
+    return found_in_motion if film is None else with_camera(found_in_motion, film.camera, system)
 
 
 def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:
     """The first effect of each group of twins; without effects that repeat readings, which are found by another method,
-    and without sensors with memory, which candidate models cannot linearise by the present state."""
+    without sensors with memory, which candidate models cannot linearise by the present state, and without a camera's,
+    which are fitted to pixels."""
     out: list[type[Effect]] = []
     for effect in effects:
-        if not (twins(effect, out, system) or effect.repeats_readings or remembers(effect)):
+        if not (
+            twins(effect, out, system) or effect.repeats_readings or remembers(effect) or effect.stage is Stage.CAMERA
+        ):
             out.append(effect)
     return out
 

@@ -11,6 +11,7 @@ no other edit. The catalogue, the command line and the diagnosis find it in `EFF
 from visadapt.effects.actuation import *
 from visadapt.effects.aerial import *
 from visadapt.effects.base import *
+from visadapt.effects.camera import *
 from visadapt.effects.forces import *
 from visadapt.effects.friction import *
 from visadapt.effects.hinge import *

@@ -34,11 +34,15 @@ class ActuatorDelay(ActuationEffect):
     equation = "u(t) = command(t - delay)"
     source = "Franklin, Powell and Workman (1998), Digital Control of Dynamic Systems, section 4.3.3"
     table = (Parameter("delay", "s", 0.0, 0.2, 0.0),)
-    indistinguishable_from = ("measurement_delay",)
+    indistinguishable_from = ("measurement_delay", "camera_delay")
     settled_by: ClassVar[Mapping[str, str]] = {
         "measurement_delay": (
             "time command and sensor against one clock: film the machine beside a lamp that lights with the command; a "
             "late motion is the actuator's delay, a late reading of it the sensor's"
+        ),
+        "camera_delay": (
+            "let a lamp in the picture light with the command: if it lights late in the film, the camera is late; if "
+            "the cart alone moves late, the actuator is"
         ),
         "actuator_lag": (
             "record steps of the command, large and held for half a second, at the highest rate that the sensors have: "

@@ -26,6 +26,7 @@ class Stage(StrEnum):
     ACTUATION = "actuation"
     DYNAMICS = "dynamics"
     SENSING = "sensing"
+    CAMERA = "camera"
     ANY = "any"
 
 
@@ -229,7 +230,7 @@ class DynamicsEffect(Effect):
         return None
 
 
-Reading: TypeAlias = tuple[Tensor, Tensor]  # what a sensor reads of a row (B, n_state), and its new memory
+Reading: TypeAlias = tuple[Tensor, Tensor]  # what is read of a row, states (B, n_state) or a frame, and the new memory
 
 
 class SensingEffect(Effect):

@@ -5,13 +5,21 @@ from __future__ import annotations
 import inspect
 from collections.abc import Iterable
 
-from visadapt.effects.base import EFFECTS, ActuationEffect, DynamicsEffect, Effect, Parameter, SensingEffect
+from visadapt.effects.base import (
+    EFFECTS,
+    ActuationEffect,
+    DynamicsEffect,
+    Effect,
+    Parameter,
+    SensingEffect,
+)
+from visadapt.effects.camera import CameraEffect
 from visadapt.effects.own import is_own, own_effects
 from visadapt.systems import SYSTEMS, System
 
 
 def catalogue(system: System | None = None) -> list[type[Effect]]:
-    """The named effects that act on a system, or on any: those on commands, dynamics and readings.
+    """The named effects that act on a system, or on any: those on commands, dynamics, readings and frames.
 
     On a system of one's own the library's effects act joint by joint, command by command and sensor by sensor.
 
@@ -19,7 +27,7 @@ def catalogue(system: System | None = None) -> list[type[Effect]]:
     >>> "viscous_friction" in [effect.name for effect in va.catalogue(va.CartPole())]
     True
     """
-    stages = (ActuationEffect, DynamicsEffect, SensingEffect)
+    stages = (ActuationEffect, DynamicsEffect, SensingEffect, CameraEffect)
     named: list[type[Effect]] = [effect for effect in EFFECTS.values() if issubclass(effect, stages)]
     if system is None:
         return named
@@ -67,7 +75,7 @@ def catalogue_markdown() -> str:
 
 
 def _sorted(system: System | None) -> list[type[Effect]]:
-    stages = ("actuation", "dynamics", "sensing")
+    stages = ("actuation", "dynamics", "sensing", "camera")
     return sorted(catalogue(system), key=lambda effect: (stages.index(effect.stage), effect.order, effect.name))
 
 

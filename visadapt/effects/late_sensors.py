@@ -1,4 +1,4 @@
-"""Sensors whose readings arrive late: all of them together, or one against the clock of the others."""
+"""What arrives late: the readings of all sensors together, of one against the clock of the others, or frames."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from visadapt.effects.base import Parameter, Reading, SensingEffect
+from visadapt.effects.base import Effect, Parameter, Reading, SensingEffect
+from visadapt.effects.camera import CameraEffect
 from visadapt.systems import CartPole
 
 
-class LateSensors(SensingEffect):
-    """Sensors that read the state as it was `delay` s ago; the others read it as it is.
+class Late(Effect):
+    """Shows some of the states as they were `delay` s ago, and the others as they are.
 
     Between two rows, positions are interpolated by the cubic with the rows' positions and velocities (Hermite), and
     velocities are its slope; states without a velocity are interpolated linearly. Before the episode, its first state
@@ -39,7 +40,8 @@ class LateSensors(SensingEffect):
         row = torch.cat((state, torch.full_like(state[:, :1], -1)), 1)
         return row[:, None].expand(-1, int(shift.max().floor()) + 1, -1)
 
-    def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
+    def earlier(self, measured: Tensor, memory: Tensor, period: float) -> Reading:
+        """The states (B, n_state) of one row with the late ones among them, and the new memory."""
         number = memory[:, -1, -1] + 1
         rows = torch.cat((memory, torch.cat((measured, number[:, None]), 1)[:, None]), 1)
         shift = self._shift(measured, period)
@@ -67,6 +69,27 @@ class LateSensors(SensingEffect):
         return (self.value("delay", state) / period).expand(len(state))
 
 
+class LateSensors(Late, SensingEffect):
+    """Sensors that read the state as it was `delay` s ago; the others read it as it is."""
+
+    def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
+        return self.earlier(measured, memory, period)
+
+
+class CameraDelay(Late, CameraEffect):
+    """Frames that arrive late, by any delay: a row's frame shows the scene that much earlier."""
+
+    name = "camera_delay"
+    systems = (CartPole,)
+    equation = "frame(t) = picture of state(max(t - delay, 0))"
+    table = (Parameter("delay", "s", 0.0, 0.2, 0.0),)
+    indistinguishable_from = ("actuator_delay", "measurement_delay")
+    late: ClassVar[list[int]] = list(range(len(CartPole.states)))
+
+    def scene(self, state: Tensor, memory: Tensor, period: float) -> Reading:
+        return self.earlier(state, memory, period)
+
+
 class MeasurementDelay(LateSensors):
     """Measurements that arrive late, by any delay."""
 
@@ -74,7 +97,7 @@ class MeasurementDelay(LateSensors):
     systems = (CartPole,)
     equation = "measured(t) = state(max(t - delay, 0))"
     table = (Parameter("delay", "s", 0.0, 0.2, 0.0),)
-    indistinguishable_from = ("actuator_delay",)
+    indistinguishable_from = ("actuator_delay", "camera_delay")
     late: ClassVar[list[int]] = list(range(len(CartPole.states)))
 
 

@@ -156,9 +156,10 @@ def look(
 ) -> tuple[Tensor, WorldState]:
     """What is seen (B, ...) of the row `at`, and the world with that row read.
 
-    Through a camera, `observe`, the true state; without one (None) what the sensors measure.
+    Through a camera, `observe`, which is shown the true state and then altered as the world's camera effects say;
+    without one (None) what the sensors measure.
     """
-    return world.measure(at, generator) if observe is None else (observe(at.state), at)
+    return world.measure(at, generator) if observe is None else world.show(at, observe, generator)
 
 
 def _depends_on_time(world: World, time: Tensor, state: Tensor) -> bool:

@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from visadapt.estimation.kalman import Linear, backward
 from visadapt.estimation.linearise import linearise_step, load_effect
 from visadapt.estimation.noise import Noise, UnknownNoise, most_probable_noise
-from visadapt.learning.poses import PoseFinder, Poses
+from visadapt.estimation.poses import PoseFinder, Poses
 from visadapt.recordings import Episode
 from visadapt.world import World
 

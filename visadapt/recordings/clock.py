@@ -56,6 +56,8 @@ class RawEpisode:
     """the file's names of the variables"""
     number: float | None = None
     """of the episode, if the file has several"""
+    frame: NDArray[np.uint8] | None = None
+    """(T, H, W), where frames are read in the place of states"""
 
     @property
     def source(self) -> str:
@@ -80,7 +82,9 @@ class RawEpisode:
         """The rows from `start` up to, but not including, `end`."""
         rows = slice(start, end)
         time, action, state = self.time[rows], self.action[rows], self.state[rows]
-        return replace(self, time=time, action=action, state=state, place=lambda row: self.place(start + row))
+        frame = None if self.frame is None else self.frame[rows]
+        place = lambda row: self.place(start + row)  # noqa: E731
+        return replace(self, time=time, action=action, state=state, frame=frame, place=place)
 
 
 def check_forward(raw: RawEpisode) -> None:

@@ -50,7 +50,8 @@ class Episode:
                 continue
             if values.ndim != axes:
                 shape = f"the shape {values.shape}"
-                raise RecordingError(f"{name} has {shape}; {axes} axes, of which time is the first, are right")
+                grey = " (grey levels, no colours)" if name == "frame" else ""
+                raise RecordingError(f"{name} has {shape}; {axes} axes, of which time is the first, are right{grey}")
             if rows < 1:
                 raise RecordingError("an episode needs at least one row")
             if len(values) != rows:
@@ -84,13 +85,17 @@ class Recording:
     episodes: tuple[Episode, ...]
     """`state` has the columns `measured`, `action` all actions of the system, in its order"""
     measured: tuple[str, ...]
-    """names of the measured states, in the system's order"""
+    """names of the measured states, in the system's order; none in a recording of frames"""
     period: float
     """s between rows, the median"""
     sources: tuple[str, ...]
     """where each episode comes from, for messages: "run3.csv, episode 2" """
     warnings: tuple[str, ...] = ()
     """what was changed or left out, a line each"""
+    usable: tuple[NDArray[np.bool_], ...] = ()
+    """(T,) of each episode, which rows are measurements; without it, all are"""
+    resolution: tuple[float, ...] = ()
+    """smallest differences of the measured states that mean anything; without it, those between their numbers"""
 
     @property
     def samples(self) -> int:

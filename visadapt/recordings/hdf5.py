@@ -139,7 +139,7 @@ def _read_episode(path: Path, file: h5py.File, number: int, frames: bool) -> Epi
         if name not in group:
             raise RecordingError(f"{where} has no dataset {name!r}")
     if "state" not in group and not frames:
-        raise RecordingError(f"{where} holds frames alone; states are needed")
+        raise RecordingError(f"{where} holds frames alone; states are needed (or a renderer, by --renderer)")
     arrays: dict[str, NDArray[Any]] = {}
     for name in ("time", "action", "state", "task_state", *(["frame"] if frames else [])):
         try:

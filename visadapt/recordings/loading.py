@@ -29,8 +29,9 @@ def load_recording(
     paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     system: System,
     columns: Mapping[str, str] | None = None,
+    frames: bool = False,
 ) -> Recording:
-    """Read states and actions from CSV and HDF5 files.
+    """Read states and actions from CSV and HDF5 files, or frames and actions from HDF5 files.
 
     Names are matched by `csv.py`. Clocks are checked by `clock.py`; rows of an unsteady one keep their stamps. Angles
     are unwrapped within an episode so that upright is 0 (if the pole turns over, in the turn in which it is upright
@@ -41,6 +42,7 @@ def load_recording(
         paths: one or several: files, or folders whose CSV and HDF5 files are taken in the order of their names.
         system: the source, which defines names and units.
         columns: our names of columns to the file's, where these are not evident.
+        frames: whether to read frames in the place of states, which are then not used.
 
     Raises:
         RecordingError: the recording cannot be used; one line that says which file, row and column, and what would be
@@ -61,7 +63,7 @@ def load_recording(
 
     whole: list[RawEpisode] = []
     for path in _files([paths] if isinstance(paths, str | os.PathLike) else paths, note):
-        episodes = _read(path, system, columns or {})
+        episodes = _read(path, system, columns or {}, frames)
         for raw in episodes:
             check_finite(raw, system.actions)
             check_forward(raw)
@@ -69,14 +71,15 @@ def load_recording(
         whole += [without_outliers(raw, system, note) for raw in episodes]
     whole = _commands(_shared(whole, system, note), system, note)
     check_commands(whole, system.actions, note)
-    with np.errstate(over="ignore", invalid="ignore"):  # of absurd readings, which are refused here or below
-        for raw in whole:
-            check_units(raw, system)
-    whole = check_sensors(whole, system, note)
+    if not frames:
+        with np.errstate(over="ignore", invalid="ignore"):  # of absurd readings, which are refused here or below
+            for raw in whole:
+                check_units(raw, system)
+        whole = check_sensors(whole, system, note)
     parts = [part for raw in whole for part in uninterrupted(_unwrapped(raw, system), note)]
     parts, period = alike(_long_enough(parts, note), note)
     return Recording(
-        episodes=tuple(Episode(part.time, part.action, part.state) for part in parts),
+        episodes=tuple(Episode(part.time, part.action, None if frames else part.state, part.frame) for part in parts),
         measured=whole[0].measured,
         period=period,
         sources=tuple(part.source for part in parts),
@@ -118,36 +121,48 @@ def _is_the_same(one: Path, other: Path) -> bool:
     return False
 
 
-def _read(path: Path, system: System, given: Mapping[str, str]) -> list[RawEpisode]:
+def _read(path: Path, system: System, given: Mapping[str, str], frames: bool) -> list[RawEpisode]:
     try:
         with path.open("rb") as file:
             is_hdf5 = file.read(4) == b"\x89HDF"
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    return _read_hdf5(path, system) if is_hdf5 else read_rows(path, system, given)
+    if frames and not is_hdf5:
+        raise RecordingError(
+            f"{path}: no HDF5 file; times, commands and frames as visadapt.write_recording writes them are right"
+        )
+    return _read_hdf5(path, system, frames) if is_hdf5 else read_rows(path, system, given)
 
 
-def _read_hdf5(path: Path, system: System) -> list[RawEpisode]:
+def _read_hdf5(path: Path, system: System, frames: bool) -> list[RawEpisode]:
     ours, actions = ([variable.name for variable in variables] for variables in (system.states, system.actions))
     state_names, action_names = read_names(path, system)
+    if frames:
+        state_names = []
     measured = tuple(name for name in ours if name in state_names)
     rows = []
-    for number, episode in enumerate(read_recording(path, frames=False)):
+    for number, episode in enumerate(read_recording(path, frames)):
         source = f"{path}, episode {number}"
-        assert episode.state is not None  # without states, read_recording raises
-        if episode.state.shape[1] != len(state_names) or episode.action.shape[1] != len(action_names):
+        if frames and episode.frame is None:
+            raise RecordingError(f"{source} has no frames; leave out --renderer to diagnose its states")
+        states = np.zeros((len(episode.time), 0)) if frames else episode.state
+        assert states is not None  # without states, read_recording raises
+        if states.shape[1] != len(state_names) or episode.action.shape[1] != len(action_names):
             raise RecordingError(
-                f"{source}: {episode.state.shape[1]} columns of state and {episode.action.shape[1]} of action; "
-                f"{', '.join(state_names)} and {', '.join(action_names)} are right"
+                f"{source}: {states.shape[1]} columns of state and {episode.action.shape[1]} of action; "
+                f"{', '.join([*state_names, *action_names])} are right"
             )
         there = [*state_names, *action_names]
         for name in needed(system)[1:]:
-            if name not in there:
+            if name not in there and not (frames and name in ours):
                 raise RecordingError(f"{source}: {name!r} is missing; it has {', '.join(there)}")
-        state = episode.state[:, [state_names.index(name) for name in measured]].astype(float)
+        state = states[:, [state_names.index(name) for name in measured]].astype(float)
         action = episode.action[:, [action_names.index(name) for name in actions]].astype(float)
         time = episode.time.astype(float)
-        rows.append(RawEpisode(path, time, action, state, measured, lambda row: f"row {row + 1}", number=number))
+        seen = episode.frame if frames else None
+        rows.append(
+            RawEpisode(path, time, action, state, measured, lambda row: f"row {row + 1}", number=number, frame=seen)
+        )
     return rows
 
 

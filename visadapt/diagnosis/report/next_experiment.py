@@ -14,6 +14,7 @@ MOTIONS: dict[Stage, str] = {
     Stage.ACTUATION: "steps and chirps of the command over its whole range",
     Stage.DYNAMICS: "free motions with the motor off, slow and fast, over the whole range of positions",
     Stage.SENSING: "known positions and angles, set by hand and held still",
+    Stage.CAMERA: "a card with marks at known places, held still before the camera",
 }
 """What to record to separate effects of a stage from others, for a system on a track."""
 

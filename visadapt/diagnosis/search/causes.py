@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from visadapt.diagnosis.result import Cause, Estimate, Ranked
 from visadapt.diagnosis.search.model_comparison import ComparedModel, ModelComparison
 from visadapt.diagnosis.search.search import ScoredModel, Search
-from visadapt.effects import Effect, Parameter, Role
+from visadapt.effects import Effect, Parameter, Role, Stage
 from visadapt.effects.catalogue import twins
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.covariance import deviations
@@ -139,10 +139,12 @@ def ranking(
     return tuple(sorted(out, key=lambda ranked: -ranked.probability))
 
 
-def stage_shares(search: Search, comparison: ModelComparison, repeat_costs: Sequence[float]) -> dict[str, float]:
+def stage_shares(
+    search: Search, comparison: ModelComparison, others: Sequence[tuple[Stage, float]]
+) -> dict[str, float]:
     """Share of the explained gap by stage: the log likelihood lost without each cause.
 
-    `repeat_costs` are the losses if repeated readings were taken for measurements; they count as sensing.
+    `others` are the losses without causes that were found before the search, with their stages.
     """
     shares = {"actuation": 0.0, "dynamics": 0.0, "sensing": 0.0, "camera": 0.0}
     best = comparison.best
@@ -150,6 +152,7 @@ def stage_shares(search: Search, comparison: ModelComparison, repeat_costs: Sequ
         without = search.fitted.get(frozenset(best.names) - {effect.name}, search.source)
         lost = max(0.0, float(best.fits.likelihood[0] - without.fits.likelihood[0]))
         shares[effect.stage.value] = shares.get(effect.stage.value, 0.0) + lost
-    shares["sensing"] += sum(repeat_costs)
+    for stage, cost in others:
+        shares[stage.value] += cost
     whole = sum(shares.values())
     return {stage: share / whole if whole > 0 else 0.0 for stage, share in shares.items()}

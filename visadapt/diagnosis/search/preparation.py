@@ -66,6 +66,12 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
     commands = [torch.tensor(np.asarray(e.action, dtype=np.float64)) for e in recording.episodes]
     stamps = [torch.tensor(np.asarray(e.time, dtype=np.float64)) for e in recording.episodes]
     repeats = find_repeats(states, channels, profile.angle_sensor)
+    usable = [torch.ones_like(values) for values in states]
+    if recording.usable:
+        usable = [every * torch.tensor(rows)[:, None] for every, rows in zip(usable, recording.usable, strict=True)]
+        used = [a * b for a, b in zip(repeats.used, usable, strict=True)]
+        lost = [rows & torch.tensor(kept) for rows, kept in zip(repeats.lost, recording.usable, strict=True)]
+        repeats = replace(repeats, used=used, lost=lost)
 
     # A window holds predictions from half of its rows, however fast these follow each other.
     longest = max(profile.window_rows, round(2 * PREDICTION_TIME / recording.period))
@@ -74,11 +80,12 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
         measured: Sequence[Tensor], clock: Sequence[Tensor], stretches: Sequence[tuple[int, int, int]] | None = None
     ) -> tuple[Segments, Segments]:
         """`rows` and `raw` of episodes or stretches of these."""
-        all_used = [torch.ones_like(m) for m in measured]
         rows, raw = (
             cut(measured, valid, commands, clock, channels, recording.period, longest, stretches)
-            for valid in (repeats.used, all_used)
+            for valid in (repeats.used, usable)
         )
+        if recording.resolution:
+            rows, raw = replace(rows, step=recording.resolution), replace(raw, step=recording.resolution)
         return rows, raw
 
     def searched(rows: Segments) -> Tensor:

@@ -16,7 +16,7 @@ from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.preparation import PreparedRecording
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import BAND
-from visadapt.effects import Dropout, FrozenZone
+from visadapt.effects import Dropout, Effect, FrozenZone
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.repeated_readings import SMOOTHING_RATIO, zone
 from visadapt.estimation.segments import Segments
@@ -26,19 +26,20 @@ MIN_REPEATS = 2  # Repeated readings required for a cause
 
 
 def repeated_reading_causes(
-    recording: PreparedRecording, search: Search, comparison: ModelComparison
+    recording: PreparedRecording, search: Search, comparison: ModelComparison, lost_rows: type[Effect] = Dropout
 ) -> list[tuple[Cause, float]]:
     """The causes of repeated readings; their probability is 1, since noise never repeats a reading.
 
-    Each with the log likelihood that would be lost if the readings that it repeats were taken for measurements.
+    `lost_rows` is the effect that repeats whole rows. Each with the log likelihood that would be lost if the readings
+    that it repeats were taken for measurements.
     """
     out = []
     repeats = recording.repeats
     lost, rows = sum(int(x.sum()) for x in repeats.lost), sum(len(x) - 1 for x in repeats.lost)
     if lost >= MIN_REPEATS:
-        parameters = {"rate": Estimate(lost / rows, Dropout.table[0].unit, wilson(lost, rows, Z_90))}
+        parameters = {"rate": Estimate(lost / rows, lost_rows.table[0].unit, wilson(lost, rows, Z_90))}
         cost = _cost(recording, search, comparison, repeats.lost)
-        out.append((Cause(Dropout.name, parameters, 1.0, math.nan), cost))
+        out.append((Cause(lost_rows.name, parameters, 1.0, math.nan), cost))
     frozen = sum(int(x.sum()) for x in repeats.frozen)
     in_windows = int(_in_windows(recording.rows, repeats.frozen).sum())
     if frozen >= MIN_REPEATS and (recording.defect is not None or in_windows >= MIN_REPEATS):

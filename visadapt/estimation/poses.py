@@ -8,6 +8,8 @@ Levenberg and Marquardt's damped Gauss-Newton steps (Marquardt 1963, J. SIAM 11(
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -64,6 +66,8 @@ class PoseFinder:
         squares = torch.stack([(part - mean).square().sum() for part in rendered]).sum()
         self.limit = UNEXPLAINED * float((squares / len(self._grid) / mean.numel()).sqrt())
         """misfit beyond which a frame is unexplained, in grey levels of [0, 1]"""
+        self.grey = float(mean.mean())
+        """mean grey level, of [0, 1], of the frames over the grid"""
         self._small = torch.cat([_shrink(part) for part in rendered])
 
     @torch.no_grad()
@@ -76,15 +80,27 @@ class PoseFinder:
         return Poses(place, covariance, misfit, sound & (misfit <= self.limit))
 
     @torch.no_grad()
+    def nearest(self, frames: Tensor, change: Callable[[Tensor], Tensor] | None = None) -> tuple[Tensor, Tensor]:
+        """The poses (T, 2) of the grid nearest to frames (T, H, W) in [0, 1], and their mean squared distances (T,).
+
+        `change` is made to the rendered frames of the grid, at half the resolution.
+        """
+        drawn = self._small
+        if change is not None:
+            height, width = (math.ceil(side / 2) for side in self.size)
+            drawn = change(drawn.unflatten(1, (height, width))).flatten(1)
+        small = _shrink(frames)
+        # |f - t|^2 less |f|^2, which is the same for every t.
+        least, index = (drawn.square().sum(1) - 2 * small @ drawn.T).min(1)
+        return self._grid[index], (least + small.square().sum(1)) / small.shape[1]
+
+    @torch.no_grad()
     def _render(self, place: Tensor) -> Tensor:
         out: Tensor = self.renderer(place[:, 0], place[:, 1])
         return out
 
     def _find(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        small = _shrink(frames)
-        # |f - t|^2 less |f|^2, which is the same for every t.
-        nearest = (self._small.square().sum(1) - 2 * small @ self._small.T).argmin(1)
-        place = self._grid[nearest]
+        place, _ = self.nearest(frames)
         error = frames - self._render(place)
         loss = error.square().mean((1, 2))
         damping = torch.full_like(loss, 1e-2)

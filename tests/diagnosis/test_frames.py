@@ -1,0 +1,183 @@
+"""A film and its commands are diagnosed as recordings of states are; what cannot be is refused by one clear line."""
+
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+import torch
+
+import visadapt as va
+from renderers import DrawnCartPole, load_renderer
+from tests.diagnosis.test_report import SCHEMA
+from visadapt.cli import main as cli
+from visadapt.diagnosis.search.camera import find_camera
+from visadapt.effects import Blur, Brightness, CameraRotation, CameraShift, Occlusion, ViscousFriction
+from visadapt.estimation.camera_fit import through
+from visadapt.estimation.poses import PoseFinder
+
+RENDERER = va.shipped("renderer")
+
+
+def film(path, effects=(), camera=lambda frames: frames, episodes=5, rows=60, seed=2):
+    """A film of the drawn cart-pole, kept upright with some noise in the command; two grey levels of noise."""
+    target = va.SyntheticTarget(lambda batch, generator: effects, camera=DrawnCartPole())
+    policy = va.load_policy(va.shipped("cartpole_frames"))
+    runs = va.run(target, policy, episodes, rows, torch.Generator().manual_seed(seed), exploration=0.4)
+    noise = np.random.default_rng(seed)
+    shown = []
+    for one in runs:
+        frame = 255 * camera(torch.from_numpy(one.episode.frame) / 255).numpy()
+        frame = (frame + 2 * noise.standard_normal(frame.shape)).round().clip(0, 255).astype(np.uint8)
+        shown.append(va.Episode(time=one.episode.time, action=one.episode.action, frame=frame))
+    va.write_recording(path, shown)
+    return path
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory):
+    """A film in which nothing departs from the source."""
+    return film(tmp_path_factory.mktemp("film") / "run.h5", episodes=2, rows=30)
+
+
+def rewritten(path, **changed):
+    """The film with arrays of its first episode changed, each by a function."""
+    episodes = va.read_recording(path)
+    old = episodes[0]
+    arrays = {name: getattr(old, name) for name in ("time", "action", "frame")}
+    episodes[0] = va.Episode(**{name: changed.get(name, lambda a: a)(array) for name, array in arrays.items()})
+    out = path.with_name("changed.h5")
+    va.write_recording(out, episodes[:1])
+    return out
+
+
+def refused(capsys, *arguments, system="cartpole"):
+    """The line by which the command refuses its input."""
+    assert cli.main(["diagnose", *map(str, arguments), "--system", system]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[-1].startswith("visadapt: ")
+    return lines[-1]
+
+
+def diagnosed(path, **options):
+    system = va.CartPole()
+    recording = va.load_recording(path, system, frames=True)
+    world = va.World(system, period=recording.period)
+    return va.diagnose(recording, world, renderer=load_renderer(Path(RENDERER)), **options)
+
+
+class TestMotion:
+    def test_friction_is_found_in_a_film(self, tmp_path):
+        found = diagnosed(film(tmp_path / "run.h5", [ViscousFriction(coefficient=3.0)]))
+        assert found.verdict == "identified"
+        assert [cause.effect for cause in found.causes] == ["viscous_friction"]
+        assert found.causes[0].parameters["coefficient"].value == pytest.approx(3.0, rel=0.02)
+
+    def test_frames_that_are_not_explained_are_left_out_with_a_warning(self, still):
+        def flash(frame):
+            frame[[7, 8, 20]] = 0
+            return frame
+
+        found = diagnosed(rewritten(still, frame=flash))
+        assert any("no pose was found in 3 of" in line and "row 8 of" in line for line in found.warnings)
+        assert found.verdict == "no_gap"
+        assert np.isnan(found.where.states["x_dot"])
+
+
+@pytest.fixture(scope="module")
+def poses():
+    """A renderer, the finder of poses in its frames, and drawn frames in [0, 1] of cart-poles anywhere."""
+    renderer = load_renderer(Path(RENDERER)).requires_grad_(False)
+    places = np.random.default_rng(0).uniform((-0.8, -0.2), (0.8, 0.2), (16, 2))
+    drawn = torch.from_numpy(DrawnCartPole()(*places.T)).float() / 255
+    return renderer, PoseFinder(renderer, 1.5, 0.5), drawn
+
+
+def camera_of(poses, *effects):
+    """The camera found in frames with effects and noise."""
+    renderer, finder, drawn = poses
+    frames = 255 * through(drawn, effects).detach()
+    noise = 2 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
+    with torch.inference_mode():
+        return find_camera(renderer, finder, (frames + noise).round().clamp(0, 255).to(torch.uint8))
+
+
+def values(cause):
+    return {name: estimate.value for name, estimate in cause.parameters.items()}
+
+
+class TestCamera:
+    def test_a_camera_that_is_as_it_should_be_has_no_fault(self, poses):
+        assert camera_of(poses).causes() == []
+
+    def test_a_turned_darker_picture(self, poses):
+        found = camera_of(poses, CameraRotation(angle=0.1), Brightness(gain=0.8, offset=0.1))
+        assert {cause.effect: values(cause) for cause in found.causes()} == {
+            "camera_rotation": {"angle": pytest.approx(0.1, abs=1e-3)},
+            "brightness": {"gain": pytest.approx(0.8, abs=5e-3), "offset": pytest.approx(0.1, abs=5e-3)},
+        }
+
+    def test_a_box_in_front(self, poses):
+        box = {"left": 20.0, "top": 30.0, "right": 45.0, "bottom": 60.0, "grey": 0.35}
+        (cause,) = camera_of(poses, Occlusion(**box)).causes()
+        assert values(cause) == pytest.approx(box, abs=0.1)
+
+    def test_a_camera_moved_along_a_featureless_track_is_a_cart_elsewhere(self, poses):
+        (cause,) = camera_of(poses, CameraShift(dx=4.0, dy=-3.0)).causes()
+        assert cause.parameters["dy"].value == pytest.approx(-3.0, abs=0.05)
+        assert cause.parameters["dx"].ci90 == (-20.0, 20.0)
+
+    def test_it_is_a_cause_beside_that_of_the_motion(self, tmp_path):
+        def blurred(frames):
+            return through(frames.float(), [Blur(sigma=1.0)]).detach()
+
+        path = film(tmp_path / "run.h5", [ViscousFriction(coefficient=3.0)], blurred, episodes=3)
+        found = diagnosed(path)
+        assert (found.verdict, [cause.effect for cause in found.causes]) == ("identified", ["blur", "viscous_friction"])
+        assert found.where.stages["camera"] > 0
+        assert found.where.stages["dynamics"] > 0
+        assert [effect.name for effect in found.effects()] == ["blur", "viscous_friction"]
+        jsonschema.Draft202012Validator(SCHEMA).validate(found.to_json())
+
+    def test_lost_frames(self, tmp_path):
+        path = rewritten(film(tmp_path / "run.h5", episodes=1), frame=repeat_every_fifth)
+        (cause,) = diagnosed(path).causes
+        assert cause.effect == "frame_drop"
+        assert values(cause)["rate"] == pytest.approx(0.2, abs=0.03)
+
+
+def repeat_every_fifth(frame):
+    frame[5::5] = frame[4:-1:5]
+    return frame
+
+
+class TestBadInput:
+    def test_a_film_without_a_renderer(self, still, capsys):
+        assert "--renderer" in refused(capsys, still)
+
+    def test_another_size(self, still, capsys):
+        path = rewritten(still, frame=lambda frame: frame[:, :, :100])
+        assert "frames of 100 x 100 px (height x width); the renderer draws 100 x 120 px" in refused(
+            capsys, path, "--renderer", RENDERER
+        )
+
+    def test_another_scene(self, still, capsys):
+        path = rewritten(still, frame=lambda frame: 255 - frame)
+        assert "it is of another scene" in refused(capsys, path, "--renderer", RENDERER)
+
+    def test_a_frozen_film(self, still, capsys):
+        path = rewritten(still, frame=lambda frame: np.repeat(frame[:1], len(frame), 0))
+        assert "frames are the same" in refused(capsys, path, "--renderer", RENDERER)
+
+    def test_a_film_without_times_and_commands(self, tmp_path, capsys):
+        (tmp_path / "run.mp4").write_bytes(b"\0\0\0\x18ftypmp42")
+        assert "no HDF5 file; times, commands and frames" in refused(
+            capsys, tmp_path / "run.mp4", "--renderer", RENDERER
+        )
+
+    def test_a_film_without_commands(self, still, capsys):
+        path = rewritten(still, action=lambda action: action[:, :0])
+        assert "0 of action" in refused(capsys, path, "--renderer", RENDERER)
+
+    def test_a_vehicle(self, still, capsys):
+        assert "renderers draw a cart-pole" in refused(capsys, still, "--renderer", RENDERER, system="quadrotor")

@@ -1,0 +1,198 @@
+"""From a recording of frames to the camera, and to the positions that are seen in them.
+
+Velocities are never differentiated: they are unknowns of the fits, as of any recording without them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from visadapt.diagnosis.report import next_experiment
+from visadapt.diagnosis.report.text import estimate
+from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Diagnosis, Gap
+from visadapt.diagnosis.search.camera import CameraFindings, find_camera
+from visadapt.effects import EFFECTS, AngleDelay, Dropout, FrozenZone, MeasurementDelay, PositionDelay
+from visadapt.estimation.camera_fit import SeenBy
+from visadapt.estimation.poses import PoseFinder
+from visadapt.progress import Progress, Report, staged
+from visadapt.recordings import Episode, Recording
+from visadapt.systems import System
+
+POSE = ("x", "theta")  # What a frame shows of a cart-pole
+
+RESOLUTION = (0.002, 0.005)
+"""m and rad, the smallest differences of poses that mean anything (0.08 px, and 0.2 px at the pole's tip): what a
+renderer draws wrongly is alike in neighbouring frames, so that the scatter of poses does not tell how far they are off.
+Those of the shipped renderer are off by 0.14 mm and 0.23 mrad (root mean square), with scales off by up to 0.1 %."""
+
+MISFIT = "root mean square of frames less those drawn by the renderer, in grey levels of 255"
+
+UNSEEN = (Dropout, FrozenZone, MeasurementDelay, PositionDelay, AngleDelay)
+"""Faults of sensors that a camera cannot have: it shows cart and pole in one frame. A late camera is a camera's."""
+
+LEAN = 0.5  # rad, largest |theta| at which the pole is looked for
+
+VAGUE = 3.0  # Deviation of a pose, over the median, above which a frame does not show it
+
+LEAST_EXPLAINED = 0.2
+"""Share of the frames that the renderer must explain; below, it is taken to be of another scene."""
+
+LONGEST_MISS = 10
+"""Rows in a row without a usable frame at which an episode is split: upright, errors grow by e in about 5 rows."""
+
+FEWEST_POSES = 5  # In a part of an episode; shorter ones are left out
+
+
+class FramesError(ValueError):
+    """Frames that cannot be diagnosed; the message is one line: which, and what would be right."""
+
+
+@dataclass(frozen=True)
+class Film:
+    """What a recording of frames was found to show."""
+
+    positions: Recording  # x and theta as measured, in the place of frames
+    camera: CameraFindings
+
+
+def watch(recording: Recording, system: System, renderer: nn.Module, report: Report | None = None) -> Film:
+    """Find the camera that explains the frames, then the positions that are seen through it.
+
+    Raises:
+        FramesError: frames of another size or scene than the renderer's, or that never change.
+    """
+    across = system.states[system.index("x")]
+    reach = max(-across.low, across.high)
+    finder = PoseFinder(renderer, reach, LEAN)
+    check_frames(recording, finder.size)
+    every = torch.cat([torch.from_numpy(np.ascontiguousarray(episode.frame)) for episode in recording.episodes])
+    camera = find_camera(renderer, finder, every, staged(report, "camera"))
+    if camera.best.camera:
+        finder = PoseFinder(SeenBy(renderer, camera.best.effects), reach, LEAN)
+    return Film(positions(recording, finder, staged(report, "poses")), camera)
+
+
+def with_camera(motion: Diagnosis, camera: CameraFindings, system: System) -> Diagnosis:
+    """The diagnosis of motion seen through the camera that was found, with that camera among the causes."""
+    causes = camera.causes()
+    names = tuple(cause.effect for cause in causes)
+    if not names:
+        return motion
+    if motion.verdict == UNEXPLAINED:
+        values = "; ".join(
+            f"{cause.effect} ({name} = {estimate(one)})" for cause in causes for name, one in cause.parameters.items()
+        )
+        return replace(motion, warnings=(*motion.warnings, f"found in the pixels, and corrected: {values}"))
+    doubtful = [[EFFECTS[name] for name in (one.effect, *one.indistinguishable_from)] for one in causes]
+    settled = next_experiment.separate(doubtful, system)
+    gap, following = motion.gap, motion.next_experiment
+    if motion.verdict == NO_GAP:
+        before, after = 255 * camera.unchanged.misfit, 255 * camera.best.misfit
+        floor = min(255 * camera.noise, after)
+        gap, following = Gap(MISFIT, before, after, floor, after, (before - after) / (before - floor)), ""
+    return replace(
+        motion,
+        verdict=AMBIGUOUS if settled or motion.verdict == AMBIGUOUS else IDENTIFIED,
+        causes=(*causes, *motion.causes),
+        ranking=tuple(replace(one, effects=(*names, *one.effects)) for one in motion.ranking),
+        gap=gap,
+        next_experiment=" ".join(text for text in (settled, following) if text),
+    )
+
+
+def check_frames(recording: Recording, size: tuple[int, ...]) -> None:
+    """Raises FramesError where frames are not of the renderer's (height, width), or none differs from another."""
+    for episode, source in zip(recording.episodes, recording.sources, strict=True):
+        assert episode.frame is not None
+        if episode.frame.shape[1:] != size:
+            shown = " x ".join(str(side) for side in episode.frame.shape[1:])
+            drawn = " x ".join(str(side) for side in size)
+            raise FramesError(f"{source}: frames of {shown} px (height x width); the renderer draws {drawn} px")
+        if len(episode.frame) > 1 and (episode.frame == episode.frame[0]).all():
+            raise FramesError(f"{source}: all {len(episode.frame)} frames are the same; a film that moves is right")
+
+
+def positions(recording: Recording, finder: PoseFinder, progress: Progress | None = None) -> Recording:
+    """The recording with x and theta as measured, in the place of frames.
+
+    Rows whose frame the renderer does not explain, or that does not show the pose, are not `usable`; where there are
+    many of them in a row, the episode is split. An exact copy of the frame before it has the same pose.
+
+    Raises:
+        FramesError: the renderer explains hardly any frame.
+    """
+    places, explained, misfits, deviations, fresh = [], [], [], [], []
+    for number, episode in enumerate(recording.episodes):
+        assert episode.frame is not None
+        poses = finder(torch.from_numpy(np.ascontiguousarray(episode.frame)))
+        new = np.ones(len(episode.frame), dtype=bool)
+        new[1:] = (episode.frame[1:] != episode.frame[:-1]).any((1, 2))
+        shown = np.flatnonzero(new)[np.cumsum(new) - 1]
+        places.append(poses.place.nan_to_num().numpy()[shown])
+        explained.append(poses.explained.numpy()[shown])
+        # A late camera repeats its first frame, until it has seen another one: no frame was lost.
+        fresh.append(np.ones(len(new), dtype=bool))
+        fresh[-1][1 : 1 + int(new[1:].argmax())] = False
+        misfits.append(poses.misfit.numpy())
+        deviations.append(poses.covariance.diagonal(dim1=1, dim2=2).sqrt().nan_to_num(torch.inf).numpy()[shown])
+        if progress is not None:
+            progress(number + 1, len(recording.episodes), float(poses.misfit.square().mean()))
+    # A pole that is out of the frame may have any angle.
+    most = np.maximum(RESOLUTION, VAGUE * np.median(np.concatenate(deviations), 0))
+    explained = [found & (own <= most).all(1) for found, own in zip(explained, deviations, strict=True)]
+    total, seen = sum(map(len, explained)), sum(int(each.sum()) for each in explained)
+    if seen < LEAST_EXPLAINED * total:
+        raise FramesError(
+            f"{recording.sources[0]}: the renderer explains {seen} of {total} frames (misfit "
+            f"{255 * float(np.median(np.concatenate(misfits))):.1f} grey levels, at most {255 * finder.limit:.1f} is "
+            "right): it is of another scene; `visadapt renderer` trains one on frames of this one"
+        )
+    episodes: list[Episode] = []
+    usable: list[NDArray[np.bool_]] = []
+    sources: list[str] = []
+    parts = zip(recording.episodes, places, explained, fresh, recording.sources, strict=True)
+    for episode, place, used, first_seen, source in parts:
+        for first, last in _stretches(used):
+            rows = slice(first, last)
+            episodes.append(
+                replace(
+                    episode,
+                    **{key: getattr(episode, key)[rows] for key in ("time", "action")},
+                    state=place[rows],
+                    frame=None,
+                )
+            )
+            usable.append((used & first_seen)[rows])
+            sources.append(source)
+    if not episodes:
+        raise FramesError(f"{recording.sources[0]}: no {FEWEST_POSES} frames close to each other are explained")
+    warnings = recording.warnings
+    if seen < total:
+        episode_number = next(k for k, used in enumerate(explained) if not used.all())
+        row = int((~explained[episode_number]).argmax())
+        warnings += (
+            f"no pose was found in {total - seen} of {total} frames, row {row + 1} of "
+            f"{recording.sources[episode_number]} the first; they were left out",
+        )
+    return replace(
+        recording,
+        episodes=tuple(episodes),
+        measured=POSE,
+        sources=tuple(sources),
+        warnings=warnings,
+        usable=tuple(usable),
+        resolution=RESOLUTION,
+    )
+
+
+def _stretches(used: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First row and the row after the last of each part without long misses, from its first usable row to its last."""
+    rows = np.flatnonzero(used)
+    cuts = [0, *(np.flatnonzero(np.diff(rows) > LONGEST_MISS) + 1), len(rows)]
+    return [(int(rows[a]), int(rows[b - 1]) + 1) for a, b in pairwise(cuts) if b - a >= FEWEST_POSES]

@@ -1,0 +1,208 @@
+"""Which effects of the camera explain the pixels better, if any: judged on frames, before motion is looked at."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from visadapt.diagnosis.result import Cause, Estimate
+from visadapt.diagnosis.search.causes import Z_90
+from visadapt.effects import Blur, Brightness, CameraEffect, CameraRotation, CameraShift, CameraZoom, Gamma, Occlusion
+from visadapt.effects.camera import moved
+from visadapt.estimation.camera_fit import Camera, CameraFit, fit_camera, made, through
+from visadapt.estimation.poses import PoseFinder
+from visadapt.progress import Progress
+
+SEARCHED: Camera = (CameraRotation, CameraZoom, CameraShift, Occlusion, Blur, Gamma, Brightness)
+
+FRAMES, FRAMES_AT_FIRST = 16, 6
+"""Frames, spread over the recording, to which a camera is fitted, and for which its first values are looked for."""
+
+MIN_CLOSED = 0.02
+"""Share by which an effect must lower the root mean square misfit: the same as that of a gap."""
+
+ALIKE = 0.005  # Share by which the misfit of another effect may be larger than the best one's for both to fit as well
+
+MOST_EFFECTS = 3
+
+ASTRAY = 2.0  # Mean squares of a frame, over their median, above which its pose may be a wrong one
+
+OF_ANOTHER_KIND = 10.0  # The same above which a frame is left out: a flash, or no picture
+
+COVERED = 10 / 255  # Mean misfit of a pixel above which something may cover it
+COVERED_PIXELS = 6
+
+PROBE, UNSEEN_SHARE = 5.0, 0.5
+"""Pixels by which a camera is moved along the track to see whether that shows, and the share of the pixels' noise below
+which what a position of the cart does not make good does not."""
+
+
+@dataclass(frozen=True)
+class CameraFindings:
+    """The camera that explains the frames best; the fits have the same frames."""
+
+    unchanged: CameraFit  # without effects
+    best: CameraFit
+    alone: dict[type[CameraEffect], CameraFit]  # each effect of the best by itself
+    without: dict[type[CameraEffect], CameraFit]  # the best less one
+    alike: dict[type[CameraEffect], tuple[str, ...]]  # effects that explain the frames as well in the place of another
+    fixed: frozenset[str]  # parameters that these frames do not show
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the pixels' white noise, grey levels of [0, 1] (Immerkaer 1996, CVIU 64(2))."""
+        residual = self.best.residual
+        mask = residual.new_tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])[None, None]
+        bent = nn.functional.conv2d(residual[:, None], mask)
+        return float(bent.abs().mean()) * math.sqrt(math.pi / 2) / 6
+
+    @property
+    def lost(self) -> float:
+        """Log likelihood of the pixels of one frame that would be lost without the effects."""
+        return 0.5 * self.best.residual[0].numel() * math.log(self.unchanged.mean_square / self.best.mean_square)
+
+    def causes(self) -> list[Cause]:
+        """The effects of the best camera as the result states them; shares are those of the pixels' misfit."""
+        whole = self.unchanged.misfit - self.best.misfit
+        deviations = iter(self.best.covariance.diagonal().sqrt().tolist())
+        out = []
+        for kind, effect in zip(self.best.camera, self.best.effects, strict=True):
+            parameters = {}
+            for p in kind.table:
+                value, reach = getattr(effect, p.name).item(), Z_90 * next(deviations)
+                low, high = max(p.low, value - reach), min(p.high, value + reach)
+                parameters[p.name] = Estimate(value, p.unit, (p.low, p.high) if p.name in self.fixed else (low, high))
+            closed = (self.unchanged.misfit - self.alone[kind].misfit) / whole
+            reopened = (self.without[kind].misfit - self.best.misfit) / whole
+            out.append(Cause(kind.name, parameters, 1.0, closed, reopened, indistinguishable_from=self.alike[kind]))
+        return out
+
+
+def find_camera(
+    renderer: nn.Module, finder: PoseFinder, frames: Tensor, progress: Progress | None = None
+) -> CameraFindings:
+    """Search the camera of frames (T, H, W) uint8."""
+    rows = torch.linspace(0, len(frames) - 1, min(FRAMES, len(frames))).long()
+    shown = frames[rows].float() / 255
+    place = finder(frames[rows]).place
+    unchanged = fit_camera(renderer, shown, (), torch.zeros(0), place, frozenset())
+    own = unchanged.residual.square().mean((1, 2))
+    usual = own <= OF_ANOTHER_KIND * own.median()
+    if not usual.all():
+        shown, place = shown[usual], unchanged.place[usual]
+        unchanged = fit_camera(renderer, shown, (), torch.zeros(0), place, frozenset())
+    fixed = frozenset({"dx"}) if _track_is_featureless(finder, unchanged) else frozenset()
+    done, least = 0, 2 * len(SEARCHED)
+
+    def fitted(camera: Camera, values: Tensor, at: Tensor) -> CameraFit:
+        nonlocal done
+        fit = fit_camera(renderer, shown, camera, values, at, fixed)
+        own = fit.residual.square().mean((1, 2))
+        astray = own > ASTRAY * own.median()
+        if astray.any():  # looked for again through the camera that explains the others
+            there = torch.where(astray[:, None], _nearest(finder, fit.effects, shown)[0].to(fit.place), fit.place)
+            fit = min(fit, fit_camera(renderer, shown, camera, fit.values, there, fixed), key=lambda one: one.misfit)
+        if progress is not None:
+            done += 1
+            progress(min(done, least), least, fit.mean_square)
+        return fit
+
+    best, alike = unchanged, {}
+    alone: dict[type[CameraEffect], CameraFit] = {}
+    while len(best.camera) < MOST_EFFECTS:
+        tried: dict[type[CameraEffect], CameraFit] = {}
+        for kind in SEARCHED:
+            start = None if kind in best.camera else _start(kind, finder, shown, best, fixed)
+            if start is not None:
+                values, at = start
+                tried[kind] = fitted((*best.camera, kind), torch.cat((best.values, values)), at)
+        if not best.camera:
+            alone = tried
+        chosen = min(tried, key=lambda kind: tried[kind].misfit)
+        if tried[chosen].misfit > (1 - MIN_CLOSED) * best.misfit:
+            break
+        best = tried[chosen]
+        alike[chosen] = tuple(
+            kind.name for kind, fit in tried.items() if kind is not chosen and fit.misfit < (1 + ALIKE) * best.misfit
+        )
+    while True:
+        without = {}
+        for kind in best.camera:
+            rest = tuple(other for other in best.camera if other is not kind)
+            keep = torch.cat([torch.full((len(k.table),), k is not kind) for k in best.camera])
+            without[kind] = fitted(rest, best.values[keep], best.place) if rest else unchanged
+        idle = [kind for kind, fit in without.items() if best.misfit > (1 - MIN_CLOSED) * fit.misfit]
+        if not idle:
+            break
+        best = without[idle[0]]
+    alone = {kind: alone.get(kind, unchanged) for kind in best.camera}
+    return CameraFindings(unchanged, best, alone, without, alike, fixed)
+
+
+def _start(
+    kind: type[CameraEffect], finder: PoseFinder, shown: Tensor, best: CameraFit, fixed: frozenset[str]
+) -> tuple[Tensor, Tensor] | None:
+    """First values (P,) of an effect and places (N, 2), beside what the best camera has; None where there are none."""
+    neutral = torch.tensor([math.nan if p.neutral is None else p.neutral for p in kind.table], dtype=torch.float64)
+    if kind is Occlusion:
+        box = _covered(best.residual, shown)
+        return None if box is None else (box, _nearest(finder, [*best.effects, *made((kind,), box)], shown)[0])
+    if kind is Blur:
+        return neutral + 0.7, best.place  # its slope at 0 is 0
+    few = shown[torch.linspace(0, len(shown) - 1, min(FRAMES_AT_FIRST, len(shown))).long()]
+    if kind is Brightness:
+        gains = torch.logspace(math.log2(0.35), math.log2(1.9), 11, base=2)
+        points = torch.stack((gains, few.mean() - gains * finder.grey), 1)
+    elif kind is Gamma:
+        points = torch.logspace(math.log2(0.35), math.log2(2.9), 13, base=2)[:, None]
+    else:
+        axes = [torch.tensor([p.neutral]) if p.name in fixed else torch.linspace(p.low, p.high, 15) for p in kind.table]
+        points = torch.cartesian_prod(*axes).reshape(-1, len(kind.table))
+    points = torch.cat((neutral[None], points.double()))
+    cameras = [[*best.effects, *made((kind,), point)] for point in points]
+    first = int(torch.stack([_nearest(finder, camera, few)[1].mean() for camera in cameras]).argmin())
+    return points[first], _nearest(finder, cameras[first], shown)[0] if first else best.place
+
+
+def _nearest(finder: PoseFinder, camera: Sequence[CameraEffect], frames: Tensor) -> tuple[Tensor, Tensor]:
+    """`PoseFinder.nearest` through a camera: frames are moved back, the greys of what is drawn are changed."""
+    still = []
+    whole = torch.eye(3).to(frames)
+    for effect in sorted(camera, key=lambda one: one.order):
+        motion = effect.motion(frames)
+        if motion is not None:
+            whole = motion @ whole
+            continue
+        # What is drawn for the grid has half the resolution.
+        values = [getattr(effect, p.name).item() * (0.5 if p.unit == "px" else 1.0) for p in effect.table]
+        still += made((type(effect),), torch.tensor(values))
+    if not torch.equal(whole, torch.eye(3).to(frames)):
+        frames = moved(frames, [whole.inverse()])
+    return finder.nearest(frames, (lambda drawn: through(drawn, still)) if still else None)
+
+
+def _covered(residual: Tensor, shown: Tensor) -> Tensor | None:
+    """The box (5,) of the largest patch that is as wrong in all frames, as `Occlusion` has it."""
+    wrong = (residual.mean(0).abs() > COVERED).numpy().astype(np.uint8)
+    count, _, patches, _ = cv2.connectedComponentsWithStats(wrong)
+    if count < 2:
+        return None
+    left, top, width, height, area = patches[1 + int(patches[1:, cv2.CC_STAT_AREA].argmax())].tolist()
+    if area < COVERED_PIXELS:
+        return None
+    grey = float(shown[:, top : top + height, left : left + width].median())
+    return torch.tensor([left, top, left + width, top + height, grey], dtype=torch.float64)
+
+
+def _track_is_featureless(finder: PoseFinder, unchanged: CameraFit) -> bool:
+    """Whether a camera moved along the track shows the same as a cart at another place."""
+    drawn = finder.renderer(*unchanged.place.to(unchanged.residual).T)
+    shift = CameraShift(dx=PROBE, dy=0.0)
+    again = finder((255 * through(drawn, [shift])).round().clamp(0, 255).to(torch.uint8))
+    return float(again.misfit.median()) < UNSEEN_SHARE * unchanged.misfit

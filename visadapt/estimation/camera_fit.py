@@ -1,0 +1,178 @@
+"""A camera's parameters from frames, together with the poses that they show: analysis by synthesis.
+
+    minimise over phi and p_1 .. p_N   sum_t |y_t - C(Psi(p_t); phi)|^2
+
+y_t a frame, Psi the renderer, p_t = (x, theta), C the camera's effects with their parameters phi, the same in all
+frames. Levenberg and Marquardt's steps are taken in phi and all p_t at once; the p_t are eliminated frame by frame
+(Schur complement; Triggs et al. 2000, Bundle adjustment, section 6.1). The covariance of phi holds white noise of the
+pixels, and what the renderer itself draws wrongly at a pixel in every frame, which no number of frames averages out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from visadapt.effects.camera import CameraEffect, moved
+from visadapt.estimation.poses import DIFFERENCE, SPACING
+
+Camera = tuple[type[CameraEffect], ...]
+
+STEPS = 12  # At most
+
+SMALL_GAIN = 1e-4  # Share by which a step must lower the squared misfit for another one to be taken
+
+DIFFERENCE_SHARE, LONGEST_DIFFERENCE = 0.01, 0.5
+"""Half-width of the central differences of a parameter, as a share of its range, and in its unit at most."""
+
+
+class SeenBy(nn.Module):
+    """A renderer seen by a camera with effects: x (B,) and theta (B,) to frames (B, H, W)."""
+
+    def __init__(self, renderer: nn.Module, effects: Sequence[CameraEffect]) -> None:
+        super().__init__()
+        self.renderer = renderer
+        self.effects = list(effects)
+
+    def forward(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Frames (B, H, W) of cart positions (B,) in m and pole angles (B,) in rad."""
+        return through(self.renderer(x, theta), self.effects)
+
+
+def through(frame: Tensor, effects: Sequence[CameraEffect]) -> Tensor:
+    """Frames (B, H, W) as a camera with effects without memory shows them."""
+    ordered = sorted(effects, key=lambda effect: effect.order)
+    frame = moved(frame, [motion for effect in ordered if (motion := effect.motion(frame)) is not None])
+    for effect in ordered:
+        frame, _ = effect.apply_to(frame, frame[:, None, :0], None)
+    return frame
+
+
+@dataclass(frozen=True)
+class CameraFit:
+    """Camera effects fitted to frames."""
+
+    camera: Camera
+    values: Tensor  # (P,) float64, in the order of the effects and of their tables
+    place: Tensor  # (N, 2) x in m and theta in rad of the frames
+    mean_square: float  # of frame less what is drawn, grey levels of [0, 1]
+    covariance: Tensor  # (P, P) of the values
+    residual: Tensor  # (N, H, W)
+
+    @property
+    def effects(self) -> list[CameraEffect]:
+        """The effects at their fitted values."""
+        return made(self.camera, self.values)
+
+    @property
+    def misfit(self) -> float:
+        """Root mean square of frame less what is drawn, grey levels of [0, 1]."""
+        return self.mean_square**0.5
+
+
+def made(camera: Camera, values: Tensor) -> list[CameraEffect]:
+    """The effects with values (P,)."""
+    parts = values.split([len(kind.table) for kind in camera]) if camera else ()
+    return [
+        kind(**dict(zip((p.name for p in kind.table), part.tolist(), strict=True)))
+        for kind, part in zip(camera, parts, strict=True)
+    ]
+
+
+def fit_camera(
+    renderer: nn.Module, frames: Tensor, camera: Camera, values: Tensor, place: Tensor, fixed: frozenset[str]
+) -> CameraFit:
+    """Fit camera effects to frames (N, H, W) in [0, 1], from values (P,) and places (N, 2); `fixed` are the names of
+    parameters that stay as they are."""
+    table = [parameter for kind in camera for parameter in kind.table]
+    low, high = (torch.tensor([getattr(p, end) for p in table], dtype=torch.float64) for end in ("low", "high"))
+    free = torch.tensor([p.name not in fixed for p in table], dtype=torch.float64)
+    step = (DIFFERENCE_SHARE * (high - low)).clamp_max(LONGEST_DIFFERENCE)
+
+    def shown(scene: Tensor, at: Tensor) -> Tensor:
+        return through(scene, made(camera, at))
+
+    def scene_at(at: Tensor) -> Tensor:
+        out: Tensor = renderer(at[:, 0].to(frames), at[:, 1].to(frames))
+        return out
+
+    def slopes(at: Tensor, phi: Tensor) -> tuple[Tensor, Tensor]:
+        """Derivatives (N, 2, H W) by place and (N, P, H W) by the camera's parameters."""
+        move = DIFFERENCE * torch.eye(2).to(at)
+        by_place = [shown(scene_at(at + h), phi) - shown(scene_at(at - h), phi) for h in move]
+        scene = scene_at(at)
+        nudge = torch.diag(step)
+        by_value = [
+            free[k] * (shown(scene, phi + h) - shown(scene, phi - h)) / (2 * step[k]) for k, h in enumerate(nudge)
+        ]
+        empty = frames.new_zeros(len(frames), 0, frames[0].numel())
+        return (
+            torch.stack(by_place, 1).flatten(2) / (2 * DIFFERENCE),
+            torch.stack(by_value, 1).flatten(2).to(frames) if by_value else empty,
+        )
+
+    values, place = values.double().clone(), place.double().clone()
+    error = frames - shown(scene_at(place), values)
+    loss, damping, parts = float(error.square().mean()), 1e-3, None
+    for _ in range(STEPS):
+        if parts is None:
+            parts = _normal(*slopes(place, values), error)
+        change, moves = _solved(*parts, damping)
+        tried = torch.minimum(torch.maximum(values + change, low), high)
+        there = place + moves.clamp(-SPACING, SPACING)
+        error_there = frames - shown(scene_at(there), tried)
+        loss_there = float(error_there.square().mean())
+        if loss_there < loss:
+            gained = 1 - loss_there / loss
+            values, place, error, loss, damping, parts = tried, there, error_there, loss_there, damping / 10, None
+            if gained < SMALL_GAIN:
+                break
+        else:
+            damping *= 10
+            if damping > 1e3:
+                break
+    by_place, by_value = slopes(place, values)
+    covariance = _covariance(by_place, by_value, error, (high - low).square() / 12)
+    return CameraFit(camera, values, place, loss, covariance, error)
+
+
+def _normal(by_place: Tensor, by_value: Tensor, error: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Blocks of the normal equations: places (N, 2, 2), both (N, P, 2), values (P, P), and their right sides."""
+    flat = error.flatten(1)[..., None]
+    return (
+        (by_place @ by_place.mT).double(),
+        (by_value @ by_place.mT).double(),
+        (by_value @ by_value.mT).double().sum(0),
+        (by_place @ flat)[..., 0].double(),
+        (by_value @ flat)[..., 0].double().sum(0),
+    )
+
+
+def _solved(own: Tensor, both: Tensor, whole: Tensor, g: Tensor, b: Tensor, damping: float) -> tuple[Tensor, Tensor]:
+    """Steps (P,) of the values and (N, 2) of the places."""
+    own = own + torch.diag_embed(own.diagonal(dim1=1, dim2=2) * damping + 1e-9)
+    whole = whole + torch.diag(whole.diagonal() * damping + 1e-9)
+    gain = torch.linalg.solve(own, both.mT).mT  # (N, P, 2)
+    reduced = whole - (gain @ both.mT).sum(0)
+    change = torch.linalg.solve(reduced, b - (gain @ g[..., None])[..., 0].sum(0))
+    moves = torch.linalg.solve(own, (g - (change @ both))[..., None])[..., 0]
+    return change, moves
+
+
+def _covariance(by_place: Tensor, by_value: Tensor, error: Tensor, wide: Tensor) -> Tensor:
+    """(P, P): pixels' white noise, and the error that is the same in all frames; `wide` (P,) is known beforehand."""
+    own = (by_place @ by_place.mT).double()
+    own = own + 1e-9 * torch.eye(2).to(own)
+    gain = torch.linalg.solve(own, (by_place @ by_value.mT).double()).mT  # (N, P, 2)
+    clear = by_value - gain.to(by_place) @ by_place  # less what the places take up
+    common = clear.sum(0).double()
+    count = len(error)
+    always = error.mean(0).square().mean().double()
+    white = (error.square().mean().double() - always).clamp_min(1e-12) * count / max(1, count - 1)
+    static = (always - white / count).clamp_min(0)
+    information = (clear @ clear.mT).double().sum(0) + torch.diag(white / wide)
+    inverse = torch.linalg.inv(information)
+    return inverse @ (white * information + static * common @ common.mT) @ inverse
