@@ -63,7 +63,9 @@ def load_parameters(path: str | os.PathLike[str], system_class: type[SystemT]) -
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ParameterFileError(f"{path}: {key} must be a number in SI units, got {value!r}")
         if not abs(value) <= LARGEST:
-            raise ParameterFileError(f"{path}: {key} must be finite, and at most {LARGEST:g}")
+            raise ParameterFileError(
+                f"{path}: {key} must be finite, got {value!r:.30} (at most {LARGEST:.2g} is right)"
+            )
     try:
         return system_class(**{key: float(value) for key, value in parameters.items()})
     except ValueError as error:
