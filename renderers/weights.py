@@ -16,8 +16,8 @@ from renderers.learnt import LayeredRenderer, MLPRenderer
 
 KINDS: dict[str, type[LayeredRenderer] | type[MLPRenderer]] = {"layered": LayeredRenderer, "mlp": MLPRenderer}
 FORMAT_VERSION = 1
-HEADER_KEY, CHECKSUM_KEY = "renderers", "sha256"
-"""Keys of the JSON, and of the checksum, in the header of the safetensors file."""
+HEADER_KEY = "renderers"
+"""Key of the JSON, after its checksum, in the header of the safetensors file."""
 
 
 class RendererError(ValueError):
@@ -29,12 +29,26 @@ def save_renderer(path: Path, renderer: LayeredRenderer | MLPRenderer, training:
     kind = next(name for name, cls in KINDS.items() if type(renderer) is cls)
     header = {"format": FORMAT_VERSION, "kind": kind, "arguments": renderer.arguments, "training": dict(training)}
     weights = {key: value.detach().contiguous() for key, value in renderer.state_dict().items()}
-    text = json.dumps(header)
-    save_file(weights, path, {HEADER_KEY: text, CHECKSUM_KEY: checksum(text, weights)})
+    save_file(weights, path, {HEADER_KEY: sealed(json.dumps(header), weights)})
 
 
-def checksum(text: str, tensors: Mapping[str, Tensor]) -> str:
-    """The SHA-256 of tensors by name, and of the text that says what they are."""
+def sealed(text: str, tensors: Mapping[str, Tensor]) -> str:
+    """The JSON that says what tensors are, after a checksum of both.
+
+    One entry of a header, since safetensors writes several in an order that changes from run to run.
+    """
+    return f"{_checksum(text, tensors)} {text}"
+
+
+def unsealed(entry: str, tensors: Mapping[str, Tensor]) -> str | None:
+    """The JSON of what `sealed` gave; None where it or a tensor is not what it was. Older files have no checksum."""
+    if entry.startswith("{"):
+        return entry
+    checksum, _, text = entry.partition(" ")
+    return text if checksum == _checksum(text, tensors) else None
+
+
+def _checksum(text: str, tensors: Mapping[str, Tensor]) -> str:
     found = hashlib.sha256(text.encode())
     for name, values in sorted(tensors.items()):
         found.update(f"{name} {values.dtype} {tuple(values.shape)}".encode())
@@ -52,8 +66,7 @@ def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRen
     try:
         path.open("rb").close()  # since safetensors says of every other reason that there is no such file
         with safe_open(path, framework="pt") as file:
-            about = file.metadata() or {}
-            text = about.get(HEADER_KEY)
+            entry = (file.metadata() or {}).get(HEADER_KEY)
             weights = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     except FileNotFoundError as error:
         raise RendererError(f"{path}: there is no such renderer") from error
@@ -61,9 +74,9 @@ def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRen
         raise RendererError(f"{path}: cannot be read: {error.strerror or error}") from error
     except SafetensorError as error:
         raise RendererError(f"{path}: not a complete safetensors file ({error})") from error
-    if text is None:
+    if entry is None:
         raise RendererError(f"{path}: a safetensors file, but not a renderer's")
-    if about.get(CHECKSUM_KEY) not in (None, checksum(text, weights)):  # older files have none
+    if (text := unsealed(entry, weights)) is None:
         raise RendererError(f"{path}: is damaged: its checksum is not that of what it holds")
     try:
         header = json.loads(text)

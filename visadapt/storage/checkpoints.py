@@ -16,11 +16,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from renderers.weights import checksum
+from renderers.weights import sealed, unsealed
 from visadapt.storage.atomic_files import replacing
 
-TREE_KEY, CHECKSUM_KEY = "visadapt.tree", "visadapt.sha256"
-"""Keys of the JSON, and of the checksum, in the header of the safetensors file."""
+TREE_KEY = "visadapt.tree"
+"""Key of the JSON, after its checksum, in the header of the safetensors file."""
 
 
 class CheckpointError(ValueError):
@@ -32,7 +32,7 @@ def save_tree(path: Path, tree: Any) -> None:
     tensors: dict[str, Tensor] = {}
     skeleton = json.dumps(_strip(tree, tensors))
     with replacing(path) as temporary:
-        save_file(tensors, temporary, {TREE_KEY: skeleton, CHECKSUM_KEY: checksum(skeleton, tensors)})
+        save_file(tensors, temporary, {TREE_KEY: sealed(skeleton, tensors)})
 
 
 def load_tree(path: Path) -> Any:
@@ -40,7 +40,7 @@ def load_tree(path: Path) -> Any:
     try:
         path.open("rb").close()  # since safetensors says of every other reason that there is no such file
         with safe_open(path, framework="pt") as file:
-            about = file.metadata() or {}
+            entry = (file.metadata() or {}).get(TREE_KEY)
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     except FileNotFoundError as error:
         raise CheckpointError(f"{path}: there is no such checkpoint") from error
@@ -48,12 +48,12 @@ def load_tree(path: Path) -> Any:
         raise CheckpointError(f"{path}: cannot be read: {error.strerror or error}") from error
     except SafetensorError as error:
         raise CheckpointError(f"{path}: not a complete safetensors file ({error})") from error
-    if TREE_KEY not in about:
+    if entry is None:
         raise CheckpointError(f"{path}: a safetensors file, but not one that visadapt wrote")
-    if about.get(CHECKSUM_KEY) not in (None, checksum(about[TREE_KEY], tensors)):  # older files have none
+    if (skeleton := unsealed(entry, tensors)) is None:
         raise CheckpointError(f"{path}: is damaged: its checksum is not that of what it holds")
     with fitting(path):
-        return _restore(json.loads(about[TREE_KEY]), tensors)
+        return _restore(json.loads(skeleton), tensors)
 
 
 @contextmanager
