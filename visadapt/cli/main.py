@@ -44,11 +44,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         # Whoever read the output has read enough, as `head` does; Python would complain once more at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except Exception as error:
-        # The messages of our own exceptions and of the system's are for whoever runs the command.
+    except (Exception, SystemExit) as error:
+        # The messages of our own exceptions, of the system's and of the user's code are for whoever runs the command.
+        message: object = error
         if not isinstance(error, OSError) and type(error).__module__.partition(".")[0] not in ("visadapt", "renderers"):
-            raise
-        print(f"visadapt: {printable(error)}", file=sys.stderr)
+            # Without a command it is argparse that ends the program.
+            message = importlib.import_module("visadapt.cli.inputs").own_line(error) if command else None
+            if message is None:
+                raise
+        print(f"visadapt: {printable(message)}", file=sys.stderr)
         return 2  # argparse's own
     return 0
 
