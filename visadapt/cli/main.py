@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import signal
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from contextlib import suppress
+from typing import Any, NoReturn
 
 from visadapt.cli import arguments as asked
 
@@ -30,6 +32,8 @@ RESUMED = ("adapt", "train", "renderer")  # Subcommands that go on where an inte
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command: 0 done; 2 bad input, described by one line on stderr; 130 interrupted."""
     command = ""
+    with suppress(ValueError):  # outside the main thread
+        signal.signal(signal.SIGTERM, _terminated)
     try:
         options = _parser().parse_args(arguments)
         command = options.command
@@ -48,13 +52,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The messages of our own exceptions, of the system's and of the user's code are for whoever runs the command.
         message: object = error
         if not isinstance(error, OSError) and type(error).__module__.partition(".")[0] not in ("visadapt", "renderers"):
-            # Without a command it is argparse that ends the program.
-            message = importlib.import_module("visadapt.cli.inputs").own_line(error) if command else None
+            inputs: Any = sys.modules.get("visadapt.cli.inputs")  # by which code of the user's is imported
+            message = inputs.own_line(error) if inputs else None
             if message is None:
                 raise
         print(f"visadapt: {printable(message)}", file=sys.stderr)
         return 2  # argparse's own
     return 0
+
+
+def _terminated(number: int, _frame: object) -> NoReturn:
+    """End as after an interrupt, so that nothing half-written is left."""
+    raise SystemExit(128 + number)
 
 
 class _Parser(argparse.ArgumentParser):
