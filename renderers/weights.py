@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,13 +10,14 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import Tensor, uint8
 
 from renderers.learnt import LayeredRenderer, MLPRenderer
 
 KINDS: dict[str, type[LayeredRenderer] | type[MLPRenderer]] = {"layered": LayeredRenderer, "mlp": MLPRenderer}
 FORMAT_VERSION = 1
 HEADER_KEY = "renderers"
-"""Key of the JSON in the header of the safetensors file."""
+"""Key of the JSON, after its checksum, in the header of the safetensors file."""
 
 
 class RendererError(ValueError):
@@ -27,7 +29,31 @@ def save_renderer(path: Path, renderer: LayeredRenderer | MLPRenderer, training:
     kind = next(name for name, cls in KINDS.items() if type(renderer) is cls)
     header = {"format": FORMAT_VERSION, "kind": kind, "arguments": renderer.arguments, "training": dict(training)}
     weights = {key: value.detach().contiguous() for key, value in renderer.state_dict().items()}
-    save_file(weights, path, {HEADER_KEY: json.dumps(header)})
+    save_file(weights, path, {HEADER_KEY: sealed(json.dumps(header), weights)})
+
+
+def sealed(text: str, tensors: Mapping[str, Tensor]) -> str:
+    """The JSON that says what tensors are, after a checksum of both.
+
+    One entry of a header, since safetensors writes several in an order that changes from run to run.
+    """
+    return f"{_checksum(text, tensors)} {text}"
+
+
+def unsealed(entry: str, tensors: Mapping[str, Tensor]) -> str | None:
+    """The JSON of what `sealed` gave; None where it or a tensor is not what it was. Older files have no checksum."""
+    if entry.startswith("{"):
+        return entry
+    checksum, _, text = entry.partition(" ")
+    return text if checksum == _checksum(text, tensors) else None
+
+
+def _checksum(text: str, tensors: Mapping[str, Tensor]) -> str:
+    found = hashlib.sha256(text.encode())
+    for name, values in sorted(tensors.items()):
+        found.update(f"{name} {values.dtype} {tuple(values.shape)}".encode())
+        found.update(values.detach().cpu().contiguous().reshape(-1).view(uint8).numpy().tobytes())
+    return found.hexdigest()
 
 
 def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRenderer | MLPRenderer:
@@ -37,22 +63,29 @@ def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRen
         RendererError: the file is missing, incomplete, or not a renderer's; or the renderer has another architecture
             or frame size.
     """
-    if not path.is_file():
-        raise RendererError(f"{path}: there is no such renderer")
     try:
+        path.open("rb").close()  # since safetensors says of every other reason that there is no such file
         with safe_open(path, framework="pt") as file:
-            text = (file.metadata() or {}).get(HEADER_KEY)
+            entry = (file.metadata() or {}).get(HEADER_KEY)
             weights = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
+    except FileNotFoundError as error:
+        raise RendererError(f"{path}: there is no such renderer") from error
+    except OSError as error:
+        raise RendererError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except SafetensorError as error:
         raise RendererError(f"{path}: not a complete safetensors file ({error})") from error
-    if text is None:
+    if entry is None:
         raise RendererError(f"{path}: a safetensors file, but not a renderer's")
+    if (text := unsealed(entry, weights)) is None:
+        raise RendererError(f"{path}: is damaged: its checksum is not that of what it holds")
     try:
         header = json.loads(text)
         if header["format"] != FORMAT_VERSION:
             raise RendererError(f"{path}: format {header['format']}, this version reads {FORMAT_VERSION}")
         renderer = KINDS[header["kind"]](**header["arguments"])
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:  # json's is a ValueError
+        if isinstance(error, RendererError):
+            raise
         raise RendererError(f"{path}: its header does not describe a known renderer ({error})") from error
     try:
         renderer.load_state_dict(weights)

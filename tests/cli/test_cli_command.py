@@ -1,6 +1,8 @@
 """What all subcommands share: help, exit statuses, and what the wheel holds."""
 
 import importlib
+import os
+import signal
 import subprocess
 import sys
 import tomllib
@@ -10,6 +12,7 @@ import pytest
 
 import visadapt
 from tests.cli.commands import run
+from tests.recorded import a_run, write
 from visadapt.cli.arguments import SYSTEMS_HELP
 from visadapt.cli.main import COMMANDS
 from visadapt.systems import SYSTEMS
@@ -67,6 +70,34 @@ def test_a_bug_is_not_taken_for_bad_input(monkeypatch):
     monkeypatch.setattr("visadapt.cli.effects.catalogue_text", broken)
     with pytest.raises(ZeroDivisionError):
         run("effects")
+
+
+@pytest.mark.parametrize(
+    ("sent", "status", "says"),
+    [(signal.SIGINT, 130, "visadapt: interrupted\n"), (signal.SIGTERM, 143, "")],
+)
+def test_interrupted_or_ended_it_says_so_in_a_line_and_leaves_nothing(tmp_path, sent, status, says):
+    write(tmp_path / "run.csv", a_run(0.1, 1e-3))
+    script = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from visadapt.cli.main import main; sys.exit(main())"
+    )
+    arguments = ("diagnose", "run.csv", "--system", "cartpole", "--jobs", "2", "--json", "a.json")
+    begun = subprocess.Popen(
+        [sys.executable, "-c", script, *arguments],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert begun.stderr is not None
+    assert "200 rows of 4 channels" in begun.stderr.readline()
+    os.killpg(begun.pid, sent)
+    printed, told = begun.communicate(timeout=60)
+    assert (begun.returncode, printed, told) == (status, "", says)
+    assert [path.name for path in tmp_path.iterdir()] == ["run.csv"]
 
 
 def test_whoever_closes_the_output_early_is_not_told_of_it():

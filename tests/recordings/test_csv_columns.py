@@ -101,6 +101,12 @@ class TestPaths:
         assert [source[-5:] for source in load(tmp_path).sources] == ["a.csv", "b.csv", "c.csv"]
         assert [s[-5:] for s in load(tmp_path / "b.csv", tmp_path / "a.csv").sources] == ["b.csv", "a.csv"]
 
+    def test_a_column_is_not_taken_twice(self, tmp_path):
+        path = write(tmp_path / "a.csv", a_table())
+        refuses("column 'x' is taken for both x and theta", path, columns={"x": "x", "theta": "x"})
+        write(path, {"episode": [0] * 41, **a_table()})
+        refuses("column 'episode' is taken for both episode and command", path, columns={"command": "episode"})
+
     def test_hidden_files_of_a_folder_are_left_alone(self, tmp_path):
         write(tmp_path / "a.csv", a_table())
         (tmp_path / "._a.csv").write_bytes(b"\0\1\2")

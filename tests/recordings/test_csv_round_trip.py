@@ -41,6 +41,13 @@ class TestRoundTrip:
         write_recording(path, turned, [STATES[index] for index in order], ["command"])
         self.assert_same(load(path))
 
+    def test_hdf5_with_names_of_its_own(self, tmp_path):
+        path = tmp_path / "a.h5"
+        write_recording(path, self.episodes(), ["cart", "x_dot", "phi", "theta_dot"], ["u"])
+        self.assert_same(load(path, columns={"x": "cart", "theta": "phi"}))
+        refuses("column 'x' is missing; it has time, cart", path)
+        refuses("has no column 'pole' for theta; it has", path, columns={"x": "cart", "theta": "pole"})
+
     def test_hdf5_that_does_not_fit(self, tmp_path):
         path = tmp_path / "a.h5"
         write_recording(path, [replace(episode, state=episode.state[:, :3]) for episode in self.episodes()])

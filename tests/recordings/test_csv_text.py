@@ -9,6 +9,7 @@ class TestText:
         "form",
         [
             {"separator": ";"},
+            {"separator": "\t"},
             {"end": "\r\n"},
             {"encoding": "utf-8-sig"},
             {"before": "# a rig\n\n# 0.05 s\n"},
@@ -34,12 +35,28 @@ class TestText:
             ("", "column 'theta' is empty"),
             ("oops", "column 'theta' is 'oops'; a number is right"),
             ('"0,12"', "column 'theta' is '0,12'; a decimal point is right"),
+            ("1_0.5", "column 'theta' is '1_0.5'; a number is right"),
+            ("\uff11", "column 'theta' is .*; a number is right"),
+            ("1" * 200_000, "no row of CSV: field larger than field limit"),
+            ('"0.1', "a quotation mark is left open|no row of CSV"),
         ],
     )
     def test_a_cell_that_is_no_number(self, file, cell, message):
         table = {name: list(values) for name, values in a_table().items()}
         table["theta"][6] = cell
-        refuses(rf"run.csv: row 7 \(line 9\), {message}", write(file, table, before="# a comment\n"))
+        refuses(rf"run.csv: row 7 \(line 9\).*({message})", write(file, table, before="# a comment\n"))
+
+    def test_what_other_columns_hold_is_their_affair(self, file):
+        lines = write(file, a_table()).read_text().splitlines()
+        rows = [f'{line},"a, b"' if row == 5 else f"{line}," for row, line in enumerate(lines[1:])]
+        file.write_text("\n".join([f'{lines[0]},"note, or more"', *rows]))
+        assert load(file).samples == 40
+
+    def test_a_quotation_mark_swallows_no_rows(self, file):
+        lines = write(file, a_table()).read_text().splitlines()
+        rows = [f'{line},"' if row in (5, 20) else f"{line},b" for row, line in enumerate(lines[1:])]
+        file.write_text("\n".join([f"{lines[0]},note", *rows]))
+        refuses(r"row 6 \(line 7\): a quotation mark is left open", file)
 
     def test_a_torn_last_line(self, file):
         content = write(file, a_table()).read_text()
@@ -60,6 +77,12 @@ class TestText:
             (b"time,x,theta,command\n", "has no rows"),
             (b"0.0,1,2,3\n0.1,1,2,3\n", "line 1 holds numbers where the columns' names belong"),
             (b"\xff\xfe\x00time", "not text in UTF-8"),
+            ("time,x,theta,command\n".encode("utf-16"), "not text in UTF-8, but in UTF-16; CSV in UTF-8 is right"),
+            ("time,x,theta,command\n".encode("utf-16-le"), "line 1 holds NUL bytes"),
+            (bytes(1000), "line 1 holds NUL bytes"),
+            (b"time x theta command\n0 1 2 3\n", "line 1: names separated by commas, semicolons or tabs are right"),
+            (b"<!doctype html><html></html>\n", "line 1: names separated by commas, semicolons or tabs are right"),
+            (b'time,x,theta,"command\n0,1,2,3\n', "line 1 is no line of names"),
         ],
     )
     def test_no_table_at_all(self, file, content, message):

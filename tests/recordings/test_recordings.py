@@ -1,3 +1,4 @@
+from contextlib import suppress
 from dataclasses import replace
 
 import h5py
@@ -151,8 +152,95 @@ class TestBadFiles:
 
     def test_another_version(self, recording):
         with h5py.File(recording, "a") as file:
-            file.attrs["version"] = 2
-        self.rejects(recording, "version 2 of the format; this visadapt reads version 1")
+            file.attrs["version"] = 3
+        self.rejects(recording, "version 3 of the format; this visadapt reads version 2")
+
+    def test_files_of_the_version_before_are_read(self, recording):
+        with h5py.File(recording, "a") as file:
+            file.attrs["version"] = 1
+            del file["episode_00000/state"].attrs["sha256"]
+        assert len(read_recording(recording)) == 3
+
+    @pytest.mark.parametrize("name", ["state", "frame"])
+    def test_values_that_are_not_those_written(self, recording, name):
+        with h5py.File(recording, "a") as file:
+            file[f"episode_00001/{name}"][3] = 0
+        self.rejects(recording, f"episode_00001: '{name}' is damaged")
+
+    def test_names_that_are_not_those_written(self, tmp_path):
+        path = tmp_path / "a.h5"
+        write_recording(path, [an_episode()], ["x", "x_dot", "theta", "theta_dot"])
+        with h5py.File(path, "a") as file:
+            file.attrs["state_names"] = ["theta", "theta_dot", "x", "x_dot"]
+        self.rejects(path, "'state' is damaged")
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("format", 3),
+            ("format", np.zeros(3)),
+            ("version", np.ones(3)),
+            ("version", "2"),
+            ("state_names", 3),
+            ("state_names", [1, 2, 3, 4]),
+            ("state_names", np.zeros((2, 2))),
+            ("state_names", "x"),
+            ("state_names", h5py.Empty("f")),
+            ("state_names", ["x", "x", "theta", "theta"]),
+        ],
+    )
+    def test_attributes_of_another_kind_or_size(self, recording, name, value):
+        with h5py.File(recording, "a") as file:
+            file.attrs[name] = value
+        self.rejects(recording, "version" if name == "version" else f"attribute '{name}' is not")
+
+    @pytest.mark.parametrize("place", ["episode_00001", "episode_00001/time"])
+    @pytest.mark.parametrize(
+        "link", [h5py.ExternalLink("other.h5", "/there"), h5py.ExternalLink("/etc/passwd", "/"), h5py.SoftLink("/")]
+    )
+    def test_links_are_not_followed(self, recording, place, link):
+        with h5py.File(recording.with_name("other.h5"), "w") as other, h5py.File(recording, "a") as file:
+            file.copy(file[place], other, "there")
+            del file[place]
+            file[place] = link
+        self.rejects(recording, "is a link to elsewhere; what it leads to belongs into the file itself")
+
+    def test_values_in_another_file(self, recording):
+        with h5py.File(recording, "a") as file:
+            time = file["episode_00001/time"][()]
+            del file["episode_00001/time"]
+            recording.with_name("raw").write_bytes(time.tobytes())
+            raw = [(str(recording.with_name("raw")), 0, time.nbytes)]
+            file["episode_00001"].create_dataset("time", time.shape, time.dtype, external=raw)
+        self.rejects(recording, "the values of 'time' are in another file")
+
+    @pytest.mark.parametrize(("shape", "dtype"), [((10**10,), "f8"), ((38,), h5py.vlen_dtype(float)), ((38,), "O")])
+    def test_a_dataset_of_impossible_size_or_kind(self, recording, shape, dtype):
+        with h5py.File(recording, "a") as file:
+            del file["episode_00001/time"]
+            dtype = h5py.string_dtype() if dtype == "O" else dtype
+            file["episode_00001"].create_dataset("time", shape, dtype, chunks=(10,))
+        self.rejects(recording, "'time' is damaged")
+
+    def test_damage_over_which_hdf5_never_ends(self, tmp_path):
+        path = tmp_path / "a.h5"
+        write_recording(path, [an_episode(rows=12)], ["x", "x_dot", "theta", "theta_dot"], ["command"])
+        content = bytearray(path.read_bytes())
+        content[2561] = 8  # the free space of a heap
+        path.write_bytes(content)
+        self.rejects(path, "to read it ends the process, or takes more than 5 s")
+
+    def test_a_flipped_bit_anywhere_changes_nothing_that_is_read(self, tmp_path):
+        path = tmp_path / "a.h5"
+        whole = [an_episode(rows=12)]
+        write_recording(path, whole, ["x", "x_dot", "theta", "theta_dot"], ["command"])
+        content, rng = path.read_bytes(), np.random.default_rng(0)
+        for place in rng.integers(0, len(content), 100):
+            damaged = bytearray(content)
+            damaged[place] ^= 1 << rng.integers(8)
+            path.write_bytes(damaged)
+            with suppress(RecordingError):
+                assert_same(read_recording(path)[0], whole[0])
 
     @pytest.mark.parametrize("name", ["time", "action"])
     def test_a_missing_dataset(self, recording, name):
@@ -167,6 +255,7 @@ class TestBadFiles:
 
     def test_nan_says_episode_and_row(self, recording):
         with h5py.File(recording, "a") as file:
+            file.attrs["version"] = 1
             values = file["episode_00001/state"][()]
             values[9, 2] = np.nan
             file["episode_00001/state"][...] = values
@@ -174,6 +263,7 @@ class TestBadFiles:
 
     def test_frames_of_another_size(self, recording):
         with h5py.File(recording, "a") as file:
+            file.attrs["version"] = 1
             del file["episode_00002/frame"]
             file["episode_00002/frame"] = np.zeros((ROWS + 2, 5, 6), np.uint8)
         self.rejects(recording, r"episode_00002 has frame rows of shape \(5, 6\), the first episode of \(10, 12\)")

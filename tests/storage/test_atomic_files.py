@@ -1,4 +1,6 @@
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -87,6 +89,26 @@ def test_a_pipe_is_written_to_and_not_replaced(tmp_path):
         os.close(reader)
     assert pipe.is_fifo()
     assert names(tmp_path) == ["pipe"]
+
+
+def test_what_a_killed_process_left_is_removed_and_no_more(tmp_path):
+    path = tmp_path / "film.mp4"
+    code = f"""
+import os, signal
+from visadapt.storage.atomic_files import replacing
+with replacing({str(path)!r}) as temporary:
+    temporary.write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    subprocess.run([sys.executable, "-c", code], check=False)
+    assert len(names(tmp_path)) == 1
+    with replacing(path) as first, replacing(path) as second:
+        first.write_text("first")
+        assert names(tmp_path) == [first.name]
+        second.write_text("second")
+        assert first.exists()
+    assert path.read_text() == "first"
+    assert names(tmp_path) == ["film.mp4"]
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,22 @@
 import resource
+from contextlib import suppress
 
 import pytest
 import torch
 from safetensors.torch import save_file
 from torch import nn
 
+from visadapt.learning.training_state import CHECKPOINT_ITERATIONS, TrainingState
 from visadapt.policies import StatePolicy
-from visadapt.storage.checkpoints import CheckpointError, load_network, load_tree, load_weights, save_network, save_tree
+from visadapt.storage.checkpoints import (
+    TREE_KEY,
+    CheckpointError,
+    load_network,
+    load_tree,
+    load_weights,
+    save_network,
+    save_tree,
+)
 
 
 def same(one, other):
@@ -123,6 +133,64 @@ class TestBadFiles:
                 load_tree(path)
             assert str(caught.value).startswith(f"{path}: ")
             assert "\n" not in str(caught.value)
+
+    @pytest.mark.parametrize(
+        ("tree", "says"),
+        [
+            ("{", "holds not what is needed here"),
+            ('{"list": ' * 3000, "holds not what is needed here"),
+            ("[1]", "is damaged: its checksum"),
+            ('{"tensor": "7"}', r"holds not what is needed here .KeyError: '7'"),
+            ('{"dict": [["a"]]}', "holds not what is needed here"),
+        ],
+    )
+    def test_a_tree_that_is_none(self, tmp_path, tree, says):
+        path = tmp_path / "t.safetensors"
+        save_file({"0": torch.zeros(1)}, path, {TREE_KEY: tree})
+        with pytest.raises(CheckpointError, match=f"^{path}: {says}") as caught:
+            load_tree(path)
+        assert "\n" not in str(caught.value)
+
+    def test_a_folder(self, tmp_path):
+        with pytest.raises(CheckpointError, match=f"^{tmp_path}: cannot be read: Is a directory"):
+            load_tree(tmp_path)
+
+    def test_a_flipped_bit_anywhere_is_told_or_changes_nothing(self, tmp_path):
+        path, tree = tmp_path / "t.safetensors", {"a": torch.arange(30.0), "settings": {"seed": 1}}
+        save_tree(path, tree)
+        whole = path.read_bytes()
+        for place in range(len(whole)):
+            damaged = bytearray(whole)
+            damaged[place] ^= 1 << place % 8
+            path.write_bytes(damaged)
+            with suppress(CheckpointError):
+                assert same(load_tree(path), tree), place
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("generator", None),
+            ("generator", torch.zeros(3, dtype=torch.uint8)),
+            ("optimiser", None),
+            ("optimiser", {}),
+            ("network", None),
+            ("losses", None),
+        ],
+    )
+    def test_a_training_state_that_lacks_something(self, tmp_path, name, value):
+        def state():
+            network, path = nn.Linear(2, 1), tmp_path / "t.safetensors"
+            adam = torch.optim.Adam(network.parameters())
+            return TrainingState(network, adam, torch.Generator(), 0.1, CHECKPOINT_ITERATIONS, None, path)
+
+        whole = state()
+        for _ in range(CHECKPOINT_ITERATIONS):
+            whole.descend(whole.network(torch.ones(1, 2)).sum())
+        whole.keep({})
+        tree = load_tree(whole.path)
+        save_tree(whole.path, {**tree, name: value})
+        with pytest.raises(CheckpointError, match=r"t.safetensors: holds not what is needed here"):
+            state().resume()
 
 
 class TestNetworks:

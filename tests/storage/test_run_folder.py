@@ -38,6 +38,13 @@ class TestOpening:
         with pytest.raises(RunError, match=r"\(budget\)"):
             open_run(tmp_path, {key: value for key, value in SETTINGS.items() if key != "budget"})
 
+    @pytest.mark.parametrize("content", ["[]", "3", "null", '{"settings": []}', "{}", "{" * 3000, "\xff"])
+    def test_settings_of_another_shape(self, tmp_path, content):
+        (tmp_path / "settings.json").write_text(content, encoding="latin-1")
+        with pytest.raises(RunError, match=f"^{tmp_path / 'settings.json'}: (no|holds no)") as caught:
+            open_run(tmp_path, SETTINGS)
+        assert "\n" not in str(caught.value)
+
 
 class TestOnce:
     def test_it_is_made_once_and_read_from_then_on(self, tmp_path):

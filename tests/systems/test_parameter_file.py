@@ -32,6 +32,10 @@ def test_an_empty_table_is_the_default(tmp_path):
         ("[parameters]\ngravity = '9.8'\n", "gravity must be a number in SI units, got '9.8'"),
         ("[parameters]\ngravity = true\n", "gravity must be a number in SI units, got True"),
         ("[parameters\n", "not TOML"),
+        (f"[parameters]\ngravity = {'1' * 400}\n", "gravity must be finite, got 1{30} "),
+        (f"[parameters]\ngravity = {'1' * 5000}\n", "not TOML: Exceeds the limit"),
+        ("[parameters]\ngravity = 1e39\n", r"gravity must be finite, got 1e.39 .at most 3.4e.38 is right"),
+        (f"[parameters]\ngravity = {'[' * 3000}{']' * 3000}\n", "not TOML: maximum recursion depth"),
     ],
 )
 def test_one_line_names_file_and_key(tmp_path, text, message):

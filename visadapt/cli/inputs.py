@@ -17,15 +17,19 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from visadapt.cli.own_effects import complaints as complaints_of_effect
 from visadapt.diagnosis.saved import load_effects
 from visadapt.effects import EFFECTS, Effect
 from visadapt.effects.base import expect
 from visadapt.effects.catalogue import catalogue
 from visadapt.progress import Report, reporting
 from visadapt.storage.run_folder import open_run
-from visadapt.systems import SYSTEMS, System
+from visadapt.systems import SYSTEMS, CartPole, System
 from visadapt.systems.contract import complaints
 from visadapt.systems.parameter_file import load_parameters
+
+OWN_FILES: set[str] = set()
+"""Files of the user's whose code is run."""
 
 
 class InputError(ValueError):
@@ -126,10 +130,22 @@ def import_effects(options: argparse.Namespace) -> None:
     """Import the file of --effects, if there is one, whose effects register themselves: before any that may be named.
 
     Raises:
-        InputError: the file is missing, no Python, or raises; names its line.
+        InputError: the file is missing, no Python, or raises, which names its line; or it defines no effect that acts
+            on the system of --system, or one that does not keep to what effects are.
     """
-    if options.effects:
-        import_file(options.effects)
+    if not options.effects:
+        return
+    module = import_file(options.effects)
+    own = [effect for effect in EFFECTS.values() if effect.__module__ == module.__name__]
+    if not own:
+        raise InputError(f"{options.effects}: defines no effect: a class with a name that derives from visadapt.Effect")
+    for effect in own:
+        kinds = [options.system] if getattr(options, "system", None) else list(effect.systems)
+        for kind in [CartPole if kind is System else kind for kind in kinds]:
+            if issubclass(kind, effect.systems) and (wrong := complaints_of_effect(effect, kind())):
+                raise InputError(f"{options.effects}: {effect.__name__}: {wrong[0]}")
+    if getattr(options, "system", None) and not any(issubclass(options.system, effect.systems) for effect in own):
+        raise InputError(f"{options.effects}: none of its effects acts on a {options.system.name}")
 
 
 def import_file(given: str) -> ModuleType:
@@ -148,11 +164,21 @@ def import_file(given: str) -> ModuleType:
         raise InputError(f"{path}: not a Python file; a name that ends in .py is right")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    try:
+    OWN_FILES.add(str(path))
+    with own_code(lambda error: f"{path}: {describe(error, str(path))}"):
         spec.loader.exec_module(module)
-    except Exception as error:
-        raise InputError(f"{path}: {describe(error, str(path))}") from error
     return module
+
+
+@contextmanager
+def own_code(message: Callable[[BaseException], str]) -> Iterator[None]:
+    """Turn what code of the user's raises, which may be anything, into an InputError."""
+    try:
+        yield
+    except (KeyboardInterrupt, InputError):
+        raise
+    except BaseException as error:
+        raise InputError(message(error)) from error
 
 
 def find_factory(name: str) -> Callable[[], Any]:
@@ -162,11 +188,14 @@ def find_factory(name: str) -> Callable[[], Any]:
         sys.path.insert(0, here)
     try:
         module = importlib.import_module(module_name)
-    except Exception as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing and f"{module_name}.".startswith(f"{missing}."):
             raise InputError(f"{name}: there is no module {missing!r}, installed or in {here}") from error
         raise InputError(f"{name}: {describe(error)}") from error
+    OWN_FILES.add(str(module.__file__))
     factory = getattr(module, attribute, None)
     if not callable(factory):
         what = "nothing" if factory is None else f"a {type(factory).__name__}, not a function,"
@@ -174,7 +203,13 @@ def find_factory(name: str) -> Callable[[], Any]:
     return factory
 
 
-def describe(error: Exception, path: str | None = None) -> str:
+def own_line(error: BaseException) -> str | None:
+    """What is to be said of an error that the user's own code raised; None where it was ours."""
+    files = [frame.filename for frame in traceback.extract_tb(error.__traceback__) if frame.filename in OWN_FILES]
+    return f"{files[-1]}: {describe(error, files[-1])}" if files else None
+
+
+def describe(error: BaseException, path: str | None = None) -> str:
     """An exception of a user's Python in one line, with the line of `path`, or of the file that raised it."""
     if isinstance(error, SyntaxError):
         where = "" if path else f"{error.filename}: "
@@ -182,4 +217,5 @@ def describe(error: Exception, path: str | None = None) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if path in (None, frame.filename)]
     where = "" if not own else f"line {own[-1].lineno}: " if path else f"{own[-1].filename}, line {own[-1].lineno}: "
-    return f"{where}{type(error).__name__}: {' '.join(str(error).split())}"
+    text = "it ends the program" if isinstance(error, SystemExit) else " ".join(str(error).split())
+    return f"{where}{type(error).__name__}: {text}"

@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import signal
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from contextlib import suppress
+from typing import Any, NoReturn
 
 from visadapt.cli import arguments as asked
 
@@ -30,6 +32,8 @@ RESUMED = ("adapt", "train", "renderer")  # Subcommands that go on where an inte
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command: 0 done; 2 bad input, described by one line on stderr; 130 interrupted."""
     command = ""
+    with suppress(ValueError):  # outside the main thread
+        signal.signal(signal.SIGTERM, _terminated)
     try:
         options = _parser().parse_args(arguments)
         command = options.command
@@ -44,13 +48,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         # Whoever read the output has read enough, as `head` does; Python would complain once more at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except Exception as error:
-        # The messages of our own exceptions and of the system's are for whoever runs the command.
+    except (Exception, SystemExit) as error:
+        # The messages of our own exceptions, of the system's and of the user's code are for whoever runs the command.
+        message: object = error
         if not isinstance(error, OSError) and type(error).__module__.partition(".")[0] not in ("visadapt", "renderers"):
-            raise
-        print(f"visadapt: {printable(error)}", file=sys.stderr)
+            inputs: Any = sys.modules.get("visadapt.cli.inputs")  # by which code of the user's is imported
+            message = inputs.own_line(error) if inputs else None
+            if message is None:
+                raise
+        print(f"visadapt: {printable(message)}", file=sys.stderr)
         return 2  # argparse's own
     return 0
+
+
+def _terminated(number: int, _frame: object) -> NoReturn:
+    """End as after an interrupt, so that nothing half-written is left."""
+    raise SystemExit(128 + number)
 
 
 class _Parser(argparse.ArgumentParser):

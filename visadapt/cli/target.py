@@ -9,7 +9,7 @@ from itertools import chain
 
 import torch
 
-from visadapt.cli.inputs import InputError, describe, find_factory
+from visadapt.cli.inputs import InputError, describe, find_factory, own_code
 from visadapt.policies import ImagePolicy, Policy
 from visadapt.setups.policy_file import load_policy, load_source
 from visadapt.targets import Target
@@ -39,10 +39,8 @@ def load_target(options: argparse.Namespace, source: World, frames: bool) -> Tar
     # gymnasium too has ids of the form module:Name-v0, whose last part is no name of Python's.
     if ":" in name and name.rpartition(":")[2].isidentifier():
         factory = find_factory(name)
-        try:
+        with own_code(lambda error: f"{name}: {describe(error)}"):
             made = factory()
-        except Exception as error:
-            raise InputError(f"{name}: {describe(error)}") from error
         if isinstance(made, Target):
             if mapping is not None:
                 raise InputError(f"{name}: returns a visadapt.Target, for which --map has no use: leave it out")

@@ -30,7 +30,7 @@ def load_effects(path: str | os.PathLike[str]) -> tuple[str, list[Effect]]:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise DiagnosisFileError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DiagnosisFileError(f"{path}: not JSON: {error}") from error
     if not isinstance(content, dict) or content.get("schema") not in READABLE:
         raise DiagnosisFileError(

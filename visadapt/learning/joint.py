@@ -26,7 +26,7 @@ from visadapt.learning.windows import Observe, Windows
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
 from visadapt.recordings import Episode, read_recording, write_recording
-from visadapt.storage.checkpoints import load_tree, load_weights, save_tree
+from visadapt.storage.checkpoints import fitting, load_tree, load_weights, save_tree
 from visadapt.targets import Target, TargetError
 from visadapt.targets.rollout import run
 from visadapt.world import World
@@ -208,10 +208,11 @@ def adapt(
             states = None if true is windows else true.states
             save_tree(fitted, {"weights": grounded.state_dict(), "losses": losses, "states": states})
         tree = load_tree(fitted)
-        load_weights(grounded, tree["weights"], fitted)
-        grounding = [GroundLoss(*each) for each in tree["losses"]]
-        if tree.get("states") is not None:
-            windows = replace(windows, states=tree["states"])
+        with fitting(fitted):
+            load_weights(grounded, tree["weights"], fitted)
+            grounding = [GroundLoss(*each) for each in tree["losses"]]
+            if tree.get("states") is not None:
+                windows = replace(windows, states=tree["states"])
         if number == 0:
             own = policy.state_dict().items()
             start = {key: value.clone() for key, value in own if not key.startswith("residual.")}
@@ -236,8 +237,9 @@ def adapt(
             save_tree(tuned, {"weights": policy.state_dict(), "losses": tuning})
             partial.unlink(missing_ok=True)
         tree = load_tree(tuned)
-        load_weights(policy, tree["weights"], tuned)
-        rounds.append(Round(ledger.used, grounding, tree["losses"], found))
+        with fitting(tuned):
+            load_weights(policy, tree["weights"], tuned)
+            rounds.append(Round(ledger.used, grounding, tree["losses"], found))
     return Adapted(policy, ledger, rounds, episodes, folder, known)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from visadapt.storage.checkpoints import load_network, load_tree, load_weights, save_network, save_tree
+from visadapt.storage.checkpoints import fitting, load_network, load_tree, load_weights, save_network, save_tree
 
 CHECKPOINT_ITERATIONS = 100
 """Iterations between two checkpoints."""
@@ -46,13 +46,14 @@ class TrainingState:
         if self.path is None or not self.path.exists():
             return None
         tree = load_tree(self.path)
-        load_weights(self.network, tree["network"], self.path)
-        self.optimiser.load_state_dict(tree["optimiser"])
-        self.schedule.load_state_dict(tree["schedule"])
-        self.generator.set_state(tree["generator"])
-        self.losses = tree["losses"]
-        more: dict[str, Any] = tree["more"]
-        return more
+        with fitting(self.path):
+            load_weights(self.network, tree["network"], self.path)
+            self.optimiser.load_state_dict(tree["optimiser"])
+            self.schedule.load_state_dict(tree["schedule"])
+            self.generator.set_state(tree["generator"])
+            self.losses = [float(loss) for loss in tree["losses"]]
+            more: dict[str, Any] = tree["more"]
+            return more
 
     def descend(self, loss: Tensor) -> None:
         """One step against the gradient, of a norm of 1 at most."""

@@ -20,6 +20,9 @@ from visadapt.recordings.clock import RawEpisode
 from visadapt.recordings.episode import RecordingError
 from visadapt.systems import System
 
+SEPARATORS = ",;\t"
+UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
+
 OTHER_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
     "cartpole": {
         "x": ("position", "cart_position", "pos", "s"),
@@ -56,16 +59,24 @@ class Table:
         try:
             text = path.read_text(encoding="utf-8-sig")  # line ends of any kind become \n
         except UnicodeDecodeError as error:
-            raise RecordingError(f"{path}: not text in UTF-8 (byte {error.start}); a CSV file is right") from error
+            coded = ", but in UTF-16" if error.object[:2] in UTF_16_MARKS else f" (byte {error.start})"
+            raise RecordingError(f"{path}: not text in UTF-8{coded}; CSV in UTF-8 is right") from error
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-        lines = [(number, line.strip()) for number, line in enumerate(text.split("\n"), 1)]
-        lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
+        lines = [(number, line) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
+        lines = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
         if not lines:
             raise RecordingError(f"{path}: is empty; a line of names and rows of numbers below it are right")
         (number, first), *rows = lines
-        separator = ";" if first.count(";") > first.count(",") else ","
-        header = tuple(name.strip().strip('"') for name in first.split(separator))
+        if "\0" in text[:1000]:
+            raise RecordingError(f"{path}: line {number} holds NUL bytes, as no text in UTF-8; CSV in UTF-8 is right")
+        separator = max(SEPARATORS, key=first.count)
+        if separator not in first:
+            raise RecordingError(f"{path}: line {number}: names separated by commas, semicolons or tabs are right")
+        try:
+            header = tuple(name.strip() for name in next(csv.reader([first], delimiter=separator, strict=True)))
+        except csv.Error as error:
+            raise RecordingError(f"{path}: line {number} is no line of names: {error}") from error
         if all(_is_number(name) for name in header):
             raise RecordingError(
                 f"{path}: line {number} holds numbers where the columns' names belong "
@@ -83,8 +94,16 @@ class Table:
         if not self.rows:
             raise RecordingError(f"{self.path}: has no rows below its line of names")
         values = []
-        for row, cells in enumerate(csv.reader((line for _, line in self.rows), delimiter=self.separator)):
+        reader, row = csv.reader((line for _, line in self.rows), delimiter=self.separator, strict=True), 0
+        while row < len(self.rows):
             where = f"{self.path}: {self.place(row)}"
+            try:
+                cells = next(reader)
+            except csv.Error as error:
+                raise RecordingError(f"{where} is no row of CSV: {error}; is a quotation mark left open?") from error
+            row += 1
+            if reader.line_num > row:
+                raise RecordingError(f"{where}: a quotation mark is left open, so that the next lines are part of it")
             if len(cells) < len(self.header):
                 raise RecordingError(
                     f"{where} is cut short: {len(cells)} of {len(self.header)} cells; is the file incomplete?"
@@ -92,7 +111,7 @@ class Table:
             if len(cells) > len(self.header):
                 raise RecordingError(f"{where} has {len(cells)} cells, the line of names {len(self.header)}")
             try:
-                values.append([float(cells[column].partition("#")[0]) for column in columns])
+                values.append([_number(cells[column].partition("#")[0]) for column in columns])
             except ValueError:
                 column = next(column for column in columns if not _is_number(cells[column]))
                 raise RecordingError(f"{where}, column {self.header[column]!r} {_complaint(cells[column])}") from None
@@ -110,7 +129,7 @@ def read_rows(path: Path, system: System, given: Mapping[str, str]) -> list[RawE
         RecordingError: the file or a column is missing, or a cell is not a number.
     """
     table = Table.open(path)
-    found = _match(path, table.header, system, given)
+    found = match(path, table.header, system, given)
     values = dict(zip(found, table.numbers(list(found.values())).T, strict=True))
     measured = tuple(variable.name for variable in system.states if variable.name in found)
     state = np.column_stack([values[name] for name in measured])
@@ -133,15 +152,20 @@ def needed(system: System) -> tuple[str, ...]:
     return ("time", *(name for name in names if name not in rates), *(variable.name for variable in system.actions))
 
 
-def _match(path: Path, header: tuple[str, ...], system: System, given: Mapping[str, str]) -> dict[str, int]:
+def match(
+    path: Path, header: tuple[str, ...], system: System, given: Mapping[str, str], states: bool = True
+) -> dict[str, int]:
     """The index of each of our variables in a file's header; `given` maps our names to the file's.
+
+    Without `states`, of time and actions alone, as where frames take their place.
 
     Raises:
         RecordingError: a needed column is missing, several columns could be one variable, or `given` names a variable
             or a column that does not exist.
     """
     others = {"time": ("t", "timestamp"), **OTHER_NAMES.get(system.name, {})}
-    ours = ["episode", "time", *(variable.name for variable in (*system.states, *system.actions))]
+    wanted_states = [state.name for state in system.states] if states else []
+    ours = ["episode", "time", *wanted_states, *(action.name for action in system.actions)]
     for name in given:
         if name not in ours:
             raise RecordingError(f"--columns {name}=...: {system.name} has no {name!r}; it has {', '.join(ours)}")
@@ -155,6 +179,9 @@ def _match(path: Path, header: tuple[str, ...], system: System, given: Mapping[s
             which = ", ".join(repr(header[index]) for index in candidates)
             raise RecordingError(f"{path}: the columns {which} could each be {name}; say which: --columns {name}=...")
         if candidates:
+            taken = next((other for other, index in found.items() if index == candidates[0]), None)
+            if taken is not None:
+                raise RecordingError(f"{path}: column {header[candidates[0]]!r} is taken for both {taken} and {name}")
             found[name] = candidates[0]
         elif name in given:
             raise RecordingError(f"{path}: has no column {given[name]!r} for {name}; it has {', '.join(header)}")
@@ -166,9 +193,16 @@ def _match(path: Path, header: tuple[str, ...], system: System, given: Mapping[s
     return found
 
 
+def _number(cell: str) -> float:
+    """The number in a cell; without the underscores and the foreign digits that Python takes too."""
+    if "_" in cell or not cell.isascii():
+        raise ValueError(cell)
+    return float(cell)
+
+
 def _is_number(cell: str) -> bool:
     try:
-        float(cell)
+        _number(cell)
     except ValueError:
         return False
     return True

@@ -7,16 +7,20 @@
     /episode_00000/frame    (T, H, W) uint8, gzip
     /episode_00000/task_state  (T, n_task_state) floating point, where the target has a task
 
-All datasets carry a checksum (Fletcher-32), so that damaged bytes are reported and not read as data.
+All datasets carry a checksum (Fletcher-32) and, since version 2, as the attribute `sha256` that of their type, shape,
+values and names of columns: damage, also of what says how to read the values, is reported and not read as data. Files
+that others write, or edit, may be of version 1, without it. A file is read on its own: links, and values that are
+stored in other files, are refused.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
@@ -26,7 +30,15 @@ from visadapt.recordings.episode import Episode, RecordingError
 from visadapt.storage.atomic_files import replacing
 from visadapt.systems import System
 
-FORMAT, VERSION = "visadapt recording", 1
+Read = TypeVar("Read")
+
+FORMAT, VERSION = "visadapt recording", 2
+READABLE = (1, VERSION)
+COMPRESSION = 1100
+"""Values over stored bytes that compression reaches at most; a dataset that claims more is damaged."""
+READING_S, READING_BYTES_PER_S = 5, 10e6
+"""s of computation that reading a file may take at least, and bytes for which it may take a second more."""
+DATASETS = ("time", "action", "state", "task_state", "frame")
 FRAMES_IN_CHUNK = 16
 """Frames that are compressed together, so that reading one decompresses at most this many."""
 
@@ -66,13 +78,13 @@ def write_recording(
                 file.attrs[f"{kind}_names"] = list(names)
         for number, episode in enumerate(episodes):
             group = file.create_group(_group_name(number))
-            for name in ("time", "action", "state", "task_state"):
-                if (values := getattr(episode, name)) is not None:
-                    group.create_dataset(name, data=values, fletcher32=True)
-            if episode.frame is not None:
-                rows, height, width = episode.frame.shape
-                chunks = (min(rows, FRAMES_IN_CHUNK), height, width)
-                group.create_dataset("frame", data=episode.frame, chunks=chunks, compression="gzip", fletcher32=True)
+            present = {name: values for name in DATASETS if (values := getattr(episode, name)) is not None}
+            for name, values in present.items():
+                packed = {}
+                if name == "frame":
+                    packed = {"chunks": (min(len(values), FRAMES_IN_CHUNK), *values.shape[1:]), "compression": "gzip"}
+                dataset = group.create_dataset(name, data=values, fletcher32=True, **packed)
+                dataset.attrs["sha256"] = _digest(file, name, values, len(episodes), [*present])
         file.flush()
         content = file.id.get_file_image()
     with replacing(path) as temporary:
@@ -81,10 +93,15 @@ def write_recording(
 
 def read_names(path: str | os.PathLike[str], system: System | type[System]) -> tuple[list[str], list[str]]:
     """Names of the columns of state and of action, the system's if the file has none; raises like `read_recording`."""
-    with _opened(Path(path)) as file:
-        state = file.attrs.get("state_names", [variable.name for variable in system.states])
-        action = file.attrs.get("action_names", [variable.name for variable in system.actions])
-    return list(state), list(action)
+
+    def read() -> tuple[list[str], list[str]]:
+        with _opened(Path(path)) as file:
+            return (
+                _names(file, "state") or [variable.name for variable in system.states],
+                _names(file, "action") or [variable.name for variable in system.actions],
+            )
+
+    return _tried(path, read)
 
 
 def read_recording(path: str | os.PathLike[str], frames: bool = True) -> list[Episode]:
@@ -102,10 +119,41 @@ def read_recording(path: str | os.PathLike[str], frames: bool = True) -> list[Ep
     2
     """
     path = Path(path)
-    with _opened(path) as file:
-        episodes = [_read_episode(path, file, number, frames) for number in range(len(file))]
-    _check_alike(path, episodes)
-    return episodes
+
+    def read() -> list[Episode]:
+        with _opened(path) as file:
+            for number in range(len(file)):
+                if _group_name(number) not in file:
+                    raise RecordingError(
+                        f"{path}: {_group_name(number)} is missing; {len(file)} groups, numbered from 0, were expected"
+                    )
+            episodes = [_read_episode(path, file, number, frames) for number in range(len(file))]
+        _check_alike(path, episodes)
+        return episodes
+
+    return _tried(path, read)
+
+
+def _tried(path: str | os.PathLike[str], read: Callable[[], Read]) -> Read:
+    """What is read, after it was read in a process of its own: damage may keep HDF5 busy for ever, or end the process.
+
+    Raises:
+        RecordingError: that process was ended by either; or whatever `read` raises.
+    """
+    if hasattr(os, "fork") and Path(path).is_file():
+        import resource  # not on every system, as fork
+
+        seconds = READING_S + int(Path(path).stat().st_size / READING_BYTES_PER_S)
+        if (child := os.fork()) == 0:
+            try:
+                resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+                with suppress(Exception):
+                    read()
+            finally:
+                os._exit(0)
+        if os.waitpid(child, 0)[1]:
+            raise RecordingError(f"{path}: is damaged: to read it ends the process, or takes more than {seconds} s")
+    return read()
 
 
 @contextmanager
@@ -114,16 +162,43 @@ def _opened(path: Path) -> Iterator[h5py.File]:
         raise RecordingError(f"{path}: there is no such file")
     try:
         with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT:
+            if not _is(file.attrs.get("format"), FORMAT):
                 raise RecordingError(f"{path}: an HDF5 file, but its attribute 'format' is not {FORMAT!r}")
-            if (version := file.attrs.get("version")) != VERSION:
+            version = file.attrs.get("version")
+            if not any(_is(version, each) for each in READABLE):
                 raise RecordingError(f"{path}: version {version} of the format; this visadapt reads version {VERSION}")
             yield file
-    except OSError as error:
-        # HDF5's own message describes its internals and may be several lines long.
+    except RecordingError:
+        raise
+    except Exception as error:
+        # HDF5's own messages describe its internals, may be several lines long, and are of many kinds.
         raise RecordingError(
-            f"{path}: not a readable HDF5 file, or cut short; a recording written by visadapt is right"
+            f"{path}: not a readable HDF5 file, or cut short or damaged; a recording written by visadapt is right"
         ) from error
+
+
+def _is(value: object, wanted: str | int) -> bool:
+    """Whether an attribute, which may be of any kind and size, is this."""
+    return isinstance(value, str if isinstance(wanted, str) else np.integer) and value == wanted
+
+
+def _names(file: h5py.File, kind: str) -> list[str] | None:
+    """The names of the columns of state or action, if the file has them."""
+    if (found := file.attrs.get(f"{kind}_names")) is None:
+        return None
+    names = list(found) if isinstance(found, np.ndarray) and found.ndim == 1 else []
+    if not names or not all(isinstance(name, str) for name in names) or len({*names}) < len(names):
+        raise RecordingError(
+            f"{file.filename}: its attribute '{kind}_names' is not a list of names, each different, of the columns"
+        )
+    return names
+
+
+def _digest(file: h5py.File, name: str, values: NDArray[Any], episodes: int, present: Sequence[str]) -> str:
+    """The SHA-256 of a dataset, and of what stands beside it: the episodes' number, the other datasets of this one."""
+    columns = _names(file, name) if name in ("state", "action") else None
+    about = f"{episodes} {sorted(present)} {name} {columns} {values.dtype.str} {values.shape}"
+    return hashlib.sha256(about.encode() + np.ascontiguousarray(values).tobytes()).hexdigest()
 
 
 def _group_name(number: int) -> str:
@@ -132,25 +207,47 @@ def _group_name(number: int) -> str:
 
 def _read_episode(path: Path, file: h5py.File, number: int, frames: bool) -> Episode:
     where = f"{path}: {_group_name(number)}"
-    group = file.get(_group_name(number))
-    if not isinstance(group, h5py.Group):
-        raise RecordingError(f"{where} is missing; {len(file)} groups, numbered from 0, were expected")
-    for name in ("time", "action"):
-        if name not in group:
-            raise RecordingError(f"{where} has no dataset {name!r}")
+    name = _group_name(number)
+    _check_own(file, name, where)
+    group = file[name]
+    for needed in ("time", "action"):
+        if needed not in group:
+            raise RecordingError(f"{where} has no dataset {needed!r}")
     if "state" not in group and not frames:
         raise RecordingError(f"{where} holds frames alone; states are needed (or a renderer, by --renderer)")
-    arrays: dict[str, NDArray[Any]] = {}
-    for name in ("time", "action", "state", "task_state", *(["frame"] if frames else [])):
-        try:
-            if name in group:
-                arrays[name] = np.asarray(group[name][()])
-        except (OSError, TypeError) as error:  # a group has no values
-            raise RecordingError(f"{where}: {name!r} is damaged, or no dataset, and cannot be read") from error
+    arrays = {
+        name: _read_dataset(group, name, where) for name in DATASETS if name in group and (frames or name != "frame")
+    }
     try:
         return Episode(**arrays)
     except ValueError as error:
         raise RecordingError(f"{where}: {error}") from error
+
+
+def _read_dataset(group: h5py.Group, name: str, where: str) -> NDArray[Any]:
+    _check_own(group, name, where)
+    damaged = f"{where}: {name!r} is damaged, or no dataset, or was edited, and cannot be read"
+    try:
+        dataset = group[name]
+        if dataset.is_virtual or dataset.external:
+            raise RecordingError(f"{where}: the values of {name!r} are in another file; its own are right")
+        if dataset.nbytes > COMPRESSION * dataset.id.get_storage_size() or dataset.dtype.hasobject:
+            raise RecordingError(damaged)
+        values = np.asarray(dataset[()])
+        file = group.file
+        if file.attrs["version"] > 1 and dataset.attrs.get("sha256") != _digest(
+            file, name, values, len(file), [*group]
+        ):
+            raise RecordingError(damaged)
+    except (OSError, TypeError, AttributeError) as error:  # a group has no values
+        raise RecordingError(damaged) from error
+    return values
+
+
+def _check_own(group: h5py.Group, name: str, where: str) -> None:
+    """Raises RecordingError where something of a group is only a link, which may lead out of the file."""
+    if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+        raise RecordingError(f"{where}: {name!r} is a link to elsewhere; what it leads to belongs into the file itself")
 
 
 def _check_alike(path: Path, episodes: Sequence[Episode]) -> None:

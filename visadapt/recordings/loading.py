@@ -13,7 +13,7 @@ import numpy as np
 
 from visadapt.recordings.checks import check_commands, check_finite, check_units
 from visadapt.recordings.clock import Note, RawEpisode, alike, check_forward, check_steps, uninterrupted
-from visadapt.recordings.csv import needed, read_rows
+from visadapt.recordings.csv import match, read_rows
 from visadapt.recordings.episode import Episode, Recording, RecordingError
 from visadapt.recordings.hdf5 import read_names, read_recording
 from visadapt.recordings.sensors import check_sensors, without_outliers
@@ -131,38 +131,36 @@ def _read(path: Path, system: System, given: Mapping[str, str], frames: bool) ->
         raise RecordingError(
             f"{path}: no HDF5 file; times, commands and frames as visadapt.write_recording writes them are right"
         )
-    return _read_hdf5(path, system, frames) if is_hdf5 else read_rows(path, system, given)
+    return _read_hdf5(path, system, given, frames) if is_hdf5 else read_rows(path, system, given)
 
 
-def _read_hdf5(path: Path, system: System, frames: bool) -> list[RawEpisode]:
-    ours, actions = ([variable.name for variable in variables] for variables in (system.states, system.actions))
+def _read_hdf5(path: Path, system: System, given: Mapping[str, str], frames: bool) -> list[RawEpisode]:
     state_names, action_names = read_names(path, system)
     if frames:
         state_names = []
-    measured = tuple(name for name in ours if name in state_names)
+    header = ("time", *state_names, *action_names)
+    found = match(path, header, system, given, states=not frames)
+    measured = tuple(variable.name for variable in system.states if variable.name in found)
+    names = {name: header[index] for name, index in found.items()}
     rows = []
     for number, episode in enumerate(read_recording(path, frames)):
-        source = f"{path}, episode {number}"
+        where = f"{path}, episode {number}"
         if frames and episode.frame is None:
-            raise RecordingError(f"{source} has no frames; leave out --renderer to diagnose its states")
+            raise RecordingError(f"{where} has no frames; leave out --renderer to diagnose its states")
         states = np.zeros((len(episode.time), 0)) if frames else episode.state
         assert states is not None  # without states, read_recording raises
-        if states.shape[1] != len(state_names) or episode.action.shape[1] != len(action_names):
+        if (widths := (states.shape[1], episode.action.shape[1])) != (len(state_names), len(action_names)):
             raise RecordingError(
-                f"{source}: {states.shape[1]} columns of state and {episode.action.shape[1]} of action; "
-                f"{', '.join([*state_names, *action_names])} are right"
+                f"{where}: {widths[0]} columns of state and {widths[1]} of action; "
+                f"{', '.join(state_names)} and {', '.join(action_names)} are right"
             )
-        there = [*state_names, *action_names]
-        for name in needed(system)[1:]:
-            if name not in there and not (frames and name in ours):
-                raise RecordingError(f"{source}: {name!r} is missing; it has {', '.join(there)}")
-        state = states[:, [state_names.index(name) for name in measured]].astype(float)
-        action = episode.action[:, [action_names.index(name) for name in actions]].astype(float)
-        time = episode.time.astype(float)
-        seen = episode.frame if frames else None
-        rows.append(
-            RawEpisode(path, time, action, state, measured, lambda row: f"row {row + 1}", number=number, frame=seen)
+        table = np.column_stack([episode.time, states, episode.action]).astype(float)
+        state, action = (
+            table[:, [found[name] for name in each]] for each in (measured, [a.name for a in system.actions])
         )
+        place = lambda row: f"row {row + 1}"  # noqa: E731
+        seen = episode.frame if frames else None
+        rows.append(RawEpisode(path, table[:, found["time"]], action, state, measured, place, names, number, seen))
     return rows
 
 

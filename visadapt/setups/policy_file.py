@@ -20,7 +20,7 @@ from visadapt.effects import EFFECTS, Effect, Residual
 from visadapt.learning.perception import PerceptionSettings, scale
 from visadapt.policies import FlightPolicy, ImagePolicy, Policy, StatePolicy
 from visadapt.policies.networks import FlightResidualNetwork, ImageResidualNetwork, StateResidualNetwork
-from visadapt.storage.checkpoints import CheckpointError, load_tree, load_weights, save_network
+from visadapt.storage.checkpoints import CheckpointError, fitting, load_tree, load_weights, save_network
 from visadapt.systems import SYSTEMS, RigidBody
 from visadapt.world import World, WorldState
 
@@ -58,17 +58,18 @@ def load_policy(path: str | Path) -> Policy:
     """
     path = Path(path)
     tree = _load(path)
-    made = tree["settings"]
-    policy = KINDS[tree["class"]](**made["arguments"])
-    weights = tree["weights"]
-    if made.get("grounded_in") is not None:
-        policy.grounded_in = made["grounded_in"]
-        source = _world(made["grounded_in"], path)
-        policy.residual = residual_for(policy, source)
-        key = "residual.network.head.weight"
-        if key in weights and weights[key].shape != policy.state_dict()[key].shape:
-            policy.residual = residual_for(policy, source, with_history=True)
-    load_weights(policy, weights, path)
+    with fitting(path):
+        made = tree["settings"]
+        policy = KINDS[tree["class"]](**made["arguments"])
+        weights = tree["weights"]
+        if made.get("grounded_in") is not None:
+            policy.grounded_in = made["grounded_in"]
+            source = _world(made["grounded_in"], path)
+            policy.residual = residual_for(policy, source)
+            key = "residual.network.head.weight"
+            if key in weights and weights[key].shape != policy.state_dict()[key].shape:
+                policy.residual = residual_for(policy, source, with_history=True)
+        load_weights(policy, weights, path)
     return policy.eval()
 
 
@@ -88,14 +89,15 @@ def load_source(path: str | Path) -> World:
     description = made.get("grounded_in") or made.get("source")
     if description is None:
         raise CheckpointError(f"{path}: does not say in which world the policy was trained; train it again")
-    return _world(description, path)
+    with fitting(path):
+        return _world(description, path)
 
 
 def _load(path: Path) -> dict[str, Any]:
     tree = load_tree(path)
     if not isinstance(tree, dict) or not {"class", "settings", "weights"} <= tree.keys():
         raise CheckpointError(f"{path}: a checkpoint, but not of a policy")
-    if tree["class"] not in KINDS or "arguments" not in tree["settings"]:
+    if tree["class"] not in KINDS or not isinstance(tree["settings"], dict) or "arguments" not in tree["settings"]:
         raise CheckpointError(f"{path}: holds a {tree['class']}, a policy ({', '.join(sorted(KINDS))}) is needed")
     return tree
 

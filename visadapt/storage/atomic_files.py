@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import glob
 import os
 import shutil
+import socket
 import stat
 import tempfile
 import uuid
@@ -33,8 +35,9 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     The temporary file is hidden and keeps the suffix, since many writers choose a format by it. Missing folders are
     made. If the block raises or is interrupted, the temporary file is removed and a file at `path` stays as it was.
-    Links are followed, and a file that is replaced keeps its mode. What is no regular file, such as a pipe or a device,
-    is never replaced: the content is written to it.
+    What a process left that was killed while it wrote the same file is removed too. Links are followed, and a file
+    that is replaced keeps its mode. What is no regular file, such as a pipe or a device, is never replaced: the content
+    is written to it.
 
     Raises:
         DiskFullError: the disk, or the user's quota on it, is full.
@@ -44,9 +47,13 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     final = Path(os.path.realpath(path))
     through = _is_device(path)
     folder = Path(tempfile.gettempdir()) if through else final.parent
-    temporary = folder / f".{final.stem[:100]}.{uuid.uuid4().hex[:12]}{final.suffix}"
+    stem = f".{final.stem[:100]}.{socket.gethostname()[:50]}"
+    temporary = folder / f"{stem}.{os.getpid()}-{uuid.uuid4().hex[:8]}{final.suffix}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        for other in folder.glob(f"{glob.escape(stem)}.*-????????{glob.escape(final.suffix)}"):
+            if not _is_running(int(other.name[len(stem) + 1 :].partition("-")[0])):
+                other.unlink(missing_ok=True)
         yield temporary
         if through:
             with Path(path).open("ab") as device:  # appended: standard output may be a file that holds more
@@ -87,6 +94,17 @@ def check_writable(path: str | os.PathLike[str]) -> None:
             pass
     except OSError as error:
         raise NotWrittenError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _is_running(process: int) -> bool:
+    """Whether there is a process of that number on this machine."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # it is another user's
+        return True
+    return True
 
 
 def _is_device(path: str | os.PathLike[str]) -> bool:

@@ -7,7 +7,8 @@ file's header.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from renderers.weights import sealed, unsealed
 from visadapt.storage.atomic_files import replacing
 
 TREE_KEY = "visadapt.tree"
-"""Key of the JSON in the header of the safetensors file."""
+"""Key of the JSON, after its checksum, in the header of the safetensors file."""
 
 
 class CheckpointError(ValueError):
@@ -28,24 +30,49 @@ class CheckpointError(ValueError):
 def save_tree(path: Path, tree: Any) -> None:
     """Write a tree to `path`, atomically."""
     tensors: dict[str, Tensor] = {}
-    skeleton = _strip(tree, tensors)
+    skeleton = json.dumps(_strip(tree, tensors))
     with replacing(path) as temporary:
-        save_file(tensors, temporary, {TREE_KEY: json.dumps(skeleton)})
+        save_file(tensors, temporary, {TREE_KEY: sealed(skeleton, tensors)})
 
 
 def load_tree(path: Path) -> Any:
-    """Read a tree; raises CheckpointError if the file is missing, incomplete, or not written by `save_tree`."""
-    if not path.is_file():
-        raise CheckpointError(f"{path}: there is no such checkpoint")
+    """Read a tree; raises CheckpointError if the file is missing, damaged, or not written by `save_tree`."""
     try:
+        path.open("rb").close()  # since safetensors says of every other reason that there is no such file
         with safe_open(path, framework="pt") as file:
-            skeleton = json.loads((file.metadata() or {})[TREE_KEY])
+            entry = (file.metadata() or {}).get(TREE_KEY)
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{path}: there is no such checkpoint") from error
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except SafetensorError as error:
         raise CheckpointError(f"{path}: not a complete safetensors file ({error})") from error
-    except KeyError:
-        raise CheckpointError(f"{path}: a safetensors file, but not one that visadapt wrote") from None
-    return _restore(skeleton, tensors)
+    if entry is None:
+        raise CheckpointError(f"{path}: a safetensors file, but not one that visadapt wrote")
+    if (skeleton := unsealed(entry, tensors)) is None:
+        raise CheckpointError(f"{path}: is damaged: its checksum is not that of what it holds")
+    with fitting(path):
+        return _restore(json.loads(skeleton), tensors)
+
+
+@contextmanager
+def fitting(path: Path) -> Iterator[None]:
+    """Turn what a block raises over a checkpoint that lacks something, or holds something else, into CheckpointError.
+
+    >>> import pathlib
+    >>> with fitting(pathlib.Path("a.safetensors")):
+    ...     {"weights": 1}["settings"]
+    Traceback (most recent call last):
+    visadapt.storage.checkpoints.CheckpointError: a.safetensors: holds not what is needed here (KeyError: 'settings')
+    """
+    try:
+        yield
+    except CheckpointError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        what = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise CheckpointError(f"{path}: holds not what is needed here ({what})") from error
 
 
 def load_weights(module: nn.Module, weights: Mapping[str, Tensor], origin: Path) -> None:

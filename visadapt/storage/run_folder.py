@@ -28,7 +28,9 @@ def open_run(folder: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
     """
     wanted = json.loads(json.dumps(_finite(settings), default=str))
     run = once(folder / "settings.json", lambda: {"settings": wanted, "versions": versions()})
-    found = run["settings"]
+    found = run.get("settings")
+    if not isinstance(found, dict):
+        raise RunError(f"{folder / 'settings.json'}: holds no settings of a run: remove the folder or name another")
     if found != wanted:
         differing = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
         raise RunError(
@@ -54,11 +56,14 @@ def once(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The JSON object in a file; raises RunError if the file is incomplete."""
+    """The JSON object in a file; raises RunError if the file is incomplete, or holds something else."""
     try:
-        return json.loads(path.read_text())
-    except json.JSONDecodeError as error:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
         raise RunError(f"{path}: not complete JSON ({error}): remove it and run again") from error
+    if not isinstance(content, dict):
+        raise RunError(f"{path}: no JSON object: remove it and run again")
+    return content
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

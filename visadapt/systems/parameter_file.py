@@ -10,13 +10,17 @@ Names and SI units are those of the system's fields; parameters that the file do
 from __future__ import annotations
 
 import inspect
-import math
 import os
 import tomllib
 from pathlib import Path
 from typing import TypeVar
 
+import torch
+
 from visadapt.systems import System
+
+LARGEST = float(torch.finfo(torch.float32).max)
+"""Of a parameter, in which policies are trained."""
 
 SystemT = TypeVar("SystemT", bound=System)
 
@@ -42,7 +46,7 @@ def load_parameters(path: str | os.PathLike[str], system_class: type[SystemT]) -
         content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise ParameterFileError(f"{path}: cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # of TOML, of its encoding, or of the Python that reads it
         raise ParameterFileError(f"{path}: not TOML: {error}") from error
     names = list(inspect.signature(system_class).parameters)
     known = ", ".join(names)
@@ -58,8 +62,10 @@ def load_parameters(path: str | os.PathLike[str], system_class: type[SystemT]) -
             raise ParameterFileError(f"{path}: unknown key {key!r} in [parameters]; there are {known}")
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ParameterFileError(f"{path}: {key} must be a number in SI units, got {value!r}")
-        if not math.isfinite(value):
-            raise ParameterFileError(f"{path}: {key} must be finite, got {value!r}")
+        if not abs(value) <= LARGEST:
+            raise ParameterFileError(
+                f"{path}: {key} must be finite, got {value!r:.30} (at most {LARGEST:.2g} is right)"
+            )
     try:
         return system_class(**{key: float(value) for key, value in parameters.items()})
     except ValueError as error:
