@@ -26,6 +26,10 @@ class Batch:
     def __getitem__(self, rows: Tensor | slice) -> Self:
         return self.map(lambda tensor: tensor[rows])
 
+    def repeat(self, count: int) -> Self:
+        """All rows `count` times over."""
+        return self.map(lambda tensor: tensor.repeat(count, *[1] * (tensor.dim() - 1)))
+
     def joined(self, other: Self) -> Self:
         """The rows of this batch and, after them, those of another."""
         return self.map(lambda *pair: torch.cat(pair), other)

@@ -6,9 +6,12 @@ import io
 import multiprocessing
 import pickle
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
+
+import torch
 
 from visadapt.effects.base import EFFECTS, Effect
 
@@ -17,6 +20,17 @@ ENDING = (signal.SIGINT, signal.SIGTERM)
 Result = TypeVar("Result")
 Work = Callable[[Sequence[int]], Sequence[Result]]
 """Gives a result for each index that it is handed, whichever others it is handed along with it."""
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Operations of torch take one thread: they are too small for more, and processes share the work."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def shared_out(work: Work[Result], count: int, jobs: int) -> list[Result]:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from visadapt.batch import Batch
 from visadapt.effects import ActuationEffect, CameraEffect, DynamicsEffect, Effect, Parameter, Residual, SensingEffect
 from visadapt.effects.base import expect
-from visadapt.effects.camera import moved
+from visadapt.effects.camera import seen_by
 from visadapt.history import History
 from visadapt.systems import SYSTEMS, System
 from visadapt.systems.dry_friction import sliding, stopped
@@ -89,6 +89,10 @@ class World(nn.Module):
         """(P,) present values of the parameters in `table`, which must be scalars."""
         values = [getattr(effect, parameter.name) for effect in self._named for parameter in effect.table]
         return torch.stack(values) if values else torch.zeros(0)
+
+    def with_effects(self, effects: Sequence[Effect]) -> World:
+        """The same system and clock with these effects instead."""
+        return World(self.system, effects, self.period, self.integrator, self.substeps)
 
     def with_values(self, values: Tensor) -> World:
         """The same world with other values of the parameters of its effects.
@@ -210,13 +214,8 @@ class World(nn.Module):
         """
         acting, sensing, seeing = self._split(at.memory)
         state, seeing = self._scene(at.state, seeing)
-        frame = draw(state)
-        frame = moved(frame, [motion for e in self._camera if (motion := e.motion(frame)) is not None])
-        remembered = []
-        for effect, own in zip(self._camera, seeing, strict=True):
-            frame, own = effect.apply_to(frame, own, generator)
-            remembered.append(own)
-        return frame, replace(at, memory=(*acting, *sensing, *remembered))
+        frame, seeing = seen_by(self._camera, draw(state), seeing, generator)
+        return frame, replace(at, memory=(*acting, *sensing, *seeing))
 
     def reading(self, state: Tensor) -> Tensor:
         """What sensors read (B, n_state) of states, each as if it were the first row of an episode."""

@@ -20,7 +20,6 @@ from visadapt.setups.training import adapt, setup_for
 from visadapt.storage.run_folder import open_run, write_json
 from visadapt.tasks.references import read_reference
 from visadapt.weights import shipped
-from visadapt.world import World
 
 
 def run(options: argparse.Namespace) -> None:
@@ -35,7 +34,7 @@ def run(options: argparse.Namespace) -> None:
     if options.diagnose and isinstance(policy, ImagePolicy):
         raise InputError(f"{options.policy}: is shown frames; --diagnose needs a policy that is shown states")
     if effects:
-        source = World(source.system, effects, source.period, source.integrator, source.substeps)
+        source = source.with_effects(effects)
     _check_renderer(options, policy)
     references = read_reference(options.references, source.period) if options.references else None
     with checked():

@@ -43,6 +43,7 @@ from visadapt.estimation.effect_fit import remembers
 from visadapt.estimation.fit_states import Effects
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
+from visadapt.processes import one_thread
 from visadapt.progress import Report, staged
 from visadapt.recordings import Recording
 from visadapt.systems import System
@@ -64,6 +65,7 @@ the source leaves."""
 RUNNERS_UP = 2  # Sets after the best for which the share of the gap that they close is computed
 
 
+@one_thread()
 @torch.inference_mode()
 def diagnose(
     recording: Recording,
@@ -111,7 +113,6 @@ def diagnose(
         raise ValueError("diagnose: the world is the source and has no effects; give the bare system")
     system = world.system
     profile = profile_of(system)
-    torch.set_num_threads(1)  # operations are too small for threads; processes share the work
     effects = list(all_effects(system) if catalogue is None else catalogue)
     films = not recording.measured
     effects = [effect for effect in effects if (effect not in UNSEEN if films else effect.stage is not Stage.CAMERA)]

@@ -84,6 +84,18 @@ def moved(frame: Tensor, motions: Sequence[Tensor]) -> Tensor:
     return out[:, 0]
 
 
+def seen_by(
+    camera: Sequence[CameraEffect], frame: Tensor, memory: Sequence[Tensor], generator: torch.Generator | None
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """Frames (B, H, W) as effects, in their order, show them, and what these then remember."""
+    frame = moved(frame, [motion for effect in camera if (motion := effect.motion(frame)) is not None])
+    remembered = []
+    for effect, own in zip(camera, memory, strict=True):
+        frame, own = effect.apply_to(frame, own, generator)
+        remembered.append(own)
+    return frame, tuple(remembered)
+
+
 class CameraRotation(CameraEffect):
     """A camera turned about its axis, or a picture turned about its centre."""
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from visadapt.effects.camera import CameraEffect, moved
+from visadapt.effects.camera import CameraEffect, seen_by
 from visadapt.estimation.poses import DIFFERENCE, SPACING
 
 Camera = tuple[type[CameraEffect], ...]
@@ -45,10 +45,7 @@ class SeenBy(nn.Module):
 def through(frame: Tensor, effects: Sequence[CameraEffect]) -> Tensor:
     """Frames (B, H, W) as a camera with effects without memory shows them."""
     ordered = sorted(effects, key=lambda effect: effect.order)
-    frame = moved(frame, [motion for effect in ordered if (motion := effect.motion(frame)) is not None])
-    for effect in ordered:
-        frame, _ = effect.apply_to(frame, frame[:, None, :0], None)
-    return frame
+    return seen_by(ordered, frame, [frame[:, None, :0]] * len(ordered), None)[0]
 
 
 @dataclass(frozen=True)

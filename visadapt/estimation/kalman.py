@@ -17,14 +17,16 @@ the innovations' covariance and e = L^-1 (r - H x), all means and adjoints then 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from visadapt.batch import Batch
+
 
 @dataclass(frozen=True)
-class Linear:
+class Linear(Batch):
     """N systems over T rows with n states and m channels."""
 
     transition: Tensor  # (N, T - 1, n, n) A
@@ -37,15 +39,6 @@ class Linear:
     def data(self) -> Linear:
         """The same systems with the first column, the data, alone."""
         return replace(self, drive=self.drive[..., :1], reading=self.reading[..., :1], start=self.start[..., :1])
-
-    def of(self, systems: slice) -> Linear:
-        """Some of the systems."""
-        return Linear(*(getattr(self, f.name)[systems] for f in fields(self)))
-
-    def repeat(self, count: int) -> Linear:
-        """`count` copies of the N systems."""
-        tensors = [getattr(self, f.name) for f in fields(self)]
-        return Linear(*(x.repeat(count, *(1,) * (x.dim() - 1)) for x in tensors))
 
 
 @dataclass(frozen=True)

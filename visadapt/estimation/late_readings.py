@@ -23,10 +23,6 @@ class Past(Batch):
     command: Tensor  # (N, K, n_action) that acted
     duration: Tensor  # (N, K) s; what is earlier than all K of them is taken to belong to the last one
 
-    def repeat(self, count: int) -> Past:
-        """The rows, `count` times over."""
-        return self.map(lambda each: each.repeat(count, *[1] * (each.dim() - 1)))
-
 
 def reading(world: World, state: Tensor, past: Past | None) -> Tensor:
     """What sensors read (N, n_state) of N states; without a past, as at the start of an episode."""

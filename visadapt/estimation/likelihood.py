@@ -194,7 +194,7 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState) -> Derivativ
     parts = []
     for first in range(0, count * windows, at_once):
         own = slice(first, first + at_once)
-        parts.append(_of_systems(problem.of(own), process[own], noise[own], used[own], drawn[own], members))
+        parts.append(_of_systems(problem[own], process[own], noise[own], used[own], drawn[own], members))
     return Derivatives(*(torch.cat(each).unflatten(0, (count, windows)) for each in zip(*parts, strict=True)))
 
 

@@ -193,19 +193,20 @@ def adapt(
         episodes += new if label is None else label(new)
         windows = Windows.cut(episodes, settings.observations, observe)
         found = explain(episodes, recording.with_name("diagnosis.json")) if explain else NOT_DIAGNOSED
-        known = _with(source, found.effects)
-        grounded = _with(known, [residual])
+        known = source.with_effects([*source.effects, *found.effects])
+        grounded = known.with_effects([*known.effects, residual])
         first, learnt = not (learnt or found.complete), learnt or not found.complete
         if not fitted.exists():
-            true = fit_named(known, windows)
             losses: list[GroundLoss] = []
+            states = None
             if found.complete:
                 residual.network.load_state_dict(untrained)
             else:
+                true = fit_named(known, windows)
                 if first:
                     rescale(residual, known, true, settings.ground.negligible)
                 losses = ground(residual, known, true, settings.ground, drawn[1], staged(report, f"{name}: ground"))
-            states = None if true is windows else true.states
+                states = None if true is windows else true.states
             save_tree(fitted, {"weights": grounded.state_dict(), "losses": losses, "states": states})
         tree = load_tree(fitted)
         with fitting(fitted):
@@ -241,11 +242,6 @@ def adapt(
             load_weights(policy, tree["weights"], tuned)
             rounds.append(Round(ledger.used, grounding, tree["losses"], found))
     return Adapted(policy, ledger, rounds, episodes, folder, known)
-
-
-def _with(world: World, effects: Sequence[Effect]) -> World:
-    """The world with more effects."""
-    return World(world.system, [*world.effects, *effects], world.period, world.integrator, world.substeps)
 
 
 def _weights(folder: Path, number: int) -> Path:

@@ -74,7 +74,7 @@ class Tracker:
         across = system.states[self._seen[0]]
         load = load_effect(type(system))
         nothing = load(**{parameter.name: 0.0 for parameter in load.table})
-        self._pushed = World(system, (nothing,), world.period, world.integrator, world.substeps)
+        self._pushed = world.with_effects((nothing,))
         self.poses = PoseFinder(renderer, max(-across.low, across.high), LEAN)
 
     def track(self, episodes: Sequence[Episode]) -> list[Episode]:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-
 from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED
 from visadapt.diagnosis.saved import load_effects
@@ -38,9 +36,7 @@ def explained(source: World, report: Report | None = None) -> Explain:
         if not path.exists():
             sources = tuple(f"episode {number}" for number in range(len(long)))
             recording = Recording(long, names, source.period, sources)
-            threads = torch.get_num_threads()
             write_json(path, diagnose(recording, source, progress=report).to_json())
-            torch.set_num_threads(threads)  # a diagnosis takes one, tuning is faster with more
         verdict = read_json(path)["verdict"]
         effects = load_effects(path)[1] if verdict in (IDENTIFIED, AMBIGUOUS) else []
         return Explanation(verdict, effects, verdict != UNEXPLAINED)

@@ -77,7 +77,7 @@ def cost_to_go(source: World, state: tuple[float, ...], action: float) -> tuple[
     s' V s is the least sum of the costs of all states and commands that follow a state s, by the discrete algebraic
     Riccati equation, iterated from V = 0.
     """
-    bare = World(source.system, (), source.period, source.integrator, source.substeps)
+    bare = source.with_effects(())
     rest = torch.zeros(1, len(state), dtype=torch.float64)
     still = rest.new_zeros(1, bare.substeps, len(bare.system.actions))
     step = linearise_step(bare, bare.values.to(rest), rest[:, 0], rest, still, by_command=True)
