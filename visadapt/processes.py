@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 
 from visadapt.effects.base import EFFECTS, Effect
 
+ENDING = (signal.SIGINT, signal.SIGTERM)
+
 Result = TypeVar("Result")
 Work = Callable[[Sequence[int]], Sequence[Result]]
 """Gives a result for each index that it is handed, whichever others it is handed along with it."""
@@ -36,7 +38,12 @@ def shared_out(work: Work[Result], count: int, jobs: int) -> list[Result]:
     for share in shares[1:]:
         receiver, sender = context.Pipe(duplex=False)
         process = context.Process(target=_run, args=(work, share, sender), daemon=True)
-        process.start()
+        # What hooks of a fork raise is lost, so a signal has to wait until they are through.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+        try:
+            process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         sender.close()
         started.append((process, receiver))
     results: list[Result | None] = [None] * count
@@ -54,6 +61,8 @@ def shared_out(work: Work[Result], count: int, jobs: int) -> list[Result]:
 def _run(work: Work[Result], share: Sequence[int], sender: Connection) -> None:
     # An interrupt from the keyboard reaches every process; the one that shares out the work ends the others.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
     try:
         found: object = list(work(share))
     except Exception as error:
