@@ -214,6 +214,8 @@ class TestBadInput:
             ["--jobs", "0"],
             ["--jobs", "many"],
             ["--seed", "a"],
+            ["--seed", "9" * 30],
+            ["--jobs", "9" * 5000],
             ["--system", "unicycle"],
         ],
     )

@@ -46,25 +46,32 @@ EVERY_STATE = dict.fromkeys(STATES, still)
 SMALL = dict.fromkeys(STATES, lambda values: 1e-12 * values)
 
 
+def noise(seed):
+    return lambda values: 0.1 * np.random.default_rng(seed).normal(size=len(values))
+
+
 @pytest.mark.parametrize(
     ("columns", "says"),
     [
         (EVERY_STATE, "no state ever changes; a recording of something that moves is right"),
         (SMALL, "no state ever changes"),
         ({**EVERY_STATE, "command": still}, "no state ever changes"),
-        ({"x": still, "x_dot": still}, r"row 1 \(line 2\), column 'x' is 0, as in every row, .* dead or frozen\?"),
+        (
+            {"x": still, "x_dot": still},
+            r"row 1 \(line 2\), column 'x' is 0, as in every row, .* is the sensor dead, or does the machine stick\?",
+        ),
         ({"x": lambda x: 0 * x + 0.3}, "column 'x' is 0.3, as in the 119 rows after it"),
         ({"theta": lambda x: 0 * x + 0.01}, "column 'theta' is 0.01, as in every row"),
         ({"x": frozen}, r"row 61 \(line 62\), column 'x' is .*, as in the 59 rows after it, .*: the sensor was frozen"),
         ({"x": lambda x: x + 1e9}, r"row \d+ .*, column 'x' is 1e\+09 m; within about \[-1.5, 1.5\] is right"),
         ({"x": lambda x: x + 1e4}, "column 'x' is 10000"),
         ({"x_dot": lambda x: x + 1e9}, r"column 'x_dot' is 1e\+09 m/s"),
-        ({"x": lambda x: at(51, 1e5)(at(50, 1e5)(x))}, r"row 51 \(line 52\), column 'x' is 100000 m"),
+        ({"x": at(slice(50, 60), 1e5)}, r"row 51 \(line 52\), column 'x' is 100000 m"),
         ({"x": at(0, 1e300)}, r"row 1 \(line 2\), column 'x' is 1e\+300 m"),
         ({"theta_dot": at(119, -1e18)}, r"row 120 \(line 121\), column 'theta_dot' is -1e\+18 rad/s"),
         (
             {"x": lambda x: x + np.where(np.arange(len(x)) % 10 == 5, 1e5, 0)},
-            "column 'x' is 100000, between .* and 10% of the column lie as far off",
+            "column 'x' is 1000.*, far off the rows before and after, and 10% of the column lie as far off",
         ),
     ],
 )
@@ -96,6 +103,14 @@ def test_an_outlier_is_set_aside(file, run, name, value):
     together = np.concatenate([episode.state for episode in recording.episodes])
     rest = np.delete(np.column_stack([run[one] for one in STATES]), 50, 0)
     np.testing.assert_allclose(together, rest)
+
+
+def test_some_outliers_in_a_row(file, run):
+    recording = load(write(file, changed(run, x=at(slice(50, 53), 120))))
+    assert [episode.samples for episode in recording.episodes] == [49, 66]
+    assert (
+        "row 51 (line 52), column 'x': 120 and 2 more: lies far off the rows before and after" in recording.warnings[0]
+    )
 
 
 def test_rows_after_an_outlier_keep_their_places(file, run):
@@ -140,3 +155,8 @@ def test_a_clock_in_minutes_where_no_rate_is_measured(file, run):
     longer["time"] = np.arange(2400) * 0.05 / 60
     longer["x"] = np.sin(0.5 * longer["time"] * 60)
     refuses("column 'x' .* metres are right .*, and seconds for the clock", write(file, longer))
+
+
+def test_a_position_of_noise_alone(file, run):
+    (warning,) = load(write(file, changed(run, x=lambda x: 1e-5 * noise(1)(x)))).warnings
+    assert "x jumps about from row to row and does not move" in warning

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
 SYSTEMS_HELP = "cartpole, quadrotor or fixed_wing"
 OWN_HELP = "or my_rig.py:Class, a system of your own (docs/own_system.md)"
+LONGEST_NUMBER = 18  # Digits of a whole number
 SCORE_SEED = 2026
 """`evaluation.SCORE_SEED`, which a test holds it to."""
 
@@ -150,7 +151,7 @@ def score(parser: argparse.ArgumentParser) -> None:
     _add_policy_and_target(parser)
     add("--episodes", metavar="N", type=_positive, default=100, help="(default: 100)")
     seed_help = f"of the starts and hidden effects (default: {SCORE_SEED})"
-    add("--seed", metavar="N", type=int, default=SCORE_SEED, help=seed_help)
+    add("--seed", metavar="N", type=_seed, default=SCORE_SEED, help=seed_help)
     add("--film", metavar="F.mp4", help="film one more episode")
     add("--json", metavar="F", help="write the score here")
     add("--effects", metavar="FILE.py", help="a file that defines effects the policy was trained with")
@@ -163,7 +164,7 @@ def _add_system(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_seed(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
+    parser.add_argument("--seed", metavar="N", type=_seed, default=0, help="of everything random (default: 0)")
 
 
 def _add_effects(parser: argparse.ArgumentParser) -> None:
@@ -200,9 +201,17 @@ def _add_target(parser: argparse.ArgumentParser, required: bool) -> None:
 
 def _positive(text: str) -> int:
     """A whole number from 1 on."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 on")
+    if not text.isdecimal() or len(text) > LONGEST_NUMBER or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text[:40]!r} is not a whole number from 1 on")
     return int(text)
+
+
+def _seed(text: str) -> int:
+    """A whole number that generators take."""
+    with suppress(ValueError):
+        if len(text) <= LONGEST_NUMBER:
+            return int(text)
+    raise argparse.ArgumentTypeError(f"{text[:40]!r} is not a whole number of at most {LONGEST_NUMBER} digits")
 
 
 def _positive_number(text: str) -> float:

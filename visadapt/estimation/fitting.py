@@ -133,13 +133,14 @@ def _step(
     prior = torch.where(high > low, (2 / (high - low)).square(), 1.0)
     diagonal = torch.diagonal(at.information, dim1=1, dim2=2)
     matrix = at.information + torch.diag_embed(prior + damping[:, None] * diagonal)
-    change = torch.linalg.solve(matrix, at.gradient[..., None])[..., 0]
+    # Where derivatives are not finite there is no step, and the fit of that set ends; those of the others go on.
+    change = torch.linalg.solve_ex(matrix, at.gradient[..., None]).result[..., 0].nan_to_num(0, 0, 0)
     theta = (fits.theta + change).clamp(low, high)
     change = theta - fits.theta
     moves = torch.cat((torch.ones(len(change), 1, dtype=change.dtype), change), 1)
     share = 1 / (1 + damping)[:, None]
     matrix = at.noise_information + 0.3 * torch.eye(at.noise_gradient.shape[1], dtype=change.dtype)
-    move = torch.linalg.solve(matrix, at.noise_gradient[..., None])[..., 0]
+    move = torch.linalg.solve_ex(matrix, at.noise_gradient[..., None]).result[..., 0].nan_to_num(0, 0, 0)
     log_change = move.clamp(-MAX_LOG_VARIANCE_CHANGE, MAX_LOG_VARIANCE_CHANGE) * share
     groups = fits.log_process.shape[1]
     noise_change = log_change @ noise_members(model)[1]

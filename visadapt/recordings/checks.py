@@ -5,7 +5,6 @@ These are heuristics that raise only where the numbers cannot be right; a record
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations, product
 
@@ -15,10 +14,8 @@ from numpy.typing import NDArray
 from visadapt.recordings.clock import UNITS_S, Note, RawEpisode
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.physics import DEGREE, DIFFERENCE_S, are_degrees, correlation, exchanged
-from visadapt.recordings.sensors import differences
+from visadapt.recordings.sensors import TURN, differences
 from visadapt.systems import System, Variable
-
-TURN = 2 * math.pi
 
 MOST_RATE_RANGES = 3.0
 """Rates above this multiple of the system's stated range are taken to be in another unit."""

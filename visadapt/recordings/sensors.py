@@ -1,11 +1,10 @@
-"""Checks of sensors: single outliers are set aside, dead, frozen and absurd ones are refused.
+"""Checks of sensors: outliers are set aside, dead, frozen and absurd ones are refused.
 
 What cannot have been measured must not be diagnosed: an effect would be found that imitates a broken sensor.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -18,8 +17,14 @@ from visadapt.recordings.clock import Note, RawEpisode
 from visadapt.recordings.episode import RecordingError
 from visadapt.systems import System, Variable
 
+TURN = 2 * np.pi
+
 OUTLIER_SCALES = 50.0
-"""Departure of a reading from the mean of its neighbours, over the usual one, above which it may be an outlier."""
+"""Jump of a reading, over the usual departure from the mean of its neighbours, above which it may be an outlier."""
+OUTLIER_ROWS = 3
+"""Outliers that may follow each other."""
+OUTLIER_RETURN = 0.2
+"""Share of the jump within which the reading after outliers is back at that before them."""
 MOST_OUTLIERS = 0.05
 """Share of outliers among the rows of an episode above which the sensor is refused."""
 ABSURD_RANGES, ABSURD_TURNS = 100.0, 1e5
@@ -28,6 +33,8 @@ STILL_RANGES = 1e-9
 """Share of the range that the system states within which a column stands still."""
 MOVING_RANGES = 1e-3
 """Rate of change, in ranges per s, by the source, above which a state must be seen to move."""
+NOISE_RATIO, FEWEST_NOISY = 1.5, 30
+"""Variance of changes over that of values above which these hardly follow each other, as noise; and least rows."""
 FROZEN_ROWS = 20
 """Equal readings in a row from which a position is compared with its measured rate."""
 
@@ -36,18 +43,17 @@ def differences(values: NDArray[np.float64], angle: bool) -> NDArray[np.float64]
     """Changes (T - 1,) from row to row; jumps of an angle by a turn are removed."""
     steps = np.diff(values)
     if angle:
-        turn = 2 * math.pi
-        steps = np.where(np.abs(np.abs(steps) - turn) < 0.5 * math.pi, steps - np.sign(steps) * turn, steps)
+        steps = np.where(np.abs(np.abs(steps) - TURN) < 0.5 * np.pi, steps - np.sign(steps) * TURN, steps)
     return steps
 
 
 def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
-    """The episode without rows in which a single reading lies where nothing moves to and back from within a row.
+    """The episode without rows in which a reading lies where nothing moves to and back from so fast.
 
     Raises:
         RecordingError: these are so many that the sensor is not to be believed.
     """
-    if len(raw.time) < 4:
+    if len(raw.time) < FROZEN_ROWS:
         return raw
     bad = np.zeros(len(raw.time), bool)
     period = float(np.median(np.diff(raw.time)))
@@ -63,7 +69,7 @@ def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
         if outliers.mean() > MOST_OUTLIERS:
             row = int(outliers.argmax())
             raise RecordingError(
-                f"{raw.cell(row, name)} is {values[row]:g}, between {values[row - 1]:g} and {values[row + 1]:g}, and "
+                f"{raw.cell(row, name)} is {values[row]:g}, far off the rows before and after, and "
                 f"{outliers.mean():.0%} of the column lie as far off: a sensor that follows the motion is right"
             )
         for row in np.flatnonzero(outliers & ~bad).tolist():
@@ -80,16 +86,17 @@ def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
 
 
 def _outliers(steps: NDArray[np.float64], values: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
-    """Which rows (T,) lie further than `reach` off the mean of their neighbours, which lie close together."""
-    off = np.full(len(values), np.nan)
-    off[1:-1] = (steps[:-1] - steps[1:]) / 2
+    """Which rows (T,) lie beyond a jump of more than `reach`, and of much more than is usual, that is soon undone."""
     apart = np.diff(np.unique(values))
-    scale = max(1.4826 * float(np.nanmedian(np.abs(off))), float(apart.min()) if len(apart) else 0.0)
-    # A lone outlier pulls the mean of its neighbours' neighbours half as far to the other side.
-    alone = np.ones(len(values), bool)
-    for neighbour in (np.r_[np.nan, off[:-1]], np.r_[off[1:], np.nan]):
-        alone &= ~(np.abs(neighbour + off / 2) > 0.2 * np.abs(off))
-    return alone & (np.abs(off) > max(reach, OUTLIER_SCALES * scale))
+    usual = 1.4826 * float(np.median(np.abs(np.diff(steps)))) / 2
+    least = max(reach, OUTLIER_SCALES * max(usual, float(apart.min()) if len(apart) else 0.0))
+    bad = np.zeros(len(values), bool)
+    for jump in np.flatnonzero(np.abs(steps) > least):
+        away = np.abs(np.cumsum(steps[jump : jump + OUTLIER_ROWS + 1]))
+        back = np.flatnonzero(away < OUTLIER_RETURN * away[0])
+        if len(back) and (away[: back[0]] > least).all():
+            bad[jump + 1 : jump + 1 + back[0]] = True
+    return bad
 
 
 def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) -> list[RawEpisode]:
@@ -102,12 +109,13 @@ def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) ->
         for name, values in raw.states.items():
             variable, row = system.states[system.index(name)], int(np.abs(values).argmax())
             limit = ABSURD_RANGES * variable.largest
-            if abs(values[row]) > (ABSURD_TURNS * 2 * math.pi if variable.unit == "rad" else limit):
+            if abs(values[row]) > (ABSURD_TURNS * TURN if variable.unit == "rad" else limit):
                 raise RecordingError(
                     f"{raw.cell(row, name)} is {values[row]:g} {variable.unit}; "
                     f"within about [{variable.low:g}, {variable.high:g}] is right"
                 )
         _check_not_frozen(raw, system)
+        _note_noise(raw, system, note)
     measured = episodes[0].measured
     still = [name for name in measured if all(_is_still(raw.states[name], system, name) for raw in episodes)]
     if len(still) == len(measured):
@@ -121,7 +129,8 @@ def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) ->
         if name not in rates:
             raise RecordingError(
                 f"{raw.cell(0, name)} is {raw.states[name][0]:g}, as in every row, although what is commanded and "
-                "measured moves it: is the sensor dead or frozen? a column that changes is right"
+                "measured moves it: is the sensor dead, or does the machine stick? a recording in which it moves is "
+                "right"
             )
         note(f"{name} never changes although its position does: a dead sensor; it was left out", raw.source)
     kept = [column for column, name in enumerate(measured) if name not in dead]
@@ -171,3 +180,17 @@ def _check_not_frozen(raw: RawEpisode, system: System) -> None:
                     f"which {system.rate_of(name)} says that it moves by {travelled:.3g} {variable.unit}: the sensor "
                     "was frozen; leave these rows out"
                 )
+
+
+def _note_noise(raw: RawEpisode, system: System, note: Note) -> None:
+    """Notes where a position only jumps about although it must move: a broken sensor, or a machine that sticks."""
+    for name, values in raw.states.items():
+        if system.rate_of(name) is None or len(values) < FEWEST_NOISY or not np.ptp(values):
+            continue
+        values = np.unwrap(values) if _unit(system, name) == "rad" else values
+        if np.diff(values).var() > NOISE_RATIO * values.var() and _must_move(raw, system, name):
+            note(
+                f"{name} jumps about from row to row and does not move, although what is commanded and measured moves "
+                "it: does its sensor follow the motion, or does the machine stick?",
+                raw.source,
+            )

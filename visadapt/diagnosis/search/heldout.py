@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -164,7 +165,8 @@ def _of_folds(
         box = None
         if black_box:
             others = used[k].nonzero()[:, 0]
-            box = fit_black_box(*on(k, others[rows.select(others).spread(BLACK_BOX_ROWS)]))
+            with suppress(torch.linalg.LinAlgError):  # type: ignore[attr-defined]  # then nothing is predicted better than without it
+                box = fit_black_box(*on(k, others[rows.select(others).spread(BLACK_BOX_ROWS)]))
         held = out[k].nonzero()[:, 0]
         parts.append((held, rollout_errors(*on(k, held), box)))
     return parts

@@ -71,7 +71,7 @@ class ModelComparison:
 
 def compare(search: Search) -> ModelComparison:
     """Compare the best models that a search has fitted, and the source."""
-    close = [f for f in search.ranked if f.log_odds > search.best.log_odds - COMPARE_WITHIN]
+    close = [f for f in search.ranked if f.log_odds >= search.best.log_odds - COMPARE_WITHIN]
     close = close[: search.profile.compared_models]
     leftover = search.leftover(close)
     if all(f is not search.source for f in close):

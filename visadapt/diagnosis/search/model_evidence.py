@@ -26,12 +26,14 @@ def log_posterior_odds(effects: Effects, fits: FitState, catalogue: int) -> floa
     Information Theory, Inference and Learning Algorithms, chapter 28.
     """
     table = [p for e in effects for p in e.table]
+    if not math.isfinite(fits.likelihood[0]):
+        return -math.inf  # a set whose fit ended in no numbers
     if not table:
         return float(fits.likelihood[0])
     width = widths(effects)
     precision, information = posterior(effects, fits)
-    variance = torch.linalg.inv(information).diagonal()
-    if _uninformed(effects, fits, variance, precision):
+    variance = torch.linalg.inv_ex(information).inverse.diagonal()
+    if not bool((variance > 0).all()) or _uninformed(effects, fits, variance, precision):
         return -math.inf
     density = -width.log()
     for k, parameter in enumerate(table):

@@ -57,10 +57,13 @@ TALL = 10.0  # Prior deviation of a bump's height, over the size of the unexplai
 
 def pushes(recording: Recording, world: World) -> tuple[Push, ...]:
     """The pushes in a recording beyond what a world explains, in the order of time."""
-    tracks = load_tracks(recording, world)
-    if not tracks:
-        return ()
-    found = _Fit(tracks).pushes()
+    try:
+        tracks = load_tracks(recording, world)
+        if not tracks:
+            return ()
+        found = _Fit(tracks).pushes()
+    except torch.linalg.LinAlgError:  # type: ignore[attr-defined]
+        return ()  # errors too small, or too large, for any push to stand out
     tries = sum(len(track.time) for track in tracks) * tracks[0].load.shape[1]
     loads = world.system.loads
     named = [_named(one, tracks[one.part].episode, loads[one.joint], tries) for one in found]

@@ -64,6 +64,10 @@ POLISH_MODELS = 8
 since a quick fit of a set that is right may not have shed all its process noise; and the most of them."""
 
 
+class NoFitError(ValueError):
+    """The source's fit to a recording ends in numbers that are not finite; the message is one line."""
+
+
 @dataclass(frozen=True)
 class ScoredModel:
     """One set of effects, fitted to a recording."""
@@ -112,6 +116,11 @@ class Search:
             self.fit([((), replace(source, state=initial_fit(system, rows).state))], FINAL)
         else:
             self.fitted[frozenset()] = ScoredModel((), source, float(source.likelihood[0]))
+        if not math.isfinite(self.source.log_odds):
+            raise NoFitError(
+                f"no states of a {system.name} come near this recording, so that nothing can be computed of it; "
+                "readings and parameters that a machine may have are right"
+            )
 
     def run(self, progress: Progress | None = None) -> None:
         """Grow sets while that raises the posterior odds, then try sets near the best."""
@@ -244,7 +253,7 @@ class Search:
         best = self.best
         fewer = [f.fits.theta.shape[1] < best.fits.theta.shape[1] for f in self.ranked]
         within = [POLISH_SIMPLER_WITHIN if simpler else POLISH_WITHIN for simpler in fewer]
-        close = [f for f, most in zip(self.ranked, within, strict=True) if f.log_odds > best.log_odds - most]
+        close = [f for f, most in zip(self.ranked, within, strict=True) if f.log_odds >= best.log_odds - most]
         close = close[:POLISH_MODELS]
         smaller = [self.fitted.get(frozenset(best.names) - {name}) for name in best.names]
         return close + [f for f in smaller if f is not None and all(f is not other for other in close)]
