@@ -5,21 +5,23 @@ Velocities are never differentiated: they are unknowns of the fits, as of any re
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from visadapt.diagnosis.report import next_experiment
 from visadapt.diagnosis.report.text import estimate
-from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Diagnosis, Gap
+from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Diagnosis, Gap, Pixels
 from visadapt.diagnosis.search.camera import CameraFindings, find_camera
+from visadapt.diagnosis.search.pixels import judged, left_over, own_error
 from visadapt.effects import EFFECTS, AngleDelay, Dropout, FrozenZone, MeasurementDelay, PositionDelay
-from visadapt.estimation.camera_fit import SeenBy
-from visadapt.estimation.poses import PoseFinder
+from visadapt.estimation.camera_fit import SeenBy, within_frame
+from visadapt.estimation.poses import PoseFinder, Poses
 from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import System
@@ -57,8 +59,12 @@ class FramesError(ValueError):
 class Film:
     """What a recording of frames was found to show."""
 
-    positions: Recording  # x and theta as measured, in the place of frames
+    positions: Recording  # x and theta as measured, in the place of frames; episodes may be parts of those filmed
+    frames: list[NDArray[np.uint8]]  # (T, H, W) of each of these episodes
     camera: CameraFindings
+    seen: nn.Module  # the renderer, seen by that camera
+    pixels: Pixels
+    left: Tensor  # (H, W) mean square of what the frames hold beyond what is drawn and noise
 
 
 def watch(recording: Recording, system: System, renderer: nn.Module, report: Report | None = None) -> Film:
@@ -75,20 +81,28 @@ def watch(recording: Recording, system: System, renderer: nn.Module, report: Rep
     camera = find_camera(renderer, finder, every, staged(report, "camera"))
     if camera.best.camera:
         finder = PoseFinder(SeenBy(renderer, camera.best.effects), reach, LEAN)
-    return Film(positions(recording, finder, staged(report, "poses")), camera)
+    known = within_frame(camera.best.effects, every[0].float()).to(torch.uint8)
+    poses = found_in(recording, finder, known, staged(report, "poses"))
+    left = left_over(finder.renderer, camera.best.effects, every, torch.cat([each.place for each in poses]))
+    found, frames = positions(recording, poses, finder.limit)
+    return Film(found, frames, camera, finder.renderer, judged(left, own_error(renderer)), left)
 
 
-def with_camera(motion: Diagnosis, camera: CameraFindings, system: System) -> Diagnosis:
-    """The diagnosis of motion seen through the camera that was found, with that camera among the causes."""
+def with_camera(motion: Diagnosis, film: Film, system: System) -> Diagnosis:
+    """The diagnosis of motion seen through the camera that was found, with that camera among the causes.
+
+    Where the pixels are unexplained, so is the recording; a warning states what the motion shows nevertheless.
+    """
+    camera = film.camera
+    motion = replace(motion, where=replace(motion.where, pixels=film.pixels))
     causes = camera.causes()
+    if film.pixels.unexplained:
+        return _unexplained_in_pixels(motion, causes)
     names = tuple(cause.effect for cause in causes)
     if not names:
         return motion
     if motion.verdict == UNEXPLAINED:
-        values = "; ".join(
-            f"{cause.effect} ({name} = {estimate(one)})" for cause in causes for name, one in cause.parameters.items()
-        )
-        return replace(motion, warnings=(*motion.warnings, f"found in the pixels, and corrected: {values}"))
+        return replace(motion, warnings=(*motion.warnings, f"found in the pixels, and corrected: {_values(causes)}"))
     doubtful = [[EFFECTS[name] for name in (one.effect, *one.indistinguishable_from)] for one in causes]
     settled = next_experiment.separate(doubtful, system)
     gap, following = motion.gap, motion.next_experiment
@@ -106,6 +120,29 @@ def with_camera(motion: Diagnosis, camera: CameraFindings, system: System) -> Di
     )
 
 
+def _unexplained_in_pixels(motion: Diagnosis, camera: Sequence[Cause]) -> Diagnosis:
+    """The diagnosis where frames show what neither renderer nor camera explains: its causes become warnings."""
+    found = [
+        f"found in the {place}, to be trusted less: {_values(causes)}"
+        for place, causes in (("pixels", camera), ("motion", motion.causes))
+        if causes
+    ]
+    return replace(
+        motion,
+        verdict=UNEXPLAINED,
+        causes=(),
+        next_experiment=next_experiment.LOOK,
+        warnings=(*motion.warnings, *found),
+    )
+
+
+def _values(causes: Sequence[Cause]) -> str:
+    return "; ".join(
+        f"{cause.effect} ({', '.join(f'{name} = {estimate(one)}' for name, one in cause.parameters.items())})"
+        for cause in causes
+    )
+
+
 def check_frames(recording: Recording, size: tuple[int, ...]) -> None:
     """Raises FramesError where frames are not of the renderer's (height, width), or none differs from another."""
     for episode, source in zip(recording.episodes, recording.sources, strict=True):
@@ -118,19 +155,29 @@ def check_frames(recording: Recording, size: tuple[int, ...]) -> None:
             raise FramesError(f"{source}: all {len(episode.frame)} frames are the same; a film that moves is right")
 
 
-def positions(recording: Recording, finder: PoseFinder, progress: Progress | None = None) -> Recording:
-    """The recording with x and theta as measured, in the place of frames.
+def found_in(recording: Recording, finder: PoseFinder, known: Tensor, progress: Progress | None = None) -> list[Poses]:
+    """The poses in the frames of each episode; `known` (H, W) is 1 where the finder's renderer draws what is seen."""
+    out = []
+    for number, episode in enumerate(recording.episodes):
+        out.append(finder(known * torch.from_numpy(np.ascontiguousarray(episode.frame))))
+        if progress is not None:
+            progress(number + 1, len(recording.episodes), float(out[-1].misfit.square().mean()))
+    return out
 
-    Rows whose frame the renderer does not explain, or that does not show the pose, are not `usable`; where there are
-    many of them in a row, the episode is split. An exact copy of the frame before it has the same pose.
+
+def positions(recording: Recording, found: Sequence[Poses], limit: float) -> tuple[Recording, list[NDArray[np.uint8]]]:
+    """The recording with x and theta as measured in the place of frames, and the frames (T, H, W) of its episodes.
+
+    Rows whose frame the renderer does not explain (with a misfit above `limit`), or that does not show the pose, are
+    not `usable`; where there are many of them in a row, the episode is split. An exact copy of the frame before it has
+    the same pose.
 
     Raises:
         FramesError: the renderer explains hardly any frame.
     """
     places, explained, misfits, deviations, fresh = [], [], [], [], []
-    for number, episode in enumerate(recording.episodes):
+    for episode, poses in zip(recording.episodes, found, strict=True):
         assert episode.frame is not None
-        poses = finder(torch.from_numpy(np.ascontiguousarray(episode.frame)))
         new = np.ones(len(episode.frame), dtype=bool)
         new[1:] = (episode.frame[1:] != episode.frame[:-1]).any((1, 2))
         shown = np.flatnonzero(new)[np.cumsum(new) - 1]
@@ -141,8 +188,6 @@ def positions(recording: Recording, finder: PoseFinder, progress: Progress | Non
         fresh[-1][1 : 1 + int(new[1:].argmax())] = False
         misfits.append(poses.misfit.numpy())
         deviations.append(poses.covariance.diagonal(dim1=1, dim2=2).sqrt().nan_to_num(torch.inf).numpy()[shown])
-        if progress is not None:
-            progress(number + 1, len(recording.episodes), float(poses.misfit.square().mean()))
     # A pole that is out of the frame may have any angle.
     most = np.maximum(RESOLUTION, VAGUE * np.median(np.concatenate(deviations), 0))
     explained = [found & (own <= most).all(1) for found, own in zip(explained, deviations, strict=True)]
@@ -150,12 +195,13 @@ def positions(recording: Recording, finder: PoseFinder, progress: Progress | Non
     if seen < LEAST_EXPLAINED * total:
         raise FramesError(
             f"{recording.sources[0]}: the renderer explains {seen} of {total} frames (misfit "
-            f"{255 * float(np.median(np.concatenate(misfits))):.1f} grey levels, at most {255 * finder.limit:.1f} is "
+            f"{255 * float(np.median(np.concatenate(misfits))):.1f} grey levels, at most {255 * limit:.1f} is "
             "right): it is of another scene; `visadapt renderer` trains one on frames of this one"
         )
     episodes: list[Episode] = []
     usable: list[NDArray[np.bool_]] = []
     sources: list[str] = []
+    frames: list[NDArray[np.uint8]] = []
     parts = zip(recording.episodes, places, explained, fresh, recording.sources, strict=True)
     for episode, place, used, first_seen, source in parts:
         for first, last in _stretches(used):
@@ -170,6 +216,8 @@ def positions(recording: Recording, finder: PoseFinder, progress: Progress | Non
             )
             usable.append((used & first_seen)[rows])
             sources.append(source)
+            assert episode.frame is not None
+            frames.append(episode.frame[rows])
     if not episodes:
         raise FramesError(f"{recording.sources[0]}: no {FEWEST_POSES} frames close to each other are explained")
     warnings = recording.warnings
@@ -180,7 +228,7 @@ def positions(recording: Recording, finder: PoseFinder, progress: Progress | Non
             f"no pose was found in {total - seen} of {total} frames, row {row + 1} of "
             f"{recording.sources[episode_number]} the first; they were left out",
         )
-    return replace(
+    shown_in = replace(
         recording,
         episodes=tuple(episodes),
         measured=POSE,
@@ -189,6 +237,7 @@ def positions(recording: Recording, finder: PoseFinder, progress: Progress | Non
         usable=tuple(usable),
         resolution=RESOLUTION,
     )
+    return shown_in, frames
 
 
 def _stretches(used: NDArray[np.bool_]) -> list[tuple[int, int]]:

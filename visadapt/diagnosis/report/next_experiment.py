@@ -23,6 +23,12 @@ MOTIONS_IN_FLIGHT = {
 }
 """Those that differ for an aircraft."""
 
+LOOK = (
+    "Look at the frames where they are unexplained: if the scene itself is another one, train a renderer on frames of "
+    "it; if light, lens or something that moves is the cause, film without it."
+)
+"""For frames that neither the renderer nor an effect of the camera explains."""
+
 
 def separate(classes: Sequence[Collection[type[Effect]]], system: System) -> str:
     """The experiments that separate the members of each class; empty where every class has one member."""
