@@ -31,18 +31,18 @@ from datasets.blind.rigs import Rig
 from datasets.blind.scene import LOOKS
 from datasets.blind.sealing import key_path, names, seal
 from datasets.blind.simulation import Case, Run, simulate
-from datasets.blind.sizing import SEARCH_SUBSTEPS, draw_job, seek
+from datasets.blind.sizing import SEARCH_SUBSTEPS, Job, draw_job, seek
 
 LookName = Literal["plain", "textured"]
 
 MIX = {"single": 0.5, "pair": 0.2, "none": 0.15, "foreign": 0.15}
 """share of the films; of the singles half are the camera's, a pair is a fault of the camera and another effect"""
-ROWS, EPISODES = 500, (5, 10)
+ROWS, EPISODES = 400, (4, 8)
 """frames of a film, approximately, and smallest and largest number of episodes"""
 POSE_NOISE = (0.002, 0.0, 0.005, 0.0)
 """m, m/s, rad, rad/s: noise of the positions that the controller is given, and unit of strengths"""
-STRENGTHS, CAMERA_STRENGTHS = (2.0, 30.0), (0.5, np.inf)
-"""weakest and strongest effect on motion, and on pixels"""
+STRENGTHS, WEAKEST_FAULT = (2.0, 30.0), 0.5
+"""weakest and strongest effect on motion, and weakest on pixels"""
 CART_REACH = 1.15
 """m: |x| never exceeds this, so that the cart stays in the frame of a camera that is moved"""
 CALIBRATION_FRAMES = 2000
@@ -111,38 +111,42 @@ def make(settings: Settings) -> list[FilmDraft]:
         pending = [draft for draft in drafts if draft.frames is None]
         if not pending:
             return drafts
-        for draft in pending:
-            _attempt(draft, settings.look, 0.95 ** (attempt // 2))
+        _attempt(pending, settings.look, 0.95 ** (attempt // 2))
     raise RuntimeError("some films could not be made; try another seed")
 
 
-def _attempt(draft: FilmDraft, look: LookName, excitation: float) -> None:
-    """Redraw, run and film a draft; leave it where it leaves the frame or misses its strengths."""
-    rng = draft.rng
+def _attempt(drafts: list[FilmDraft], look: LookName, excitation: float) -> None:
+    """Redraw, run and film the drafts; leave those that leave the frame or miss their strengths."""
+    cases = [_draw_case(draft.rng, excitation) for draft in drafts]
+    bare = simulate(cases, SEARCH_SUBSTEPS)
+    kept = [(draft, case) for draft, case, run in zip(drafts, cases, bare, strict=True) if _in_frame(run)]
+    parts: list[list[Job]] = []
+    for draft, case in kept:
+        faults, kinds = _draw_kinds(draft)
+        draft.camera = {kind.name: _sized(draft.rng, kind) for kind in faults}
+        parts.append([draw_job(draft.rng, kind.name, case, STRENGTHS) for kind in kinds])
+    seek([job for own in parts for job in own], np.array(POSE_NOISE)[[0, 2]])
+    ready = []
+    for (draft, case), own in zip(kept, parts, strict=True):
+        if all(0.9 * STRENGTHS[0] <= job.strength <= 1.1 * STRENGTHS[1] for job in own):
+            case.effects = {job.name: job.parameters for job in own}
+            # A late camera shows the pose of an earlier instant, as a late sensor reads it.
+            late = draft.camera.get("camera_delay")
+            effects = case.effects | ({"measurement_delay": late} if late else {})
+            ready.append((draft, case, own, replace(case, effects=effects)))
+    runs = simulate([filmed for *_, filmed in ready], RECORDING_SUBSTEPS)
+    for (draft, case, own, _), run in zip(ready, runs, strict=True):
+        strengths = {job.name: job.strength for job in own}
+        strengths |= {name: _strength(draft, name, run, look) for name in draft.camera}
+        if _in_frame(run) and all(strengths[name] >= WEAKEST_FAULT for name in draft.camera):
+            draft.case, draft.run, draft.strengths = case, run, strengths
+            draft.frames = _filmed(draft, run, look)
+
+
+def _draw_case(rng: np.random.Generator, excitation: float) -> Case:
     episodes = int(rng.integers(EPISODES[0], EPISODES[1] + 1))
     case = draw_case(rng, round(ROWS / episodes), episodes, np.array(POSE_NOISE), Rig(), False, excitation)
-    case = replace(case, turns_exactly=True)
-    faults, kinds = _draw_kinds(draft)
-    if not _in_frame(simulate([case], SEARCH_SUBSTEPS)[0]):
-        return
-    jobs = [draw_job(rng, kind.name, case, STRENGTHS) for kind in kinds]
-    seek(jobs, np.array(POSE_NOISE)[[0, 2]])
-    if not all(0.9 * STRENGTHS[0] <= job.strength <= 1.1 * STRENGTHS[1] for job in jobs):
-        return
-    case.effects = {job.name: job.parameters for job in jobs}
-    draft.camera = {kind.name: _sized(rng, kind) for kind in faults}
-    late = draft.camera.get("camera_delay")
-    # A late camera shows the pose of an earlier instant, as a late sensor reads it.
-    run = simulate(
-        [replace(case, effects=case.effects | ({"measurement_delay": late} if late else {}))], RECORDING_SUBSTEPS
-    )[0]
-    if not _in_frame(run):
-        return
-    frames = _filmed(draft, run, look)
-    strengths = {job.name: job.strength for job in jobs}
-    strengths |= {name: _strength(draft, name, run, look) for name in draft.camera}
-    if all(strengths[name] >= CAMERA_STRENGTHS[0] for name in draft.camera):
-        draft.case, draft.run, draft.frames, draft.strengths = case, run, frames, strengths
+    return replace(case, turns_exactly=True)
 
 
 def _draw_kinds(draft: FilmDraft) -> tuple[list[Kind], list[Kind]]:

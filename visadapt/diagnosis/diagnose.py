@@ -179,7 +179,7 @@ def diagnose(
         recording=RecordingSummary(len(recording.episodes), recording.samples, float(f"{recording.period:.9g}")),
         verdict=verdict,
         where=Where(
-            stage_shares(search, comparison, found_before),
+            stage_shares(search, comparison, groups, found_before),
             errors.by_state(system, rows.channels, bool(found)),
             regions,
             () if prepared.whole is None else pushes(prepared.whole, world),

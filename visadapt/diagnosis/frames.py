@@ -18,9 +18,9 @@ from visadapt.diagnosis.report import next_experiment
 from visadapt.diagnosis.report.text import estimate
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Diagnosis, Gap, Pixels
 from visadapt.diagnosis.search.camera import CameraFindings, find_camera
-from visadapt.diagnosis.search.pixels import judged, left_over, own_error
-from visadapt.effects import EFFECTS, AngleDelay, Dropout, FrozenZone, MeasurementDelay, PositionDelay
-from visadapt.estimation.camera_fit import SeenBy, within_frame
+from visadapt.diagnosis.search.pixels import judged, left_over, usual
+from visadapt.effects import EFFECTS, AngleDelay, CameraEffect, Dropout, FrozenZone, MeasurementDelay, PositionDelay
+from visadapt.estimation.camera_fit import SeenBy, smoothed, within_frame
 from visadapt.estimation.poses import PoseFinder, Poses
 from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, Recording
@@ -39,6 +39,8 @@ UNSEEN = (Dropout, FrozenZone, MeasurementDelay, PositionDelay, AngleDelay)
 """Faults of sensors that a camera cannot have: it shows cart and pole in one frame. A late camera is a camera's."""
 
 LEAN = 0.5  # rad, largest |theta| at which the pole is looked for
+
+HIDDEN = 0.5  # `Poses.contrast` above which a frame does not show cart and pole
 
 VAGUE = 3.0  # Deviation of a pose, over the median, above which a frame does not show it
 
@@ -79,13 +81,15 @@ def watch(recording: Recording, system: System, renderer: nn.Module, report: Rep
     check_frames(recording, finder.size)
     every = torch.cat([torch.from_numpy(np.ascontiguousarray(episode.frame)) for episode in recording.episodes])
     camera = find_camera(renderer, finder, every, staged(report, "camera"))
-    if camera.best.camera:
-        finder = PoseFinder(SeenBy(renderer, camera.best.effects), reach, LEAN)
-    known = within_frame(camera.best.effects, every[0].float()).to(torch.uint8)
-    poses = found_in(recording, finder, known, staged(report, "poses"))
-    left = left_over(finder.renderer, camera.best.effects, every, torch.cat([each.place for each in poses]))
-    found, frames = positions(recording, poses, finder.limit)
-    return Film(found, frames, camera, finder.renderer, judged(left, own_error(renderer)), left)
+    effects, seen = camera.best.effects, renderer
+    if effects:
+        seen = SeenBy(renderer, effects)
+        finder = PoseFinder(SeenBy(renderer, effects, smooth=True), reach, LEAN)
+    poses = found_in(recording, finder, effects, staged(report, "poses"))
+    left = left_over(seen, effects, every, torch.cat([each.place for each in poses]))
+    found, frames = positions(recording, poses)
+    pixels = judged(left, usual(renderer, effects, camera.best.place))
+    return Film(found, frames, camera, seen, pixels, left)
 
 
 def with_camera(motion: Diagnosis, film: Film, system: System) -> Diagnosis:
@@ -155,38 +159,42 @@ def check_frames(recording: Recording, size: tuple[int, ...]) -> None:
             raise FramesError(f"{source}: all {len(episode.frame)} frames are the same; a film that moves is right")
 
 
-def found_in(recording: Recording, finder: PoseFinder, known: Tensor, progress: Progress | None = None) -> list[Poses]:
-    """The poses in the frames of each episode; `known` (H, W) is 1 where the finder's renderer draws what is seen."""
+def found_in(
+    recording: Recording, finder: PoseFinder, camera: Sequence[CameraEffect], progress: Progress | None = None
+) -> list[Poses]:
+    """The poses in the frames of each episode, by the finder of what `camera` shows."""
     out = []
     for number, episode in enumerate(recording.episodes):
-        out.append(finder(known * torch.from_numpy(np.ascontiguousarray(episode.frame))))
+        frames = torch.from_numpy(np.ascontiguousarray(episode.frame))
+        if camera:
+            frames = smoothed(frames.float() * within_frame(camera, frames.float()), camera)
+        out.append(finder(frames))
         if progress is not None:
             progress(number + 1, len(recording.episodes), float(out[-1].misfit.square().mean()))
     return out
 
 
-def positions(recording: Recording, found: Sequence[Poses], limit: float) -> tuple[Recording, list[NDArray[np.uint8]]]:
+def positions(recording: Recording, found: Sequence[Poses]) -> tuple[Recording, list[NDArray[np.uint8]]]:
     """The recording with x and theta as measured in the place of frames, and the frames (T, H, W) of its episodes.
 
-    Rows whose frame the renderer does not explain (with a misfit above `limit`), or that does not show the pose, are
-    not `usable`; where there are many of them in a row, the episode is split. An exact copy of the frame before it has
-    the same pose.
+    Rows whose frame the renderer does not explain, or that does not show the pose, are not `usable`; where there are
+    many of them in a row, the episode is split. An exact copy of the frame before it has the same pose.
 
     Raises:
         FramesError: the renderer explains hardly any frame.
     """
-    places, explained, misfits, deviations, fresh = [], [], [], [], []
+    places, explained, contrasts, deviations, fresh = [], [], [], [], []
     for episode, poses in zip(recording.episodes, found, strict=True):
         assert episode.frame is not None
         new = np.ones(len(episode.frame), dtype=bool)
         new[1:] = (episode.frame[1:] != episode.frame[:-1]).any((1, 2))
         shown = np.flatnonzero(new)[np.cumsum(new) - 1]
         places.append(poses.place.nan_to_num().numpy()[shown])
-        explained.append(poses.explained.numpy()[shown])
+        explained.append((poses.contrast <= HIDDEN).numpy()[shown])
         # A late camera repeats its first frame, until it has seen another one: no frame was lost.
         fresh.append(np.ones(len(new), dtype=bool))
         fresh[-1][1 : 1 + int(new[1:].argmax())] = False
-        misfits.append(poses.misfit.numpy())
+        contrasts.append(poses.contrast.numpy())
         deviations.append(poses.covariance.diagonal(dim1=1, dim2=2).sqrt().nan_to_num(torch.inf).numpy()[shown])
     # A pole that is out of the frame may have any angle.
     most = np.maximum(RESOLUTION, VAGUE * np.median(np.concatenate(deviations), 0))
@@ -194,9 +202,10 @@ def positions(recording: Recording, found: Sequence[Poses], limit: float) -> tup
     total, seen = sum(map(len, explained)), sum(int(each.sum()) for each in explained)
     if seen < LEAST_EXPLAINED * total:
         raise FramesError(
-            f"{recording.sources[0]}: the renderer explains {seen} of {total} frames (misfit "
-            f"{255 * float(np.median(np.concatenate(misfits))):.1f} grey levels, at most {255 * limit:.1f} is "
-            "right): it is of another scene; `visadapt renderer` trains one on frames of this one"
+            f"{recording.sources[0]}: the renderer explains {seen} of {total} frames (where it draws cart and pole, "
+            f"they differ by {100 * float(np.median(np.concatenate(contrasts))):.0f} % of the contrast, at most "
+            f"{100 * HIDDEN:.0f} % is right): it is of another scene; `visadapt renderer` trains one on frames of this "
+            "one"
         )
     episodes: list[Episode] = []
     usable: list[NDArray[np.bool_]] = []

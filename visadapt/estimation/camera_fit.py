@@ -16,12 +16,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from visadapt.effects.camera import CameraEffect, seen_by
+from visadapt.effects.camera import Blur, CameraEffect, seen_by
 from visadapt.estimation.poses import DIFFERENCE, SPACING
+from visadapt.estimation.structure import white_noise
 
 Camera = tuple[type[CameraEffect], ...]
 
-CLUSTER = 10  # px, side of the squares of the frame within which errors are alike
+SMOOTHING = 1.5  # px, standard deviation
+
+ALIKE = 100
+"""Pixels, 10 by 10, in which what is left of the frames beyond noise counts as one error, the same in all frames."""
 
 STEPS = 12  # At most
 
@@ -34,24 +38,37 @@ DIFFERENCE_SHARE, LONGEST_DIFFERENCE = 0.01, 0.5
 class SeenBy(nn.Module):
     """A renderer seen by a camera with effects: x (B,) and theta (B,) to frames (B, H, W).
 
-    Where a camera that was moved looks beyond the renderer's frames, they are 0.
+    Where a camera that was moved looks beyond the renderer's frames, they are 0. With `smooth` they are `smoothed`.
     """
 
-    def __init__(self, renderer: nn.Module, effects: Sequence[CameraEffect]) -> None:
+    def __init__(self, renderer: nn.Module, effects: Sequence[CameraEffect], smooth: bool = False) -> None:
         super().__init__()
         self.renderer = renderer
         self.effects = list(effects)
+        self.smooth = smooth
 
     def forward(self, x: Tensor, theta: Tensor) -> Tensor:
         """Frames (B, H, W) of cart positions (B,) in m and pole angles (B,) in rad."""
         frame = through(self.renderer(x, theta), self.effects)
-        return frame * within_frame(self.effects, frame)
+        frame = frame * within_frame(self.effects, frame)
+        return smoothed(frame, self.effects) if self.smooth else frame
 
 
 def through(frame: Tensor, effects: Sequence[CameraEffect]) -> Tensor:
     """Frames (B, H, W) as a camera with effects without memory shows them, in [0, 1] as all recorded frames are."""
     ordered = sorted(effects, key=lambda effect: effect.order)
     return seen_by(ordered, frame, [frame[:, None, :0]] * len(ordered), None)[0].clamp(0, 1)
+
+
+def smoothed(frames: Tensor, camera: Sequence[CameraEffect]) -> Tensor:
+    """Frames (B, H, W), smoothed where a camera is moved.
+
+    A picture that is moved by a fraction of a pixel loses its sharpest edges, and a fit to sharp frames then prefers
+    whole pixels, or no motion at all: by 0.1 px, a zoom of 0.2 %.
+    """
+    if all(effect.motion(frames) is None for effect in camera):
+        return frames
+    return Blur(sigma=SMOOTHING).apply_to(frames, frames, None)[0]
 
 
 def within_frame(camera: Sequence[CameraEffect], like: Tensor) -> Tensor:
@@ -101,10 +118,16 @@ def made(camera: Camera, values: Tensor) -> list[CameraEffect]:
 
 
 def fit_camera(
-    renderer: nn.Module, frames: Tensor, camera: Camera, values: Tensor, place: Tensor, fixed: frozenset[str]
+    renderer: nn.Module,
+    frames: Tensor,
+    camera: Camera,
+    values: Tensor,
+    place: Tensor,
+    fixed: frozenset[str],
+    smooth: bool = False,
 ) -> CameraFit:
     """Fit camera effects to frames (N, H, W) in [0, 1], from values (P,) and places (N, 2); `fixed` are the names of
-    parameters that stay as they are."""
+    parameters that stay as they are; with `smooth`, to `smoothed` frames."""
     table = [parameter for kind in camera for parameter in kind.table]
     low, high = (torch.tensor([getattr(p, end) for p in table], dtype=torch.float64) for end in ("low", "high"))
     free = torch.tensor([p.name not in fixed for p in table], dtype=torch.float64)
@@ -113,11 +136,16 @@ def fit_camera(
     def shown(scene: Tensor, at: Tensor) -> Tensor:
         return through(scene, made(camera, at))
 
+    def counted(pictures: Tensor, phi: Tensor) -> Tensor:
+        """Pictures (N, H, W), 0 where the renderer draws nothing of what is seen."""
+        effects = made(camera, phi)
+        pictures = pictures * within_frame(effects, frames)
+        return smoothed(pictures, effects) if smooth else pictures
+
     def compared(at: Tensor, phi: Tensor) -> tuple[Tensor, float]:
-        """What is left of the frames where the renderer draws what they show, and its mean square there."""
-        seen = within_frame(made(camera, phi), frames)
-        left = (frames - shown(scene_at(at), phi)) * seen
-        return left, float(left.square().mean() / seen.mean())
+        """What is left of the frames, and its mean square where the renderer draws what they show."""
+        left = counted(frames - shown(scene_at(at), phi), phi)
+        return left, float(left.square().mean() / within_frame(made(camera, phi), frames).mean())
 
     def scene_at(at: Tensor) -> Tensor:
         out: Tensor = renderer(at[:, 0].to(frames), at[:, 1].to(frames))
@@ -132,11 +160,10 @@ def fit_camera(
         by_value = [
             free[k] * (shown(scene, phi + h) - shown(scene, phi - h)) / (2 * step[k]) for k, h in enumerate(nudge)
         ]
-        seen = within_frame(made(camera, phi), frames).flatten()
         empty = frames.new_zeros(len(frames), 0, frames[0].numel())
         return (
-            seen * torch.stack(by_place, 1).flatten(2) / (2 * DIFFERENCE),
-            seen * torch.stack(by_value, 1).flatten(2).to(frames) if by_value else empty,
+            torch.stack([counted(each, phi) for each in by_place], 1).flatten(2) / (2 * DIFFERENCE),
+            torch.stack([counted(each.to(frames), phi) for each in by_value], 1).flatten(2) if by_value else empty,
         )
 
     values, place = values.double().clone(), place.double().clone()
@@ -157,7 +184,11 @@ def fit_camera(
             damping *= 10
             if damping > 1e3:
                 break
-    covariance = _covariance(*slopes(place, values), error, (high - low).square() / 12)
+    noise = white_noise(frames - shown(scene_at(place), values))
+    covariance = _covariance(*slopes(place, values), error, noise, (high - low).square() / 12)
+    if smooth:
+        smooth = False
+        error, loss = compared(place, values)
     return CameraFit(camera, values, place, loss, covariance, error)
 
 
@@ -184,27 +215,17 @@ def _solved(own: Tensor, both: Tensor, whole: Tensor, g: Tensor, b: Tensor, damp
     return change, moves
 
 
-def _covariance(by_place: Tensor, by_value: Tensor, error: Tensor, wide: Tensor) -> Tensor:
-    """(P, P) of the parameters, `wide` (P,) their variances beforehand.
-
-    What the renderer draws wrongly is alike in neighbouring pixels and in all frames: the sandwich of Liang and Zeger
-    (1986, Biometrika 73(1)), whose clusters are squares of the frame; nothing less than white noise of the pixels does.
-    """
+def _covariance(by_place: Tensor, by_value: Tensor, error: Tensor, noise: float, wide: Tensor) -> Tensor:
+    """(P, P) of the parameters, `wide` (P,) their variances beforehand: white noise of the pixels, and what else is
+    left, which is alike in many pixels and frames and so counts as few errors."""
     if not len(wide):
         return wide.new_zeros(0, 0)
     own = (by_place @ by_place.mT).double()
     own = own + 1e-9 * torch.eye(2).to(own)
     gain = torch.linalg.solve(own, (by_place @ by_value.mT).double()).mT  # (N, P, 2)
     clear = by_value - gain.to(by_place) @ by_place  # less what the places take up
-    white = error.square().mean().double().clamp_min(1e-12)
-    information = (clear @ clear.mT).double().sum(0) + torch.diag(white / wide)
-    scores = (clear * error.flatten(1)[:, None]).sum(0).unflatten(1, error.shape[1:])  # (P, H, W)
-    sums = CLUSTER**2 * torch.nn.functional.avg_pool2d(scores, CLUSTER, ceil_mode=True, divisor_override=CLUSTER**2)
-    squares = sums.flatten(1).double()
-    # In units in which white noise alone gives 1 in every direction.
-    half = torch.linalg.cholesky(white * information)
-    spread = torch.linalg.solve_triangular(half, squares, upper=False)
-    size, direction = torch.linalg.eigh(spread @ spread.mT)
-    middle = half @ direction @ torch.diag(size.clamp_min(1)) @ direction.mT @ half.mT
-    inverse = torch.linalg.inv(information)
-    return inverse @ middle @ inverse
+    white = max(noise**2, 1e-12)
+    left = white_noise(error) ** 2  # of the noise, where frames are smoothed
+    structured = max(0.0, float(error.square().mean()) - left) * len(error) * ALIKE
+    information = (clear @ clear.mT).double().sum(0)
+    return torch.linalg.inv(information / (white + structured) + torch.diag(1 / wide))

@@ -139,6 +139,8 @@ def find_camera(
         if not idle:
             break
         best = without[idle[0]]
+    if best.camera:
+        best = fit_camera(renderer, shown, best.camera, best.values, best.place, fixed, smooth=True)
     alone = {kind: alone.get(kind, unchanged) for kind in best.camera}
     return CameraFindings(unchanged, best, alone, without, alike, fixed)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import cv2
@@ -10,7 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from visadapt.diagnosis.result import Box, Pixels
-from visadapt.effects import CameraEffect
+from visadapt.effects import CameraEffect, CameraShift
+from visadapt.effects.camera import moved
 from visadapt.estimation.camera_fit import within_frame
 from visadapt.estimation.structure import size_of, structure
 
@@ -21,7 +23,7 @@ FRAMES = 96  # Frames, spread over the film, whose pixels are looked at
 USUAL = 1 / 255
 """What renderers whose file does not say it draw wrongly: root mean square of the structure, of [0, 1]."""
 
-FACTOR = 1.7  # Structure of a film over the renderer's own, above which frames are unexplained
+FACTOR = 1.7  # Structure of a film over what is usual, above which frames are unexplained
 
 STANDS_OUT = 4.0  # Structure of a pixel over the mean, above which it belongs to a box
 MOST_BOXES, LEAST_SHARE = 5, 0.05
@@ -41,17 +43,26 @@ def left_over(seen: nn.Module, camera: Sequence[CameraEffect], frames: Tensor, p
     return structure(residual[own <= OF_ANOTHER_KIND * own.median()])
 
 
-def own_error(renderer: nn.Module) -> float:
-    """What a renderer draws wrongly by itself, root mean square of [0, 1]."""
+def usual(renderer: nn.Module, camera: Sequence[CameraEffect], place: Tensor) -> float:
+    """What is left, root mean square of [0, 1], where nothing is unexplained: the renderer's own errors, and, where the
+    camera is moved, what is lost of drawn frames of places (N, 2) that are moved by half a pixel and back."""
     known = getattr(renderer, "error", None)
-    return USUAL if known is None else float(known)
+    own = USUAL if known is None else float(known)
+    drawn = renderer(*place.float().T)
+    if all(effect.motion(drawn) is None for effect in camera):
+        return own
+    half = CameraShift(dx=0.5, dy=0.5).motion(drawn)
+    assert half is not None
+    inside = (..., slice(1, -1), slice(1, -1))
+    lost = size_of(structure((moved(moved(drawn, [half]), [half.inverse()]) - drawn)[inside]))
+    return math.hypot(own, lost)
 
 
-def judged(left: Tensor, own: float) -> Pixels:
-    """What is left (H, W) beside what the renderer itself draws wrongly, with the boxes in which it stands out."""
+def judged(left: Tensor, expected: float) -> Pixels:
+    """What is left (H, W) beside what is `usual`, with the boxes in which it stands out."""
     whole = size_of(left)
-    unexplained = whole > FACTOR * own
-    return Pixels(255 * whole, 255 * own, unexplained, tuple(_boxes(left)) if unexplained else ())
+    unexplained = whole > FACTOR * expected
+    return Pixels(255 * whole, 255 * expected, unexplained, tuple(_boxes(left)) if unexplained else ())
 
 
 def _boxes(left: Tensor) -> list[Box]:
