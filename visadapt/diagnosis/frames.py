@@ -19,8 +19,8 @@ from visadapt.diagnosis.report.text import estimate
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Diagnosis, Gap, Pixels
 from visadapt.diagnosis.search.camera import CameraFindings, find_camera
 from visadapt.diagnosis.search.pixels import judged, left_over, usual
-from visadapt.effects import EFFECTS, AngleDelay, CameraEffect, Dropout, FrozenZone, MeasurementDelay, PositionDelay
-from visadapt.estimation.camera_fit import SeenBy, smoothed, within_frame
+from visadapt.effects import EFFECTS, AngleDelay, Dropout, FrozenZone, MeasurementDelay, PositionDelay
+from visadapt.estimation.camera_fit import SeenBy, within_frame
 from visadapt.estimation.poses import PoseFinder, Poses
 from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, Recording
@@ -84,8 +84,9 @@ def watch(recording: Recording, system: System, renderer: nn.Module, report: Rep
     effects, seen = camera.best.effects, renderer
     if effects:
         seen = SeenBy(renderer, effects)
-        finder = PoseFinder(SeenBy(renderer, effects, smooth=True), reach, LEAN)
-    poses = found_in(recording, finder, effects, staged(report, "poses"))
+        finder = PoseFinder(seen, reach, LEAN)
+    known = within_frame(effects, every[0].float()).to(torch.uint8)
+    poses = found_in(recording, finder, known, staged(report, "poses"))
     left = left_over(seen, effects, every, torch.cat([each.place for each in poses]))
     found, frames = positions(recording, poses)
     pixels = judged(left, usual(renderer, effects, camera.best.place))
@@ -159,16 +160,11 @@ def check_frames(recording: Recording, size: tuple[int, ...]) -> None:
             raise FramesError(f"{source}: all {len(episode.frame)} frames are the same; a film that moves is right")
 
 
-def found_in(
-    recording: Recording, finder: PoseFinder, camera: Sequence[CameraEffect], progress: Progress | None = None
-) -> list[Poses]:
-    """The poses in the frames of each episode, by the finder of what `camera` shows."""
+def found_in(recording: Recording, finder: PoseFinder, known: Tensor, progress: Progress | None = None) -> list[Poses]:
+    """The poses in the frames of each episode; `known` (H, W) is 1 where the finder's renderer draws what is seen."""
     out = []
     for number, episode in enumerate(recording.episodes):
-        frames = torch.from_numpy(np.ascontiguousarray(episode.frame))
-        if camera:
-            frames = smoothed(frames.float() * within_frame(camera, frames.float()), camera)
-        out.append(finder(frames))
+        out.append(finder(known * torch.from_numpy(np.ascontiguousarray(episode.frame))))
         if progress is not None:
             progress(number + 1, len(recording.episodes), float(out[-1].misfit.square().mean()))
     return out

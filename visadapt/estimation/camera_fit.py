@@ -38,20 +38,18 @@ DIFFERENCE_SHARE, LONGEST_DIFFERENCE = 0.01, 0.5
 class SeenBy(nn.Module):
     """A renderer seen by a camera with effects: x (B,) and theta (B,) to frames (B, H, W).
 
-    Where a camera that was moved looks beyond the renderer's frames, they are 0. With `smooth` they are `smoothed`.
+    Where a camera that was moved looks beyond the renderer's frames, they are 0.
     """
 
-    def __init__(self, renderer: nn.Module, effects: Sequence[CameraEffect], smooth: bool = False) -> None:
+    def __init__(self, renderer: nn.Module, effects: Sequence[CameraEffect]) -> None:
         super().__init__()
         self.renderer = renderer
         self.effects = list(effects)
-        self.smooth = smooth
 
     def forward(self, x: Tensor, theta: Tensor) -> Tensor:
         """Frames (B, H, W) of cart positions (B,) in m and pole angles (B,) in rad."""
         frame = through(self.renderer(x, theta), self.effects)
-        frame = frame * within_frame(self.effects, frame)
-        return smoothed(frame, self.effects) if self.smooth else frame
+        return frame * within_frame(self.effects, frame)
 
 
 def through(frame: Tensor, effects: Sequence[CameraEffect]) -> Tensor:

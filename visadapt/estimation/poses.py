@@ -75,7 +75,7 @@ class PoseFinder:
 
     @torch.no_grad()
     def __call__(self, frames: Tensor) -> Poses:
-        """Poses in frames (T, H, W), uint8 or other grey levels of 255."""
+        """Poses in frames (T, H, W) uint8."""
         parts = [self._find(part.to(self._like) / 255) for part in frames.split(CHUNK)]
         place, covariance, misfit, contrast = (torch.cat(tensors).cpu() for tensors in zip(*parts, strict=True))
         # Where the picture does not depend on the pose (a cart out of sight) there is nothing to be found either.

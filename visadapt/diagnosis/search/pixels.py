@@ -16,7 +16,8 @@ from visadapt.effects.camera import moved
 from visadapt.estimation.camera_fit import within_frame
 from visadapt.estimation.structure import size_of, structure
 
-OF_ANOTHER_KIND = 10.0  # Mean squares of a frame, over their median, above which it is left out
+OF_ANOTHER_KIND, FEW = 10.0, 0.1
+"""Mean squares of a frame, over their median, above which it is left out, and share of the frames that may be."""
 
 FRAMES = 96  # Frames, spread over the film, whose pixels are looked at
 
@@ -32,7 +33,7 @@ MOST_BOXES, LEAST_SHARE = 5, 0.05
 def left_over(seen: nn.Module, camera: Sequence[CameraEffect], frames: Tensor, place: Tensor) -> Tensor:
     """`structure` (H, W) of frames (T, H, W) uint8 less what is drawn of their poses (T, 2); 0 where nothing is drawn.
 
-    `seen` is the renderer through `camera`. Frames that are far worse than most, such as flashes, are left out.
+    `seen` is the renderer through `camera`. A few frames that are far worse than most, such as flashes, are left out.
     """
     rows = torch.linspace(0, len(frames) - 1, min(FRAMES, len(frames))).long()
     rows = rows[place[rows].isfinite().all(1)]
@@ -40,7 +41,7 @@ def left_over(seen: nn.Module, camera: Sequence[CameraEffect], frames: Tensor, p
     drawn = seen(x, theta)
     residual = (frames[rows].float() / 255 - drawn) * within_frame(camera, drawn)
     own = residual.square().mean((1, 2))
-    return structure(residual[own <= OF_ANOTHER_KIND * own.median()])
+    return structure(residual[own <= torch.maximum(OF_ANOTHER_KIND * own.median(), own.quantile(1 - FEW))])
 
 
 def usual(renderer: nn.Module, camera: Sequence[CameraEffect], place: Tensor) -> float:
