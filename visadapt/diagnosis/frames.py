@@ -19,9 +19,10 @@ from visadapt.diagnosis.report.text import estimate
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Diagnosis, Gap, Pixels
 from visadapt.diagnosis.search.camera import CameraFindings, find_camera
 from visadapt.diagnosis.search.pixels import judged, left_over, usual
-from visadapt.effects import EFFECTS, AngleDelay, Dropout, FrozenZone, MeasurementDelay, PositionDelay
+from visadapt.effects import EFFECTS, AngleDelay, Dropout, FrameDrop, FrozenZone, MeasurementDelay, PositionDelay, Stage
 from visadapt.estimation.camera_fit import SeenBy, within_frame
 from visadapt.estimation.poses import PoseFinder, Poses
+from visadapt.estimation.profiles import profile_of
 from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import System
@@ -37,6 +38,10 @@ MISFIT = "root mean square of frames less those drawn by the renderer, in grey l
 
 UNSEEN = (Dropout, FrozenZone, MeasurementDelay, PositionDelay, AngleDelay)
 """Faults of sensors that a camera cannot have: it shows cart and pole in one frame. A late camera is a camera's."""
+
+WITHIN = 1.0
+"""Error of the source's predictions, over the noise of positions, below which motion shows no gap: what a renderer
+draws wrongly, and more where a moved camera's pictures are interpolated, makes small errors that are no noise."""
 
 LEAN = 0.5  # rad, largest |theta| at which the pole is looked for
 
@@ -99,8 +104,10 @@ def with_camera(motion: Diagnosis, film: Film, system: System) -> Diagnosis:
     Where the pixels are unexplained, so is the recording; a warning states what the motion shows nevertheless.
     """
     camera = film.camera
-    motion = replace(motion, where=replace(motion.where, pixels=film.pixels))
     causes = camera.causes()
+    if motion.gap.before < WITHIN:
+        motion = _without_gap(motion, bool(causes), system)
+    motion = replace(motion, where=replace(motion.where, pixels=film.pixels))
     if film.pixels.unexplained:
         return _unexplained_in_pixels(motion, causes)
     names = tuple(cause.effect for cause in causes)
@@ -122,6 +129,19 @@ def with_camera(motion: Diagnosis, film: Film, system: System) -> Diagnosis:
         ranking=tuple(replace(one, effects=(*names, *one.effects)) for one in motion.ranking),
         gap=gap,
         next_experiment=" ".join(text for text in (settled, following) if text),
+    )
+
+
+def _without_gap(motion: Diagnosis, seen_by_a_faulty_camera: bool, system: System) -> Diagnosis:
+    """The diagnosis where the source predicts the positions as closely as they can be seen."""
+    stages = dict.fromkeys(motion.where.stages, 0.0) | {Stage.CAMERA.value: float(seen_by_a_faulty_camera)}
+    drops = tuple(cause for cause in motion.causes if cause.effect == FrameDrop.name)
+    return replace(
+        motion,
+        verdict=IDENTIFIED if drops else NO_GAP,
+        causes=drops,
+        where=replace(motion.where, stages=stages | ({Stage.CAMERA.value: 1.0} if drops else {})),
+        next_experiment="" if drops else next_experiment.more(profile_of(system)),
     )
 
 
