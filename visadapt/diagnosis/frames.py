@@ -19,7 +19,17 @@ from visadapt.diagnosis.report.text import estimate
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Diagnosis, Gap, Pixels
 from visadapt.diagnosis.search.camera import CameraFindings, find_camera
 from visadapt.diagnosis.search.pixels import judged, left_over, usual
-from visadapt.effects import EFFECTS, AngleDelay, Dropout, FrameDrop, FrozenZone, MeasurementDelay, PositionDelay, Stage
+from visadapt.effects import (
+    EFFECTS,
+    AngleDelay,
+    CameraShift,
+    Dropout,
+    FrameDrop,
+    FrozenZone,
+    MeasurementDelay,
+    PositionDelay,
+    Stage,
+)
 from visadapt.estimation.camera_fit import SeenBy, within_frame
 from visadapt.estimation.poses import PoseFinder, Poses
 from visadapt.estimation.profiles import profile_of
@@ -111,8 +121,10 @@ def with_camera(motion: Diagnosis, film: Film, system: System) -> Diagnosis:
     if film.pixels.unexplained:
         return _unexplained_in_pixels(motion, causes)
     names = tuple(cause.effect for cause in causes)
+    along = next_experiment.ALONG if camera.fixed and {CameraShift.name}.issuperset(names) else ""
     if not names:
-        return motion
+        open_too = along if motion.verdict == NO_GAP else ""
+        return replace(motion, next_experiment=" ".join(text for text in (motion.next_experiment, open_too) if text))
     if motion.verdict == UNEXPLAINED:
         return replace(motion, warnings=(*motion.warnings, f"found in the pixels, and corrected: {_values(causes)}"))
     doubtful = [[EFFECTS[name] for name in (one.effect, *one.indistinguishable_from)] for one in causes]
@@ -128,7 +140,7 @@ def with_camera(motion: Diagnosis, film: Film, system: System) -> Diagnosis:
         causes=(*causes, *motion.causes),
         ranking=tuple(replace(one, effects=(*names, *one.effects)) for one in motion.ranking),
         gap=gap,
-        next_experiment=" ".join(text for text in (settled, following) if text),
+        next_experiment=" ".join(text for text in (settled, along, following) if text),
     )
 
 
