@@ -205,7 +205,7 @@ def recordings_of(settings: Settings, kind: Kind) -> Path:
     count = len(ROWS) if kind == "table" else settings.count
     folder = Path("data/blind") / f"{settings.label(kind)}-{count}-{settings.seed}"
     if len(recordings_in(folder)) != count or not key_of(folder).exists():
-        if kind in FILMS:
+        if kind == "film_plain" or kind == "film_textured":
             blind_films.main(blind_films.Settings(folder, FILMS[kind], count, settings.seed))
         elif kind == "quadrotor" or kind == "fixed_wing":
             blind_flights.main(blind_flights.Settings(folder, kind, count, settings.seed, effects=settings.effects))

@@ -16,7 +16,7 @@ import io
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -106,7 +106,7 @@ def make(settings: Settings) -> list[FilmDraft]:
         FilmDraft(np.random.default_rng(seed), str(mixture), number % 2 == 0, {})
         for number, (seed, mixture) in enumerate(zip(seeds[1:], mixtures, strict=True))
     ]
-    np.random.default_rng(seeds[0]).shuffle(drafts)  # type: ignore[arg-type]
+    np.random.default_rng(seeds[0]).shuffle(drafts)
     for attempt in range(80):
         pending = [draft for draft in drafts if draft.frames is None]
         if not pending:
@@ -222,7 +222,7 @@ def key_text(settings: Settings, drafts: list[FilmDraft]) -> str:
     return json.dumps({**head, "recordings": answers}, indent=1) + "\n"
 
 
-def _content(episodes: list[dict[str, NDArray[np.generic]]], state_names: tuple[str, ...] = ()) -> bytes:
+def _content(episodes: list[dict[str, NDArray[Any]]], state_names: tuple[str, ...] = ()) -> bytes:
     """A recording as HDF5, of version 1 of the format of docs/own_rig.md."""
     file = io.BytesIO()
     with h5py.File(file, "w") as out:
@@ -255,9 +255,14 @@ def calibration(look: LookName, seed: int) -> bytes:
     places = rng.uniform(
         (-CART_REACH - 0.2, -1.2 * POLE_REACH), (CART_REACH + 0.2, 1.2 * POLE_REACH), (CALIBRATION_FRAMES, 2)
     )
-    times = PERIOD * np.arange(CALIBRATION_FRAMES)
+    times = PERIOD * np.arange(CALIBRATION_FRAMES, dtype=float)
     frames = recorded(clean({}, LOOKS[look], places, times), rng)
-    arrays = {"time": times, "action": np.zeros((len(times), 1)), "state": places, "frame": frames}
+    arrays: dict[str, NDArray[Any]] = {
+        "time": times,
+        "action": np.zeros((len(times), 1)),
+        "state": places,
+        "frame": frames,
+    }
     return _content([arrays], ("x", "theta"))
 
 

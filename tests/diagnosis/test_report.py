@@ -332,7 +332,7 @@ class TestPage:
     def test_a_film_is_scrubbed_in_the_page_itself(self):
         rng = np.random.default_rng(0)
         frames = rng.integers(0, 256, (2, 100, 100, 120), dtype=np.uint8)
-        film = FilmFrames(*frames, 0.05 * np.arange(100), np.full(100, 3), 0.5, rng.random((100, 120)))
+        film = FilmFrames(frames[0], frames[1], 0.05 * np.arange(100), np.full(100, 3), 0.5, rng.random((100, 120)))
         pixels = Pixels(4.2, 0.5, True, (Box(10, 20, 40, 30, 0.8),))
         where = replace(a_diagnosis("unexplained").where, pixels=pixels)
         diagnosis = a_diagnosis("unexplained", where=where, figures=replace(some_figures(), film=film))

@@ -17,7 +17,7 @@ def shown(film: FilmFrames) -> dict[str, Any]:
     """What the page needs: pictures as data URLs, of all frames one below the other, and the words for each frame."""
     height, width = film.filmed.shape[1:]
     worst = float(film.left.max())
-    heat = cv2.applyColorMap(np.uint8(255 * film.left / max(worst, 1e-9)), cv2.COLORMAP_INFERNO)
+    heat = cv2.applyColorMap(np.asarray(255 * film.left / max(worst, 1e-9), np.uint8), cv2.COLORMAP_INFERNO)
     captions = [f"episode {k}, {t:.2f} s" for k, t in zip(film.episode, film.time, strict=True)]
     return {
         "width": width,
