@@ -158,6 +158,13 @@ COMMANDS = (
         "blind_rigs.csv",
     ),
     _blind(
+        "blind_frames",
+        "--seed 2050 --kinds film_plain film_textured --count 40 --jobs 2 --diagnosers ours "
+        "--out results/blind_frames.csv",
+        30,
+        "blind_frames.csv",
+    ),
+    _blind(
         "blind_quadrotor",
         "--system quadrotor --count 24 --seed 2032 --jobs 2 --diagnosers ours refit chance",
         10,

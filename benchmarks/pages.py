@@ -63,6 +63,7 @@ TABLES = {
     "renderers": Table(adaptation.renderers, ("renderers",)),
     "blind": Table(diagnosis.blind, ("blind_hard", "blind_easy", "blind_2029")),
     "blind rigs": Table(diagnosis.blind_rigs, ("blind_rig", "blind_large", "blind_table")),
+    "blind frames": Table(diagnosis.blind_frames, ("blind_frames",)),
     "blind flights": Table(diagnosis.blind_flights, ("blind_quadrotor", "blind_fixed_wing")),
     "rotorpy diagnosis": Table(diagnosis.crazyflie, ("rotorpy_diagnosis",)),
 }

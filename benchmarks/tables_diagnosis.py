@@ -10,7 +10,9 @@ DIAGNOSERS = ("ours", "afternoon", "greedy", "refit", "pysindy", "chance")
 MEASURES = {
     "single: among the named": "single effects named",
     "single: named, nothing else": "and nothing else",
+    "single: stage right": "single effects, stage right",
     "pair: both named": "pairs, both named",
+    "pair: stages right": "pairs, stages right",
     "triple: all named": "triples, all named",
     "none: no_gap": "nothing hidden, called no_gap",
     "foreign: unexplained": "foreign effects, called unexplained",
@@ -45,6 +47,12 @@ def blind(first: Rows, second: Rows) -> Lines:
 def blind_rigs(rows: Rows) -> Lines:
     """Lab's machines, large effects, and the rows of `datasets.blind.table`, without the measures that no set has."""
     header, *lines = _check(rows, ("rig-all", "large-all", "table"))
+    return [header, *(line for _, *line in lines if any(line[1:]))]
+
+
+def blind_frames(rows: Rows) -> Lines:
+    """Films, without the measures that no set of them has."""
+    header, *lines = _check(rows, ("film_plain", "film_textured"))
     return [header, *(line for _, *line in lines if any(line[1:]))]
 
 

@@ -18,6 +18,8 @@ class MLPRenderer(nn.Module):
     """
 
     input_gain = (10.0, 5.0, 5.0)
+    error: float | None = None
+    """root mean square of what it draws wrongly in a grey of [0, 1], noise left aside; None where nobody measured it"""
 
     def __init__(self, height: int, width: int) -> None:
         super().__init__()
@@ -99,6 +101,8 @@ class LayeredRenderer(nn.Module):
     """
 
     guess: Tensor
+    error: float | None = None
+    """root mean square of what it draws wrongly in a grey of [0, 1], noise left aside; None where nobody measured it"""
 
     def __init__(
         self, height: int, width: int, column: float, row: float, scale: float, reach: float, detail: float = 2.0

@@ -25,7 +25,10 @@ class RendererError(ValueError):
 
 
 def save_renderer(path: Path, renderer: LayeredRenderer | MLPRenderer, training: Mapping[str, Any]) -> None:
-    """Write a renderer; `training` documents its training (seed, steps, versions) as values that JSON can hold."""
+    """Write a renderer; `training` documents its training (seed, steps, versions) as values that JSON can hold.
+
+    Its "error" is the renderer's `error`, where it was measured.
+    """
     kind = next(name for name, cls in KINDS.items() if type(renderer) is cls)
     header = {"format": FORMAT_VERSION, "kind": kind, "arguments": renderer.arguments, "training": dict(training)}
     weights = {key: value.detach().contiguous() for key, value in renderer.state_dict().items()}
@@ -83,6 +86,7 @@ def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRen
         if header["format"] != FORMAT_VERSION:
             raise RendererError(f"{path}: format {header['format']}, this version reads {FORMAT_VERSION}")
         renderer = KINDS[header["kind"]](**header["arguments"])
+        renderer.error = header["training"].get("error")
     except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:  # json's is a ValueError
         if isinstance(error, RendererError):
             raise

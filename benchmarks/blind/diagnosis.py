@@ -33,11 +33,12 @@ from benchmarks.blind.baselines import BASELINES, FLYING
 from benchmarks.blind.flight_onestep import system_of
 from benchmarks.blind.scoring import Answer, Score, Truth, score
 from benchmarks.blind.tables import Row, confusion, label, read_table, tabulate, write_csv, write_table
-from datasets.blind import flights as blind_flights, gaps as blind_gaps
+from datasets.blind import films as blind_films, flights as blind_flights, gaps as blind_gaps
 from datasets.blind.kinds import Effects
+from datasets.blind.scene import COLUMN, ROW, SCALE
 from datasets.blind.table import ROWS
 
-Kind = Literal["easy", "hard", "large", "rig", "table", "quadrotor", "fixed_wing"]
+Kind = Literal["easy", "hard", "large", "rig", "table", "film_plain", "film_textured", "quadrotor", "fixed_wing"]
 """One of the sets of the cart-pole, or the set of a vehicle."""
 System = Literal["cartpole", "quadrotor", "fixed_wing"]
 
@@ -53,7 +54,7 @@ class Settings:
     seed: int = 7
     """seed of the recordings"""
     kinds: tuple[Kind, ...] = ("easy", "hard")
-    """which sets of the cart-pole"""
+    """which sets of the cart-pole; baselines diagnose no films"""
     effects: Effects = "core"
     """what the recordings are drawn from: the core of the catalogue, the rest of it, or all"""
     diagnosers: tuple[str, ...] = ("ours", *BASELINES)
@@ -76,30 +77,47 @@ class Settings:
         """The sets of the system."""
         return self.kinds if self.system == "cartpole" else (self.system,)
 
-    @property
-    def asked(self) -> tuple[str, ...]:
-        """Diagnosers that know the system and the effects: the baselines know the core alone."""
+    def asked(self, kind: Kind) -> tuple[str, ...]:
+        """Diagnosers that know the system, the effects and what is recorded: the baselines know the core alone."""
         known = DIAGNOSERS if self.system == "cartpole" else ("ours", *FLYING)
-        return tuple(name for name in self.diagnosers if name in (known if self.effects == "core" else ("ours",)))
+        alone = self.effects != "core" or kind in FILMS
+        return tuple(name for name in self.diagnosers if name in (("ours",) if alone else known))
 
     def label(self, kind: Kind) -> str:
         """The name of a set in tables and folders."""
         return kind if self.effects == "core" else f"{kind}-{self.effects}"
 
 
+FILMS: dict[Kind, blind_films.LookName] = {"film_plain": "plain", "film_textured": "textured"}
+"""The look of each set of films."""
+
+
 def ours(path: Path) -> Answer:
     """What the command `visadapt diagnose` writes, run in this process."""
+    of_film = path.suffix == ".h5"
+    seen_by = ["--system", "cartpole", "--renderer", str(renderer_of(path.parent))]
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "answer.json"
+        options = seen_by if of_film else ["--system", system_of(path)]
+        _visadapt("diagnose", str(path), *options, "--json", str(out))
+        answer: Answer = json.loads(out.read_text(encoding="utf-8"))
+    return answer
+
+
+def _visadapt(*arguments: str) -> None:
+    """The command `visadapt`, run in this process; raises RuntimeError with what it said where it fails."""
     # Imported here: a worker that runs a baseline need not load the command line.
     cli = importlib.import_module("visadapt.cli.main")
     said = io.StringIO()
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "answer.json"
-        with redirect_stdout(said), redirect_stderr(said):
-            status = cli.main(["diagnose", str(path), "--system", system_of(path), "--json", str(out)])
-        if status != 0:
-            raise RuntimeError(f"exit status {status}: {said.getvalue().strip()}")
-        answer: Answer = json.loads(out.read_text(encoding="utf-8"))
-    return answer
+    with redirect_stdout(said), redirect_stderr(said):
+        status = cli.main(list(arguments))
+    if status != 0:
+        raise RuntimeError(f"exit status {status}: {said.getvalue().strip()}")
+
+
+def renderer_of(folder: Path) -> Path:
+    """File of the renderer of a folder's films."""
+    return folder.with_name(folder.name + ".renderer.safetensors")
 
 
 DIAGNOSERS: dict[str, Callable[[Path], Answer]] = {"ours": ours, **BASELINES}
@@ -186,12 +204,23 @@ def recordings_of(settings: Settings, kind: Kind) -> Path:
         return settings.data
     count = len(ROWS) if kind == "table" else settings.count
     folder = Path("data/blind") / f"{settings.label(kind)}-{count}-{settings.seed}"
-    if len(list(folder.glob("*.csv"))) != count or not key_of(folder).exists():
-        if kind == "quadrotor" or kind == "fixed_wing":
+    if len(recordings_in(folder)) != count or not key_of(folder).exists():
+        if kind == "film_plain" or kind == "film_textured":
+            blind_films.main(blind_films.Settings(folder, FILMS[kind], count, settings.seed))
+        elif kind == "quadrotor" or kind == "fixed_wing":
             blind_flights.main(blind_flights.Settings(folder, kind, count, settings.seed, effects=settings.effects))
         else:
             blind_gaps.main(blind_gaps.Settings(folder, kind, count, settings.seed, effects=settings.effects))
+    if kind in FILMS and not renderer_of(folder).exists():
+        film = str(blind_films.calibration_path(folder))
+        guess = f"{COLUMN + 2:.0f},{ROW - 2:.0f}", f"{SCALE + 1:.0f}"
+        _visadapt("renderer", film, "--hinge", guess[0], "--scale", guess[1], "--out", str(renderer_of(folder)))
     return folder
+
+
+def recordings_in(folder: Path) -> list[Path]:
+    """The recordings of a folder, in order."""
+    return sorted(path for path in folder.glob("*") if path.suffix in (".csv", ".h5"))
 
 
 def key_of(folder: Path) -> Path:
@@ -229,8 +258,8 @@ def main(settings: Settings) -> None:
     taken: list[dict[str, str | int]] = []
     for kind in settings.sets:
         folder = recordings_of(settings, kind)
-        recordings = sorted(folder.glob("*.csv"))
-        for name in settings.asked:
+        recordings = recordings_in(folder)
+        for name in settings.asked(kind):
             log = settings.work / folder.name / f"{name}.jsonl"
             if settings.fresh:
                 log.unlink(missing_ok=True)

@@ -53,6 +53,8 @@ class Score:
     """whether every true effect has a class (named kinds only)"""
     exact: bool | None = None
     """whether, besides, there is no other class but slight ones"""
+    stage: bool | None = None
+    """whether the classes are as many as the true effects, and a class of its own holds the stage of each"""
     top3: bool | None = None
     """whether the true set is among the first three of the ranking"""
     strength: float | None = None
@@ -124,6 +126,15 @@ def matches(effects: set[str], groups: list[set[str]]) -> bool:
     )
 
 
+def stages_match(effects: set[str], groups: list[set[str]]) -> bool:
+    """Whether the classes are of the stages of the effects, one each."""
+    stages = [EFFECTS[name].stage for name in effects]
+    possible = [{EFFECTS[name].stage for name in group} for group in groups]
+    return len(possible) == len(stages) and any(
+        all(stage in own for stage, own in zip(stages, order, strict=True)) for order in permutations(possible)
+    )
+
+
 def score(truth: Truth, answer: Answer) -> Score:
     """Score one answer."""
     result = Score(truth.kind, answer["verdict"])
@@ -143,6 +154,7 @@ def score(truth: Truth, answer: Answer) -> Score:
     result.found = matches(effects, groups)
     carrying = {cause["effect"] for cause in answer["causes"] if not cause.get("slight")}
     result.exact = result.found and all(group & effects or not group & carrying for group in groups)
+    result.stage = stages_match(effects, [group for group in groups if group & carrying])
     result.top3 = any(set(entry["effects"]) == effects for entry in ranking[:3])
     if truth.kind == "single":
         result.strength = next(iter(truth.strengths.values()))

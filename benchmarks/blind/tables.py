@@ -65,9 +65,11 @@ def tabulate(kind: str, diagnoser: str, scores: Sequence[Score], seconds: Sequen
 
     share("single: named, nothing else", [s.exact for s in of("single")])
     share("single: among the named", [s.found for s in of("single")])
+    share("single: stage right", [s.stage for s in of("single")])
     share("single: in the first three", [s.top3 for s in of("single")])
     share("pair: both named", [s.found for s in of("pair")])
     share("pair: both named, nothing else", [s.exact for s in of("pair")])
+    share("pair: stages right", [s.stage for s in of("pair")])
     share("pair: in the first three", [s.top3 for s in of("pair")])
     share("triple: all named", [s.found for s in of("triple")])
     share("triple: all named, nothing else", [s.exact for s in of("triple")])

@@ -25,7 +25,7 @@ from datasets.blind.flight_control import CONTROLLERS, PERIODS, Chain, Flyers, s
 from datasets.blind.flight_kinds import FOREIGN, NEUTRAL, named
 from datasets.blind.flight_plants import PLANTS, RESTING, Array, Motion, step
 from datasets.blind.kinds import Effects, Kind, Shape
-from datasets.blind.sealing import key_path, names, seal
+from datasets.blind.sealing import as_csv, key_path, names, seal
 
 System = Literal["quadrotor", "fixed_wing"]
 
@@ -256,7 +256,8 @@ def main(settings: Settings) -> None:
     """Make the recordings, print the key's SHA-256, then write the key and the recordings."""
     key = key_path(settings.out, settings.key)
     drafts = make(settings)
-    seal(settings.out, key, key_text(settings, drafts), (lines(draft, settings.system) for draft in drafts))
+    recordings = (as_csv(lines(draft, settings.system)) for draft in drafts)
+    seal(settings.out, key, key_text(settings, drafts), recordings)
 
 
 if __name__ == "__main__":

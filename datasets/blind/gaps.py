@@ -25,7 +25,7 @@ from datasets.blind.drafts import RECORDING_SUBSTEPS, Draft, draw_case, lines, s
 from datasets.blind.kinds import AS_ONE, INSEPARABLE, REST, Effects, drawn
 from datasets.blind.plant import PERIOD, Array
 from datasets.blind.rigs import Rig, draw_rig
-from datasets.blind.sealing import key_path, names, seal
+from datasets.blind.sealing import as_csv, key_path, names, seal
 from datasets.blind.simulation import Case, simulate
 from datasets.blind.sizing import SEARCH_SUBSTEPS, Job, draw_job, seek
 from datasets.blind.table import make_table
@@ -226,7 +226,7 @@ def main(settings: Settings) -> None:
     """Make the recordings, print the key's SHA-256, then write the key and the recordings."""
     key = key_path(settings.out, settings.key)
     drafts = make(settings)
-    seal(settings.out, key, key_text(settings, drafts), map(lines, drafts))
+    seal(settings.out, key, key_text(settings, drafts), (as_csv(lines(draft)) for draft in drafts))
 
 
 if __name__ == "__main__":

@@ -7,9 +7,14 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 
-def names(count: int) -> list[str]:
+def names(count: int, suffix: str = ".csv") -> list[str]:
     """File names of the recordings, in order."""
-    return [f"{i:04d}.csv" for i in range(count)]
+    return [f"{i:04d}{suffix}" for i in range(count)]
+
+
+def as_csv(lines: Iterator[str]) -> bytes:
+    """The content of a CSV of these lines."""
+    return ("\n".join(lines) + "\n").encode()
 
 
 def key_path(folder: Path, key: Path | None) -> Path:
@@ -24,13 +29,13 @@ def key_path(folder: Path, key: Path | None) -> Path:
     return place
 
 
-def seal(folder: Path, key: Path, text: str, recordings: Iterable[Iterator[str]]) -> None:
-    """Print the SHA-256 of the key's text, then write the key, and the recordings, each given by its lines."""
+def seal(folder: Path, key: Path, text: str, recordings: Iterable[bytes], suffix: str = ".csv") -> None:
+    """Print the SHA-256 of the key's text, then write the key, and the recordings, each given by its content."""
     print(f"SHA-256 of the key: {hashlib.sha256(text.encode()).hexdigest()}", flush=True)
     folder.mkdir(parents=True, exist_ok=True)
     key.parent.mkdir(parents=True, exist_ok=True)
     key.write_text(text, encoding="utf-8")
     drawn = list(recordings)
-    for name, lines in zip(names(len(drawn)), drawn, strict=True):
-        (folder / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    for name, content in zip(names(len(drawn), suffix), drawn, strict=True):
+        (folder / name).write_bytes(content)
     print(f"{folder}: {len(drawn)} recordings; key: {key}")

@@ -146,6 +146,38 @@ class TestCamera:
         assert values(cause)["rate"] == pytest.approx(0.2, abs=0.03)
 
 
+class TestPixels:
+    def test_a_shadow_is_unexplained_and_the_motion_is_told_nevertheless(self, tmp_path):
+        def shaded(frames):
+            column = torch.arange(frames.shape[2])
+            middle = 20 + 1.5 * torch.arange(len(frames))[:, None]
+            return frames * (1 - 0.3 * torch.exp(-0.5 * ((column - middle) / 12).square()))[:, None]
+
+        found = diagnosed(film(tmp_path / "run.h5", [ViscousFriction(coefficient=3.0)], shaded, episodes=3))
+        assert (found.verdict, found.causes) == ("unexplained", ())
+        assert found.where.pixels.unexplained
+        assert any(line.startswith("found in the motion") and "viscous_friction" in line for line in found.warnings)
+        jsonschema.Draft202012Validator(SCHEMA).validate(found.to_json())
+
+    def test_what_is_wrong_in_one_place_is_found_there(self, still):
+        def blinking(frame):
+            frame[::2, 5:15, 80:110] -= 60
+            return frame
+
+        pixels = diagnosed(rewritten(still, frame=blinking)).where.pixels
+        assert pixels.unexplained
+        box = pixels.boxes[0]
+        assert (box.left, box.top, box.right, box.bottom) == pytest.approx((80, 5, 110, 15), abs=2)
+        assert box.share > 0.9
+
+    def test_a_film_of_states_is_beside_its_predictions(self, still):
+        found = diagnosed(still)
+        assert found.where.pixels.boxes == ()
+        frames = found.figures.film
+        assert frames.filmed.shape == frames.predicted.shape
+        assert np.abs(frames.filmed.astype(float) - frames.predicted).mean() < 5
+
+
 def repeat_every_fifth(frame):
     frame[5::5] = frame[4:-1:5]
     return frame

@@ -1,3 +1,4 @@
+import base64
 import json
 import math
 import re
@@ -6,6 +7,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import cv2
 import jsonschema
 import numpy as np
 import pytest
@@ -15,13 +17,16 @@ from visadapt.diagnosis.report.html import as_html, write_report
 from visadapt.diagnosis.report.text import as_text, estimate, interval, number, sentence
 from visadapt.diagnosis.result import (
     VERDICTS,
+    Box,
     Cause,
     Chart,
     Curve,
     Diagnosis,
     Estimate,
     FigureData,
+    FilmFrames,
     Gap,
+    Pixels,
     PolicyTerms,
     Prediction,
     Ranked,
@@ -30,6 +35,7 @@ from visadapt.diagnosis.result import (
     Where,
 )
 
+DATA_URL = re.compile(r"data:image/png;base64,([\w+/=]+)")
 STATES = ("x", "x_dot", "theta", "theta_dot")
 SCHEMA = json.loads((Path(next(iter(package.__path__))) / "schema.json").read_text())
 MEASURE = "root mean square error of x, theta 0.5 s ahead, in units of the noise, on held-out episodes"
@@ -283,7 +289,7 @@ class TestWords:
 class Page(HTMLParser):
     """Tags, attributes and text of a page; every tag must be closed."""
 
-    VOID = ("meta", "link", "img", "br")
+    VOID = ("meta", "link", "img", "br", "input")
 
     def __init__(self, text):
         super().__init__()
@@ -322,6 +328,27 @@ class TestPage:
         for piece in (sentence(diagnosis), diagnosis.next_experiment, *diagnosis.warnings, *SETTINGS.values()):
             assert piece in text
         assert "nan" not in re.sub(r"<svg.*?</svg>", "", as_html(diagnosis, SETTINGS), flags=re.DOTALL).split()
+
+    def test_a_film_is_scrubbed_in_the_page_itself(self):
+        rng = np.random.default_rng(0)
+        frames = rng.integers(0, 256, (2, 100, 100, 120), dtype=np.uint8)
+        film = FilmFrames(frames[0], frames[1], 0.05 * np.arange(100), np.full(100, 3), 0.5, rng.random((100, 120)))
+        pixels = Pixels(4.2, 0.5, True, (Box(10, 20, 40, 30, 0.8),))
+        where = replace(a_diagnosis("unexplained").where, pixels=pixels)
+        diagnosis = a_diagnosis("unexplained", where=where, figures=replace(some_figures(), film=film))
+        text = as_html(diagnosis, SETTINGS)
+        page = Page(text)
+        assert len(text) < 10e6
+        assert "4.2 grey levels, most at columns 10 to 40 and rows 20 to 30" in text
+        assert ("max", "99") in page.attributes
+        assert '"episode 3, 4.95 s"' in text
+        assert "left: 8.33%; top: 20.00%; width: 25.00%; height: 10.00%" in text
+        pictures = [
+            cv2.imdecode(np.frombuffer(base64.b64decode(found), np.uint8), -1) for found in DATA_URL.findall(text)
+        ]
+        assert np.array_equal(pictures[0].reshape(frames[0].shape), frames[0])
+        assert [picture.shape[:2] for picture in pictures[1:]] == [(10000, 120), (100, 120)]
+        assert not re.search(r"(?:https?:)?//[a-z]", DATA_URL.sub("", text).replace("http://www.w3.org", ""))
 
     def test_figures_are_images_in_the_page_s_colours(self):
         for svg in re.findall(r"<svg.*?</svg>", as_html(a_diagnosis("identified"), SETTINGS), re.DOTALL):

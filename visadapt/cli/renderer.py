@@ -14,6 +14,7 @@ from renderers import LayeredRenderer, save_renderer
 from renderers.training import fit
 from visadapt.cli.inputs import InputError, fingerprint, progress, unfinished
 from visadapt.cli.target import load_target
+from visadapt.estimation.structure import size_of, structure
 from visadapt.progress import staged
 from visadapt.recordings.hdf5 import read_names, read_recording
 from visadapt.storage.atomic_files import replacing
@@ -56,11 +57,12 @@ def run(options: argparse.Namespace) -> None:
             keep=lambda tree: save_tree(state, tree),
             kept=load_tree(state) if state.exists() else None,
         )
+        with torch.no_grad():
+            drawn = torch.cat([renderer(*each) for each in zip(x[held].split(64), theta[held].split(64), strict=True)])
+        residual = frames[held] / 255 - drawn
         with replacing(out) as temporary:
-            save_renderer(temporary, renderer, settings)
-    with torch.no_grad():
-        drawn = torch.cat([renderer(*each) for each in zip(x[held].split(64), theta[held].split(64), strict=True)])
-    error = 255 * (drawn - frames[held] / 255).abs().mean()
+            save_renderer(temporary, renderer, {**settings, "error": size_of(structure(residual))})
+    error = 255 * residual.abs().mean()
     column, row = renderer.origin.tolist()
     print(
         f"{out}: {error:.2f} grey levels of 255 off, on average, in {len(drawn)} frames left out of the training; "

@@ -12,7 +12,7 @@ from torch import nn
 from visadapt.diagnosis import policy_bound
 from visadapt.diagnosis.frames import UNSEEN, FramesError, watch, with_camera
 from visadapt.diagnosis.report import next_experiment
-from visadapt.diagnosis.report.figures_data import Errors, disturbances, figure_data
+from visadapt.diagnosis.report.figures_data import Errors, disturbances, figure_data, film_frames
 from visadapt.diagnosis.result import (
     AMBIGUOUS,
     IDENTIFIED,
@@ -180,7 +180,7 @@ def diagnose(
         recording=RecordingSummary(len(recording.episodes), recording.samples, float(f"{recording.period:.9g}")),
         verdict=verdict,
         where=Where(
-            stage_shares(search, comparison, found_before),
+            stage_shares(search, comparison, groups, found_before),
             errors.by_state(system, rows.channels, bool(found)),
             regions,
             () if prepared.whole is None else pushes(prepared.whole, world),
@@ -196,10 +196,13 @@ def diagnose(
             *_at_bounds(comparison),
             *(f"{one.name}: {one.caveat}" for one in best.effects if one.caveat and one.name in carrying),
         ),
-        figures=figure_data(search, source, corrected, errors, before, after, regions),
+        figures=replace(
+            figure_data(search, source, corrected, errors, before, after, regions),
+            film=film_frames(film, rows, corrected) if film else None,
+        ),
         policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, best),
     )
-    return found_in_motion if film is None else with_camera(found_in_motion, film.camera, system)
+    return found_in_motion if film is None else with_camera(found_in_motion, film, system)
 
 
 def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:

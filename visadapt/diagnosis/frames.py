@@ -5,21 +5,34 @@ Velocities are never differentiated: they are unknowns of the fits, as of any re
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from visadapt.diagnosis.report import next_experiment
 from visadapt.diagnosis.report.text import estimate
-from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Diagnosis, Gap
+from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Diagnosis, Gap, Pixels
 from visadapt.diagnosis.search.camera import CameraFindings, find_camera
-from visadapt.effects import EFFECTS, AngleDelay, Dropout, FrozenZone, MeasurementDelay, PositionDelay
-from visadapt.estimation.camera_fit import SeenBy
-from visadapt.estimation.poses import PoseFinder
+from visadapt.diagnosis.search.pixels import judged, left_over, usual
+from visadapt.effects import (
+    EFFECTS,
+    AngleDelay,
+    CameraShift,
+    Dropout,
+    FrameDrop,
+    FrozenZone,
+    MeasurementDelay,
+    PositionDelay,
+    Stage,
+)
+from visadapt.estimation.camera_fit import SeenBy, within_frame
+from visadapt.estimation.poses import PoseFinder, Poses
+from visadapt.estimation.profiles import profile_of
 from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import System
@@ -36,7 +49,13 @@ MISFIT = "root mean square of frames less those drawn by the renderer, in grey l
 UNSEEN = (Dropout, FrozenZone, MeasurementDelay, PositionDelay, AngleDelay)
 """Faults of sensors that a camera cannot have: it shows cart and pole in one frame. A late camera is a camera's."""
 
+WITHIN = 1.0
+"""Error of the source's predictions, over the noise of positions, below which motion shows no gap: what a renderer
+draws wrongly, and more where a moved camera's pictures are interpolated, makes small errors that are no noise."""
+
 LEAN = 0.5  # rad, largest |theta| at which the pole is looked for
+
+HIDDEN = 0.5  # `Poses.contrast` above which a frame does not show cart and pole
 
 VAGUE = 3.0  # Deviation of a pose, over the median, above which a frame does not show it
 
@@ -57,8 +76,12 @@ class FramesError(ValueError):
 class Film:
     """What a recording of frames was found to show."""
 
-    positions: Recording  # x and theta as measured, in the place of frames
+    positions: Recording  # x and theta as measured, in the place of frames; episodes may be parts of those filmed
+    frames: list[NDArray[np.uint8]]  # (T, H, W) of each of these episodes
     camera: CameraFindings
+    seen: nn.Module  # the renderer, seen by that camera
+    pixels: Pixels
+    left: Tensor  # (H, W) mean square of what the frames hold beyond what is drawn and noise
 
 
 def watch(recording: Recording, system: System, renderer: nn.Module, report: Report | None = None) -> Film:
@@ -73,22 +96,37 @@ def watch(recording: Recording, system: System, renderer: nn.Module, report: Rep
     check_frames(recording, finder.size)
     every = torch.cat([torch.from_numpy(np.ascontiguousarray(episode.frame)) for episode in recording.episodes])
     camera = find_camera(renderer, finder, every, staged(report, "camera"))
-    if camera.best.camera:
-        finder = PoseFinder(SeenBy(renderer, camera.best.effects), reach, LEAN)
-    return Film(positions(recording, finder, staged(report, "poses")), camera)
+    effects, seen = camera.best.effects, renderer
+    if effects:
+        seen = SeenBy(renderer, effects)
+        finder = PoseFinder(seen, reach, LEAN)
+    known = within_frame(effects, every[0].float()).to(torch.uint8)
+    poses = found_in(recording, finder, known, staged(report, "poses"))
+    left = left_over(seen, effects, every, torch.cat([each.place for each in poses]))
+    found, frames = positions(recording, poses)
+    pixels = judged(left, usual(renderer, effects, camera.best.place))
+    return Film(found, frames, camera, seen, pixels, left)
 
 
-def with_camera(motion: Diagnosis, camera: CameraFindings, system: System) -> Diagnosis:
-    """The diagnosis of motion seen through the camera that was found, with that camera among the causes."""
+def with_camera(motion: Diagnosis, film: Film, system: System) -> Diagnosis:
+    """The diagnosis of motion seen through the camera that was found, with that camera among the causes.
+
+    Where the pixels are unexplained, so is the recording; a warning states what the motion shows nevertheless.
+    """
+    camera = film.camera
     causes = camera.causes()
+    if motion.gap.before < WITHIN:
+        motion = _without_gap(motion, bool(causes), system)
+    motion = replace(motion, where=replace(motion.where, pixels=film.pixels))
+    if film.pixels.unexplained:
+        return _unexplained_in_pixels(motion, causes)
     names = tuple(cause.effect for cause in causes)
+    along = next_experiment.ALONG if camera.fixed and {CameraShift.name}.issuperset(names) else ""
     if not names:
-        return motion
+        open_too = along if motion.verdict == NO_GAP else ""
+        return replace(motion, next_experiment=" ".join(text for text in (motion.next_experiment, open_too) if text))
     if motion.verdict == UNEXPLAINED:
-        values = "; ".join(
-            f"{cause.effect} ({name} = {estimate(one)})" for cause in causes for name, one in cause.parameters.items()
-        )
-        return replace(motion, warnings=(*motion.warnings, f"found in the pixels, and corrected: {values}"))
+        return replace(motion, warnings=(*motion.warnings, f"found in the pixels, and corrected: {_values(causes)}"))
     doubtful = [[EFFECTS[name] for name in (one.effect, *one.indistinguishable_from)] for one in causes]
     settled = next_experiment.separate(doubtful, system)
     gap, following = motion.gap, motion.next_experiment
@@ -102,7 +140,43 @@ def with_camera(motion: Diagnosis, camera: CameraFindings, system: System) -> Di
         causes=(*causes, *motion.causes),
         ranking=tuple(replace(one, effects=(*names, *one.effects)) for one in motion.ranking),
         gap=gap,
-        next_experiment=" ".join(text for text in (settled, following) if text),
+        next_experiment=" ".join(text for text in (settled, along, following) if text),
+    )
+
+
+def _without_gap(motion: Diagnosis, seen_by_a_faulty_camera: bool, system: System) -> Diagnosis:
+    """The diagnosis where the source predicts the positions as closely as they can be seen."""
+    stages = dict.fromkeys(motion.where.stages, 0.0) | {Stage.CAMERA.value: float(seen_by_a_faulty_camera)}
+    drops = tuple(cause for cause in motion.causes if cause.effect == FrameDrop.name)
+    return replace(
+        motion,
+        verdict=IDENTIFIED if drops else NO_GAP,
+        causes=drops,
+        where=replace(motion.where, stages=stages | ({Stage.CAMERA.value: 1.0} if drops else {})),
+        next_experiment="" if drops else next_experiment.more(profile_of(system)),
+    )
+
+
+def _unexplained_in_pixels(motion: Diagnosis, camera: Sequence[Cause]) -> Diagnosis:
+    """The diagnosis where frames show what neither renderer nor camera explains: its causes become warnings."""
+    found = [
+        f"found in the {place}, to be trusted less: {_values(causes)}"
+        for place, causes in (("pixels", camera), ("motion", motion.causes))
+        if causes
+    ]
+    return replace(
+        motion,
+        verdict=UNEXPLAINED,
+        causes=(),
+        next_experiment=next_experiment.LOOK,
+        warnings=(*motion.warnings, *found),
+    )
+
+
+def _values(causes: Sequence[Cause]) -> str:
+    return "; ".join(
+        f"{cause.effect} ({', '.join(f'{name} = {estimate(one)}' for name, one in cause.parameters.items())})"
+        for cause in causes
     )
 
 
@@ -118,8 +192,18 @@ def check_frames(recording: Recording, size: tuple[int, ...]) -> None:
             raise FramesError(f"{source}: all {len(episode.frame)} frames are the same; a film that moves is right")
 
 
-def positions(recording: Recording, finder: PoseFinder, progress: Progress | None = None) -> Recording:
-    """The recording with x and theta as measured, in the place of frames.
+def found_in(recording: Recording, finder: PoseFinder, known: Tensor, progress: Progress | None = None) -> list[Poses]:
+    """The poses in the frames of each episode; `known` (H, W) is 1 where the finder's renderer draws what is seen."""
+    out = []
+    for number, episode in enumerate(recording.episodes):
+        out.append(finder(known * torch.from_numpy(np.ascontiguousarray(episode.frame))))
+        if progress is not None:
+            progress(number + 1, len(recording.episodes), float(out[-1].misfit.square().mean()))
+    return out
+
+
+def positions(recording: Recording, found: Sequence[Poses]) -> tuple[Recording, list[NDArray[np.uint8]]]:
+    """The recording with x and theta as measured in the place of frames, and the frames (T, H, W) of its episodes.
 
     Rows whose frame the renderer does not explain, or that does not show the pose, are not `usable`; where there are
     many of them in a row, the episode is split. An exact copy of the frame before it has the same pose.
@@ -127,35 +211,34 @@ def positions(recording: Recording, finder: PoseFinder, progress: Progress | Non
     Raises:
         FramesError: the renderer explains hardly any frame.
     """
-    places, explained, misfits, deviations, fresh = [], [], [], [], []
-    for number, episode in enumerate(recording.episodes):
+    places, explained, contrasts, deviations, fresh = [], [], [], [], []
+    for episode, poses in zip(recording.episodes, found, strict=True):
         assert episode.frame is not None
-        poses = finder(torch.from_numpy(np.ascontiguousarray(episode.frame)))
         new = np.ones(len(episode.frame), dtype=bool)
         new[1:] = (episode.frame[1:] != episode.frame[:-1]).any((1, 2))
         shown = np.flatnonzero(new)[np.cumsum(new) - 1]
         places.append(poses.place.nan_to_num().numpy()[shown])
-        explained.append(poses.explained.numpy()[shown])
+        explained.append((poses.contrast <= HIDDEN).numpy()[shown])
         # A late camera repeats its first frame, until it has seen another one: no frame was lost.
         fresh.append(np.ones(len(new), dtype=bool))
         fresh[-1][1 : 1 + int(new[1:].argmax())] = False
-        misfits.append(poses.misfit.numpy())
+        contrasts.append(poses.contrast.numpy())
         deviations.append(poses.covariance.diagonal(dim1=1, dim2=2).sqrt().nan_to_num(torch.inf).numpy()[shown])
-        if progress is not None:
-            progress(number + 1, len(recording.episodes), float(poses.misfit.square().mean()))
     # A pole that is out of the frame may have any angle.
     most = np.maximum(RESOLUTION, VAGUE * np.median(np.concatenate(deviations), 0))
     explained = [found & (own <= most).all(1) for found, own in zip(explained, deviations, strict=True)]
     total, seen = sum(map(len, explained)), sum(int(each.sum()) for each in explained)
     if seen < LEAST_EXPLAINED * total:
         raise FramesError(
-            f"{recording.sources[0]}: the renderer explains {seen} of {total} frames (misfit "
-            f"{255 * float(np.median(np.concatenate(misfits))):.1f} grey levels, at most {255 * finder.limit:.1f} is "
-            "right): it is of another scene; `visadapt renderer` trains one on frames of this one"
+            f"{recording.sources[0]}: the renderer explains {seen} of {total} frames (where it draws cart and pole, "
+            f"they differ by {100 * float(np.median(np.concatenate(contrasts))):.0f} % of the contrast, at most "
+            f"{100 * HIDDEN:.0f} % is right): it is of another scene; `visadapt renderer` trains one on frames of this "
+            "one"
         )
     episodes: list[Episode] = []
     usable: list[NDArray[np.bool_]] = []
     sources: list[str] = []
+    frames: list[NDArray[np.uint8]] = []
     parts = zip(recording.episodes, places, explained, fresh, recording.sources, strict=True)
     for episode, place, used, first_seen, source in parts:
         for first, last in _stretches(used):
@@ -170,6 +253,8 @@ def positions(recording: Recording, finder: PoseFinder, progress: Progress | Non
             )
             usable.append((used & first_seen)[rows])
             sources.append(source)
+            assert episode.frame is not None
+            frames.append(episode.frame[rows])
     if not episodes:
         raise FramesError(f"{recording.sources[0]}: no {FEWEST_POSES} frames close to each other are explained")
     warnings = recording.warnings
@@ -180,7 +265,7 @@ def positions(recording: Recording, finder: PoseFinder, progress: Progress | Non
             f"no pose was found in {total - seen} of {total} frames, row {row + 1} of "
             f"{recording.sources[episode_number]} the first; they were left out",
         )
-    return replace(
+    shown_in = replace(
         recording,
         episodes=tuple(episodes),
         measured=POSE,
@@ -189,6 +274,7 @@ def positions(recording: Recording, finder: PoseFinder, progress: Progress | Non
         usable=tuple(usable),
         resolution=RESOLUTION,
     )
+    return shown_in, frames
 
 
 def _stretches(used: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -56,6 +56,27 @@ class Push:
 
 
 @dataclass(frozen=True)
+class Box:
+    """A box of the frame, in px; right and bottom are the first ones outside."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+    share: float  # of what is unexplained in the whole frame
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """What neither renderer nor camera explains in a film's frames, noise left aside."""
+
+    error: float  # its root mean square, in grey levels of 255
+    usual: float  # the same of the renderer by itself, where nothing is wrong
+    unexplained: bool  # whether that is too much for the renderer
+    boxes: tuple[Box, ...] = ()  # where it stands out, the largest share first; empty where it is not unexplained
+
+
+@dataclass(frozen=True)
 class Where:
     """Shares of the gap by stage and by state, the regions where it is concentrated, and pushes."""
 
@@ -63,6 +84,7 @@ class Where:
     states: Mapping[str, float]  # every state of the system; NaN where it was not measured
     regions: tuple[Region, ...] = ()  # fitted regions of causes first, then lowest p-value first
     pushes: tuple[Push, ...] = ()  # in the order of time
+    pixels: Pixels | None = None  # of a film
 
 
 @dataclass(frozen=True)
@@ -155,6 +177,18 @@ class Chart:
 
 
 @dataclass(frozen=True)
+class FilmFrames:
+    """K frames of a film beside what the source with the best set of effects predicts for them."""
+
+    filmed: NDArray[np.uint8]  # (K, H, W)
+    predicted: NDArray[np.uint8]  # (K, H, W) drawn as the camera that was found would see them
+    time: NDArray[np.floating]  # (K,) s since the episode started
+    episode: NDArray[np.integer]  # (K,)
+    ahead: float  # s, over which they are predicted
+    left: NDArray[np.floating]  # (H, W) root mean square of what nothing explains, in grey levels of 255
+
+
+@dataclass(frozen=True)
 class PolicyTerms:
     """The terms of the paper's Theorem 1 for a given policy, each a pair (before, after).
 
@@ -186,6 +220,7 @@ class FigureData:
     """the mean residual over a variable, in bins; the variables of `Where.regions` first"""
     growth: Chart | None = None  # the errors of `Gap` by horizon
     spectrum: Chart | None = None  # power spectral density of the residual
+    film: FilmFrames | None = None
 
 
 @dataclass(frozen=True)
@@ -251,9 +286,7 @@ class Diagnosis:
 
     def to_json(self) -> dict[str, Any]:
         """The result as json.dumps takes it; keys and their order are those of `schema.json`, NaN becomes None."""
-        content = {"schema": SCHEMA_VERSION, **_plain(self)}
-        content["where"]["pixels"] = None
-        return content
+        return {"schema": SCHEMA_VERSION, **_plain(self)}
 
 
 def named_effects(verdict: str, causes: Sequence[Cause]) -> list[Effect]:
@@ -283,7 +316,7 @@ def _plain(value: Any, is_share: bool = False) -> Any:
         return {key: _plain(each, is_share) for key, each in value.items()}
     if isinstance(value, tuple):
         return [_plain(each) for each in value]
-    if isinstance(value, str):
+    if value is None or isinstance(value, str):
         return value
     if isinstance(value, bool):
         return value

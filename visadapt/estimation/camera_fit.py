@@ -4,8 +4,8 @@
 
 y_t a frame, Psi the renderer, p_t = (x, theta), C the camera's effects with their parameters phi, the same in all
 frames. Levenberg and Marquardt's steps are taken in phi and all p_t at once; the p_t are eliminated frame by frame
-(Schur complement; Triggs et al. 2000, Bundle adjustment, section 6.1). The covariance of phi holds white noise of the
-pixels, and what the renderer itself draws wrongly at a pixel in every frame, which no number of frames averages out.
+(Schur complement; Triggs et al. 2000, Bundle adjustment, section 6.1). The covariance of phi holds noise of the pixels
+and what the renderer itself draws wrongly, which no number of frames averages out.
 """
 
 from __future__ import annotations
@@ -16,10 +16,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from visadapt.effects.camera import CameraEffect, seen_by
+from visadapt.effects.camera import Blur, CameraEffect, seen_by
 from visadapt.estimation.poses import DIFFERENCE, SPACING
+from visadapt.estimation.structure import white_noise
 
 Camera = tuple[type[CameraEffect], ...]
+
+SMOOTHING = 1.5  # px, standard deviation
+
+ALIKE = 100
+"""Pixels, 10 by 10, in which what is left of the frames beyond noise counts as one error, the same in all frames."""
 
 STEPS = 12  # At most
 
@@ -30,7 +36,10 @@ DIFFERENCE_SHARE, LONGEST_DIFFERENCE = 0.01, 0.5
 
 
 class SeenBy(nn.Module):
-    """A renderer seen by a camera with effects: x (B,) and theta (B,) to frames (B, H, W)."""
+    """A renderer seen by a camera with effects: x (B,) and theta (B,) to frames (B, H, W).
+
+    Where a camera that was moved looks beyond the renderer's frames, they are 0.
+    """
 
     def __init__(self, renderer: nn.Module, effects: Sequence[CameraEffect]) -> None:
         super().__init__()
@@ -39,13 +48,40 @@ class SeenBy(nn.Module):
 
     def forward(self, x: Tensor, theta: Tensor) -> Tensor:
         """Frames (B, H, W) of cart positions (B,) in m and pole angles (B,) in rad."""
-        return through(self.renderer(x, theta), self.effects)
+        frame = through(self.renderer(x, theta), self.effects)
+        return frame * within_frame(self.effects, frame)
 
 
 def through(frame: Tensor, effects: Sequence[CameraEffect]) -> Tensor:
-    """Frames (B, H, W) as a camera with effects without memory shows them."""
+    """Frames (B, H, W) as a camera with effects without memory shows them, in [0, 1] as all recorded frames are."""
     ordered = sorted(effects, key=lambda effect: effect.order)
-    return seen_by(ordered, frame, [frame[:, None, :0]] * len(ordered), None)[0]
+    return seen_by(ordered, frame, [frame[:, None, :0]] * len(ordered), None)[0].clamp(0, 1)
+
+
+def smoothed(frames: Tensor, camera: Sequence[CameraEffect]) -> Tensor:
+    """Frames (B, H, W), smoothed where a camera is moved.
+
+    A picture that is moved by a fraction of a pixel loses its sharpest edges, and a fit to sharp frames then prefers
+    whole pixels, or no motion at all: by 0.1 px, a zoom of 0.2 %.
+    """
+    if all(effect.motion(frames) is None for effect in camera):
+        return frames
+    return Blur(sigma=SMOOTHING).apply_to(frames, frames, None)[0]
+
+
+def within_frame(camera: Sequence[CameraEffect], like: Tensor) -> Tensor:
+    """(H, W) 1 where a pixel looks at what lies inside the renderer's frames, of the size of `like`, else 0."""
+    ordered = sorted(camera, key=lambda effect: effect.order)
+    motions = [motion for effect in ordered if (motion := effect.motion(like)) is not None]
+    height, width = like.shape[-2:]
+    rows, columns = torch.meshgrid(torch.arange(height).to(like), torch.arange(width).to(like), indexing="ij")
+    middle = like.new_tensor([(width - 1) / 2, (height - 1) / 2])
+    there = torch.stack((columns, rows), -1) - middle
+    for motion in reversed(motions):
+        inverse = motion.inverse()
+        there = there @ inverse[:2, :2].T + inverse[:2, 2]
+    inside = ((there + middle) >= 0) & ((there + middle) <= 2 * middle)
+    return inside.all(-1).to(like)
 
 
 @dataclass(frozen=True)
@@ -57,7 +93,7 @@ class CameraFit:
     place: Tensor  # (N, 2) x in m and theta in rad of the frames
     mean_square: float  # of frame less what is drawn, grey levels of [0, 1]
     covariance: Tensor  # (P, P) of the values
-    residual: Tensor  # (N, H, W)
+    residual: Tensor  # (N, H, W), 0 where the renderer draws nothing of what is seen
 
     @property
     def effects(self) -> list[CameraEffect]:
@@ -80,10 +116,16 @@ def made(camera: Camera, values: Tensor) -> list[CameraEffect]:
 
 
 def fit_camera(
-    renderer: nn.Module, frames: Tensor, camera: Camera, values: Tensor, place: Tensor, fixed: frozenset[str]
+    renderer: nn.Module,
+    frames: Tensor,
+    camera: Camera,
+    values: Tensor,
+    place: Tensor,
+    fixed: frozenset[str],
+    smooth: bool = False,
 ) -> CameraFit:
     """Fit camera effects to frames (N, H, W) in [0, 1], from values (P,) and places (N, 2); `fixed` are the names of
-    parameters that stay as they are."""
+    parameters that stay as they are; with `smooth`, to `smoothed` frames."""
     table = [parameter for kind in camera for parameter in kind.table]
     low, high = (torch.tensor([getattr(p, end) for p in table], dtype=torch.float64) for end in ("low", "high"))
     free = torch.tensor([p.name not in fixed for p in table], dtype=torch.float64)
@@ -91,6 +133,17 @@ def fit_camera(
 
     def shown(scene: Tensor, at: Tensor) -> Tensor:
         return through(scene, made(camera, at))
+
+    def counted(pictures: Tensor, phi: Tensor) -> Tensor:
+        """Pictures (N, H, W), 0 where the renderer draws nothing of what is seen."""
+        effects = made(camera, phi)
+        pictures = pictures * within_frame(effects, frames)
+        return smoothed(pictures, effects) if smooth else pictures
+
+    def compared(at: Tensor, phi: Tensor) -> tuple[Tensor, float]:
+        """What is left of the frames, and its mean square where the renderer draws what they show."""
+        left = counted(frames - shown(scene_at(at), phi), phi)
+        return left, float(left.square().mean() / within_frame(made(camera, phi), frames).mean())
 
     def scene_at(at: Tensor) -> Tensor:
         out: Tensor = renderer(at[:, 0].to(frames), at[:, 1].to(frames))
@@ -107,21 +160,19 @@ def fit_camera(
         ]
         empty = frames.new_zeros(len(frames), 0, frames[0].numel())
         return (
-            torch.stack(by_place, 1).flatten(2) / (2 * DIFFERENCE),
-            torch.stack(by_value, 1).flatten(2).to(frames) if by_value else empty,
+            torch.stack([counted(each, phi) for each in by_place], 1).flatten(2) / (2 * DIFFERENCE),
+            torch.stack([counted(each.to(frames), phi) for each in by_value], 1).flatten(2) if by_value else empty,
         )
 
     values, place = values.double().clone(), place.double().clone()
-    error = frames - shown(scene_at(place), values)
-    loss, damping, parts = float(error.square().mean()), 1e-3, None
+    (error, loss), damping, parts = compared(place, values), 1e-3, None
     for _ in range(STEPS):
         if parts is None:
             parts = _normal(*slopes(place, values), error)
         change, moves = _solved(*parts, damping)
         tried = torch.minimum(torch.maximum(values + change, low), high)
         there = place + moves.clamp(-SPACING, SPACING)
-        error_there = frames - shown(scene_at(there), tried)
-        loss_there = float(error_there.square().mean())
+        error_there, loss_there = compared(there, tried)
         if loss_there < loss:
             gained = 1 - loss_there / loss
             values, place, error, loss, damping, parts = tried, there, error_there, loss_there, damping / 10, None
@@ -131,8 +182,11 @@ def fit_camera(
             damping *= 10
             if damping > 1e3:
                 break
-    by_place, by_value = slopes(place, values)
-    covariance = _covariance(by_place, by_value, error, (high - low).square() / 12)
+    noise = white_noise(frames - shown(scene_at(place), values))
+    covariance = _covariance(*slopes(place, values), error, noise, (high - low).square() / 12)
+    if smooth:
+        smooth = False
+        error, loss = compared(place, values)
     return CameraFit(camera, values, place, loss, covariance, error)
 
 
@@ -159,17 +213,17 @@ def _solved(own: Tensor, both: Tensor, whole: Tensor, g: Tensor, b: Tensor, damp
     return change, moves
 
 
-def _covariance(by_place: Tensor, by_value: Tensor, error: Tensor, wide: Tensor) -> Tensor:
-    """(P, P): pixels' white noise, and the error that is the same in all frames; `wide` (P,) is known beforehand."""
+def _covariance(by_place: Tensor, by_value: Tensor, error: Tensor, noise: float, wide: Tensor) -> Tensor:
+    """(P, P) of the parameters, `wide` (P,) their variances beforehand: white noise of the pixels, and what else is
+    left, which is alike in many pixels and frames and so counts as few errors."""
+    if not len(wide):
+        return wide.new_zeros(0, 0)
     own = (by_place @ by_place.mT).double()
     own = own + 1e-9 * torch.eye(2).to(own)
     gain = torch.linalg.solve(own, (by_place @ by_value.mT).double()).mT  # (N, P, 2)
     clear = by_value - gain.to(by_place) @ by_place  # less what the places take up
-    common = clear.sum(0).double()
-    count = len(error)
-    always = error.mean(0).square().mean().double()
-    white = (error.square().mean().double() - always).clamp_min(1e-12) * count / max(1, count - 1)
-    static = (always - white / count).clamp_min(0)
-    information = (clear @ clear.mT).double().sum(0) + torch.diag(white / wide)
-    inverse = torch.linalg.inv(information)
-    return inverse @ (white * information + static * common @ common.mT) @ inverse
+    white = max(noise**2, 1e-12)
+    left = white_noise(error) ** 2  # of the noise, where frames are smoothed
+    structured = max(0.0, float(error.square().mean()) - left) * len(error) * ALIKE
+    information = (clear @ clear.mT).double().sum(0)
+    return torch.linalg.inv(information / (white + structured) + torch.diag(1 / wide))

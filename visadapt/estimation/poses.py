@@ -40,6 +40,9 @@ class Poses:
     """(T, 2, 2) float64, misfit^2 (J'J)^-1: what white pixel errors of the size of the misfit would do to `place`"""
     misfit: Tensor  # (T,) root mean square of frame less rendered frame, in grey levels of [0, 1]
     explained: Tensor  # (T,) whether the renderer explains the frame at all
+    contrast: Tensor
+    """(T,) misfit where cart and pole are drawn, over how much these differ from the mean picture there: small where
+    the frame shows them, whatever light or shadow does to the rest of it"""
 
 
 class PoseFinder:
@@ -62,7 +65,7 @@ class PoseFinder:
         rendered = [self._render(part) for part in self._grid.split(CHUNK)]
         self.size = tuple(rendered[0].shape[1:])
         """height and width of a frame"""
-        mean = torch.stack([part.sum(0) for part in rendered]).sum(0) / len(self._grid)
+        self._mean = mean = torch.stack([part.sum(0) for part in rendered]).sum(0) / len(self._grid)
         squares = torch.stack([(part - mean).square().sum() for part in rendered]).sum()
         self.limit = UNEXPLAINED * float((squares / len(self._grid) / mean.numel()).sqrt())
         """misfit beyond which a frame is unexplained, in grey levels of [0, 1]"""
@@ -74,10 +77,10 @@ class PoseFinder:
     def __call__(self, frames: Tensor) -> Poses:
         """Poses in frames (T, H, W) uint8."""
         parts = [self._find(part.to(self._like) / 255) for part in frames.split(CHUNK)]
-        place, covariance, misfit = (torch.cat(tensors).cpu() for tensors in zip(*parts, strict=True))
+        place, covariance, misfit, contrast = (torch.cat(tensors).cpu() for tensors in zip(*parts, strict=True))
         # Where the picture does not depend on the pose (a cart out of sight) there is nothing to be found either.
         sound = covariance.flatten(1).isfinite().all(1)
-        return Poses(place, covariance, misfit, sound & (misfit <= self.limit))
+        return Poses(place, covariance, misfit, sound & (misfit <= self.limit), contrast)
 
     @torch.no_grad()
     def nearest(self, frames: Tensor, change: Callable[[Tensor], Tensor] | None = None) -> tuple[Tensor, Tensor]:
@@ -99,7 +102,7 @@ class PoseFinder:
         out: Tensor = self.renderer(place[:, 0], place[:, 1])
         return out
 
-    def _find(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _find(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         place, _ = self.nearest(frames)
         error = frames - self._render(place)
         loss = error.square().mean((1, 2))
@@ -122,7 +125,9 @@ class PoseFinder:
             damping = torch.where(better, damping / 10, damping * 10)
         normal = (slope @ slope.transpose(1, 2)).double()
         covariance = loss.double()[:, None, None] * torch.linalg.inv_ex(normal).inverse
-        return place.double(), covariance, loss.sqrt()
+        drawn = (frames - error - self._mean).square()
+        contrast = ((drawn * error.square()).sum((1, 2)) / drawn.square().sum((1, 2))).sqrt()
+        return place.double(), covariance, loss.sqrt(), contrast
 
     def _slope(self, place: Tensor) -> Tensor:
         """Derivatives (B, 2, H W) of the rendered frames by x and by theta."""

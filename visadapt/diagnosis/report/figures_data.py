@@ -10,14 +10,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from visadapt.diagnosis.result import Chart, Curve, FigureData, Gap, Prediction, Region
+from visadapt.diagnosis.frames import Film
+from visadapt.diagnosis.result import Chart, Curve, FigureData, FilmFrames, Gap, Prediction, Region
 from visadapt.diagnosis.search import heldout
 from visadapt.diagnosis.search.disturbance import Disturbance, binned, disturbance
 from visadapt.diagnosis.search.heldout import RolloutErrors
 from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.segments import Segments
 from visadapt.systems import System
+
+MAX_FRAMES = 100  # Of a film; 120 by 100 px with noise take 25 kB each in the page
 
 MAX_PREDICTIONS, MAX_PROFILES = 3, 3
 """Figures of held-out predictions, and of the residual over a variable; more would hide the instructive ones."""
@@ -131,6 +135,27 @@ def _predictions(search: Search, source: RolloutErrors, corrected: RolloutErrors
             )
         )
     return tuple(out)
+
+
+def film_frames(film: Film, rows: Segments, corrected: RolloutErrors) -> FilmFrames | None:
+    """The first frames for which there are predictions; None where there are fewer than two."""
+    ahead = corrected.predicted.shape[2] - 1
+    windows, starts = corrected.valid[-1].prod(-1).nonzero()[:MAX_FRAMES].T
+    if len(windows) < 2:
+        return None
+    ends = starts * corrected.stride + ahead
+    there = rows.measured[windows, ends] + corrected.error[-1, windows, starts]
+    drawn = film.seen(*there.float().T)
+    episode = rows.episode[windows]
+    index = (rows.first[windows] + ends).tolist()
+    return FilmFrames(
+        np.stack([film.frames[one][row] for one, row in zip(episode.tolist(), index, strict=True)]),
+        (255 * drawn).round().clamp(0, 255).to(torch.uint8).numpy(),
+        rows.time[windows, ends].numpy(),
+        episode.numpy(),
+        ahead * rows.period,
+        (255 * film.left.clamp_min(0).sqrt()).numpy(),
+    )
 
 
 def _profile(name: str, unit: str, residual: tuple[str, str], before: Disturbance, after: Disturbance) -> Chart:

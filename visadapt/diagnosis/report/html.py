@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from visadapt.diagnosis.report import figures, text
+from visadapt.diagnosis.report import figures, film, text
 from visadapt.diagnosis.result import Diagnosis
 from visadapt.effects import EFFECTS
 from visadapt.storage.atomic_files import replacing
@@ -26,7 +26,8 @@ def write_report(path: str | os.PathLike[str], diagnosis: Diagnosis, settings: M
 
 
 def as_html(diagnosis: Diagnosis, settings: Mapping[str, str]) -> str:
-    """The page: no scripts, no external resources; light or dark as the browser prefers."""
+    """The page: no external resources, and a script for the frames of a film alone; light or dark as the browser
+    prefers."""
     gaps = _gaps(diagnosis)
     return text.rendered(
         "page.html",
@@ -35,6 +36,7 @@ def as_html(diagnosis: Diagnosis, settings: Mapping[str, str]) -> str:
         largest=max((value for _, value, _ in gaps if math.isfinite(value)), default=0.0),
         equations={name: effect.equation for name, effect in EFFECTS.items()},
         figures=_figures(diagnosis),
+        film=film.shown(diagnosis.figures.film) if diagnosis.figures.film else None,
         settings=settings,
     )
 

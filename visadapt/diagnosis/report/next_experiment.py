@@ -23,6 +23,18 @@ MOTIONS_IN_FLIGHT = {
 }
 """Those that differ for an aircraft."""
 
+LOOK = (
+    "Look at the frames where they are unexplained: if the scene itself is another one, train a renderer on frames of "
+    "it; if light, lens or something that moves is the cause, film without it."
+)
+"""For frames that neither the renderer nor an effect of the camera explains."""
+
+ALONG = (
+    "These frames look the same from every place along the track: a camera_shift dx, or a position_offset, would not "
+    "show; a card with marks at known places, held still before the camera, settles it."
+)
+"""For a film of a track without features."""
+
 
 def separate(classes: Sequence[Collection[type[Effect]]], system: System) -> str:
     """The experiments that separate the members of each class; empty where every class has one member."""

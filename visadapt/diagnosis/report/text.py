@@ -12,6 +12,7 @@ from visadapt.diagnosis.result import (
     AMBIGUOUS,
     IDENTIFIED,
     NO_GAP,
+    Box,
     Cause,
     Diagnosis,
     Estimate,
@@ -131,8 +132,19 @@ def _alternatives(causes: Sequence[Cause]) -> list[list[Cause]]:
     return sorted(groups.values(), key=len)
 
 
+def box(one: Box) -> str:
+    """A box of the frame: "columns 10 to 30 and rows 5 to 20"."""
+    return f"columns {one.left} to {one.right} and rows {one.top} to {one.bottom}"
+
+
 def _unexplained(diagnosis: Diagnosis) -> str:
-    gap = diagnosis.gap
+    gap, pixels = diagnosis.gap, diagnosis.where.pixels
+    if pixels is not None and pixels.unexplained:
+        most = f", most at {box(pixels.boxes[0])}" if pixels.boxes else ""
+        return (
+            "The frames show what neither the renderer nor a known effect of the camera explains: "
+            f"{number(pixels.error, 2)} grey levels{most}; its own errors are {number(pixels.usual, 2)}."
+        )
     closed = [ranked.gap_closed for ranked in diagnosis.ranking if ranked.effects and math.isfinite(ranked.gap_closed)]
     best = max(closed, default=0.0)
     black_box = (gap.before - gap.black_box) / (gap.before - gap.floor) if gap.before != gap.floor else math.nan

@@ -17,6 +17,7 @@ from visadapt.effects import Blur, Brightness, CameraEffect, CameraRotation, Cam
 from visadapt.effects.camera import moved
 from visadapt.estimation.camera_fit import Camera, CameraFit, fit_camera, made, through
 from visadapt.estimation.poses import PoseFinder
+from visadapt.estimation.structure import white_noise
 from visadapt.progress import Progress
 
 SEARCHED: Camera = (CameraRotation, CameraZoom, CameraShift, Occlusion, Blur, Gamma, Brightness)
@@ -56,11 +57,8 @@ class CameraFindings:
 
     @property
     def noise(self) -> float:
-        """Standard deviation of the pixels' white noise, grey levels of [0, 1] (Immerkaer 1996, CVIU 64(2))."""
-        residual = self.best.residual
-        mask = residual.new_tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])[None, None]
-        bent = nn.functional.conv2d(residual[:, None], mask)
-        return float(bent.abs().mean()) * math.sqrt(math.pi / 2) / 6
+        """Standard deviation of the pixels' white noise, grey levels of [0, 1]."""
+        return white_noise(self.best.residual)
 
     @property
     def lost(self) -> float:
@@ -141,6 +139,8 @@ def find_camera(
         if not idle:
             break
         best = without[idle[0]]
+    if best.camera:
+        best = fit_camera(renderer, shown, best.camera, best.values, best.place, fixed, smooth=True)
     alone = {kind: alone.get(kind, unchanged) for kind in best.camera}
     return CameraFindings(unchanged, best, alone, without, alike, fixed)
 

@@ -141,18 +141,24 @@ def ranking(
 
 
 def stage_shares(
-    search: Search, comparison: ModelComparison, others: Sequence[tuple[Stage, float]]
+    search: Search,
+    comparison: ModelComparison,
+    groups: Sequence[Sequence[Alternative]],
+    others: Sequence[tuple[Stage, float]],
 ) -> dict[str, float]:
     """Share of the explained gap by stage: the log likelihood lost without each cause.
 
-    `others` are the losses without causes that were found before the search, with their stages.
+    Where its alternatives, `groups`, are of several stages, these share it evenly. `others` are the losses without
+    causes that were found before the search, with their stages.
     """
     shares = {"actuation": 0.0, "dynamics": 0.0, "sensing": 0.0, "camera": 0.0}
     best = comparison.best
-    for effect in best.effects:
+    for effect, group in zip(best.effects, groups, strict=True):
         without = search.fitted.get(frozenset(best.names) - {effect.name}, search.source)
         lost = max(0.0, float(best.fits.likelihood[0] - without.fits.likelihood[0]))
-        shares[effect.stage.value] = shares.get(effect.stage.value, 0.0) + lost
+        stages = {one.effect.stage.value for one in group} or {effect.stage.value}
+        for stage in stages:
+            shares[stage] = shares.get(stage, 0.0) + lost / len(stages)
     for stage, cost in others:
         shares[stage.value] += cost
     whole = sum(shares.values())

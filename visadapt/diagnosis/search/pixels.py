@@ -1,0 +1,79 @@
+"""Which pixels of a film nothing explains: neither the renderer nor an effect of the camera."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from visadapt.diagnosis.result import Box, Pixels
+from visadapt.effects import CameraEffect, CameraShift
+from visadapt.effects.camera import moved
+from visadapt.estimation.camera_fit import within_frame
+from visadapt.estimation.structure import size_of, structure
+
+OF_ANOTHER_KIND, FEW = 10.0, 0.1
+"""Mean squares of a frame, over their median, above which it is left out, and share of the frames that may be."""
+
+FRAMES = 96  # Frames, spread over the film, whose pixels are looked at
+
+USUAL = 1 / 255
+"""What renderers whose file does not say it draw wrongly: root mean square of the structure, of [0, 1]."""
+
+FACTOR = 1.7  # Structure of a film over what is usual, above which frames are unexplained
+
+STANDS_OUT = 4.0  # Structure of a pixel over the mean, above which it belongs to a box
+MOST_BOXES, LEAST_SHARE = 5, 0.05
+
+
+def left_over(seen: nn.Module, camera: Sequence[CameraEffect], frames: Tensor, place: Tensor) -> Tensor:
+    """`structure` (H, W) of frames (T, H, W) uint8 less what is drawn of their poses (T, 2); 0 where nothing is drawn.
+
+    `seen` is the renderer through `camera`. A few frames that are far worse than most, such as flashes, are left out.
+    """
+    rows = torch.linspace(0, len(frames) - 1, min(FRAMES, len(frames))).long()
+    rows = rows[place[rows].isfinite().all(1)]
+    x, theta = place[rows].float().T
+    drawn = seen(x, theta)
+    residual = (frames[rows].float() / 255 - drawn) * within_frame(camera, drawn)
+    own = residual.square().mean((1, 2))
+    return structure(residual[own <= torch.maximum(OF_ANOTHER_KIND * own.median(), own.quantile(1 - FEW))])
+
+
+def usual(renderer: nn.Module, camera: Sequence[CameraEffect], place: Tensor) -> float:
+    """What is left, root mean square of [0, 1], where nothing is unexplained: the renderer's own errors, and, where the
+    camera is moved, what is lost of drawn frames of places (N, 2) that are moved by half a pixel and back."""
+    known = getattr(renderer, "error", None)
+    own = USUAL if known is None else float(known)
+    drawn = renderer(*place.float().T)
+    if all(effect.motion(drawn) is None for effect in camera):
+        return own
+    half = CameraShift(dx=0.5, dy=0.5).motion(drawn)
+    assert half is not None
+    inside = (..., slice(1, -1), slice(1, -1))
+    lost = size_of(structure((moved(moved(drawn, [half]), [half.inverse()]) - drawn)[inside]))
+    return math.hypot(own, lost)
+
+
+def judged(left: Tensor, expected: float) -> Pixels:
+    """What is left (H, W) beside what is `usual`, with the boxes in which it stands out."""
+    whole = size_of(left)
+    unexplained = whole > FACTOR * expected
+    return Pixels(255 * whole, 255 * expected, unexplained, tuple(_boxes(left)) if unexplained else ())
+
+
+def _boxes(left: Tensor) -> list[Box]:
+    """The largest patches that stand out, with their shares."""
+    power = left.clamp_min(0).double().numpy()
+    marked = (power > STANDS_OUT * power.mean()).astype(np.uint8)
+    _, labels, patches, _ = cv2.connectedComponentsWithStats(cv2.dilate(marked, np.ones((3, 3), np.uint8)))
+    out = []
+    for label, (first, top, width, height, _) in enumerate(patches.tolist()):
+        share = float(power[labels == label].sum() / power.sum())
+        if label and share >= LEAST_SHARE:
+            out.append(Box(first, top, first + width, top + height, share))
+    return sorted(out, key=lambda box: -box.share)[:MOST_BOXES]
