@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from benchmarks.baselines.pets import model_inputs
-from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage
+from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage, score_path
 from visadapt.effects import Effect
 from visadapt.evaluation import score
 from visadapt.evaluation.scoring import EPISODE_STEPS
@@ -189,16 +189,14 @@ def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[
     goal = _speed_of_ours(folder)
     for samples in [each for each in CURVE if each <= sizes.target_steps + ROLLOUT]:
         model.learn(samples - model.num_timesteps, reset_num_timesteps=False)
-        yield Stage("adapted", samples, policy)
-        found = read_json(folder / f"score-adapted-{samples}.json")
+        stage = Stage("adapted", samples, policy)
+        yield stage
+        found = read_json(score_path(folder, stage))
         if found["survived"] == found["episodes"] and found["mean_speed"] <= goal:
             return
 
 
 def _speed_of_ours(folder: Path) -> float:
     """The least of ours in this problem and seed, m/s, after any samples; 0 where it has not been run."""
-    path = folder.parents[2] / "ours" / folder.parent.name / folder.name / "scores.json"
-    if not path.exists():
-        return 0.0
-    scores = read_json(path)["scores"]
-    return min((each["mean_speed"] or math.inf for key, each in scores.items() if "adapted" in key), default=0.0)
+    paths = (folder.parents[2] / "ours" / folder.parent.name / folder.name).glob("score-adapted-*.json")
+    return min((read_json(path)["mean_speed"] or math.inf for path in paths), default=0.0)

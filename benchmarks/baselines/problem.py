@@ -109,6 +109,11 @@ class Stage:
     policy: Policy
 
 
+def score_path(folder: Path, stage: Stage) -> Path:
+    """Where the score of a stage is kept in its job's folder."""
+    return folder / f"score-{stage.domain}-{stage.samples}.json"
+
+
 def grounded(
     problem: Problem, sizes: Sizes, seed: int, planner: Callable[[Residual | None], Policy]
 ) -> Iterator[Stage]:

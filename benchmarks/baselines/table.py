@@ -23,13 +23,13 @@ from typing import Any
 
 import torch
 
-from benchmarks.baselines.problem import PROBLEMS, SMOKE, Problem, Sizes, source_policy
+from benchmarks.baselines.problem import PROBLEMS, SMOKE, Sizes, score_path, source_policy
 from experiments.curves import Chart, plot_charts
 from experiments.kept_scores import kept_score
 from experiments.result_tables import Row, print_speed, read_rows, speed_row, write_rows
 from visadapt.evaluation import CartPoleScore
 from visadapt.policies import Policy
-from visadapt.storage.run_folder import once, open_run, read_json
+from visadapt.storage.run_folder import open_run, read_json, write_json
 from visadapt.targets import SyntheticTarget, Target
 from visadapt.targets.rollout import run
 
@@ -45,6 +45,7 @@ BASELINES = {
 }
 """Module of this room: method in the table"""
 ACTION_TIME = "CPU time of an action"
+ACTION = "action.json"
 
 
 @dataclass(frozen=True)
@@ -82,12 +83,12 @@ def main(settings: Settings) -> None:
         list(pool.map(_source, *zip(*starts, strict=True)))
         arguments = zip(*((settings, *job) for job in jobs), strict=True)
         list(pool.map(_scores, *arguments))
-    rows: list[Row] = []
-    for experiment in PROBLEMS:
-        for name, method in BASELINES.items():
-            paths = [_folder(settings, name, experiment, seed) / "scores.json" for seed in seeds]
-            if found := [read_json(path) for path in paths if path.exists()]:
-                rows += _rows(experiment, method, found)
+    rows = [
+        row
+        for experiment in PROBLEMS
+        for name, method in BASELINES.items()
+        for row in _rows(experiment, method, [_folder(settings, name, experiment, seed) for seed in seeds])
+    ]
     write_rows(settings.out, rows)
     _draw(settings)
     for row in rows:
@@ -98,20 +99,20 @@ def main(settings: Settings) -> None:
             print_speed(row)
 
 
-def _rows(experiment: str, method: str, found: Sequence[dict[str, Any]]) -> list[Row]:
-    """The rows of a method, of what `_scores` found for each seed."""
-    rows = []
-    for key in found[0]["scores"]:
-        domain, samples = key.split()
-        scores = [CartPoleScore(**each["scores"][key]) for each in found]
-        rows.append(speed_row(experiment, method, domain, int(samples), scores))
-    times = [each["action_ms"] for each in found]
-    last = rows[-1]
-    spread = statistics.pstdev(times)
-    time_row = replace(
-        last, measure=ACTION_TIME, unit="ms", mean=round(statistics.mean(times), 4), std=round(spread, 4)
-    )
-    return [*rows, replace(time_row, episodes=len(times), failed=0)]
+def _rows(experiment: str, method: str, folders: Sequence[Path]) -> list[Row]:
+    """The rows of a method, of the scores that its seeds have left in their folders so far."""
+    found: dict[tuple[str, int], list[CartPoleScore]] = {}
+    for path in sorted(path for folder in folders for path in folder.glob("score-*.json")):
+        _, domain, samples = path.stem.split("-")
+        found.setdefault((domain, int(samples)), []).append(CartPoleScore(**read_json(path)))
+    order = sorted(found, key=lambda key: (key[0] == "adapted", key[0] == "target", key[1]))
+    rows = [speed_row(experiment, method, domain, samples, found[domain, samples]) for domain, samples in order]
+    times = [read_json(path)["ms"] for folder in folders if (path := folder / ACTION).exists()]
+    if times:
+        mean, std = round(statistics.mean(times), 4), round(statistics.pstdev(times), 4)
+        counted = replace(rows[-1], measure=ACTION_TIME, unit="ms", episodes=len(times), failed=0, seeds=len(times))
+        rows.append(replace(counted, mean=mean, std=std))
+    return rows
 
 
 def _draw(settings: Settings) -> None:
@@ -134,27 +135,19 @@ def _source(settings: Settings, experiment: str, seed: int) -> None:
     source_policy(PROBLEMS[experiment], _sizes(settings), settings.work, seed)
 
 
-def _scores(settings: Settings, name: str, experiment: str, seed: int) -> dict[str, Any]:
-    """Scores by domain and samples, and the time of an action."""
+def _scores(settings: Settings, name: str, experiment: str, seed: int) -> None:
+    """Leave a job's scores in its folder, and at last, which says that it is done, the time of an action."""
     torch.set_num_threads(1)
     problem, sizes = PROBLEMS[experiment], _sizes(settings)
     folder = _folder(settings, name, experiment, seed)
     open_run(folder, {"seed": seed, **asdict(sizes)})
-    return once(folder / "scores.json", lambda: _run(name, problem, sizes, folder, seed))
-
-
-def _run(name: str, problem: Problem, sizes: Sizes, folder: Path, seed: int) -> dict[str, Any]:
-    scores = {}
-    policy: Policy | None = None
+    if (folder / ACTION).exists():
+        return
     for stage in _module(name).stages(problem, sizes, folder, seed):
-        path = folder / f"score-{stage.domain}-{stage.samples}.json"
         where = SyntheticTarget() if stage.domain == "source" else problem.target()
-        found = kept_score(path, stage.policy, where, sizes.episodes)
-        scores[f"{stage.domain} {stage.samples}"] = asdict(found)
+        found = kept_score(score_path(folder, stage), stage.policy, where, sizes.episodes)
         print(f"{name}, {problem.name}, seed {seed}, {stage.domain} {stage.samples}: {found}", flush=True)
-        policy = stage.policy
-    assert policy is not None
-    return {"scores": scores, "action_ms": action_time(policy, problem.target())}
+    write_json(folder / ACTION, {"ms": action_time(stage.policy, problem.target())})
 
 
 def action_time(policy: Policy, target: Target, steps: int = 100) -> float:

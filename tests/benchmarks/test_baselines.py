@@ -7,7 +7,7 @@ import torch
 
 from benchmarks.baselines.problem import PROBLEMS, drawn
 from benchmarks.baselines.table import BASELINES, Settings, main
-from benchmarks.cartpole_states import CONSTANT, SINE
+from benchmarks.cartpole_states import SINE
 from visadapt.effects import ConstantForce, PeriodicForce, Residual
 from visadapt.history import LENGTH, History
 from visadapt.policies.networks import StateResidualNetwork
@@ -71,16 +71,15 @@ def test_effects_are_drawn_from_the_whole_range_of_the_catalogue(kind):
     effect = drawn(kind, 2000, torch.Generator().manual_seed(0))
     for parameter in kind.table:
         values, span = getattr(effect, parameter.name), parameter.high - parameter.low
-        assert parameter.low <= float(values.min()) < parameter.low + 0.02 * span
-        assert parameter.high - 0.02 * span < float(values.max()) <= parameter.high
+        assert parameter.low <= float(values.detach().min()) < parameter.low + 0.02 * span
+        assert parameter.high - 0.02 * span < float(values.detach().max()) <= parameter.high
 
 
-@pytest.mark.parametrize("experiment", [CONSTANT, SINE])
-def test_all_baselines_run_and_are_tabled(tmp_path, experiment):
+def test_all_baselines_run_and_are_tabled(tmp_path):
     for library in ("casadi", "stable_baselines3"):
         pytest.importorskip(library)
     paths = {"work": tmp_path, "out": tmp_path / "table.csv", "picture": tmp_path / "picture.png"}
-    settings = Settings(experiments=(experiment,), smoke=True, jobs=1, **paths)
+    settings = Settings(experiments=(SINE,), smoke=True, jobs=1, **paths)
     main(settings)
     first = settings.out.read_text()
     rows = list(csv.DictReader(first.splitlines()))
