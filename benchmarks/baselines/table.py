@@ -45,7 +45,9 @@ BASELINES = {
 }
 """Module of this room: method in the table"""
 ACTION_TIME = "CPU time of an action"
-ACTION = "action.json"
+ACTION, DONE = "action.json", "done.json"
+SMOKE_STEPS = 10
+"""of an episode that is scored, where the numbers mean nothing"""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class Settings:
     episodes: int = 100
     """of a score"""
     smoke: bool = False
-    """see in a minute that all runs; the numbers mean nothing"""
+    """see that all runs; the numbers mean nothing"""
     jobs: int = 2
     """of (baseline, experiment, seed) at once, one core each"""
     work: Path = Path("runs/baselines")
@@ -136,21 +138,22 @@ def _source(settings: Settings, experiment: str, seed: int) -> None:
 
 
 def _scores(settings: Settings, name: str, experiment: str, seed: int) -> None:
-    """Leave a job's scores in its folder, and at last, which says that it is done, the time of an action."""
+    """Leave the scores of a job in its folder, and the time of an action of the last policy that was scored."""
     torch.set_num_threads(1)
-    problem, sizes = PROBLEMS[experiment], _sizes(settings)
+    problem, sizes, steps = PROBLEMS[experiment], _sizes(settings), SMOKE_STEPS if settings.smoke else None
     folder = _folder(settings, name, experiment, seed)
     open_run(folder, {"seed": seed, **asdict(sizes)})
-    if (folder / ACTION).exists():
+    if (folder / DONE).exists():
         return
     for stage in _module(name).stages(problem, sizes, folder, seed):
         where = SyntheticTarget() if stage.domain == "source" else problem.target()
-        found = kept_score(score_path(folder, stage), stage.policy, where, sizes.episodes)
+        found = kept_score(score_path(folder, stage), stage.policy, where, sizes.episodes, steps)
+        write_json(folder / ACTION, {"ms": action_time(stage.policy, problem.target())})
         print(f"{name}, {problem.name}, seed {seed}, {stage.domain} {stage.samples}: {found}", flush=True)
-    write_json(folder / ACTION, {"ms": action_time(stage.policy, problem.target())})
+    write_json(folder / DONE, {"done": True})
 
 
-def action_time(policy: Policy, target: Target, steps: int = 100) -> float:
+def action_time(policy: Policy, target: Target, steps: int = 50) -> float:
     """Median CPU time in ms of one action of `policy`, one machine at a time, on this thread."""
     times, act = [], policy.act
 
