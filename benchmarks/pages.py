@@ -67,6 +67,7 @@ TABLES = {
     "rotorpy diagnosis": Table(diagnosis.crazyflie, ("rotorpy_diagnosis",)),
     "baselines, constant": Table(paper.baselines_constant, ("baselines",)),
     "baselines, changing": Table(paper.baselines_changing, ("baselines",)),
+    "baselines, PPO": Table(paper.ppo_curve, ("baselines",)),
     "paper: table 1, CartPole": Table(paper.table_1_cartpole, ("cartpole_states", "baselines")),
     "paper: table 1, vehicles": Table(paper.table_1_vehicles, ("flight",)),
     "paper: table 2": Table(paper.table_2, ("cartpole_pixels",)),

@@ -72,8 +72,8 @@ class Settings:
 
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
-    modules = {name: _module(name) for name in settings.baselines}
-    assert modules
+    for name in settings.baselines:
+        _module(name)
     seeds = range(settings.seeds)
     jobs = [
         (name, experiment, seed) for seed in seeds for experiment in settings.experiments for name in settings.baselines
@@ -129,7 +129,7 @@ def _draw(settings: Settings) -> None:
         still = [row for row in own if row["domain"] == "target" and row["method"] not in learning]
         level = [{**row, "samples": end} for row in still for end in ends]
         charts.append(Chart(experiment, "mean cart speed, m/s", [*adapted, *level]))
-    plot_charts(settings.picture, charts, columns=2)
+    plot_charts(settings.picture, charts, columns=min(len(charts), 2))
 
 
 def _source(settings: Settings, experiment: str, seed: int) -> None:
