@@ -109,11 +109,13 @@ def _rows(experiment: str, method: str, folders: Sequence[Path]) -> list[Row]:
         found.setdefault((domain, int(samples)), []).append(CartPoleScore(**read_json(path)))
     order = sorted(found, key=lambda key: (key[0] == "adapted", key[0] == "target", key[1]))
     rows = [speed_row(experiment, method, domain, samples, found[domain, samples]) for domain, samples in order]
-    times = [read_json(path)["ms"] for folder in folders if (path := folder / ACTION).exists()]
-    if times:
+    timed = [read_json(path) for folder in folders if (path := folder / ACTION).exists()]
+    if timed:
+        times = [each["ms"] for each in timed]
+        about = {"domain": timed[0]["domain"], "samples": timed[0]["samples"], "episodes": len(times), "failed": 0}
         mean, std = round(statistics.mean(times), 4), round(statistics.pstdev(times), 4)
-        counted = replace(rows[-1], measure=ACTION_TIME, unit="ms", episodes=len(times), failed=0, seeds=len(times))
-        rows.append(replace(counted, mean=mean, std=std))
+        counted = replace(rows[-1], measure=ACTION_TIME, unit="ms", mean=mean, std=std, seeds=len(times))
+        rows.append(replace(counted, **about))
     return rows
 
 
@@ -148,7 +150,8 @@ def _scores(settings: Settings, name: str, experiment: str, seed: int) -> None:
     for stage in _module(name).stages(problem, sizes, folder, seed):
         where = SyntheticTarget() if stage.domain == "source" else problem.target()
         found = kept_score(score_path(folder, stage), stage.policy, where, sizes.episodes, steps)
-        write_json(folder / ACTION, {"ms": action_time(stage.policy, problem.target())})
+        about = {"domain": stage.domain, "samples": stage.samples}
+        write_json(folder / ACTION, {**about, "ms": action_time(stage.policy, problem.target())})
         print(f"{name}, {problem.name}, seed {seed}, {stage.domain} {stage.samples}: {found}", flush=True)
     write_json(folder / DONE, {"done": True})
 
