@@ -35,6 +35,7 @@ CODE = (
     "experiments",
     "train",
     "benchmarks/*.py",
+    "benchmarks/baselines",
     "benchmarks/blind",
     "assets/*.safetensors",
 )
@@ -114,6 +115,7 @@ COMMANDS = (
     ),
     Command("named_effects", "named_effects.csv", ("benchmarks.named_effects",), 30, work="--work"),
     Command("named_control", "named_control.csv", ("benchmarks.named_control",), 60, work="--work"),
+    Command("baselines", "baselines.csv", ("benchmarks.baselines",), 40, work="--work", extra="baselines"),
     Command(
         "rotorpy",
         "rotorpy.csv",
@@ -177,7 +179,7 @@ COMMANDS = (
 )
 """In an order in which each finds what it reads."""
 
-INSTALLED_BY = {"mujoco": "mujoco", "rotorpy": "rotorpy"}
+INSTALLED_BY = {"baselines": "casadi", "mujoco": "mujoco", "rotorpy": "rotorpy"}
 """Of an extra: the package whose absence says that the extra is not installed."""
 
 

@@ -1,8 +1,8 @@
 """Writes what the pages take from elsewhere into README.md and docs/*.md: `python -m benchmarks.pages`.
 
 Each table stands between the lines `<!-- table: NAME -->` and `<!-- end -->`. Tables of results come from the CSVs
-under results/; in docs/results.md each is followed by the commands that write its CSVs and, from results/runs.json, the
-date and commit at which each was run. The effects of docs/effects.md come from the registry.
+under results/; in docs/results.md and docs/paper.md each is followed by the commands that write its CSVs and, from
+results/runs.json, the date and commit at which each was run. The effects of docs/effects.md come from the registry.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks import tables_adaptation as adaptation, tables_diagnosis as diagnosis
+from benchmarks import tables_adaptation as adaptation, tables_diagnosis as diagnosis, tables_paper as paper
 from benchmarks.all import COMMANDS, stamps
 from experiments.result_tables import read_rows
 from visadapt.effects.catalogue import catalogue_markdown
@@ -22,8 +22,8 @@ from visadapt.systems import SYSTEMS
 PAGES = (Path("README.md"), *sorted(Path("docs").glob("*.md")))
 """Relative to the repository's root."""
 
-RESULTS_PAGE = "results.md"
-"""The page that states command, date and commit of each table."""
+RESULTS_PAGES = ("results.md", "paper.md")
+"""The pages that state command, date and commit of each table."""
 
 BLOCK = re.compile(r"<!-- table: (?P<name>[^>]+) -->\n.*?<!-- end -->", re.DOTALL)
 
@@ -66,6 +66,18 @@ TABLES = {
     "blind frames": Table(diagnosis.blind_frames, ("blind_frames",)),
     "blind flights": Table(diagnosis.blind_flights, ("blind_quadrotor", "blind_fixed_wing")),
     "rotorpy diagnosis": Table(diagnosis.crazyflie, ("rotorpy_diagnosis",)),
+    "baselines, constant": Table(paper.baselines_constant, ("baselines",)),
+    "baselines, changing": Table(paper.baselines_changing, ("baselines",)),
+    "baselines, PPO": Table(paper.ppo_curve, ("baselines",)),
+    "paper: table 1, CartPole": Table(paper.table_1_cartpole, ("cartpole_states", "baselines")),
+    "paper: table 1, vehicles": Table(paper.table_1_vehicles, ("flight",)),
+    "paper: table 2": Table(paper.table_2, ("cartpole_pixels",)),
+    "paper: table 4": Table(paper.table_4, ("power_loop",)),
+    "paper: figures 2 and 6": Table(paper.collection, ("data_collection",)),
+    "paper: figure 3": Table(paper.figure_3, ("baselines",)),
+    "paper: figure 8": Table(paper.figure_8, ("residual_samples",)),
+    "paper: A.4": Table(paper.runtime, ("baselines",)),
+    "paper: A.5": Table(paper.swing, ("swing_up",)),
 }
 """By name in the pages."""
 
@@ -89,7 +101,7 @@ def filled(page: Path) -> str:
 
     def block(match: re.Match[str]) -> str:
         name = match["name"]
-        body = GENERATED[name]() if name in GENERATED else results_table(name, page.name == RESULTS_PAGE)
+        body = GENERATED[name]() if name in GENERATED else results_table(name, page.name in RESULTS_PAGES)
         return f"<!-- table: {name} -->\n{body}\n<!-- end -->"
 
     return BLOCK.sub(block, page.read_text())

@@ -20,6 +20,8 @@ from visadapt.storage.atomic_files import replacing
 
 REFERENCE_LEVELS = (("target", "before adaptation", ORANGE), ("source", "in the source", MUTED))
 """Domains of results without adaptation, drawn as levels: label and colour."""
+METHOD_COLOURS = (TEAL, BLUE, INK, "#8a5fb5", "#b8487a", "#7d8c2c", "#4fa3a0", "#9a6a3c")
+"""Of the methods in charts, in the order in which they first come."""
 
 
 @matplotlib.rc_context(STYLE)
@@ -130,11 +132,11 @@ def plot_charts(path: str | os.PathLike[str], charts: Sequence[Chart], columns: 
     figure = Figure(figsize=(4.8 * max(columns, 1.5), 0.6 + 3.0 * lines), dpi=150, layout="constrained")
     places = list(figure.subplots(lines, columns, squeeze=False).flat)
     for axes, chart in zip(places, charts, strict=False):
-        _draw_chart(axes, chart, {method: (TEAL, BLUE, INK)[k % 3] for k, method in enumerate(methods)})
+        _draw_chart(axes, chart, {method: METHOD_COLOURS[k % len(METHOD_COLOURS)] for k, method in enumerate(methods)})
     for spare in places[len(charts) :]:
         figure.delaxes(spare)
     keys = {name: line for axes in places for line, name in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(keys.values(), keys, loc="outside lower center", ncols=len(keys))
+    figure.legend(keys.values(), keys, loc="outside lower center", ncols=min(len(keys), 5))
     _save(figure, path)
 
 

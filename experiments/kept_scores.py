@@ -15,13 +15,17 @@ from visadapt.targets import FlightTarget, Target
 
 @overload
 def kept_score(  # type: ignore[overload-overlap]
-    path: Path, policy: Policy, target: FlightTarget, episodes: int = ...
+    path: Path, policy: Policy, target: FlightTarget, episodes: int = ..., steps: int | None = ...
 ) -> FlightScore: ...
 @overload
-def kept_score(path: Path, policy: Policy, target: Target, episodes: int = ...) -> CartPoleScore: ...
-def kept_score(path: Path, policy: Policy, target: Target, episodes: int = 100) -> CartPoleScore | FlightScore:
+def kept_score(
+    path: Path, policy: Policy, target: Target, episodes: int = ..., steps: int | None = ...
+) -> CartPoleScore: ...
+def kept_score(
+    path: Path, policy: Policy, target: Target, episodes: int = 100, steps: int | None = None
+) -> CartPoleScore | FlightScore:
     """`score`, run only where it is not kept in the JSON file `path` yet."""
-    found: dict[str, Any] = once(path, lambda: asdict(score(policy, target, episodes)))
+    found: dict[str, Any] = once(path, lambda: asdict(score(policy, target, episodes, steps=steps)))
     if not isinstance(target, FlightTarget):
         return CartPoleScore(**found)
     # JSON has no infinity: that of a flight that was not finite is null there.

@@ -110,6 +110,12 @@ def test_files_named_in_a_page_exist(page):
         assert (ROOT / name).exists() or name in to_be_run, f"{page}: {name}"
 
 
+def script_of(module):
+    """What `python -m` runs."""
+    script = importlib.import_module(module)
+    return importlib.import_module(f"{module}.__main__") if hasattr(script, "__path__") else script
+
+
 def commands_in_pages():
     found = {match.groups() for page in PAGES for match in MODULES.finditer(page.read_text())}
     found |= {(command.arguments[0], shlex.join(command.arguments[1:])) for command in COMMANDS}
@@ -118,7 +124,7 @@ def commands_in_pages():
 
 @pytest.mark.parametrize(("module", "options"), commands_in_pages())
 def test_commands_take_the_options_that_pages_give(module, options):
-    script = importlib.import_module(module)
+    script = script_of(module)
     parts = ast.parse(Path(script.__file__).read_text()).body
     assert any(isinstance(part, ast.If) and "__main__" in ast.unparse(part.test) for part in parts)
     if hasattr(script, "Settings"):

@@ -1,8 +1,7 @@
-import importlib
-
 import tyro
 
 from benchmarks.all import COMMANDS, Command, described, folders, is_done, run_all, stamps
+from tests.test_pages import script_of
 
 
 def a_command(name, *arguments):
@@ -34,7 +33,7 @@ def test_a_command_that_fails_leaves_no_stamp_and_the_next_one_runs(tmp_path):
 def test_commands_read_what_an_earlier_one_kept_at_the_same_commit(tmp_path):
     kept: dict = {}
     for command in COMMANDS:
-        settings = importlib.import_module(command.arguments[0]).Settings
+        settings = script_of(command.arguments[0]).Settings
         given = tyro.cli(settings, args=[*command.arguments[1:], *folders(command, tmp_path, "abc")])
         for option, name in command.reads:
             assert getattr(given, option.removeprefix("--")) == kept[name]

@@ -186,7 +186,7 @@ def adapt(
         drawn = [torch.Generator().manual_seed(1_000_000 * seed + 10 * number + stage) for stage in range(3)]
         if not recording.exists():
             wanted = min(round_samples, ledger.left)
-            write_recording(recording, _collect(explorer or policy, target, wanted, settings.longest_episode, drawn[0]))
+            write_recording(recording, collect(explorer or policy, target, wanted, settings.longest_episode, drawn[0]))
         new = read_recording(recording)
         for episode in new:
             ledger.count(f"{name}: data", episode.samples)
@@ -249,7 +249,7 @@ def _weights(folder: Path, number: int) -> Path:
     return folder / f"round-{number + 1:02d}" / "policy.safetensors"
 
 
-def _collect(policy: Policy, target: Target, wanted: int, longest: int, generator: torch.Generator) -> list[Episode]:
+def collect(policy: Policy, target: Target, wanted: int, longest: int, generator: torch.Generator) -> list[Episode]:
     """Episodes of `wanted` samples under `policy`, one after the other as on a machine."""
     episodes: list[Episode] = []
     while wanted > 0:

@@ -1,0 +1,14 @@
+"""Ours with the diagnosed effect in the simulator; a residual learns the gap only where nothing is named."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from benchmarks.baselines import ours
+from benchmarks.baselines.problem import Problem, Sizes, Stage
+
+
+def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:
+    """As those of `ours`."""
+    yield from ours.stages(problem, sizes, folder, seed, diagnose=True)

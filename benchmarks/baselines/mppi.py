@@ -1,0 +1,68 @@
+"""Model predictive path integral control (Williams et al. 2017) on the source, then with the residual of ours.
+
+At each step N plans are drawn about the last one, carried out in the simulator, and averaged with weights
+exp(-cost / TEMPERATURE). Noise (0.03, 0.1, 0.3) and temperature (0.1, 0.01, 0.001) were chosen in the source, on ten
+episodes of the tuning seed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from benchmarks.baselines.problem import Problem, Sizes, Stage, begins, grounded
+from visadapt.effects import Residual
+from visadapt.history import HORIZON, History
+from visadapt.learning.policy import imagine
+from visadapt.policies import Policy
+from visadapt.tasks.balance import PAPER_CARTPOLE
+from visadapt.world import World
+
+PLANS = 128
+NOISE = 0.03
+TEMPERATURE = 0.1
+
+
+class PathIntegral(Policy):
+    """Plans of `world` by weighted averages, for any number of episodes at once."""
+
+    def __init__(self, world: World) -> None:
+        super().__init__(len(world.system.states), len(world.system.actions))
+        self.world = world
+        self.generator = torch.Generator().manual_seed(0)
+        self.last = torch.zeros(0, HORIZON, self.n_action)
+
+    @torch.no_grad()
+    def act(self, history: History) -> Tensor:
+        self.last = mean = carried(self.last, history)
+        noise = NOISE * torch.randn(len(mean), PLANS, *mean.shape[1:], generator=self.generator)
+        plans = (mean[:, None] + noise).clamp(-1, 1)
+        many = history.map(lambda tensor: tensor.repeat_interleave(PLANS, 0))
+        now = many.observations[:, -1]
+        states, _ = imagine(self.world, None, self.world.start(now), many, plans.flatten(0, 1))
+        cost = PAPER_CARTPOLE(states, plans.flatten(0, 1), now).unflatten(0, (-1, PLANS))
+        weight = torch.softmax(-cost.nan_to_num(1e9, 1e9) / TEMPERATURE, 1)
+        self.last = (weight[..., None, None] * plans).sum(1)
+        return self.last[:, 0]
+
+
+def carried(last: Tensor, history: History) -> Tensor:
+    """The last plans (B, K, n_action) a step on; of zeros where an episode begins."""
+    width = history.actions.shape[-1]
+    if len(last) != len(history.actions):
+        return torch.zeros(len(history.actions), last.shape[1], width)
+    onward = torch.cat((last[:, 1:], last[:, -1:]), 1)
+    return torch.where(begins(history)[:, None, None], 0.0, onward)
+
+
+def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:
+    """On the source, then with the residual."""
+    source = problem.setup(sizes).source
+
+    def planner(residual: Residual | None) -> Policy:
+        return PathIntegral(source.with_effects([] if residual is None else [residual]))
+
+    yield from grounded(problem, sizes, seed, planner)

@@ -1,0 +1,32 @@
+"""Domain randomisation: the source policy trained under draws from the whole range of the hidden kind of effect.
+
+It is told the kind, takes no sample of the target, and always sees 5 states and actions: from one state no policy could
+tell which draw it is in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from benchmarks.baselines.problem import Problem, Sizes, Stage, drawn
+from visadapt.learning.streams import EPISODE_STEPS
+from visadapt.setups.cartpole import cartpole_states
+
+DRAWS = EPISODE_STEPS
+"""one for each stream; as many as streams are probed with for a dependence on time"""
+
+
+def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:
+    """One policy, trained as the source policy of ours is, with a draw of the effect in each stream."""
+    setup = cartpole_states(with_history=True)
+    effect = drawn(problem.kind, DRAWS, torch.Generator().manual_seed(seed))
+    settings = setup.settings.shortened(sizes.iterations)
+    settings = replace(settings, source=replace(settings.source, batch=DRAWS))
+    trained = replace(setup, source=setup.source.with_effects([effect]), settings=settings)
+    policy = trained.pretrain(folder / "policy.safetensors", seed)
+    yield Stage("source", 0, policy)
+    yield Stage("target", 0, policy)
