@@ -1,8 +1,8 @@
 """Model predictive path integral control (Williams et al. 2017) on the source, then with the residual of ours.
 
 At each step N plans are drawn about the last one, carried out in the simulator, and averaged with weights
-exp(-cost / TEMPERATURE). Noise (0.03, 0.1, 0.3) and temperature (0.1, 0.01, 0.001) were chosen in the source, on ten
-episodes of the tuning seed.
+exp(-cost / TEMPERATURE). Noise (0.03, 0.1, 0.3) and temperature (0.1, 0.01, 0.001), seven of the nine pairs,
+were compared in the source, on ten episodes of the tuning seed.
 """
 
 from __future__ import annotations

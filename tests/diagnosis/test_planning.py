@@ -64,7 +64,7 @@ def test_it_tells_drag_from_friction_where_the_recording_did_not(policy):
 
 def test_no_motion_tells_a_bias_of_the_motor_from_a_force(policy, tmp_path):
     run = recorded(policy, va.effects.ConstantForce(force=1.0), 60, 0)
-    found = ambiguous(("constant_force", "force", 1.0), ("actuator_bias", "offset", 1.0 / SOURCE.system.max_force))
+    found = ambiguous(("constant_force", "force", 1.0), ("actuator_bias", "offset", 1.0 / va.CartPole().max_force))
     planned = va.plan(found, run, SOURCE, policy, samples=60)
     assert not planned.settles
     assert str(planned).startswith("no excitation within the ranges of the states tells constant_force from actuator")
