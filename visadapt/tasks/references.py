@@ -121,8 +121,9 @@ def read_reference(path: str | os.PathLike[str], period: float = 0.1, max_speed:
     for name in names:
         if name not in table.header:
             raise RecordingError(f"{path}: has no column {name!r}; its columns are {', '.join(table.header)}")
-    values = table.numbers([table.header.index(name) for name in names])
-    raw = RawEpisode(path, values[:, 0], values[:, :0], values[:, 1:], tuple(names[1:]), table.place)
+    rows = table.rows([table.header.index(name) for name in names])
+    values = rows.values
+    raw = RawEpisode(path, values[:, 0], values[:, :0], values[:, 1:], tuple(names[1:]), rows.place)
     check_finite(raw, ())
     check_forward(raw)
     lasts = values[-1, 0] - values[0, 0]
