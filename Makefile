@@ -21,7 +21,7 @@ demo-from-scratch: $(INSTALLED)
 	$(RUN) -m train.demo --from-scratch
 
 test: $(INSTALLED)
-	$(RUN) -m pytest -n auto --dist loadfile
+	$(RUN) -m pytest -n auto --dist worksteal
 
 # Damaged files for every reader; those that are neither read nor refused are kept in tests/crashes, as tests.
 fuzz: $(INSTALLED)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,33 +28,34 @@ def kept(first: int, last: int, every: int) -> NDArray[np.bool_]:
 
 
 def spread(recording: Recording, most: int, length: int) -> Recording:
-    """A recording of about `most` rows at most: stretches of about `length` rows, spread evenly over it.
+    """A recording of at most about `most` rows: stretches of about `length` of them, spread evenly over it.
 
-    A warning says so. Each stretch is an episode; its times still count from the start of its own.
+    Each stretch is an episode, whose times still count from where its own began. A warning says what is used.
     """
     rows = [len(episode.time) for episode in recording.episodes]
     if sum(rows) <= most:
         return recording
-    stretches = [
-        (number, int(start), int(end))
-        for number, own in enumerate(rows)
-        for start, end in _pairs(np.linspace(0, own, -(-own // length) + 1).round())
-    ]
-    count = max(1, int(most / sum(rows) * len(stretches)))
+    stretches: list[tuple[int, slice]] = []
+    for number, own in enumerate(rows):
+        edges = np.linspace(0, own, -(-own // length) + 1).round().astype(int).tolist()
+        stretches += [(number, slice(*pair)) for pair in pairwise(edges)]
+    count = max(1, most * len(stretches) // sum(rows))
     chosen = [stretches[k] for k in np.linspace(0, len(stretches) - 1, count).round().astype(int)]
-    used = sum(end - start for _, start, end in chosen)
+    episodes = [recording.episodes[number] for number, _ in chosen]
+    parts = tuple(
+        replace(episode, time=episode.time[own], action=episode.action[own], state=episode.state[own], task_state=None)
+        for episode, (_, own) in zip(episodes, chosen, strict=True)
+        if episode.state is not None
+    )
+    used = sum(len(part.time) for part in parts)
     return replace(
         recording,
-        episodes=tuple(recording.episodes[number].part(start, end) for number, start, end in chosen),
-        sources=tuple(recording.sources[number] for number, _, _ in chosen),
-        usable=tuple(recording.usable[number][start:end] for number, start, end in chosen) if recording.usable else (),
+        episodes=parts,
+        sources=tuple(recording.sources[number] for number, _ in chosen),
+        usable=tuple(recording.usable[number][own] for number, own in chosen) if recording.usable else (),
         warnings=(
             *recording.warnings,
-            f"{sum(rows):,} rows are more than are looked at: {used:,} of them were, in {count} stretches spread evenly",
+            f"{sum(rows):,} rows are more than a diagnosis looks at: {used:,} of them were used, in {count} stretches "
+            "spread evenly over the recording",
         ),
     )
-
-
-def _pairs(edges: Iterable[float]) -> Iterator[tuple[float, float]]:
-    edges = list(edges)
-    return zip(edges, edges[1:], strict=False)
