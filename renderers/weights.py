@@ -82,11 +82,14 @@ def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRen
         header = json.loads(text)
         if header["format"] != FORMAT_VERSION:
             raise RendererError(f"{path}: format {header['format']}, this version reads {FORMAT_VERSION}")
+        if min(header["arguments"]["height"], header["arguments"]["width"]) < 1:
+            raise ValueError("frames without pixels")
         renderer = KINDS[header["kind"]](**header["arguments"])
-    except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:  # json's is a ValueError
+    except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, RuntimeError) as error:
         if isinstance(error, RendererError):
             raise
-        raise RendererError(f"{path}: its header does not describe a known renderer ({error})") from error
+        what = " ".join(str(error).split())
+        raise RendererError(f"{path}: its header does not describe a known renderer ({what})") from error
     try:
         renderer.load_state_dict(weights)
     except RuntimeError as error:

@@ -76,8 +76,9 @@ def damaged_text(content: bytes, other: bytes, rng: Random) -> bytes:
             row[column : column + 1] = [change(cell) for cell in row[column : column + 1]]
         text = "\n".join(map(",".join, rows))
     elif kind == 3 and lines:
-        row = rng.randrange(len(lines))
-        lines[row : row + 1] = rng.choice(([], [lines[row]] * 3, [rng.choice(lines)], [""], [lines[row] + ",1"]))
+        place = rng.randrange(len(lines))
+        line = lines[place]
+        lines[place : place + 1] = rng.choice(([], [line] * 3, [rng.choice(lines)], [""], [line + ",1"]))
         text = "\n".join(lines)
     else:
         rng.shuffle(lines)

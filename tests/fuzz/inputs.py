@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import mmap
 import os
 import resource
 import signal
@@ -19,7 +18,8 @@ from tests.fuzz.readers import READERS
 
 CRASHES = Path(__file__).parents[1] / "crashes"
 
-LONGEST_S = 20  # s that one input may take; a damaged HDF5 file may take 5 s of computation in its own process
+LONGEST_S = 10
+"""s of computation that one input may take, beside the 5 s that HDF5 may take over a damaged one in its own process."""
 MOST_BYTES = 2 * 2**30  # more than the reader's process had before
 ADDRESS_SPACE = 8 * 2**30
 
@@ -44,8 +44,7 @@ def damaged(name: str, seed: int, index: int) -> tuple[bytes, bool]:
 
 
 def tried(name: str, indices: Sequence[int], make: Callable[[int], tuple[bytes, bool]]) -> Iterator[Tried]:
-    """What a reader answers to each input, which `make` gives; a process that one of them ends is followed by another.
-    """
+    """What a reader answers to each input, which `make` gives; a process that one ends is followed by another."""
     left = list(indices)
     READERS[name].contents()
     while left:
@@ -55,21 +54,20 @@ def tried(name: str, indices: Sequence[int], make: Callable[[int], tuple[bytes, 
         left = left[len(answers) :]
         if ended and left:
             index = left.pop(0)
-            what = f"took more than {LONGEST_S} s" if ended == signal.SIGALRM else f"ended the process, status {ended}"
+            what = f"took more than {LONGEST_S} s" if ended == signal.SIGPROF else f"ended the process, status {ended}"
             yield Tried(index, what, make(index)[0])
 
 
-def _in_a_child(
-    name: str, indices: Sequence[int], make: Callable[[int], tuple[bytes, bool]]
-) -> tuple[list[str], int]:
+def _in_a_child(name: str, indices: Sequence[int], make: Callable[[int], tuple[bytes, bool]]) -> tuple[list[str], int]:
     """The answers to the first of some inputs, from a process of its own, and that process's status."""
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile("w+") as answers:
         if (child := os.fork()) == 0:
+            status = 1
             try:
                 resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
                 resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
                 for index in indices:
-                    signal.alarm(LONGEST_S)  # which ends this process
+                    signal.setitimer(signal.ITIMER_PROF, LONGEST_S)  # the signal ends this process
                     content, unsealed = make(index)
                     before = _peak()
                     answer = answered(name, Path(folder), content, unsealed)
@@ -79,8 +77,9 @@ def _in_a_child(
                     answers.flush()
                     if grown:
                         break  # the peak is that of this one from now on
+                status = 0
             finally:
-                os._exit(0)
+                os._exit(status)
         status = os.waitpid(child, 0)[1]
         answers.seek(0)
         return [json.loads(line) for line in answers], status
@@ -109,7 +108,7 @@ def answered(name: str, folder: Path, content: bytes, unsealed: bool) -> str:
             return f"{type(error).__name__}: {text}"
         if any(isinstance(each, MemoryError) or "allocate memory" in str(each) for each in chain):
             return f"asked for more memory than there is: {text}"
-        return "refused" if path.name in text and text.splitlines() == [text] else f"not one line on the file: {text}"
+        return "refused" if str(folder) in text and "\n" not in text else f"not one line on the file: {text}"
     if unsealed and isinstance(found, bytes) and found not in reader.contents():
         return "read, but as other than what was written"
     return "read"

@@ -31,8 +31,8 @@ def run(options: argparse.Namespace) -> None:
     import_effects(options)
     policy = _state_policy(Path(options.policy), system) if options.policy else None
     renderer = _renderer(Path(options.renderer), system) if options.renderer else None
-    recording = load_recording(options.recording, system, options.columns, frames=renderer is not None)
     with progress() as report:
+        recording = load_recording(options.recording, system, options.columns, renderer is not None, report)
         result = diagnosis.diagnose(
             recording,
             World(system, period=recording.period),

@@ -7,8 +7,10 @@ Without a column `episode` the file is one episode. Rates of change may be missi
 from __future__ import annotations
 
 import csv
+import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import count, islice, pairwise
@@ -154,19 +156,19 @@ class Table:
             yield [number, line, *values]
 
 
-def _lines(path: Path, progress: Progress | None = None) -> Iterator[tuple[int, str]]:
+def _lines(path: Path, progress: Progress | None = None) -> Generator[tuple[int, str], None, None]:
     """Number and text of each line that is not blank and no comment."""
     try:
-        with path.open(encoding="utf-8-sig") as file:  # line ends of any kind become \n
-            size = path.stat().st_size
+        with path.open("rb") as raw:
+            size = os.fstat(raw.fileno()).st_size
             try:
-                for number, line in enumerate(file, 1):
+                for number, line in enumerate(io.TextIOWrapper(raw, encoding="utf-8-sig"), 1):  # line ends become \n
                     if progress is not None and number % STRETCH == 0:
-                        progress(file.buffer.tell() // 10**6, size // 10**6 + 1, math.nan)
+                        progress(raw.tell() // 10**6, size // 10**6 + 1, math.nan)
                     if (text := line.strip()) and not text.startswith("#"):
                         yield number, line.removesuffix("\n")
             except UnicodeDecodeError as error:
-                byte = file.buffer.tell() - len(error.object) + error.start
+                byte = raw.tell() - len(error.object) + error.start
                 coded = ", but in UTF-16" if not byte and error.object[:2] in UTF_16_MARKS else f" (byte {byte})"
                 raise RecordingError(f"{path}: not text in UTF-8{coded}; CSV in UTF-8 is right") from error
     except OSError as error:

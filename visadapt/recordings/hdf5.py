@@ -191,7 +191,8 @@ def _opened(path: Path) -> Iterator[h5py.File]:
                 raise RecordingError(f"{path}: an HDF5 file, but its attribute 'format' is not {FORMAT!r}")
             version = file.attrs.get("version")
             if not any(_is(version, each) for each in READABLE):
-                raise RecordingError(f"{path}: version {version} of the format; this visadapt reads version {VERSION}")
+                found = " ".join(str(version).split())[:30]
+                raise RecordingError(f"{path}: version {found} of the format; this visadapt reads version {VERSION}")
             yield file
     except RecordingError:
         raise
@@ -296,7 +297,9 @@ def _undamaged(name: str, where: str) -> Iterator[None]:
     try:
         yield
     except (OSError, TypeError, AttributeError) as error:  # a group has no values
-        raise RecordingError(f"{where}: {name!r} is damaged, or no dataset, or was edited, and cannot be read") from error
+        raise RecordingError(
+            f"{where}: {name!r} is damaged, or no dataset, or was edited, and cannot be read"
+        ) from error
 
 
 def _check_own(group: h5py.Group, name: str, where: str) -> None:

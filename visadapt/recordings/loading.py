@@ -29,6 +29,7 @@ UPRIGHT_RAD = 1.0
 """rad from 0 up to which an angle counts as upright when it is unwrapped."""
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of absurd readings, which are refused
 def load_recording(
     paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     system: System,
@@ -41,8 +42,8 @@ def load_recording(
     Names are matched by `csv.py`. Clocks are checked by `clock.py`; rows of an unsteady one keep their stamps. Angles
     are unwrapped within an episode so that upright is 0 (if the pole turns over, in the turn in which it is upright
     most often). A command in N (a column `force` that exceeds 1) is divided by the system's `max_force`. Of files that
-    are too long for memory stretches of rows are left out (`thinning.py`). The recording's warnings say what was changed
-    or left out.
+    are too long for memory stretches of rows are left out (`thinning.py`). The recording's warnings say what was
+    changed or left out.
 
     Args:
         paths: one or several: files, or folders whose CSV and HDF5 files are taken in the order of their names.
@@ -82,9 +83,8 @@ def load_recording(
     whole = _commands(_shared(whole, system, note), system, note)
     check_commands(whole, system.actions, note)
     if not frames:
-        with np.errstate(over="ignore", invalid="ignore"):  # of absurd readings, which are refused here or below
-            for raw in whole:
-                check_units(raw, system)
+        for raw in whole:
+            check_units(raw, system)
         whole = check_sensors(whole, system, note)
     parts = [part for raw in whole for part in uninterrupted(_unwrapped(raw, system), note)]
     parts, period = alike(_long_enough(parts, note), note)
