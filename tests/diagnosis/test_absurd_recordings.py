@@ -5,7 +5,7 @@ import pytest
 
 from tests.recorded import STATES, a_run
 from visadapt.diagnosis import diagnose
-from visadapt.diagnosis.search.search import NoFitError
+from visadapt.diagnosis.search.fitted_models import NoFitError
 from visadapt.effects import EFFECTS
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole

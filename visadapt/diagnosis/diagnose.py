@@ -30,11 +30,12 @@ from visadapt.diagnosis.search import duration, heldout
 from visadapt.diagnosis.search.all_rows import on_all_rows
 from visadapt.diagnosis.search.causes import Alternative, alternatives, causes, ranking, stage_shares
 from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
+from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
-from visadapt.diagnosis.search.search import ScoredModel, Search
+from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.unexplained import smooth_functions
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, twins

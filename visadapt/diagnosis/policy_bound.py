@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from visadapt.diagnosis.result import PolicyTerms
-from visadapt.diagnosis.search.search import ScoredModel
+from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import posterior
 from visadapt.estimation.kalman import backward, forward

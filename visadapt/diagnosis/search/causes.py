@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from visadapt.diagnosis.result import Cause, Estimate, Ranked
+from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.model_comparison import ComparedModel, ModelComparison
-from visadapt.diagnosis.search.search import ScoredModel, Search
+from visadapt.diagnosis.search.search import Search
 from visadapt.effects import Effect, Parameter, Role, Stage
 from visadapt.effects.catalogue import twins
 from visadapt.estimation.candidate import CandidateModel

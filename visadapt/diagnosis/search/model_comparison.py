@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import torch
 
-from visadapt.diagnosis.search.search import ScoredModel, Search
+from visadapt.diagnosis.search.fitted_models import ScoredModel
+from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.unexplained import SmoothFunction, smooth_functions
 from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from visadapt.effects.laws import JointEffect
 from visadapt.systems import System
-from visadapt.systems.rigid_body import beside
 
 
 class AddedInertia(JointEffect):
@@ -40,17 +39,18 @@ class Inertial(System):
         super().check_parameters(either_sign, (*may_be_zero, *added))
 
     def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:
-        free = super().derivative(state, command, load)  # type: ignore[safe-super]
+        after = super().derivative(state, command, load)  # type: ignore[safe-super]
         inertia = [getattr(self, f"{_ADDED}{joint}") for joint in range(len(self.loads))]
         joints = [joint for joint, value in enumerate(inertia) if isinstance(value, Tensor) or value]
-        own = [self.coordinates[joint][1] for joint in joints]
-        units = load[None] + torch.eye(load.shape[1]).to(load)[joints, None]
-        gain = torch.stack([super(Inertial, self).derivative(state, command, unit) - free for unit in units], -1)  # type: ignore[safe-super]
-        added = beside([inertia[joint] for joint in joints], load)
-        # The added inertia's reaction to the joints' accelerations, which it changes: a = free + gain (-inertia a).
-        matrix = torch.eye(len(joints)).to(load) + gain[:, own] * added[..., None, :]
-        acceleration = torch.linalg.solve(matrix, free[:, own])
-        return free - (gain @ (added * acceleration)[..., None])[..., 0]
+        units = [load + torch.eye(load.shape[1]).to(load)[joint] for joint in joints]
+        gains = [super(Inertial, self).derivative(state, command, unit) - after for unit in units]  # type: ignore[safe-super]
+        for k, joint in enumerate(joints):
+            # The body's reaction to the acceleration a of its joint, which it changes: a = free + gain (-inertia a).
+            own = self.coordinates[joint][1]
+            reaction = inertia[joint] / (1 + inertia[joint] * gains[k][:, own])
+            after = after - gains[k] * (reaction * after[:, own])[:, None]
+            gains = [gain - gains[k] * (reaction * gain[:, own])[:, None] for gain in gains]
+        return after
 
 
 @cache
