@@ -159,10 +159,10 @@ class Table:
 def _lines(path: Path, progress: Progress | None = None) -> Generator[tuple[int, str], None, None]:
     """Number and text of each line that is not blank and no comment."""
     try:
-        with path.open("rb") as raw:
+        with path.open("rb") as raw, io.TextIOWrapper(raw, encoding="utf-8-sig") as file:  # line ends become \n
             size = os.fstat(raw.fileno()).st_size
             try:
-                for number, line in enumerate(io.TextIOWrapper(raw, encoding="utf-8-sig"), 1):  # line ends become \n
+                for number, line in enumerate(file, 1):
                     if progress is not None and number % STRETCH == 0:
                         progress(raw.tell() // 10**6, size // 10**6 + 1, math.nan)
                     if (text := line.strip()) and not text.startswith("#"):
