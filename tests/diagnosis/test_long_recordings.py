@@ -24,12 +24,12 @@ def diagnosed(episodes):
 
 @pytest.fixture(scope="module")
 def short():
-    return diagnosed(5)
+    return diagnosed(10)
 
 
 @pytest.fixture(scope="module")
 def long():
-    return diagnosed(40)
+    return diagnosed(80)
 
 
 def width(result):
@@ -38,7 +38,7 @@ def width(result):
 
 
 def test_every_row_of_a_long_recording_narrows_the_interval(short, long):
-    # Eight times the rows: 0.35 of the width; the rows that are searched alone would give 0.5.
+    # Eight times the rows: 0.35 of the width; the rows that are searched alone would give 0.71.
     assert width(long[0]) < 0.45 * width(short[0])
 
 
@@ -49,10 +49,10 @@ def test_a_long_recording_is_diagnosed_as_a_short_one(short, long):
         assert result.causes[0].parameters["coefficient"].value == pytest.approx(COEFFICIENT, rel=0.03)
         assert result.gap.closed == pytest.approx(1.0, abs=0.05)
         assert result.warnings == ()
-    assert long[0].recording.samples == 40 * 59  # executed commands
+    assert long[0].recording.samples == 80 * 59  # executed commands
 
 
 def test_what_there_is_to_do_is_said_before_it_begins(short, long):
     (line,) = long[1]
-    assert re.fullmatch(r"2,400 rows of 2 channels, 2 effects: about \d+ s on 1 core, up to five times .*", line)
-    assert short[1][0].startswith("300 rows of 2 channels")
+    assert re.fullmatch(r"4,800 rows of 2 channels, 2 effects: about \d+ s on 1 core, up to five times .*", line)
+    assert short[1][0].startswith("600 rows of 2 channels")
