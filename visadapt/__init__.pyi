@@ -1,5 +1,6 @@
 from . import effects as effects
 from .diagnosis.diagnose import diagnose as diagnose
+from .diagnosis.planning import Plan as Plan, plan as plan
 from .diagnosis.result import Diagnosis as Diagnosis
 from .effects.base import (
     ActuationEffect as ActuationEffect,

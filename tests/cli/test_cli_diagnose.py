@@ -110,6 +110,12 @@ class TestCommand:
         for setting in (str(recording), "CartPole(cart_mass=1.0", "<td>7</td>", f"torch {torch.__version__}"):
             assert setting in text
 
+    def test_a_plan_where_nothing_is_open(self, recording, stub, tmp_path, capsys):
+        path = tmp_path / "plan.csv"
+        assert run(recording, "--plan", path) == 0
+        assert "--plan: nothing to settle, the verdict is identified" in capsys.readouterr().out
+        assert not path.exists()
+
     def test_effects_of_one_s_own(self, recording, stub, tmp_path):
         path = tmp_path / "mine.py"
         path.write_text(OWN_EFFECT.format(name="Mine", effect="test_cli_mine"))

@@ -34,11 +34,16 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add(
         "--policy",
         metavar="P.safetensors",
-        help="a policy on states, as `visadapt train` writes it, for which the terms of the paper's Theorem 1 are "
-        "given, on the terminal and in the report",
+        help="a policy on states, as `visadapt train` writes it: the terms of the paper's Theorem 1 are given for it, "
+        "on the terminal and in the report, and --plan adds to its commands",
     )
     add("--json", metavar="F", help="write the result here, as visadapt/diagnosis/schema.json says")
     add("--report", metavar="F.html", help="write a page with figures here")
+    plan_help = (
+        "where several effects fit equally well, write here what to add to the commands of --policy (or, without "
+    )
+    plan_help += "one, the commands) of 200 samples that tell them apart"
+    add("--plan", metavar="F.csv", help=plan_help)
     _add_seed(parser)
     add(
         "--jobs",

@@ -12,11 +12,15 @@ from torch import nn
 from renderers import load_renderer
 from visadapt import diagnosis
 from visadapt.cli.inputs import InputError, import_effects, progress, the_system
+from visadapt.diagnosis import Diagnosis
+from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.report.html import write_report
 from visadapt.diagnosis.report.text import as_text
+from visadapt.diagnosis.result import AMBIGUOUS
 from visadapt.effects.own import is_own
 from visadapt.policies import StatePolicy
-from visadapt.recordings import load_recording
+from visadapt.progress import staged
+from visadapt.recordings import Recording, load_recording
 from visadapt.setups.policy_file import load_policy
 from visadapt.storage.atomic_files import replacing
 from visadapt.storage.run_folder import versions
@@ -31,11 +35,14 @@ def run(options: argparse.Namespace) -> None:
     import_effects(options)
     policy = _state_policy(Path(options.policy), system) if options.policy else None
     renderer = _renderer(Path(options.renderer), system) if options.renderer else None
+    if options.plan and renderer is not None:
+        raise InputError("--plan: a plan needs a recording of states, not of frames")
     with progress() as report:
         recording = load_recording(options.recording, system, options.columns, renderer is not None, report)
+        source = World(system, period=recording.period)
         result = diagnosis.diagnose(
             recording,
-            World(system, period=recording.period),
+            source,
             seed=options.seed,
             jobs=options.jobs,
             progress=report,
@@ -50,6 +57,21 @@ def run(options: argparse.Namespace) -> None:
     if options.report:
         settings = _settings(options, system, time.perf_counter() - began)
         write_report(options.report, result, settings)
+    if options.plan:
+        _plan(options, result, recording, source, policy)
+
+
+def _plan(
+    options: argparse.Namespace, result: Diagnosis, recording: Recording, source: World, policy: StatePolicy | None
+) -> None:
+    if result.verdict != AMBIGUOUS:
+        print(f"--plan: nothing to settle, the verdict is {result.verdict}; {options.plan} was not written")
+        return
+    with progress() as report:
+        planned = plan(result, recording, source, policy, seed=options.seed, progress=staged(report, "plan"))
+    if planned.settles:
+        planned.write(options.plan)
+    print(planned)
 
 
 def _settings(options: argparse.Namespace, system: System, seconds: float) -> dict[str, str]:

@@ -14,7 +14,7 @@ from visadapt.storage.atomic_files import check_writable
 from visadapt.systems import SYSTEMS
 
 INPUTS = ("recording", "params", "effects", "policy", "renderer", "diagnosis", "references", "map")
-OUTPUTS = ("out", "json", "report", "film")
+OUTPUTS = ("out", "json", "report", "plan", "film")
 
 
 def check_files(options: argparse.Namespace) -> None:

@@ -64,6 +64,7 @@ def run(
     steps: int,
     generator: torch.Generator,
     exploration: float = 0.0,
+    added: Tensor | None = None,
     strict: bool = True,
     see: See | None = None,
 ) -> list[Run]:
@@ -71,6 +72,7 @@ def run(
 
     Args:
         exploration: standard deviation of white noise on the commands, so that what they do shows in the data.
+        added: (steps, n_action) or more of them, added to the policy's commands, such as those of a `Plan`.
         strict: whether a state that is not finite is an error; if not, its episode ends before it.
         see: what the policy is shown, where that is not what `policy.shown` names.
 
@@ -96,6 +98,8 @@ def run(
         action = policy.act(history)
         if exploration > 0:
             action = (action + exploration * torch.randn(action.shape, generator=generator).to(action)).clamp(-1, 1)
+        if added is not None:
+            action = (action + added[len(rows)].to(action)).clamp(-1, 1)
         rows.append((observation, action))
         observation = target.step(action)
         finite = observation.state.isfinite().all(1)

@@ -1,0 +1,279 @@
+"""The experiment that settles an ambiguity: the excitation of the commands that tells two explanations apart best.
+
+An ambiguous diagnosis names effects that fit a recording equally well. Each explanation is simulated, with the noise of
+the recording, under every excitation of a family (square waves, sines, white noise; the largest that keeps all states
+within 0.9 of the system's ranges), and every explanation is fitted to what each shows. The worth of an excitation is
+the log likelihood by which the truth then leads: of all pairs of the first explanation and another, in either role, the
+least. This is the expected information of Box and Hill (1967), Technometrics 9(1), with fits in place of a linear model
+and the worst case in place of the mean.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from visadapt.diagnosis.policy_bound import StatesToActions, actions
+from visadapt.diagnosis.result import AMBIGUOUS, Diagnosis
+from visadapt.diagnosis.search.fitted_models import FittedModels
+from visadapt.diagnosis.search.preparation import prepare
+from visadapt.effects import EFFECTS, Effect
+from visadapt.estimation.fit_states import CAREFUL, QUICK, with_effect
+from visadapt.estimation.likelihood import FitState
+from visadapt.history import History
+from visadapt.progress import Progress
+from visadapt.recordings import Episode, Recording
+from visadapt.storage.atomic_files import replacing
+from visadapt.systems import System
+from visadapt.world import World
+
+FREQUENCIES = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # Hz
+SIZES = (0.05, 0.1, 0.2, 0.4, 0.8)
+"""Amplitudes that are tried, and the standard deviation of white noise, as shares of half the command's range."""
+MARGIN = 0.9  # Share of the states' ranges that an experiment may reach
+SUBSTEP = 0.0125  # s, the longest integration step of a simulation
+WORTH = 3.0  # Log likelihood below which an experiment is said to settle nothing
+
+
+@dataclass(frozen=True)
+class Plan:
+    """An excitation that is added to a policy's commands, and what is expected of it.
+
+    >>> import numpy as np, visadapt as va
+    >>> time, added = 0.05 * np.arange(201), np.zeros((201, 1))
+    >>> print(va.Plan((("gust",), ("spring",)), "a sine of 0.8 Hz", time, added, ("command",), 12.0, 5.0))
+    to tell gust from spring: add a sine of 0.8 Hz to the commands, for 10 s (expected log odds 12; 5 for white noise)
+    """
+
+    explanations: tuple[tuple[str, ...], ...]
+    """names of the effects of each; the first is told apart from the others"""
+    excitation: str
+    """in words"""
+    time: NDArray[np.floating]
+    """(T,) s"""
+    added: NDArray[np.floating]
+    """(T, n_action) in the command's units"""
+    actions: tuple[str, ...]
+    """names of the commands"""
+    log_odds: float
+    """log likelihood by which the truth is expected to lead the other explanation, in the worst case"""
+    white: float
+    """the same for white noise of the largest admissible size; NaN where none is admissible"""
+
+    @property
+    def settles(self) -> bool:
+        """Whether the experiment is expected to tell the explanations apart."""
+        return self.log_odds > WORTH
+
+    def __str__(self) -> str:
+        sets = [" and ".join(names) for names in self.explanations]
+        if not self.settles:
+            return f"no excitation within the ranges of the states tells {sets[0]} from {', '.join(sets[1:])}"
+        white = "" if math.isnan(self.white) else f"; {self.white:.0f} for white noise"
+        return (
+            f"to tell {sets[0]} from {', '.join(sets[1:])}: add {self.excitation} to the commands, for "
+            f"{self.time[-1]:.3g} s (expected log odds {self.log_odds:.0f}{white})"
+        )
+
+    def write(self, path: str | Path) -> None:
+        """Write a CSV with the columns `time` and, for each command, what is added to it."""
+        with replacing(path) as temporary:
+            header = ",".join(("time", *self.actions))
+            np.savetxt(temporary, np.column_stack((self.time, self.added)), "%.9g", ",", header=header, comments="")
+
+
+@torch.inference_mode()
+def plan(
+    found: Diagnosis,
+    recording: Recording,
+    source: World,
+    policy: StatesToActions | None = None,
+    samples: int = 200,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Plan:
+    """Design the experiment that tells the explanations of an ambiguous diagnosis apart.
+
+    Args:
+        found: the diagnosis of `recording`.
+        recording: of states; the experiment starts in its first state.
+        source: the world that was diagnosed, without effects.
+        policy: gives the commands to which the excitation is added; without one these are zero.
+        samples: of the experiment.
+        seed: of the simulated noise.
+        progress: called with (excitations tried, excitations in all, best log odds so far).
+
+    Raises:
+        ValueError: the diagnosis is not ambiguous, the recording has no states, or the machine leaves the ranges of its
+            states under every excitation.
+
+    >>> import pathlib, tempfile, torch, visadapt as va
+    >>> policy, source = va.load_policy(va.shipped("cartpole_states")), va.World(va.CartPole())
+    >>> runs = va.run(va.SyntheticTarget(), policy, 2, 30, torch.Generator().manual_seed(0))
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.h5"
+    >>> va.write_recording(path, [run.episode for run in runs], ["x", "x_dot", "theta", "theta_dot"], ["command"])
+    >>> run = va.load_recording(path, source.system)
+    >>> found = va.diagnose(run, source, catalogue=[va.effects.ConstantForce])
+    >>> va.plan(found, run, source, policy)
+    Traceback (most recent call last):
+    ValueError: the verdict is no_gap: there is nothing to settle; ambiguous diagnoses are planned for
+    """
+    if found.verdict != AMBIGUOUS:
+        raise ValueError(
+            f"the verdict is {found.verdict}: there is nothing to settle; ambiguous diagnoses are planned for"
+        )
+    if not recording.measured:
+        raise ValueError("a plan needs a recording of states, not of frames")
+    sets, system = explanations(found), source.system
+    noise, start = _noise_and_start(sets[0], recording, system)
+    generator = torch.Generator().manual_seed(seed)
+    names, added = _excitations(system, recording.period, samples, generator)
+    sizes = torch.tensor(SIZES, dtype=added.dtype)[:, None, None, None]
+    tried = (sizes * added).flatten(0, 1)  # (sizes times excitations, T, n_action)
+    shown = [_simulate(each, system, recording, tried, policy, noise, start, generator) for each in sets]
+    admissible = torch.stack([each[1] for each in shown]).all(0).unflatten(0, (len(SIZES), len(names)))
+    largest = admissible.long().cumprod(0).sum(0) - 1  # of each excitation; -1 without any
+    if bool((largest < 0).all()):
+        raise ValueError(
+            "the machine leaves the ranges of its states under every excitation: give the policy of the rig"
+        )
+    worth = torch.full((len(names),), math.nan)
+    for done, k in enumerate(torch.nonzero(largest >= 0)[:, 0].tolist()):
+        row = int(largest[k]) * len(names) + k
+        recordings = [_recording(recording, system, states[row], commands[row]) for (states, commands), _ in shown]
+        worth[k] = min(
+            _lead(sets[truth], sets[other], recordings[truth], system)
+            for rival in range(1, len(sets))
+            for truth, other in ((0, rival), (rival, 0))
+        )
+        if progress is not None:
+            progress(done + 1, len(names), float(worth.nan_to_num(-math.inf).max()))
+    best = int(worth.nan_to_num(-math.inf).argmax())
+    size = SIZES[int(largest[best])]
+    excitation = f"{names[best]} of {size:g} of half its range"
+    time = recording.period * np.arange(samples)
+    command = tried[int(largest[best]) * len(names) + best].numpy()
+    labels = tuple(tuple(effect.name for effect in each) for each in sets)
+    commands = tuple(action.name for action in system.actions)
+    white = [k for k, name in enumerate(names) if name.startswith("white")]
+    return Plan(labels, excitation, time, command, commands, float(worth[best]), float(worth[white].max()))
+
+
+def explanations(found: Diagnosis) -> list[list[Effect]]:
+    """The effects of an ambiguous diagnosis, and these with one exchanged for each that fits equally well."""
+    values = {cause.effect: {name: one.value for name, one in cause.parameters.items()} for cause in found.causes}
+    alternatives = {cause.effect: cause.indistinguishable_from for cause in found.causes}
+    first = found.effects()
+    exchanged = [
+        [*first[:k], EFFECTS[other](**values[other]), *first[k + 1 :]]
+        for k, effect in enumerate(first)
+        for other in alternatives[effect.name]
+        if other in values
+    ]
+    if not exchanged:
+        raise ValueError("the diagnosis gives no values of the effects that it cannot tell apart: there is no plan")
+    return [first, *exchanged]
+
+
+def _start(source: FitState, effects: Sequence[Effect]) -> FitState:
+    """A start for the fit of a set from the source's, at the effects' values."""
+    fits = source
+    for effect in effects:
+        fits = with_effect(fits, [float(getattr(effect, parameter.name)) for parameter in effect.table])
+    return fits
+
+
+def _noise_and_start(effects: Sequence[Effect], recording: Recording, system: System) -> tuple[Tensor, Tensor]:
+    """Standard deviations (n,) of the measurement noise, 0 of what was not measured, and the first state (n,)."""
+    classes = tuple(type(effect) for effect in effects)
+    prepared = prepare(recording, system, classes)
+    models = FittedModels(system, prepared.rows, classes, prepared.source)
+    fits = models.fit([(classes, _start(models.source.fits, effects))], CAREFUL)[0].fits
+    noise = torch.zeros(len(system.states), dtype=torch.float64)
+    noise[list(prepared.rows.channels)] = (fits.log_noise[0] / 2).exp()
+    return noise, fits.state[0, 0, 0]
+
+
+def _excitations(system: System, period: float, samples: int, generator: torch.Generator) -> tuple[list[str], Tensor]:
+    """Excitations of one command each, in words, and their values (N, samples, n_action) for a whole half range."""
+    time = period * torch.arange(samples, dtype=torch.float64)
+    names, shapes = [], []
+    for k, action in enumerate(system.actions):
+        where = f" on {action.name}" if len(system.actions) > 1 else ""
+        phases = {f: 2 * math.pi * f * time for f in FREQUENCIES if f * period < 0.25}
+        own = {
+            f"a square wave of {f:g} Hz{where}": torch.where(phase.sin() >= 0, 1.0, -1.0) for f, phase in phases.items()
+        }
+        own |= {f"a sine of {f:g} Hz{where}": phase.sin() for f, phase in phases.items()}
+        own[f"white noise{where}"] = torch.randn(samples, generator=generator, dtype=torch.float64)
+        for name, values in own.items():
+            shape = torch.zeros(samples, len(system.actions), dtype=torch.float64)
+            shape[:, k] = values * (action.high - action.low) / 2
+            names.append(name)
+            shapes.append(shape)
+    return names, torch.stack(shapes)
+
+
+Shown = tuple[tuple[Tensor, Tensor], Tensor]
+
+
+def _simulate(
+    effects: Sequence[Effect],
+    system: System,
+    recording: Recording,
+    added: Tensor,
+    policy: StatesToActions | None,
+    noise: Tensor,
+    first: Tensor,
+    generator: torch.Generator,
+) -> Shown:
+    """Readings (N, T + 1, n) and commands (N, T + 1, n_action) under each of N excitations, and (N,) whether all states
+    stay within their ranges."""
+    world = World(system, effects, recording.period, substeps=math.ceil(recording.period / SUBSTEP)).double()
+    ranges = torch.tensor([max(-v.low, v.high) for v in system.states], dtype=torch.float64)
+
+    def read(at: Tensor) -> Tensor:
+        return at + noise * torch.randn(at.shape, generator=generator, dtype=at.dtype)
+
+    at = world.start(first.expand(len(added), -1))
+    measured, at = world.measure(at, generator)
+    history = History.start(read(measured), added.shape[-1])
+    readings, commands, inside = [history.observations[:, -1]], [], (at.state.abs() <= MARGIN * ranges).all(1)
+    for t in range(added.shape[1]):
+        command = added[:, t] if policy is None else actions(policy, history).to(added) + added[:, t]
+        command = system.within_range(command)
+        at = world.step(at, command)
+        measured, at = world.measure(at, generator)
+        inside &= (at.state.abs() <= MARGIN * ranges).all(1)
+        at = replace(at, state=torch.where(inside[:, None], at.state, first))  # what left is not followed to infinity
+        history = history.acting(command).observing(read(measured))
+        readings.append(history.observations[:, -1])
+        commands.append(command)
+    return (torch.stack(readings, 1), torch.stack((*commands, 0 * commands[-1]), 1)), inside
+
+
+def _recording(like: Recording, system: System, states: Tensor, commands: Tensor) -> Recording:
+    """One simulated experiment, with the states that were measured."""
+    measured = [system.index(name) for name in like.measured]
+    time = like.period * np.arange(len(states))
+    episode = Episode(time, commands.numpy(), states[:, measured].numpy())
+    return Recording((episode,), like.measured, like.period, ("the simulated experiment",))
+
+
+def _lead(truth: Sequence[Effect], other: Sequence[Effect], recording: Recording, system: System) -> float:
+    """Log likelihood by which the truth leads another explanation, both fitted to the recording."""
+    sets = [tuple(type(effect) for effect in effects) for effects in (truth, other)]
+    catalogue = list(dict.fromkeys((*sets[0], *sets[1])))
+    prepared = prepare(recording, system)
+    models = FittedModels(system, prepared.rows, catalogue, prepared.source)
+    # In one batch: of two fits in turn, the second would stop where it falls far behind on its way.
+    starts = [(own, _start(models.source.fits, effects)) for own, effects in zip(sets, (truth, other), strict=True)]
+    first, second = models.fit(starts, QUICK)
+    return float(first.fits.likelihood[0] - second.fits.likelihood[0])
