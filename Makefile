@@ -5,13 +5,14 @@
 
 PYTHON ?= python3
 PIP_ARGS ?=
+MINUTES ?= 10
 VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 TYPED := $(foreach room,visadapt renderers datasets experiments train benchmarks tests,$(if $(wildcard $(room)/*.py),$(room)))
 
 .DELETE_ON_ERROR:
-.PHONY: demo demo-from-scratch test lint types format clean
+.PHONY: demo demo-from-scratch test fuzz lint types format clean
 
 demo: $(INSTALLED)
 	$(RUN) -m train.demo
@@ -20,7 +21,11 @@ demo-from-scratch: $(INSTALLED)
 	$(RUN) -m train.demo --from-scratch
 
 test: $(INSTALLED)
-	$(RUN) -m pytest -n auto --dist loadfile
+	$(RUN) -m pytest -n auto --dist worksteal
+
+# Damaged files for every reader; those that are neither read nor refused are kept in tests/crashes, as tests.
+fuzz: $(INSTALLED)
+	$(RUN) -m tests.fuzz --minutes $(MINUTES)
 
 lint: $(INSTALLED)
 	$(RUN) -m ruff check .

@@ -85,12 +85,15 @@ def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRen
         header = json.loads(text)
         if header["format"] != FORMAT_VERSION:
             raise RendererError(f"{path}: format {header['format']}, this version reads {FORMAT_VERSION}")
+        if min(header["arguments"]["height"], header["arguments"]["width"]) < 1:
+            raise ValueError("frames without pixels")
         renderer = KINDS[header["kind"]](**header["arguments"])
-        renderer.error = header["training"].get("error")
-    except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:  # json's is a ValueError
+        renderer.error = _error(header["training"])
+    except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, RuntimeError) as error:
         if isinstance(error, RendererError):
             raise
-        raise RendererError(f"{path}: its header does not describe a known renderer ({error})") from error
+        what = " ".join(str(error).split())
+        raise RendererError(f"{path}: its header does not describe a known renderer ({what})") from error
     try:
         renderer.load_state_dict(weights)
     except RuntimeError as error:
@@ -100,3 +103,11 @@ def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRen
             f"{path}: its frames are {renderer.size[1]} x {renderer.size[0]} px, {size[1]} x {size[0]} are needed"
         )
     return renderer
+
+
+def _error(training: dict[str, Any]) -> float | None:
+    """A renderer's own error as its file gives it, a grey level in [0, 1]; None where it was not measured."""
+    error = training.get("error")
+    if error is not None and not 0 <= float(error) < 1:
+        raise ValueError(f"an error of {error}, which must be within [0, 1)")
+    return None if error is None else float(error)

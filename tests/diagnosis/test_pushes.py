@@ -1,6 +1,7 @@
 """Pushes of a double pendulum and of a cart: found with times and impulses, and none named where there is none."""
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
@@ -19,8 +20,12 @@ SHOULDER, ELBOW = (0, 1.5, 0.4), (1, 3.2, -0.35)
 """A push: on which joint, its middle in s, its peak in N m."""
 
 
-def recorded(*given, name="run"):
-    """5 s of a double pendulum with friction and a weaker motor than the source's, under torques, and pushes."""
+RUNS = ((), (ELBOW,), (SHOULDER, ELBOW))
+
+
+@functools.cache
+def every():
+    """5 s of double pendulums with friction and a weaker motor than the source's, under torques, and pushes of RUNS."""
     effects = {effect.name: effect for effect in catalogue(DoublePendulum())}
     machine = World(
         DoublePendulum(),
@@ -33,18 +38,29 @@ def recorded(*given, name="run"):
     ).double()
     time = PERIOD * np.arange(1250)
     torque = np.stack((1.6 * np.sin(4 * time) + 0.9 * np.sin(9.5 * time + 1), 0.3 * np.sin(6 * time)), 1)
-    push = np.zeros_like(torque)
-    for joint, middle, peak in given:
-        push[:, joint] += peak * np.exp(-0.5 * ((time - middle) / WIDTH) ** 2)
-    push[:, 0] /= 0.85  # it acts whole, whatever the motor makes of its command
-    at = machine.start(torch.zeros(1, 4, dtype=torch.float64))
+    push = np.zeros((len(time), len(RUNS), 2))
+    for run, given in enumerate(RUNS):
+        for joint, middle, peak in given:
+            push[:, run, joint] += peak * np.exp(-0.5 * ((time - middle) / WIDTH) ** 2)
+    push[..., 0] /= 0.85  # it acts whole, whatever the motor makes of its command
+    at = machine.start(torch.zeros(len(RUNS), 4, dtype=torch.float64))
     states = []
-    for command in torch.from_numpy(torque + push)[:, None]:
-        states.append(at.state[0])
-        at = machine.step(at, command)
+    with torch.no_grad():
+        for command in torch.from_numpy(torque[:, None] + push):
+            states.append(at.state)
+            at = machine.step(at, command)
     noise = np.random.default_rng(0).normal(size=(len(time), 4)) * [2e-4, 2e-4, 0.05, 0.05]
-    state = torch.stack(states).detach().numpy() + noise
-    return Recording((Episode(time, torque, state),), tuple(s.name for s in DoublePendulum.states), PERIOD, (name,))
+    return {
+        given: Recording(
+            (Episode(time, torque, clean + noise),), tuple(s.name for s in DoublePendulum.states), PERIOD, ("run",)
+        )
+        for given, clean in zip(RUNS, torch.stack(states, 1).numpy(), strict=True)
+    }
+
+
+def recorded(*given):
+    """One of these runs."""
+    return every()[given]
 
 
 def found_in(recording):

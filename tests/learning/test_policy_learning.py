@@ -217,7 +217,7 @@ class TestOpposing:
         assert ((found > -2.0) & (found < 0.0)).all()
 
 
-def learn(checkpoint, stop=None, iterations=120, **more):
+def learn(checkpoint, stop=None, iterations=24, **more):
     """Tune a policy in a world with memory; interrupt it once `stop` iterations are done."""
 
     def progress(done, total, loss):
@@ -281,12 +281,16 @@ class TestReplay:
 
 
 class TestResuming:
+    @pytest.fixture(autouse=True)
+    def checkpoints(self, monkeypatch):
+        monkeypatch.setattr("visadapt.learning.training_state.CHECKPOINT_ITERATIONS", 20)
+
     @pytest.mark.parametrize("more", [{}, {"streams": 3, "every": 2}])
     def test_interrupted_after_a_checkpoint_it_goes_on_to_the_same_numbers(self, tmp_path, more):
         weights, losses = learn(None, **more)
         path = tmp_path / "partial.safetensors"
         with pytest.raises(KeyboardInterrupt):
-            learn(path, stop=110, **more)
+            learn(path, stop=22, **more)
         resumed, again = learn(path, **more)
         assert again == losses
         for key, value in weights.items():
@@ -295,9 +299,9 @@ class TestResuming:
     def test_it_does_go_on_and_does_not_begin_anew(self, tmp_path):
         path = tmp_path / "partial.safetensors"
         with pytest.raises(KeyboardInterrupt):
-            learn(path, stop=101)
+            learn(path, stop=21)
         with pytest.raises(KeyboardInterrupt):
-            learn(path, stop=102)
+            learn(path, stop=22)
         seen = path.read_bytes()
-        learn(path, iterations=120)  # would rewrite the checkpoint at 100, had it begun anew
+        learn(path)  # would rewrite the checkpoint at 20, had it begun anew
         assert path.read_bytes() == seen

@@ -22,7 +22,7 @@ from visadapt.tasks.balance import PAPER_CARTPOLE, Balance
 from visadapt.world import World
 
 TUNE = TuneSettings(
-    Balance(PAPER_CARTPOLE), iterations=105, batch=4, learning_rate=3e-3, observation_noise=0.0, recorded=0.5
+    Balance(PAPER_CARTPOLE), iterations=25, batch=4, learning_rate=3e-3, observation_noise=0.0, recorded=0.5
 )
 GROUND = GroundSettings(steps=60, every=20)
 SMALL = SetupSettings(TUNE, TUNE, GROUND, longest_episode=12)
@@ -112,8 +112,16 @@ class TestSettings:
             run(tmp_path, QUICK, budget=20, round_samples=size)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def checkpoints():
+    """States of a training are kept after 20 iterations, not after 100."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("visadapt.learning.training_state.CHECKPOINT_ITERATIONS", 20)
+        yield
+
+
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def whole(checkpoints, tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
     policy, adapted = run(folder, SMALL)
     return policy.state_dict(), adapted, folder
@@ -133,9 +141,9 @@ class TestInterruption:
         [
             ("data", 45),
             ("round 1/2: ground", 40),
-            ("round 1/2: tune", 102),
+            ("round 1/2: tune", 22),
             ("round 2/2: ground", 0),
-            ("round 2/2: tune", 50),
+            ("round 2/2: tune", 10),
         ],
     )
     def test_started_again_it_ends_with_the_same_numbers(self, whole, tmp_path, stage, after):

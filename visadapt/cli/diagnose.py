@@ -37,9 +37,9 @@ def run(options: argparse.Namespace) -> None:
     renderer = _renderer(Path(options.renderer), system) if options.renderer else None
     if options.plan and renderer is not None:
         raise InputError("--plan: a plan needs a recording of states, not of frames")
-    recording = load_recording(options.recording, system, options.columns, frames=renderer is not None)
-    source = World(system, period=recording.period)
     with progress() as report:
+        recording = load_recording(options.recording, system, options.columns, renderer is not None, report)
+        source = World(system, period=recording.period)
         result = diagnosis.diagnose(
             recording,
             source,

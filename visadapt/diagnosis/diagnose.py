@@ -47,6 +47,7 @@ from visadapt.estimation.profiles import profile_of
 from visadapt.processes import one_thread
 from visadapt.progress import Report, staged
 from visadapt.recordings import Recording
+from visadapt.recordings.thinning import spread
 from visadapt.systems import System
 from visadapt.world import World
 
@@ -62,6 +63,10 @@ AT_BOUND = 1e-3  # Distance from an end of its range, as a share of it, within w
 MIN_CLOSED_TO_EXPLAIN = 0.5
 """Share of the gap that the best set must close for what it leaves to be the next thing to look into; else it is what
 the source leaves."""
+
+MOST_SEARCHES, STRETCH_WINDOWS = 24, 4
+"""Rows of a recording that are used, as a multiple of those that the search uses, and windows of those that follow each
+other: intervals of so many are narrow already, and the time grows with the rows."""
 
 RUNNERS_UP = 2  # Sets after the best for which the share of the gap that they close is computed
 
@@ -126,7 +131,9 @@ def diagnose(
     if policy is not None:
         policy_bound.check(policy, system)
     candidates = searched(effects, system)
-    prepared = prepare(recording, system, candidates)
+    stretch = STRETCH_WINDOWS * max(profile.window_rows, round(heldout.PREDICTION_TIME / recording.period))
+    used = spread(recording, MOST_SEARCHES * profile.search_rows, stretch)
+    prepared = prepare(used, system, candidates)
     rows = prepared.rows
     search = Search(system, rows.select(prepared.searched), candidates, prepared.source, jobs)
     if announce is not None:
@@ -190,7 +197,7 @@ def diagnose(
         gap=gap,
         next_experiment=_next(search, comparison, verdict, groups, gap),
         warnings=(
-            *recording.warnings,
+            *used.warnings,
             *prepared.warnings,
             *_warnings(comparison, verdict, unexplained),
             *_at_bounds(comparison),

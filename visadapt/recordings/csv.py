@@ -7,17 +7,22 @@ Without a column `episode` the file is one episode. Rates of change may be missi
 from __future__ import annotations
 
 import csv
+import io
 import math
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import count, islice, pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from visadapt.recordings.clock import RawEpisode
+from visadapt.progress import Progress
+from visadapt.recordings.clock import Note, RawEpisode
 from visadapt.recordings.episode import RecordingError
+from visadapt.recordings.thinning import STRETCH, thinned
 from visadapt.systems import System
 
 SEPARATORS = ",;\t"
@@ -36,39 +41,43 @@ OTHER_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 @dataclass(frozen=True)
-class Table:
-    """A file's text, split into the header and the rows, which are not parsed yet.
+class Rows:
+    """Rows of a file as numbers."""
 
-    Row numbers start from 1 and leave out the header, comments (lines that begin with #) and blank lines; line numbers
-    are those of an editor.
-    """
+    values: NDArray[np.float64]
+    """(N, columns)"""
+    numbers: NDArray[np.intp]
+    """(N,) from 1 on, without the header, comments (lines that begin with #) and blank lines"""
+    lines: NDArray[np.intp]
+    """(N,) those of an editor"""
+    total: int
+    """of the file, where more than N"""
+
+    def place(self, row: int) -> str:
+        """The name in messages of a row, counted from 0."""
+        return f"row {self.numbers[row]} (line {self.lines[row]})"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A file whose header is read, and whose rows are not yet."""
 
     path: Path
     header: tuple[str, ...]
     separator: str
-    rows: tuple[tuple[int, str], ...]
-    """number and text of each row's line"""
 
     @classmethod
     def open(cls, path: Path) -> Table:
-        """Read a file and parse its header.
+        """Read a file's header.
 
         Raises:
             RecordingError: the file is missing, unreadable, not text, empty, or has no header.
         """
-        try:
-            text = path.read_text(encoding="utf-8-sig")  # line ends of any kind become \n
-        except UnicodeDecodeError as error:
-            coded = ", but in UTF-16" if error.object[:2] in UTF_16_MARKS else f" (byte {error.start})"
-            raise RecordingError(f"{path}: not text in UTF-8{coded}; CSV in UTF-8 is right") from error
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-        lines = [(number, line) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
-        lines = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
-        if not lines:
+        with closing(_lines(path)) as lines:
+            number, first = next(lines, (0, ""))
+        if not number:
             raise RecordingError(f"{path}: is empty; a line of names and rows of numbers below it are right")
-        (number, first), *rows = lines
-        if "\0" in text[:1000]:
+        if "\0" in first:
             raise RecordingError(f"{path}: line {number} holds NUL bytes, as no text in UTF-8; CSV in UTF-8 is right")
         separator = max(SEPARATORS, key=first.count)
         if separator not in first:
@@ -82,27 +91,56 @@ class Table:
                 f"{path}: line {number} holds numbers where the columns' names belong "
                 "(say episode,time,x,theta,command)"
             )
-        return cls(path, header, separator, tuple(rows))
+        return cls(path, header, separator)
 
-    def numbers(self, columns: Sequence[int]) -> NDArray[np.float64]:
-        """Some columns (rows, len(columns)); the other columns may hold anything.
+    def rows(self, columns: Sequence[int], most: float = math.inf, progress: Progress | None = None) -> Rows:
+        """The rows' numbers in some columns; the other columns may hold anything.
+
+        The file is read a stretch of rows at a time. Of more than `most` rows every second stretch is kept, or every
+        fourth, and so on.
 
         Raises:
             RecordingError: no rows, a row with more or fewer cells than the header, or a cell that is not a number;
                 the message names row, line and column.
         """
-        if not self.rows:
+        stretches: list[NDArray[np.float64]] = []
+        every, total = 1, 0
+        with closing(_lines(self.path, progress)) as lines:
+            next(lines)  # the header
+            rows = self._parsed(lines, columns)
+            while block := [*islice(rows, STRETCH)]:
+                if total // STRETCH % every == 0:
+                    stretches.append(np.array(block))
+                total += len(block)
+                if len(stretches) * STRETCH > most:
+                    stretches, every = stretches[::2], 2 * every
+        if not total:
             raise RecordingError(f"{self.path}: has no rows below its line of names")
-        values = []
-        reader, row = csv.reader((line for _, line in self.rows), delimiter=self.separator, strict=True), 0
-        while row < len(self.rows):
-            where = f"{self.path}: {self.place(row)}"
+        table = np.concatenate(stretches)
+        return Rows(table[:, 2:], table[:, 0].astype(np.intp), table[:, 1].astype(np.intp), total)
+
+    def _parsed(self, lines: Iterator[tuple[int, str]], columns: Sequence[int]) -> Iterator[list[float]]:
+        """Of each row its number, its line, and its numbers in some columns."""
+        pulled: list[int] = []
+
+        def texts() -> Iterator[str]:
+            for line, text in lines:
+                pulled.append(line)
+                yield text
+
+        reader = csv.reader(texts(), delimiter=self.separator, strict=True)
+        for number in count(1):
+            pulled.clear()
             try:
-                cells = next(reader)
+                cells = next(reader, None)
             except csv.Error as error:
+                where = f"{self.path}: row {number} (line {pulled[0]})"
                 raise RecordingError(f"{where} is no row of CSV: {error}; is a quotation mark left open?") from error
-            row += 1
-            if reader.line_num > row:
+            if cells is None:
+                return
+            line, *more = pulled
+            where = f"{self.path}: row {number} (line {line})"
+            if more:
                 raise RecordingError(f"{where}: a quotation mark is left open, so that the next lines are part of it")
             if len(cells) < len(self.header):
                 raise RecordingError(
@@ -111,36 +149,63 @@ class Table:
             if len(cells) > len(self.header):
                 raise RecordingError(f"{where} has {len(cells)} cells, the line of names {len(self.header)}")
             try:
-                values.append([_number(cells[column].partition("#")[0]) for column in columns])
+                values = [_number(cells[column].partition("#")[0]) for column in columns]
             except ValueError:
                 column = next(column for column in columns if not _is_number(cells[column]))
                 raise RecordingError(f"{where}, column {self.header[column]!r} {_complaint(cells[column])}") from None
-        return np.array(values)
-
-    def place(self, row: int) -> str:
-        """The name in messages of a row, counted from 0."""
-        return f"row {row + 1} (line {self.rows[row][0]})"
+            yield [number, line, *values]
 
 
-def read_rows(path: Path, system: System, given: Mapping[str, str]) -> list[RawEpisode]:
+def _lines(path: Path, progress: Progress | None = None) -> Generator[tuple[int, str], None, None]:
+    """Number and text of each line that is not blank and no comment."""
+    try:
+        with path.open("rb") as raw, io.TextIOWrapper(raw, encoding="utf-8-sig") as file:  # line ends become \n
+            size = os.fstat(raw.fileno()).st_size
+            try:
+                for number, line in enumerate(file, 1):
+                    if progress is not None and number % STRETCH == 0:
+                        progress(raw.tell() // 10**6, size // 10**6 + 1, math.nan)
+                    if (text := line.strip()) and not text.startswith("#"):
+                        yield number, line.removesuffix("\n")
+            except UnicodeDecodeError as error:
+                byte = raw.tell() - len(error.object) + error.start
+                coded = ", but in UTF-16" if not byte and error.object[:2] in UTF_16_MARKS else f" (byte {byte})"
+                raise RecordingError(f"{path}: not text in UTF-8{coded}; CSV in UTF-8 is right") from error
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def read_rows(
+    path: Path,
+    system: System,
+    given: Mapping[str, str],
+    note: Note,
+    most_bytes: float = math.inf,
+    progress: Progress | None = None,
+) -> list[RawEpisode]:
     """The episodes of a file; `given` maps our names of columns to the file's, where these are not evident.
+
+    Of values that take more than `most_bytes` some stretches are left out, which is noted.
 
     Raises:
         RecordingError: the file or a column is missing, or a cell is not a number.
     """
     table = Table.open(path)
     found = match(path, table.header, system, given)
-    values = dict(zip(found, table.numbers(list(found.values())).T, strict=True))
+    rows = table.rows(list(found.values()), most_bytes / (8 * len(found)), progress)
+    if len(rows.values) < rows.total:
+        note(thinned(len(rows.values), rows.total), str(path))
+    values = dict(zip(found, rows.values.T, strict=True))
     measured = tuple(variable.name for variable in system.states if variable.name in found)
     state = np.column_stack([values[name] for name in measured])
     action = np.column_stack([values[variable.name] for variable in system.actions])
     names = {name: table.header[index] for name, index in found.items()}
-    whole = RawEpisode(path, values["time"], action, state, measured, table.place, names)
+    whole = RawEpisode(path, values["time"], action, state, measured, rows.place, names)
     if "episode" not in found:
         return [whole]
     label = values["episode"]
     if np.isnan(label).any():
-        raise RecordingError(f"{path}: {table.place(int(np.isnan(label).argmax()))}, column 'episode' is not a number")
+        raise RecordingError(f"{path}: {rows.place(int(np.isnan(label).argmax()))}, column 'episode' is not a number")
     edges = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), len(label)]
     return [replace(whole.part(start, end), number=float(label[start])) for start, end in pairwise(edges)]
 

@@ -16,9 +16,11 @@ stored in other files, are refused.
 from __future__ import annotations
 
 import hashlib
+import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visadapt.recordings.episode import Episode, RecordingError
+from visadapt.recordings.thinning import kept
 from visadapt.storage.atomic_files import replacing
 from visadapt.systems import System
 
@@ -39,6 +42,8 @@ COMPRESSION = 1100
 READING_S, READING_BYTES_PER_S = 5, 10e6
 """s of computation that reading a file may take at least, and bytes for which it may take a second more."""
 DATASETS = ("time", "action", "state", "task_state", "frame")
+PART_BYTES = 2**24
+"""Bytes of a dataset that are read at once where not all of its rows are used."""
 FRAMES_IN_CHUNK = 16
 """Frames that are compressed together, so that reading one decompresses at most this many."""
 
@@ -84,7 +89,8 @@ def write_recording(
                 if name == "frame":
                     packed = {"chunks": (min(len(values), FRAMES_IN_CHUNK), *values.shape[1:]), "compression": "gzip"}
                 dataset = group.create_dataset(name, data=values, fletcher32=True, **packed)
-                dataset.attrs["sha256"] = _digest(file, name, values, len(episodes), [*present])
+                about = _about(file, name, values, len(episodes), [*present])
+                dataset.attrs["sha256"] = hashlib.sha256(about.encode() + values.tobytes()).hexdigest()
         file.flush()
         content = file.id.get_file_image()
     with replacing(path) as temporary:
@@ -118,18 +124,37 @@ def read_recording(path: str | os.PathLike[str], frames: bool = True) -> list[Ep
     >>> va.read_recording(path)[0].samples
     2
     """
+    return [*read_stretches(path, frames)[0].values()]
+
+
+def read_stretches(
+    path: str | os.PathLike[str], frames: bool = True, most_bytes: float = math.inf
+) -> tuple[dict[int, Episode], int]:
+    """As `read_recording`: the episodes by their number in the file, and the file's rows.
+
+    Of values that take more than `most_bytes` stretches of rows are left out (`thinning.py`), so that episodes have
+    gaps, or are missing.
+    """
     path = Path(path)
 
-    def read() -> list[Episode]:
+    def read() -> tuple[dict[int, Episode], int]:
         with _opened(path) as file:
             for number in range(len(file)):
                 if _group_name(number) not in file:
                     raise RecordingError(
                         f"{path}: {_group_name(number)} is missing; {len(file)} groups, numbered from 0, were expected"
                     )
-            episodes = [_read_episode(path, file, number, frames) for number in range(len(file))]
-        _check_alike(path, episodes)
-        return episodes
+            every = [_datasets(path, file, number, frames) for number in range(len(file))]
+            starts = [0, *accumulate(each["time"].size for each in every)]
+            size = sum(dataset.nbytes for each in every for dataset in each.values())
+            used = [kept(start, end, max(1, math.ceil(size / most_bytes))) for start, end in pairwise(starts)]
+            episodes = {
+                number: _read_episode(path, file, number, datasets, rows)
+                for number, (datasets, rows) in enumerate(zip(every, used, strict=True))
+                if rows.any() or not rows.size
+            }
+        _check_alike(path, [*episodes.values()])
+        return episodes, starts[-1]
 
     return _tried(path, read)
 
@@ -166,7 +191,8 @@ def _opened(path: Path) -> Iterator[h5py.File]:
                 raise RecordingError(f"{path}: an HDF5 file, but its attribute 'format' is not {FORMAT!r}")
             version = file.attrs.get("version")
             if not any(_is(version, each) for each in READABLE):
-                raise RecordingError(f"{path}: version {version} of the format; this visadapt reads version {VERSION}")
+                found = " ".join(str(version).split())[:30]
+                raise RecordingError(f"{path}: version {found} of the format; this visadapt reads version {VERSION}")
             yield file
     except RecordingError:
         raise
@@ -194,20 +220,20 @@ def _names(file: h5py.File, kind: str) -> list[str] | None:
     return names
 
 
-def _digest(file: h5py.File, name: str, values: NDArray[Any], episodes: int, present: Sequence[str]) -> str:
-    """The SHA-256 of a dataset, and of what stands beside it: the episodes' number, the other datasets of this one."""
+def _about(file: h5py.File, name: str, values: Any, episodes: int, present: Sequence[str]) -> str:
+    """What stands beside a dataset's values: their kind and names, the episodes' number, this one's other datasets."""
     columns = _names(file, name) if name in ("state", "action") else None
-    about = f"{episodes} {sorted(present)} {name} {columns} {values.dtype.str} {values.shape}"
-    return hashlib.sha256(about.encode() + np.ascontiguousarray(values).tobytes()).hexdigest()
+    return f"{episodes} {sorted(present)} {name} {columns} {values.dtype.str} {values.shape}"
 
 
 def _group_name(number: int) -> str:
     return f"episode_{number:05d}"
 
 
-def _read_episode(path: Path, file: h5py.File, number: int, frames: bool) -> Episode:
-    where = f"{path}: {_group_name(number)}"
+def _datasets(path: Path, file: h5py.File, number: int, frames: bool) -> dict[str, h5py.Dataset]:
+    """The datasets of an episode that are to be read, none of which is evidently damaged or elsewhere."""
     name = _group_name(number)
+    where = f"{path}: {name}"
     _check_own(file, name, where)
     group = file[name]
     for needed in ("time", "action"):
@@ -215,33 +241,65 @@ def _read_episode(path: Path, file: h5py.File, number: int, frames: bool) -> Epi
             raise RecordingError(f"{where} has no dataset {needed!r}")
     if "state" not in group and not frames:
         raise RecordingError(f"{where} holds frames alone; states are needed (or a renderer, by --renderer)")
-    arrays = {
-        name: _read_dataset(group, name, where) for name in DATASETS if name in group and (frames or name != "frame")
-    }
+    found = {}
+    for name in DATASETS:
+        if name in group and (frames or name != "frame"):
+            _check_own(group, name, where)
+            with _undamaged(name, where):
+                dataset = found[name] = group[name]
+                if dataset.is_virtual or dataset.external:
+                    raise RecordingError(f"{where}: the values of {name!r} are in another file; its own are right")
+                if dataset.nbytes > COMPRESSION * dataset.id.get_storage_size() or dataset.dtype.hasobject:
+                    raise TypeError
+    return found
+
+
+def _read_episode(
+    path: Path, file: h5py.File, number: int, datasets: Mapping[str, h5py.Dataset], rows: NDArray[np.bool_]
+) -> Episode:
+    where = f"{path}: {_group_name(number)}"
+    arrays = {name: _read_dataset(dataset, name, where, rows) for name, dataset in datasets.items()}
     try:
         return Episode(**arrays)
     except ValueError as error:
         raise RecordingError(f"{where}: {error}") from error
 
 
-def _read_dataset(group: h5py.Group, name: str, where: str) -> NDArray[Any]:
-    _check_own(group, name, where)
-    damaged = f"{where}: {name!r} is damaged, or no dataset, or was edited, and cannot be read"
-    try:
-        dataset = group[name]
-        if dataset.is_virtual or dataset.external:
-            raise RecordingError(f"{where}: the values of {name!r} are in another file; its own are right")
-        if dataset.nbytes > COMPRESSION * dataset.id.get_storage_size() or dataset.dtype.hasobject:
-            raise RecordingError(damaged)
+def _read_dataset(dataset: h5py.Dataset, name: str, where: str, rows: NDArray[np.bool_]) -> NDArray[Any]:
+    """These rows of a dataset; all are read, a part at a time, since the checksum is of all."""
+    file, used = dataset.file, []
+    with _undamaged(name, where):
+        about = _about(file, name, dataset, len(file), [*dataset.parent])
+        found = hashlib.sha256(about.encode())
+        for part, own in _parts(dataset, rows):
+            found.update(part.tobytes())
+            used.append(own)
+        if file.attrs["version"] > 1 and dataset.attrs.get("sha256") != found.hexdigest():
+            raise TypeError
+    return used[0] if len(used) == 1 else np.concatenate(used)
+
+
+def _parts(dataset: h5py.Dataset, rows: NDArray[np.bool_]) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+    """The values of a dataset, in one part where all rows are used, and of each part those that are."""
+    if rows.all():
         values = np.asarray(dataset[()])
-        file = group.file
-        if file.attrs["version"] > 1 and dataset.attrs.get("sha256") != _digest(
-            file, name, values, len(file), [*group]
-        ):
-            raise RecordingError(damaged)
+        yield values, values
+        return
+    step = max(FRAMES_IN_CHUNK, len(rows) * PART_BYTES // dataset.nbytes)
+    for start in range(0, len(dataset), step):
+        values = dataset[start : start + step]
+        yield values, values[rows[start : start + step]]
+
+
+@contextmanager
+def _undamaged(name: str, where: str) -> Iterator[None]:
+    """Turn what HDF5 raises over what is no dataset, or cannot be read, into RecordingError."""
+    try:
+        yield
     except (OSError, TypeError, AttributeError) as error:  # a group has no values
-        raise RecordingError(damaged) from error
-    return values
+        raise RecordingError(
+            f"{where}: {name!r} is damaged, or no dataset, or was edited, and cannot be read"
+        ) from error
 
 
 def _check_own(group: h5py.Group, name: str, where: str) -> None:

@@ -11,38 +11,46 @@ from pathlib import Path
 
 import numpy as np
 
+from visadapt.progress import Report, staged
 from visadapt.recordings.checks import check_commands, check_finite, check_units
 from visadapt.recordings.clock import Note, RawEpisode, alike, check_forward, check_steps, uninterrupted
 from visadapt.recordings.csv import match, read_rows
 from visadapt.recordings.episode import Episode, Recording, RecordingError
-from visadapt.recordings.hdf5 import read_names, read_recording
+from visadapt.recordings.hdf5 import read_names, read_stretches
 from visadapt.recordings.sensors import check_sensors, without_outliers
+from visadapt.recordings.thinning import thinned
 from visadapt.systems import System
 
 SHORTEST_EPISODE_S = 0.5
 """s; shorter episodes hold too few predictions several steps ahead and are left out."""
+MOST_BYTES = 2**28
+"""Of the values of all files together: 4.8 million rows of a cart-pole. The checks take some copies of them."""
 UPRIGHT_RAD = 1.0
 """rad from 0 up to which an angle counts as upright when it is unwrapped."""
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of absurd readings, which are refused
 def load_recording(
     paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     system: System,
     columns: Mapping[str, str] | None = None,
     frames: bool = False,
+    progress: Report | None = None,
 ) -> Recording:
     """Read states and actions from CSV and HDF5 files, or frames and actions from HDF5 files.
 
     Names are matched by `csv.py`. Clocks are checked by `clock.py`; rows of an unsteady one keep their stamps. Angles
     are unwrapped within an episode so that upright is 0 (if the pole turns over, in the turn in which it is upright
-    most often). A command in N (a column `force` that exceeds 1) is divided by the system's `max_force`. The
-    recording's warnings say what was changed or left out.
+    most often). A command in N (a column `force` that exceeds 1) is divided by the system's `max_force`. Of files that
+    are too long for memory stretches of rows are left out (`thinning.py`). The recording's warnings say what was
+    changed or left out.
 
     Args:
         paths: one or several: files, or folders whose CSV and HDF5 files are taken in the order of their names.
         system: the source, which defines names and units.
         columns: our names of columns to the file's, where these are not evident.
         frames: whether to read frames in the place of states, which are then not used.
+        progress: called with (stage, MB done, MB in all, nan).
 
     Raises:
         RecordingError: the recording cannot be used; one line that says which file, row and column, and what would be
@@ -62,8 +70,11 @@ def load_recording(
         places.setdefault(text, []).append(where)
 
     whole: list[RawEpisode] = []
-    for path in _files([paths] if isinstance(paths, str | os.PathLike) else paths, note):
-        episodes = _read(path, system, columns or {}, frames)
+    files = _files([paths] if isinstance(paths, str | os.PathLike) else paths, note)
+    sizes = [path.stat().st_size for path in files]
+    for path, size in zip(files, sizes, strict=True):
+        most = MOST_BYTES * size / max(1, sum(sizes))
+        episodes = _read(path, system, columns or {}, frames, note, most, progress)
         for raw in episodes:
             check_finite(raw, system.actions)
             check_forward(raw)
@@ -72,9 +83,8 @@ def load_recording(
     whole = _commands(_shared(whole, system, note), system, note)
     check_commands(whole, system.actions, note)
     if not frames:
-        with np.errstate(over="ignore", invalid="ignore"):  # of absurd readings, which are refused here or below
-            for raw in whole:
-                check_units(raw, system)
+        for raw in whole:
+            check_units(raw, system)
         whole = check_sensors(whole, system, note)
     parts = [part for raw in whole for part in uninterrupted(_unwrapped(raw, system), note)]
     parts, period = alike(_long_enough(parts, note), note)
@@ -121,7 +131,9 @@ def _is_the_same(one: Path, other: Path) -> bool:
     return False
 
 
-def _read(path: Path, system: System, given: Mapping[str, str], frames: bool) -> list[RawEpisode]:
+def _read(
+    path: Path, system: System, given: Mapping[str, str], frames: bool, note: Note, most: float, report: Report | None
+) -> list[RawEpisode]:
     try:
         with path.open("rb") as file:
             is_hdf5 = file.read(4) == b"\x89HDF"
@@ -131,10 +143,14 @@ def _read(path: Path, system: System, given: Mapping[str, str], frames: bool) ->
         raise RecordingError(
             f"{path}: no HDF5 file; times, commands and frames as visadapt.write_recording writes them are right"
         )
-    return _read_hdf5(path, system, given, frames) if is_hdf5 else read_rows(path, system, given)
+    if is_hdf5:
+        return _read_hdf5(path, system, given, frames, note, most)
+    return read_rows(path, system, given, note, most, staged(report, f"reading {path.name} (MB)"))
 
 
-def _read_hdf5(path: Path, system: System, given: Mapping[str, str], frames: bool) -> list[RawEpisode]:
+def _read_hdf5(
+    path: Path, system: System, given: Mapping[str, str], frames: bool, note: Note, most: float
+) -> list[RawEpisode]:
     state_names, action_names = read_names(path, system)
     if frames:
         state_names = []
@@ -143,7 +159,10 @@ def _read_hdf5(path: Path, system: System, given: Mapping[str, str], frames: boo
     measured = tuple(variable.name for variable in system.states if variable.name in found)
     names = {name: header[index] for name, index in found.items()}
     rows = []
-    for number, episode in enumerate(read_recording(path, frames)):
+    episodes, total = read_stretches(path, frames, most)
+    if (used := sum(len(episode.time) for episode in episodes.values())) < total:
+        note(thinned(used, total), str(path))
+    for number, episode in episodes.items():
         where = f"{path}, episode {number}"
         if frames and episode.frame is None:
             raise RecordingError(f"{where} has no frames; leave out --renderer to diagnose its states")

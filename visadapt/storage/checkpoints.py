@@ -70,7 +70,7 @@ def fitting(path: Path) -> Iterator[None]:
         yield
     except CheckpointError:
         raise
-    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
         what = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise CheckpointError(f"{path}: holds not what is needed here ({what})") from error
 

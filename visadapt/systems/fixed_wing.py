@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import ClassVar
 
 import torch
@@ -137,7 +138,8 @@ class FixedWing(RigidBody):
 
     def wrench(self, velocity: Tensor, rates: Tensor, command: Tensor) -> tuple[Tensor, Tensor]:
         """Beard and McLain's section 4.2, and thrust; force and torque (B, 3) each."""
-        table, limit = self._table(velocity)
+        like = velocity.dtype, velocity.device
+        table, limit = _constant_table(self, *like) if self.is_constant else self._table(velocity)
         plane, speed = velocity[:, ::2], velocity.norm(dim=-1, keepdim=True)
         in_plane = plane.norm(dim=-1, keepdim=True).clamp_min(_LEAST_AIRSPEED)
         ahead = torch.where(in_plane > _LEAST_AIRSPEED, velocity[:, :1], 1.0)  # atan2 has no gradient at (0, 0)
@@ -204,6 +206,12 @@ class FixedWing(RigidBody):
         ]
         gathered = beside([*values, self.linear_range], like)
         return gathered[..., :-1].unflatten(-1, (len(_EFFECTS), len(_CAUSES))), gathered[..., -1:]
+
+
+@lru_cache(64)
+def _constant_table(wing: FixedWing, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    with torch.inference_mode(False):
+        return wing._table(torch.empty(0, dtype=dtype, device=device))
 
 
 _TABLE = tuple(

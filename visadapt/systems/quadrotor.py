@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from visadapt.systems.base import Variable, holds
-from visadapt.systems.rigid_body import RigidBody, beside, columns, times
+from visadapt.systems.rigid_body import RigidBody, beside, columns, constant, times
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,9 @@ class Quadrotor(RigidBody):
         Flightmare's plate with rotors: m l^2 / 12 times (4.5, 4.5, 7) about x, y and z.
         """
         size = beside(((self.mass - self.payload) * self.arm_length**2 / 12,), like)
-        return size[..., None] * torch.diag(like.new_tensor((4.5, 4.5, 7.0)))
+        return size[..., None] * constant((4.5, 0.0, 0.0, 0.0, 4.5, 0.0, 0.0, 0.0, 7.0), like.dtype, like.device).view(
+            3, 3
+        )
 
     def thrust(self, command: Tensor) -> Tensor:
         """Mass-normalised thrust (B,) in m/s2 at commands (B, 4)."""

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar
+from dataclasses import fields
+from functools import cached_property, lru_cache
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -72,10 +74,17 @@ class RigidBody(System):
         turned = rotation(attitude)
         force, torque = self.wrench(times(turned.mT, velocity), rates, command)
         inertia = self.inertia(state)
+        inverse = _inverse_inertia(self, state.dtype, state.device) if self.is_constant else inertia.inverse()
         whole = torque + load[:, 3:] - torch.linalg.cross(rates, times(inertia, rates))
-        weight = columns(self.gravity) * state.new_tensor((0.0, 0.0, 1.0))
+        weight = columns(self.gravity) * constant((0.0, 0.0, 1.0), state.dtype, state.device)
         acceleration = (times(turned, force) + load[:, :3]) / columns(self.mass) - weight
-        return torch.cat((velocity, acceleration, turning(attitude, rates), times(inertia.inverse(), whole)), 1)
+        return torch.cat((velocity, acceleration, turning(attitude, rates), times(inverse, whole)), 1)
+
+    @cached_property
+    def is_constant(self) -> bool:
+        """Whether no parameter is a tensor, so that what depends on parameters alone need be computed only once."""
+        parameters: Any = self
+        return not any(isinstance(getattr(parameters, each.name), Tensor) for each in fields(parameters))
 
 
 def columns(value: float | Tensor) -> float | Tensor:
@@ -84,14 +93,28 @@ def columns(value: float | Tensor) -> float | Tensor:
 
 
 def beside(values: Sequence[float | Tensor], like: Tensor) -> Tensor:
-    """Parameters gathered in a tensor (n,), or (B, n) if one of them is (B,)."""
+    """Parameters gathered in a tensor (n,), or (B, n) if one of them is (B,). It is not to be written to."""
     tensors = {i: value for i, value in enumerate(values) if isinstance(value, Tensor)}
-    gathered = like.new_tensor([0.0 if isinstance(value, Tensor) else value for value in values])
+    numbers = tuple(0.0 if isinstance(value, Tensor) else value for value in values)
+    gathered = constant(numbers, like.dtype, like.device)
     if tensors:
         gathered = gathered.repeat(*torch.broadcast_shapes(*(value.shape for value in tensors.values())), 1)
         for i, value in tensors.items():
             gathered[..., i] = value
     return gathered
+
+
+@lru_cache(256)
+def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Numbers as a tensor (n,), made once: an integration asks for the same ones thousands of times."""
+    with torch.inference_mode(False):  # else no gradient could pass what is multiplied by it
+        return torch.tensor(values, dtype=dtype, device=device)
+
+
+@lru_cache(64)
+def _inverse_inertia(system: RigidBody, dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        return system.inertia(torch.empty(0, dtype=dtype, device=device)).inverse()
 
 
 def times(matrix: Tensor, vector: Tensor) -> Tensor:

@@ -120,8 +120,8 @@ class EnvMap:
             TargetError: the file is missing or no TOML, a key is unknown, missing or impossible; names file and key.
         """
         try:
-            table = tomllib.loads(Path(path).read_text())
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            table = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+        except (OSError, ValueError, RecursionError) as error:  # of TOML, of its encoding, or of Python
             raise TargetError(f"{path}: cannot be read as TOML: {error}") from error
         known = [item.name for item in fields(cls)]
         for key in table:
@@ -136,7 +136,7 @@ class EnvMap:
             for key in {"crop", "contrast"} & table.keys():
                 table[key] = tuple(table[key])
             return cls(states=states, actions=actions, **table)
-        except (TargetError, TypeError, AttributeError) as error:
+        except (TargetError, TypeError, AttributeError, ArithmeticError) as error:
             raise TargetError(f"{path}: {error}") from error
 
     def check(self, name: str, system: type[System], n_observation: int, n_action: int) -> None:
