@@ -4,14 +4,20 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 
 from tests.diagnosed import record
 from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.sensor_checks import derived_velocities
 from visadapt.effects import ViscousFriction
+from visadapt.estimation.segments import cut
 from visadapt.recordings import Episode
 from visadapt.systems import CartPole
 
 WHOLE = record(measured=("x", "x_dot", "theta", "theta_dot"), noise=(0.0, 0.0, 0.0, 0.0))
+
+
+WHOLE_POSITIONS = tuple(Episode(e.time, e.action, e.state[:, [0, 2]]) for e in WHOLE.episodes)
 
 
 def jittered(read_late: bool):
@@ -46,6 +52,25 @@ def test_it_is_decided_whether_the_readings_or_the_log_were_late(read_late, filt
     assert any("evenly spaced" in warning for warning in prepared.warnings) != read_late
     steps = prepared.rows.time[0].diff()
     assert bool((steps - steps.mean()).abs().max() < 1e-9) != read_late
+
+
+def test_velocities_that_a_rig_derives_are_left_out():
+    prepared = prepare(
+        with_filtered_velocities(dataclasses.replace(jittered(True), episodes=WHOLE_POSITIONS)), CartPole()
+    )
+    assert prepared.rows.channels == (0, 2)
+    assert sum("derived on the rig, not measured; left out" in warning for warning in prepared.warnings) == 2
+
+
+def test_noise_of_few_readings_does_not_make_velocities_late():
+    late = 0
+    for seed in range(30):
+        generator, episode = np.random.default_rng(seed), WHOLE.episodes[seed % len(WHOLE.episodes)]
+        state = episode.state[:60] + generator.normal(0, (0.01, 0.04, 0.018, 0.1), (60, 4))
+        short = [torch.from_numpy(x) for x in (state, np.ones((60, 4)), episode.action[:60], episode.time[:60])]
+        rows = cut(*([each] for each in short), (0, 1, 2, 3), 0.05, 60)
+        late += bool(derived_velocities(CartPole(), rows))
+    assert late == 0
 
 
 def test_whole_episodes_are_in_the_sources_signs_with_lost_readings_filled_in():

@@ -80,6 +80,8 @@ def to_source(rows: Segments, convention: Convention, angle_sensor: Sequence[int
 MAX_LAG = 0.2
 """Largest lag, in periods, of a measured velocity behind the slope of its position; backward differences lag by 0.5."""
 
+SURE = 2.0  # Standard errors by which a lag must exceed it: noise of few readings alone gives lags too
+
 
 def derived_velocities(system: System, rows: Segments) -> dict[str, float]:
     """Names of velocities that lag behind the slope of their position, with the lag in s.
@@ -99,9 +101,11 @@ def derived_velocities(system: System, rows: Segments) -> dict[str, float]:
         error = velocity[:, 1:-1] - (position[:, 2:] - position[:, :-2]) / span
         used = inside * rows.used[..., k].unfold(1, 3, 1).amin(-1)
         # Least squares of error = -lag acceleration.
-        lag = float(-(error * acceleration * used).sum() / (acceleration.square() * used).sum())
-        if lag > MAX_LAG * rows.period:
-            out[system.states[channel].name] = lag
+        information = (acceleration.square() * used).sum()
+        lag = -(error * acceleration * used).sum() / information
+        variance = ((error + lag * acceleration).square() * used).sum() / used.sum()
+        if lag - SURE * (variance / information).sqrt() > MAX_LAG * rows.period:
+            out[system.states[channel].name] = float(lag)
     return out
 
 
