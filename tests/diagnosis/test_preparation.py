@@ -67,8 +67,9 @@ def test_noise_of_few_readings_does_not_make_velocities_late():
     for seed in range(30):
         generator, episode = np.random.default_rng(seed), WHOLE.episodes[seed % len(WHOLE.episodes)]
         state = episode.state[:60] + generator.normal(0, (0.01, 0.04, 0.018, 0.1), (60, 4))
-        short = [torch.from_numpy(x) for x in (state, np.ones((60, 4)), episode.action[:60], episode.time[:60])]
-        rows = cut(*([each] for each in short), (0, 1, 2, 3), 0.05, 60)
+        measured, used = [torch.from_numpy(state)], [torch.ones(60, 4)]
+        command, time = [torch.from_numpy(episode.action[:60])], [torch.from_numpy(episode.time[:60])]
+        rows = cut(measured, used, command, time, (0, 1, 2, 3), 0.05, 60)
         late += bool(derived_velocities(CartPole(), rows))
     assert late == 0
 
