@@ -1,4 +1,6 @@
-from visadapt.diagnosis.report.next_experiment import separate
+import pytest
+
+from visadapt.diagnosis.report.next_experiment import explain, separate
 from visadapt.effects import ActuatorBias, ConstantForce, CoulombFriction, QuadraticDrag, Spring, ViscousFriction
 from visadapt.systems import CartPole, Quadrotor
 
@@ -17,3 +19,14 @@ def test_an_experiment_for_a_cart_is_not_advised_on_a_vehicle_which_needs_none()
     assert "spring balance" in separate([pair], CartPole())
     assert "spring balance" not in separate([pair], Quadrotor())
     assert "flights" in separate([pair], Quadrotor())
+
+
+@pytest.mark.parametrize(
+    ("port", "said"),
+    [
+        ("cart_force", "An unexplained load (cart force) depends on x dot: record runs that cover"),
+        ("theta", "An unexplained error of the reading of theta depends on x dot: record runs that cover"),
+    ],
+)
+def test_a_disturbance_is_a_load_or_an_error_of_a_reading(port, said):
+    assert explain(port, "x_dot", CartPole()).startswith(said)

@@ -199,7 +199,7 @@ def diagnose(
         warnings=(
             *used.warnings,
             *prepared.warnings,
-            *_warnings(comparison, verdict, unexplained),
+            *_warnings(comparison, verdict, unexplained, system),
             *_at_bounds(comparison),
             *(f"{one.name}: {one.caveat}" for one in best.effects if one.caveat and one.name in carrying),
         ),
@@ -292,7 +292,7 @@ def _next(
         if not gap.closed >= MIN_CLOSED_TO_EXPLAIN:
             source = CandidateModel(search.system, (), search.rows)
             first = smooth_functions(source, search.source.fits)[0]
-        return next_experiment.explain(first.port, first.variable)
+        return next_experiment.explain(first.port, first.variable, search.system)
     return next_experiment.separate([[one.effect for one in group] for group in groups], search.system)
 
 
@@ -309,11 +309,11 @@ def _at_bounds(comparison: ModelComparison) -> list[str]:
     ]
 
 
-def _warnings(comparison: ModelComparison, verdict: str, unexplained: bool) -> list[str]:
+def _warnings(comparison: ModelComparison, verdict: str, unexplained: bool, system: System) -> list[str]:
     if verdict in (IDENTIFIED, AMBIGUOUS) and unexplained:
         first = comparison.functions[0]
         return [
-            "the causes close the gap but do not explain everything: an unexplained disturbance acts as "
-            f"{first.port} and depends on {first.variable}"
+            "the causes close the gap but do not explain everything: "
+            + next_experiment.disturbance_on(first.port, first.variable, system)
         ]
     return []

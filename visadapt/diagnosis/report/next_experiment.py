@@ -54,10 +54,18 @@ def separate(classes: Sequence[Collection[type[Effect]]], system: System) -> str
     return " ".join(parts)
 
 
-def explain(port: str, variable: str) -> str:
+def disturbance_on(port: str, variable: str, system: System) -> str:
+    """An unexplained disturbance in words: a load, or an error of a state's reading, that depends on a variable."""
+    loads = [load.name for load in system.loads]
+    what = f"load ({plain(port)})" if port in loads else f"error of the reading of {plain(port)}"
+    return f"an unexplained {what} depends on {plain(variable)}"
+
+
+def explain(port: str, variable: str, system: System) -> str:
     """The experiment that shows an unexplained disturbance on `port`, a function of `variable`, more clearly."""
+    said = disturbance_on(port, variable, system)
     return (
-        f"An unexplained disturbance acts as {plain(port)} and depends on {plain(variable)}: record runs that cover "
+        f"{said[0].upper()}{said[1:]}: record runs that cover "
         f"the whole range of {plain(variable)} slowly and fast, with all else as constant as possible, and add an "
         "effect of your own for it (--effects)."
     )
