@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -11,16 +10,12 @@ from torch import nn
 
 from visadapt.diagnosis import policy_bound
 from visadapt.diagnosis.frames import UNSEEN, FramesError, watch, with_camera
-from visadapt.diagnosis.report import next_experiment
 from visadapt.diagnosis.report.figures_data import Errors, disturbances, figure_data, film_frames
 from visadapt.diagnosis.result import (
     AMBIGUOUS,
     IDENTIFIED,
-    NO_GAP,
-    UNEXPLAINED,
     Cause,
     Diagnosis,
-    Gap,
     RecordingSummary,
     Region,
     Where,
@@ -28,18 +23,17 @@ from visadapt.diagnosis.result import (
 )
 from visadapt.diagnosis.search import duration, heldout
 from visadapt.diagnosis.search.all_rows import on_all_rows
-from visadapt.diagnosis.search.causes import Alternative, alternatives, causes, ranking, stage_shares
+from visadapt.diagnosis.search.causes import alternatives, causes, ranking, stage_shares
 from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
 from visadapt.diagnosis.search.fitted_models import ScoredModel
-from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
+from visadapt.diagnosis.search.model_comparison import compare
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.search.unexplained import smooth_functions
+from visadapt.diagnosis.verdict import MIN_GAP_CLOSED, at_bounds, left_unexplained, next_step, verdict_of
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, twins
-from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.effect_fit import remembers
 from visadapt.estimation.fit_states import Effects
 from visadapt.estimation.likelihood import FitState
@@ -50,19 +44,6 @@ from visadapt.recordings import Recording
 from visadapt.recordings.thinning import spread
 from visadapt.systems import System
 from visadapt.world import World
-
-MIN_GAP_CLOSED = 0.95
-"""Share of the gap that the causes must close to count as identified although something remains unexplained."""
-
-CLEAR_OF_NOISE = 3.0
-"""Error of predictions over the noise, above which there is a gap, and above which, with the causes, the share of it
-that they close decides the verdict."""
-
-AT_BOUND = 1e-3  # Distance from an end of its range, as a share of it, within which a strength is at that end
-
-MIN_CLOSED_TO_EXPLAIN = 0.5
-"""Share of the gap that the best set must close for what it leaves to be the next thing to look into; else it is what
-the source leaves."""
 
 MOST_SEARCHES, STRETCH_WINDOWS = 24, 4
 """Rows of a recording that are used, as a multiple of those that the search uses, and windows of those that follow each
@@ -177,7 +158,7 @@ def diagnose(
 
     explaining = (*repeat_causes, *causes(search, comparison, groups, gap_closed))
     unexplained = comparison.unexplained(improvable)
-    verdict = _verdict(comparison, gap, unexplained, improvable, explaining, bool(repeats))
+    verdict = verdict_of(comparison, gap, unexplained, improvable, explaining, bool(repeats))
     found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
     carrying = {cause.effect for cause in without_slight(found)}
     before, after = disturbances(search, comparison)
@@ -195,12 +176,12 @@ def diagnose(
         causes=found,
         ranking=ranking(comparison, effects, system, gap_closed, repeat_causes),
         gap=gap,
-        next_experiment=_next(search, comparison, verdict, groups, gap),
+        next_experiment=next_step(search, comparison, verdict, groups, gap),
         warnings=(
             *used.warnings,
             *prepared.warnings,
-            *_warnings(comparison, verdict, unexplained, system),
-            *_at_bounds(comparison),
+            *left_unexplained(comparison, verdict, unexplained, system),
+            *at_bounds(comparison),
             *(f"{one.name}: {one.caveat}" for one in best.effects if one.caveat and one.name in carrying),
         ),
         figures=replace(
@@ -229,36 +210,6 @@ def _fitted(sets: Mapping[frozenset[str], ScoredModel]) -> list[tuple[Effects, F
     return [(each.effects, each.fits) for each in sets.values()]
 
 
-def _verdict(
-    comparison: ModelComparison,
-    gap: Gap,
-    unexplained: bool,
-    improvable: bool,
-    explaining: Sequence[Cause],
-    repeats: bool,
-) -> str:
-    """The verdict where these causes are what explains the gap best.
-
-    Args:
-        unexplained: they leave something.
-        improvable: a black box beside them clearly closes more of the gap.
-        repeats: readings are repeated.
-    """
-    if unexplained:
-        # Where the noise is low, any model of a real machine leaves something significant: then the share of the gap
-        # that is closed decides, otherwise whether what is unexplained is negligible.
-        clear = gap.after > CLEAR_OF_NOISE * gap.floor
-        enough = gap.closed >= MIN_GAP_CLOSED if clear else comparison.negligible and not improvable
-        if not (comparison.best.effects and enough):
-            return UNEXPLAINED
-    elif math.isnan(gap.closed) and not repeats:
-        return NO_GAP  # the source predicts as well as the noise allows
-    carrying = without_slight(explaining)
-    if not carrying:
-        return UNEXPLAINED if unexplained or gap.before > CLEAR_OF_NOISE * gap.floor else NO_GAP
-    return AMBIGUOUS if any(cause.indistinguishable_from for cause in carrying) else IDENTIFIED
-
-
 def _regions(
     found: Sequence[Cause],
     disturbance: Disturbance,
@@ -280,40 +231,3 @@ def _regions(
             fitted.append(Region(variable, start.value, end.value, share, 1 - cause.probability))
     taken = {region.variable for region in fitted}
     return (*fitted, *(one for one in regions_of(disturbance, seed) if one.variable not in taken))
-
-
-def _next(
-    search: Search, comparison: ModelComparison, verdict: str, groups: Sequence[Sequence[Alternative]], gap: Gap
-) -> str:
-    if verdict == NO_GAP:
-        return next_experiment.more(search.profile)
-    if verdict == UNEXPLAINED:
-        first = comparison.functions[0]
-        if not gap.closed >= MIN_CLOSED_TO_EXPLAIN:
-            source = CandidateModel(search.system, (), search.rows)
-            first = smooth_functions(source, search.source.fits)[0]
-        return next_experiment.explain(first.port, first.variable, search.system)
-    return next_experiment.separate([[one.effect for one in group] for group in groups], search.system)
-
-
-def _at_bounds(comparison: ModelComparison) -> list[str]:
-    """A warning for each strength that the best set has at an end of the range searched."""
-    table = [(effect, parameter) for effect in comparison.best.effects for parameter in effect.table]
-    return [
-        f"{effect.name}: {parameter.name} is at {end:g} {parameter.unit}, the end of the range searched; the truth may "
-        "lie beyond it, and the other causes are then wrong as well"
-        for (effect, parameter), value in zip(table, comparison.best.fits.theta[0].tolist(), strict=True)
-        for end in (parameter.low, parameter.high)
-        if parameter.is_strength and end != parameter.neutral
-        if abs(value - end) < AT_BOUND * (parameter.high - parameter.low)
-    ]
-
-
-def _warnings(comparison: ModelComparison, verdict: str, unexplained: bool, system: System) -> list[str]:
-    if verdict in (IDENTIFIED, AMBIGUOUS) and unexplained:
-        first = comparison.functions[0]
-        return [
-            "the causes close the gap but do not explain everything: "
-            + next_experiment.disturbance_on(first.port, first.variable, system)
-        ]
-    return []

@@ -1,0 +1,97 @@
+"""What a diagnosis says of its comparison of models: the verdict, its warnings, and what to record next."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from visadapt.diagnosis.report import next_experiment
+from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Gap, without_slight
+from visadapt.diagnosis.search.causes import Alternative
+from visadapt.diagnosis.search.model_comparison import ModelComparison
+from visadapt.diagnosis.search.search import Search
+from visadapt.diagnosis.search.unexplained import smooth_functions
+from visadapt.estimation.candidate import CandidateModel
+from visadapt.systems import System
+
+MIN_GAP_CLOSED = 0.95
+"""Share of the gap that the causes must close to count as identified although something remains unexplained."""
+
+CLEAR_OF_NOISE = 3.0
+"""Error of predictions over the noise, above which there is a gap, and above which, with the causes, the share of it
+that they close decides the verdict."""
+
+AT_BOUND = 1e-3  # Distance from an end of its range, as a share of it, within which a strength is at that end
+
+MIN_CLOSED_TO_EXPLAIN = 0.5
+"""Share of the gap that the best set must close for what it leaves to be the next thing to look into; else it is what
+the source leaves."""
+
+
+def verdict_of(
+    comparison: ModelComparison,
+    gap: Gap,
+    unexplained: bool,
+    improvable: bool,
+    explaining: Sequence[Cause],
+    repeats: bool,
+) -> str:
+    """The verdict where these causes are what explains the gap best.
+
+    Args:
+        unexplained: they leave something.
+        improvable: a black box beside them clearly closes more of the gap.
+        repeats: readings are repeated.
+    """
+    if unexplained:
+        # Where the noise is low, any model of a real machine leaves something significant: then the share of the gap
+        # that is closed decides, otherwise whether what is unexplained is negligible.
+        clear = gap.after > CLEAR_OF_NOISE * gap.floor
+        enough = gap.closed >= MIN_GAP_CLOSED if clear else comparison.negligible and not improvable
+        if not (comparison.best.effects and enough):
+            return UNEXPLAINED
+    elif math.isnan(gap.closed) and not repeats:
+        return NO_GAP  # the source predicts as well as the noise allows
+    carrying = without_slight(explaining)
+    if not carrying:
+        return UNEXPLAINED if unexplained or gap.before > CLEAR_OF_NOISE * gap.floor else NO_GAP
+    return AMBIGUOUS if any(cause.indistinguishable_from for cause in carrying) else IDENTIFIED
+
+
+def next_step(
+    search: Search, comparison: ModelComparison, verdict: str, groups: Sequence[Sequence[Alternative]], gap: Gap
+) -> str:
+    """The experiment to make next, in words."""
+    if verdict == NO_GAP:
+        return next_experiment.more(search.profile)
+    if verdict == UNEXPLAINED:
+        first = comparison.functions[0]
+        if not gap.closed >= MIN_CLOSED_TO_EXPLAIN:
+            source = CandidateModel(search.system, (), search.rows)
+            first = smooth_functions(source, search.source.fits)[0]
+        return next_experiment.explain(first.port, first.variable, search.system)
+    return next_experiment.separate([[one.effect for one in group] for group in groups], search.system)
+
+
+def at_bounds(comparison: ModelComparison) -> list[str]:
+    """A warning for each strength that the best set has at an end of the range searched."""
+    table = [(effect, parameter) for effect in comparison.best.effects for parameter in effect.table]
+    return [
+        f"{effect.name}: {parameter.name} is at {end:g} {parameter.unit}, the end of the range searched; the truth may "
+        "lie beyond it, and the other causes are then wrong as well"
+        for (effect, parameter), value in zip(table, comparison.best.fits.theta[0].tolist(), strict=True)
+        for end in (parameter.low, parameter.high)
+        if parameter.is_strength and end != parameter.neutral
+        if abs(value - end) < AT_BOUND * (parameter.high - parameter.low)
+    ]
+
+
+def left_unexplained(comparison: ModelComparison, verdict: str, unexplained: bool, system: System) -> list[str]:
+    """A warning where causes are named although they leave something."""
+    if verdict in (IDENTIFIED, AMBIGUOUS) and unexplained:
+        first = comparison.functions[0]
+        return [
+            "the causes close the gap but do not explain everything: "
+            + next_experiment.disturbance_on(first.port, first.variable, system)
+        ]
+    return []
