@@ -116,6 +116,14 @@ class TestCommand:
         assert "--plan: nothing to settle, the verdict is identified" in capsys.readouterr().out
         assert not path.exists()
 
+    def test_a_plan_for_a_pole_that_falls_needs_the_policy(self, recording, monkeypatch, tmp_path, capsys):
+        monkeypatch.setattr(diagnosis, "diagnose", lambda *given, **asked: a_diagnosis("ambiguous"))
+        path = tmp_path / "plan.csv"
+        assert run(recording, "--plan", path) == 2
+        (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("visadapt:")]
+        assert line.endswith("under every excitation: give the policy of the rig")
+        assert not path.exists()
+
     def test_effects_of_one_s_own(self, recording, stub, tmp_path):
         path = tmp_path / "mine.py"
         path.write_text(OWN_EFFECT.format(name="Mine", effect="test_cli_mine"))

@@ -39,10 +39,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     )
     add("--json", metavar="F", help="write the result here, as visadapt/diagnosis/schema.json says")
     add("--report", metavar="F.html", help="write a page with figures here")
-    plan_help = (
-        "where several effects fit equally well, write here what to add to the commands of --policy (or, without "
-    )
-    plan_help += "one, the commands) of 200 samples that tell them apart"
+    plan_help = "where several effects fit equally well, write here what to add to the commands to tell them apart"
     add("--plan", metavar="F.csv", help=plan_help)
     _add_seed(parser)
     add(

@@ -11,7 +11,7 @@ from torch import nn
 
 from renderers import load_renderer
 from visadapt import diagnosis
-from visadapt.cli.inputs import InputError, import_effects, progress, the_system
+from visadapt.cli.inputs import InputError, checked, import_effects, progress, the_system
 from visadapt.diagnosis import Diagnosis
 from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.report.html import write_report
@@ -67,7 +67,7 @@ def _plan(
     if result.verdict != AMBIGUOUS:
         print(f"--plan: nothing to settle, the verdict is {result.verdict}; {options.plan} was not written")
         return
-    with progress() as report:
+    with progress() as report, checked():
         planned = plan(result, recording, source, policy, seed=options.seed, progress=staged(report, "plan"))
     if planned.settles:
         planned.write(options.plan)

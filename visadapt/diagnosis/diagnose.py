@@ -27,7 +27,7 @@ from visadapt.diagnosis.search.causes import alternatives, causes, ranking, stag
 from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
 from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.model_comparison import compare
-from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.preparation import limited, prepare
 from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
@@ -41,13 +41,8 @@ from visadapt.estimation.profiles import profile_of
 from visadapt.processes import one_thread
 from visadapt.progress import Report, staged
 from visadapt.recordings import Recording
-from visadapt.recordings.thinning import spread
 from visadapt.systems import System
 from visadapt.world import World
-
-MOST_SEARCHES, STRETCH_WINDOWS = 24, 4
-"""Rows of a recording that are used, as a multiple of those that the search uses, and windows of those that follow each
-other: intervals of so many are narrow already, and the time grows with the rows."""
 
 RUNNERS_UP = 2  # Sets after the best for which the share of the gap that they close is computed
 
@@ -112,8 +107,7 @@ def diagnose(
     if policy is not None:
         policy_bound.check(policy, system)
     candidates = searched(effects, system)
-    stretch = STRETCH_WINDOWS * max(profile.window_rows, round(heldout.PREDICTION_TIME / recording.period))
-    used = spread(recording, MOST_SEARCHES * profile.search_rows, stretch)
+    used = limited(recording, system)
     prepared = prepare(used, system, candidates)
     rows = prepared.rows
     search = Search(system, rows.select(prepared.searched), candidates, prepared.source, jobs)

@@ -23,7 +23,7 @@ from torch import Tensor
 from visadapt.diagnosis.policy_bound import StatesToActions, actions
 from visadapt.diagnosis.result import AMBIGUOUS, Diagnosis
 from visadapt.diagnosis.search.fitted_models import FittedModels
-from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.preparation import limited, prepare
 from visadapt.effects import EFFECTS, Effect
 from visadapt.estimation.fit_states import CAREFUL, QUICK, with_effect
 from visadapt.estimation.likelihood import FitState
@@ -193,7 +193,7 @@ def _start(source: FitState, effects: Sequence[Effect]) -> FitState:
 def _noise_and_start(effects: Sequence[Effect], recording: Recording, system: System) -> tuple[Tensor, Tensor]:
     """Standard deviations (n,) of the measurement noise, 0 of what was not measured, and the first state (n,)."""
     classes = tuple(type(effect) for effect in effects)
-    prepared = prepare(recording, system, classes)
+    prepared = prepare(limited(recording, system), system, classes)
     models = FittedModels(system, prepared.rows, classes, prepared.source)
     fits = models.fit([(classes, _start(models.source.fits, effects))], CAREFUL)[0].fits
     noise = torch.zeros(len(system.states), dtype=torch.float64)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from visadapt.effects.base import Effect, Parameter, Reading, Stage
+from visadapt.effects.lossy import Lossy
 from visadapt.systems import CartPole
 
 FAINTEST = 1e-12  # Grey level below which a power is not taken, whose slope has no limit at 0
@@ -221,25 +222,19 @@ class Brightness(CameraEffect):
         return self.column("gain", frame) * frame + self.column("offset", frame), memory
 
 
-class FrameDrop(CameraEffect):
+class FrameDrop(Lossy, CameraEffect):
     """Lost frames: with probability `rate`, the last frame is shown again."""
 
     name = "frame_drop"
     order = 80
-    repeats_readings = True
     systems = (CartPole,)
     equation = "frame_k = frame_(k-1) with probability rate"
-    source = "Schenato et al. (2007), Foundations of control and estimation over lossy networks, section II"
-    table = (Parameter("rate", "1", 0.0, 0.5, 0.0),)
     no_gradient = "whether a frame is lost is a random yes or no"
 
     def apply_to(self, frame: Tensor, memory: Tensor, generator: torch.Generator | None) -> Reading:
-        if generator is None:
-            raise ValueError("frame_drop is random: it needs a torch.Generator")
-        drawn = torch.rand(len(frame), generator=generator, device=generator.device).to(frame)
+        lost = self.lost(frame, generator)
         if memory.numel():  # the first frame of an episode is never lost, as there is none before it
-            lost = (drawn < self.value("rate", frame))[:, None, None]
-            frame = torch.where(lost, memory.unflatten(2, frame.shape[1:])[:, 0], frame)
+            frame = torch.where(lost[:, None, None], memory.unflatten(2, frame.shape[1:])[:, 0], frame)
         return frame, frame.flatten(1)[:, None]
 
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from visadapt.effects.base import Parameter, Reading, Role, SensingEffect, inside
+from visadapt.effects.lossy import Lossy
 from visadapt.systems import CartPole
 
 
@@ -113,7 +114,7 @@ class PositionOffset(SensorOffset):
     sensor = CartPole.index("x")
 
 
-class Dropout(SensingEffect):
+class Dropout(Lossy, SensingEffect):
     """Lost rows: with probability `rate`, a row repeats the whole row before it.
 
     The first row of an episode is never lost, as there is none before it.
@@ -121,10 +122,7 @@ class Dropout(SensingEffect):
 
     name = "dropout"
     order = 60
-    repeats_readings = True
     equation = "measured_k = measured_(k-1) with probability rate"
-    source = "Schenato et al. (2007), Foundations of control and estimation over lossy networks, section II"
-    table = (Parameter("rate", "1", 0.0, 0.5, 0.0),)
     no_gradient = "whether a row is lost is a random yes or no"
 
     def memory(self, state: Tensor, period: float) -> Tensor:
@@ -132,10 +130,7 @@ class Dropout(SensingEffect):
         return torch.cat((state, torch.zeros_like(state[:, :1])), 1)[:, None]
 
     def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
-        if generator is None:
-            raise ValueError("dropout is random: it needs a torch.Generator")
-        drawn = torch.rand(len(measured), generator=generator, device=generator.device).to(measured)
-        lost = (drawn < self.value("rate", measured)) & (memory[:, 0, -1] > 0)
+        lost = self.lost(measured, generator) & (memory[:, 0, -1] > 0)
         out = torch.where(lost[:, None], memory[:, 0, :-1], measured)
         return out, torch.cat((out, torch.ones_like(out[:, :1])), 1)[:, None]
 

@@ -18,6 +18,7 @@ from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.repeated_readings import RepeatedReadings, find_repeats
 from visadapt.estimation.segments import Segments, cut
 from visadapt.recordings import Recording
+from visadapt.recordings.thinning import spread
 from visadapt.systems import System
 
 
@@ -54,6 +55,18 @@ def _filled(values: Tensor, used: Tensor, stamps: Tensor) -> Tensor:
         for column, kept in zip(values.numpy().T, used.numpy().T > 0, strict=True)
     ]
     return torch.tensor(np.stack(columns, 1))
+
+
+MOST_SEARCHES, STRETCH_WINDOWS = 24, 4
+"""Rows of a recording that are used, as a multiple of those that the search uses, and windows of those that follow each
+other: intervals of so many are narrow already, and the time grows with the rows."""
+
+
+def limited(recording: Recording, system: System) -> Recording:
+    """The recording; of one with more rows than a diagnosis looks at, stretches that are spread evenly over it."""
+    profile = profile_of(system)
+    stretch = STRETCH_WINDOWS * max(profile.window_rows, round(PREDICTION_TIME / recording.period))
+    return spread(recording, MOST_SEARCHES * profile.search_rows, stretch)
 
 
 def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effect]] = ()) -> PreparedRecording:
