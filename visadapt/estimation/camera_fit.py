@@ -134,15 +134,15 @@ def fit_camera(
     def shown(scene: Tensor, at: Tensor) -> Tensor:
         return through(scene, made(camera, at))
 
-    def counted(pictures: Tensor, phi: Tensor) -> Tensor:
+    def counted(pictures: Tensor, phi: Tensor, smooth: bool = smooth) -> Tensor:
         """Pictures (N, H, W), 0 where the renderer draws nothing of what is seen."""
         effects = made(camera, phi)
         pictures = pictures * within_frame(effects, frames)
         return smoothed(pictures, effects) if smooth else pictures
 
-    def compared(at: Tensor, phi: Tensor) -> tuple[Tensor, float]:
+    def compared(at: Tensor, phi: Tensor, smooth: bool = smooth) -> tuple[Tensor, float]:
         """What is left of the frames, and its mean square where the renderer draws what they show."""
-        left = counted(frames - shown(scene_at(at), phi), phi)
+        left = counted(frames - shown(scene_at(at), phi), phi, smooth)
         return left, float(left.square().mean() / within_frame(made(camera, phi), frames).mean())
 
     def scene_at(at: Tensor) -> Tensor:
@@ -184,9 +184,8 @@ def fit_camera(
                 break
     noise = white_noise(frames - shown(scene_at(place), values))
     covariance = _covariance(*slopes(place, values), error, noise, (high - low).square() / 12)
-    if smooth:
-        smooth = False
-        error, loss = compared(place, values)
+    if smooth:  # what is left of sharp frames is compared with that of other cameras
+        error, loss = compared(place, values, smooth=False)
     return CameraFit(camera, values, place, loss, covariance, error)
 
 

@@ -38,3 +38,12 @@ def structure(residual: Tensor) -> Tensor:
 def size_of(left: Tensor) -> float:
     """Root mean square of a `structure` (H, W)."""
     return float(left.mean().clamp_min(0).sqrt())
+
+
+def spread(count: int, most: int) -> Tensor:
+    """Which of `count` frames to look at: at most `most`, spread evenly from the first to the last.
+
+    >>> spread(9, 3)
+    tensor([0, 4, 8])
+    """
+    return torch.linspace(0, count - 1, min(most, count)).long()
