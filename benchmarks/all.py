@@ -113,6 +113,13 @@ COMMANDS = (
         work="--work",
         reads=(("--current", "flight"),),
     ),
+    Command(
+        "theorem",
+        "theorem.csv",
+        ("benchmarks.theorem",),
+        10,
+        reads=(("--cartpole", "cartpole_states"), ("--flight", "flight")),
+    ),
     Command("named_effects", "named_effects.csv", ("benchmarks.named_effects",), 30, work="--work"),
     Command("named_control", "named_control.csv", ("benchmarks.named_control",), 60, work="--work"),
     Command("baselines", "baselines.csv", ("benchmarks.baselines",), 40, work="--work", extra="baselines"),

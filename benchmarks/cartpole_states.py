@@ -27,6 +27,7 @@ from experiments.kept_scores import kept_score
 from experiments.result_tables import print_speed, read_rows, speed_row, write_rows
 from visadapt.evaluation import CartPoleScore
 from visadapt.policies import Policy
+from visadapt.setups.base import Setup
 from visadapt.setups.cartpole import cartpole_states
 from visadapt.storage.run_folder import open_run
 from visadapt.targets import SyntheticTarget, constant_force, sine_force
@@ -78,13 +79,19 @@ def main(settings: Settings) -> None:
         print_speed(row)
 
 
-def _scores(settings: Settings, experiment: str, seed: int) -> dict[str, CartPoleScore]:
-    """Scores of one seed of an experiment, by samples; before adaptation by domain."""
-    torch.set_num_threads(1)
+def opened(settings: Settings, experiment: str, seed: int) -> tuple[Setup, Path]:
+    """The setup of an experiment, and a seed's folder; raises RunError where that is another run's."""
     folder = settings.work / ("constant" if experiment == CONSTANT else "sine") / f"seed-{seed}"
     setup = cartpole_states(with_history=experiment == SINE)
     about = {"seed": seed, "episodes": settings.episodes, "plans": PLANS[experiment], **setup.settings.numbers()}
     open_run(folder, about)
+    return setup, folder
+
+
+def _scores(settings: Settings, experiment: str, seed: int) -> dict[str, CartPoleScore]:
+    """Scores of one seed of an experiment, by samples; before adaptation by domain."""
+    torch.set_num_threads(1)
+    setup, folder = opened(settings, experiment, seed)
     target = SyntheticTarget(constant_force(FORCE) if experiment == CONSTANT else sine_force)
     unadapted = setup.pretrain(folder / "policy.safetensors", seed)
 

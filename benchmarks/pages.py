@@ -12,7 +12,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks import tables_adaptation as adaptation, tables_diagnosis as diagnosis, tables_paper as paper
+from benchmarks import (
+    tables_adaptation as adaptation,
+    tables_diagnosis as diagnosis,
+    tables_paper as paper,
+    tables_theorem as theorem,
+)
 from benchmarks.all import COMMANDS, stamps
 from experiments.result_tables import read_rows
 from visadapt.effects.catalogue import catalogue_markdown
@@ -71,6 +76,8 @@ TABLES = {
     "baselines, PPO": Table(paper.ppo_curve, ("baselines",)),
     "paper: table 1, CartPole": Table(paper.table_1_cartpole, ("cartpole_states", "baselines")),
     "paper: table 1, vehicles": Table(paper.table_1_vehicles, ("flight",)),
+    "paper: theorem 1": Table(theorem.theorem_1, ("theorem",)),
+    "paper: Lipschitz constants": Table(theorem.lipschitz, ("theorem",)),
     "paper: table 2": Table(paper.table_2, ("cartpole_pixels",)),
     "paper: table 4": Table(paper.table_4, ("power_loop",)),
     "paper: figures 2 and 6": Table(paper.collection, ("data_collection",)),

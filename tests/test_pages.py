@@ -15,7 +15,7 @@ import tyro
 
 import visadapt.diagnosis
 from benchmarks.all import COMMANDS
-from benchmarks.pages import BLOCK, GENERATED, PAGES, TABLES, filled
+from benchmarks.pages import BLOCK, GENERATED, PAGES, RESULTS_PAGES, TABLES, filled
 from tests.own_systems import page_code
 from visadapt.cli import main
 from visadapt.effects import EFFECTS
@@ -77,9 +77,9 @@ def test_every_effect_of_the_library_is_in_the_catalogue():
 
 
 def test_results_state_command_date_and_commit_of_every_csv():
-    page = text_of("results.md")
+    text = "\n".join(text_of(page) for page in RESULTS_PAGES)
     for command in COMMANDS:
-        lines = [line for line in page.splitlines() if line.startswith(f"- `results/{command.table}`")]
+        lines = [line for line in text.splitlines() if line.startswith(f"- `results/{command.table}`")]
         assert any(f"`{command.shown}`" in line for line in lines), command.name
         assert all(re.search(r"run on [\d-]+ at commit \w+|not run yet", line) for line in lines)
 
