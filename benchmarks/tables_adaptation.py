@@ -198,6 +198,16 @@ def renderers(rows: Rows) -> Lines:
     return [*lines, ["frames from which no angle can be read", *unread]]
 
 
+def action_times(rows: Rows) -> Lines:
+    """PyTorch beside the exported file."""
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    lines = [["one action, one core, ms", *methods, "ratio"]]
+    for experiment in dict.fromkeys(row["experiment"] for row in rows):
+        times = [float(row["mean"]) for row in rows if row["experiment"] == experiment]
+        lines.append([experiment, *(f"{each:.2g}" for each in times), f"{times[0] / times[-1]:.1f}"])
+    return lines
+
+
 def headline(pixels: Rows, states: Rows, flights: Rows, crazyflie: Rows, diagnosed: Rows) -> Lines:
     """Six numbers: what is reached, from how many samples, and how often it fails."""
     lines = [["", "without", "with visadapt", "failed without, with", "target samples", "paper, with"]]

@@ -13,6 +13,7 @@ import pytest
 import torch
 import tyro
 
+import visadapt as va
 import visadapt.diagnosis
 from benchmarks.all import COMMANDS
 from benchmarks.pages import BLOCK, GENERATED, PAGES, TABLES, filled
@@ -189,6 +190,23 @@ def test_the_target_of_the_page_is_made():
     scope: dict = {}
     exec(compile(code, "my_rig.py", "exec"), scope)
     assert isinstance(scope["make"](), Target)
+
+
+def test_the_loop_of_the_page_balances_a_cart_pole(tmp_path):
+    """As `visadapt.run` does, in a simulator of its own."""
+    (code,) = (block for block in PYTHON.findall(text_of("own_rig.md")) if "def control" in block)
+    scope: dict = {}
+    exec(compile(code, "machine.py", "exec"), scope)
+    va.export_policy(tmp_path / "policy.onnx", va.load_policy(va.shipped("cartpole_states")))
+    world = va.World(CartPole())
+    at = [world.start(torch.tensor([[0.2, 0.0, 0.1, 0.0]]))]
+
+    def send(action):
+        at.append(world.step(at[-1], torch.as_tensor(action)[None]))
+
+    scope["control"](tmp_path / "policy.onnx", lambda: at[-1].state[0].numpy(), send, 200)
+    assert len(at) == 201
+    assert float(at[-1].state.abs().max()) < 0.1
 
 
 def test_the_rig_and_the_map_of_the_page_load(tmp_path):
