@@ -1,3 +1,5 @@
+from collections.abc import Callable
+
 import numpy as np
 import onnxruntime
 import pytest
@@ -10,6 +12,8 @@ from visadapt.history import History
 from visadapt.policies import Policy
 from visadapt.setups.onnx_file import ExportError, export_policy
 from visadapt.setups.policy_file import load_source, residual_for
+from visadapt.targets.rollout import SHOWN
+from visadapt.tasks.base import FlightTask
 
 
 class Both(Policy):
@@ -17,14 +21,14 @@ class Both(Policy):
 
     def __init__(self, policy, path):
         super().__init__(policy.n_state, policy.n_action)
-        self.policy, self.shown = policy, policy.shown
+        self.policy = policy
         self.session = onnxruntime.InferenceSession(path)
         self.apart = []
 
     def forward(self, history: History) -> Tensor:
         wanted = self.policy(history)
         seen = history.observations
-        seen = (255 * seen).round().byte() if self.shown == "frame" else seen
+        seen = (255 * seen).round().byte() if self.policy.shown == "frame" else seen
         for row, actions, plan in zip(seen, history.actions, wanted, strict=True):
             (found,) = self.session.run(None, {"observations": row.numpy(), "actions": actions.numpy()})
             self.apart.append(np.abs(found - plan.numpy()).max())
@@ -37,23 +41,30 @@ def with_residual(name):
     quick = va.World(source.system, period=source.period, integrator="euler", substeps=1)
     policy.residual = residual_for(policy, quick, with_history=name == "fixed_wing")
     torch.manual_seed(0)
-    head = policy.residual.network.head
-    nn.init.normal_((head[-1] if isinstance(head, nn.Sequential) else head).weight, std=0.02)
+    for weight in policy.residual.network.head.parameters():
+        nn.init.normal_(weight, std=0.02)
     nn.init.normal_(policy.feedforward.weight, std=0.2)
     return policy, source
+
+
+def fixed_wing_target(source):
+    task = va.setup_for(source).settings.source.task
+    assert isinstance(task, FlightTask)
+    return va.FlightTarget(task, source.system)
 
 
 @pytest.mark.parametrize("name", ["cartpole_states", "cartpole_frames", "fixed_wing"])
 def test_a_machine_runs_the_file_as_torch_runs_the_policy(name, tmp_path):
     policy, source = with_residual(name)
     export_policy(tmp_path / "policy.onnx", policy, source)
-    target = {
+    targets: dict[str, Callable[[], va.Target]] = {
         "cartpole_states": lambda: va.SyntheticTarget(va.constant_force(1.0)),
         "cartpole_frames": lambda: va.SyntheticTarget(va.constant_force(1.0), DrawnCartPole()),
-        "fixed_wing": lambda: va.FlightTarget(va.setup_for(source).settings.source.task, source.system),
-    }[name]()
+        "fixed_wing": lambda: fixed_wing_target(source),
+    }
     both = Both(policy, tmp_path / "policy.onnx")
-    episodes = va.run(target, both, 2, 12, torch.Generator().manual_seed(1))
+    see = SHOWN[policy.shown]
+    episodes = va.run(targets[name](), both, 2, 12, torch.Generator().manual_seed(1), see=see)
     assert all(np.ptp(one.episode.action) > 0.01 for one in episodes)
     assert len(both.apart) == 24
     assert max(both.apart) < 1e-4

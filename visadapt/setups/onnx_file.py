@@ -72,9 +72,9 @@ def export_policy(path: str | Path, policy: Policy, source: World | None = None)
     with _quiet(), torch.no_grad():
         # First the policy itself: what physics computes once and keeps is then a constant of the file.
         plans = [deployed(*example.values()).cpu().numpy() for example in examples]
-        example, names = tuple(examples[0].values()), list(examples[0])
+        names, given = list(examples[0]), tuple(examples[0].values())
         try:
-            model = torch.onnx.export(deployed, example, input_names=names, output_names=["plan"], verbose=False)
+            model = torch.onnx.export(deployed, given, input_names=names, output_names=["plan"], verbose=False)
         except torch.onnx.OnnxExporterError as error:
             why = str(error.__cause__ or error).partition("\n")[0]
             raise ExportError(f"{path} was not written: the policy has no form in ONNX: {why}") from error
