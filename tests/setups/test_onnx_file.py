@@ -41,7 +41,7 @@ def with_residual(name):
     quick = va.World(source.system, period=source.period, integrator="euler", substeps=1)
     policy.residual = residual_for(policy, quick, with_history=name == "fixed_wing")
     torch.manual_seed(0)
-    for weight in policy.residual.network.head.parameters():
+    for weight in policy.residual.network.get_submodule("head").parameters():
         nn.init.normal_(weight, std=0.02)
     nn.init.normal_(policy.feedforward.weight, std=0.2)
     return policy, source
