@@ -176,6 +176,8 @@ def adapt(
     policy.residual, untrained = residual, copy.deepcopy(residual.network.state_dict())
     known, learnt = source, False
     ledger = Ledger(budget)
+    recorded: list[Episode] = []
+    unlabelled: list[Episode] = []
     episodes: list[Episode] = []
     rounds: list[Round] = []
     count = math.ceil(budget / round_samples)
@@ -190,16 +192,22 @@ def adapt(
         new = read_recording(recording)
         for episode in new:
             ledger.count(f"{name}: data", episode.samples)
-        episodes += new if label is None else label(new)
-        windows = Windows.cut(episodes, settings.observations, observe)
-        found = explain(episodes, recording.with_name("diagnosis.json")) if explain else NOT_DIAGNOSED
+        recorded += new
+        unlabelled += new
+        found = explain(recorded, recording.with_name("diagnosis.json")) if explain else NOT_DIAGNOSED
+        windows: Windows | None = None
+        if not found.complete:
+            # Not before: from what a faulty camera shows no states are estimated, and what has names needs none.
+            episodes += unlabelled if label is None else label(unlabelled)
+            unlabelled = []
+            windows = Windows.cut(episodes, settings.observations, observe)
         known = source.with_effects([*source.effects, *found.effects])
         grounded = known.with_effects([*known.effects, residual])
         first, learnt = not (learnt or found.complete), learnt or not found.complete
         if not fitted.exists():
             losses: list[GroundLoss] = []
             states = None
-            if found.complete:
+            if windows is None:
                 residual.network.load_state_dict(untrained)
             else:
                 true = fit_named(known, windows)
@@ -212,7 +220,7 @@ def adapt(
         with fitting(fitted):
             load_weights(grounded, tree["weights"], fitted)
             grounding = [GroundLoss(*each) for each in tree["losses"]]
-            if tree.get("states") is not None:
+            if windows is not None and tree.get("states") is not None:
                 windows = replace(windows, states=tree["states"])
         if number == 0:
             own = policy.state_dict().items()
@@ -223,17 +231,16 @@ def adapt(
         if not tuned.exists():
             partial, progress = tuned.with_suffix(".partial.safetensors"), staged(report, f"{name}: tune")
             no_gap = found.complete and not len(known.effects)
-            world, how = grounded, settings.tuning
-            starts: Windows | None = windows
+            world, how, trust = grounded, settings.tuning, settings.trust
             if found.complete:
                 # What has a name holds in every state, not near the recorded ones alone, as a residual does.
-                world, how, starts = known, replace(settings.tuning, recorded=0.0), None
+                world, how, trust = known, replace(settings.tuning, recorded=0.0), 1.0
             if settings.trust < 1:
                 policy.load_state_dict(start, strict=False)
-            tuning = [] if no_gap else tune(policy, world, observe, how, drawn[2], starts, progress, partial)
-            if settings.trust < 1:
+            tuning = [] if no_gap else tune(policy, world, observe, how, drawn[2], windows, progress, partial)
+            if trust < 1:
                 reached = policy.state_dict()
-                way = {key: torch.lerp(start[key], reached[key], settings.trust) for key in start}
+                way = {key: torch.lerp(start[key], reached[key], trust) for key in start}
                 policy.load_state_dict(way, strict=False)
             save_tree(tuned, {"weights": policy.state_dict(), "losses": tuning})
             partial.unlink(missing_ok=True)
@@ -241,7 +248,7 @@ def adapt(
         with fitting(tuned):
             load_weights(policy, tree["weights"], tuned)
             rounds.append(Round(ledger.used, grounding, tree["losses"], found))
-    return Adapted(policy, ledger, rounds, episodes, folder, known)
+    return Adapted(policy, ledger, rounds, [*episodes, *unlabelled], folder, known)
 
 
 def _weights(folder: Path, number: int) -> Path:

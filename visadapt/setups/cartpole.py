@@ -156,6 +156,7 @@ def cartpole_frames(
         policy=lambda: ImagePolicy(seen.background.sigmoid().detach(), CONTRAST),
         residual=partial(residual_for, perception=perception),
         settings=settings,
+        renderer=seen,
         observe=observe,
         label=label,
         prepare=prepare,

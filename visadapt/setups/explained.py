@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from torch import nn
+
 from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED
 from visadapt.diagnosis.saved import load_effects
@@ -16,18 +18,19 @@ from visadapt.storage.run_folder import read_json, write_json
 from visadapt.world import World
 
 
-def explained(source: World, report: Report | None = None) -> Explain:
-    """Diagnoses episodes with all states; each diagnosis is kept as `visadapt diagnose --json` writes it.
+def explained(source: World, renderer: nn.Module | None = None, report: Report | None = None) -> Explain:
+    """Diagnoses episodes with all states or, given the renderer of their scene, by their frames alone.
 
-    Episodes too short for a diagnosis are left out. Of causes that the episodes cannot tell apart the likeliest is
-    taken. Where no cause is named the whole gap is left to a residual.
+    Each diagnosis is kept as `visadapt diagnose --json` writes it. Episodes too short for one are left out. Of causes
+    that the episodes cannot tell apart the likeliest is taken. Where no cause is named the whole gap is left to a
+    residual.
 
     Raises:
         ValueError: the source has effects, which a diagnosis would have to know.
     """
     if len(source.effects):
         raise ValueError("a diagnosis starts from the bare system: give the source without effects")
-    names = tuple(state.name for state in source.system.states)
+    measured = () if renderer else tuple(state.name for state in source.system.states)
 
     def explain(episodes: Sequence[Episode], path: Path) -> Explanation:
         long = tuple(e for e in episodes if e.time[-1] - e.time[0] >= SHORTEST_EPISODE_S)
@@ -35,8 +38,8 @@ def explained(source: World, report: Report | None = None) -> Explain:
             return Explanation(UNEXPLAINED, [], complete=False)
         if not path.exists():
             sources = tuple(f"episode {number}" for number in range(len(long)))
-            recording = Recording(long, names, source.period, sources)
-            write_json(path, diagnose(recording, source, progress=report).to_json())
+            recording = Recording(long, measured, source.period, sources)
+            write_json(path, diagnose(recording, source, progress=report, renderer=renderer).to_json())
         verdict = read_json(path)["verdict"]
         effects = load_effects(path)[1] if verdict in (IDENTIFIED, AMBIGUOUS) else []
         return Explanation(verdict, effects, verdict != UNEXPLAINED)
