@@ -116,6 +116,13 @@ COMMANDS = (
     ),
     Command("named_effects", "named_effects.csv", ("benchmarks.named_effects",), 30, work="--work"),
     Command("named_control", "named_control.csv", ("benchmarks.named_control",), 60, work="--work"),
+    Command(
+        "named_control_frames",
+        "named_control_frames.csv",
+        ("benchmarks.named_control", "--shown", "frames", "--out", "results/named_control_frames.csv"),
+        60,
+        work="--work",
+    ),
     Command("baselines", "baselines.csv", ("benchmarks.baselines",), 40, work="--work", extra="baselines"),
     Command(
         "rotorpy",

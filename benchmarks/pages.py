@@ -57,6 +57,7 @@ TABLES = {
     "collection": Table(adaptation.collection, ("data_collection",)),
     "named": Table(adaptation.named, ("named_effects",)),
     "named control": Table(adaptation.named_control, ("named_control",)),
+    "named control, frames": Table(adaptation.named_control, ("named_control_frames",)),
     "rotorpy": Table(adaptation.rotorpy, ("rotorpy",)),
     "loops": Table(adaptation.loops, ("power_loop",)),
     "swing": Table(adaptation.swing, ("swing_up",)),

@@ -137,7 +137,7 @@ def named_control(rows: Rows) -> Lines:
     for experiment in dict.fromkeys(row["experiment"] for row in rows):
         own = {row["method"]: _speed_cells(row) for row in rows if row["experiment"] == experiment}
         cells = [f"{own[method][0]} ({own[method][1]})" for method in METHODS]
-        lines.append([experiment.removeprefix("CartPole, states, ").replace("_", " "), *cells])
+        lines.append([experiment.split(", ", 2)[2], *cells])
     return lines
 
 
