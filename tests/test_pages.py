@@ -65,7 +65,7 @@ def test_every_table_is_on_a_page():
 
 def test_a_changed_number_is_put_right(tmp_path):
     page = tmp_path / "README.md"
-    page.write_text(text_of("README.md").replace("0.058", "0.028"))
+    page.write_text(text_of("README.md").replace("± 0.", "± 9.", 1))
     assert filled(page) == text_of("README.md") != page.read_text()
 
 
@@ -206,7 +206,9 @@ def test_the_loop_of_the_page_balances_a_cart_pole(tmp_path):
 
     scope["control"](tmp_path / "policy.onnx", lambda: at[-1].state[0].numpy(), send, 200)
     assert len(at) == 201
-    assert float(at[-1].state.abs().max()) < 0.1
+    _, speed, angle, _ = at[-1].state[0].abs().tolist()
+    assert speed < 0.01
+    assert angle < 0.01
 
 
 def test_the_rig_and_the_map_of_the_page_load(tmp_path):

@@ -123,7 +123,7 @@ def cartpole_frames(
     source = source or World(CartPole())
     seen = renderer if isinstance(renderer, LayeredRenderer) else _load(Path(renderer or shipped("renderer")))
     seen.requires_grad_(False).eval()
-    tracker = Tracker(seen, source)
+    tracker = Tracker(seen, source.with_effects(()))
     settings = settings or _narrowed(from_frames(source), seen)
     perception = settings.perception or PerceptionSettings()
 
