@@ -97,6 +97,8 @@ class Settings:
 
     shown: Literal["states", "frames"] = "states"
     """what the policies are shown"""
+    kinds: tuple[str, ...] = ()
+    """what is hidden, of `HIDDEN` or `HIDDEN_FROM_FRAMES`; without, all of it"""
     seeds: int = 3
     episodes: int = 100
     samples: int = 300
@@ -130,7 +132,8 @@ def main(settings: Settings) -> None:
 
 
 def _hidden(settings: Settings) -> Hidden:
-    return HIDDEN if settings.shown == "states" else HIDDEN_FROM_FRAMES
+    every = HIDDEN if settings.shown == "states" else HIDDEN_FROM_FRAMES
+    return {kind: every[kind] for kind in settings.kinds or every}
 
 
 def _setup(settings: Settings) -> Setup:

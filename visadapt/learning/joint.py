@@ -63,6 +63,8 @@ class SetupSettings:
     """the policy in the source"""
     tuning: TuneSettings
     """the policy in the grounded source, in each round"""
+    named: TuneSettings | None = None
+    """the policy in the source with effects that have names; without it, as `tuning`"""
     ground: GroundSettings = field(default_factory=GroundSettings)
     """the residual"""
     observations: str = "state"
@@ -85,6 +87,12 @@ class SetupSettings:
         if finer is not None:
             finer = replace(finer, iterations=min(iterations, finer.iterations))
         return replace(self, source=replace(self.source, iterations=iterations), refinement=finer)
+
+    @property
+    def with_names(self) -> TuneSettings:
+        """How the policy is tuned where all effects have names: they hold in every state, not in the recorded ones
+        alone, as a residual does."""
+        return replace(self.named or self.tuning, recorded=0.0)
 
     def numbers(self) -> dict[str, Any]:
         """All of them as JSON takes them, for a run's folder; a task's tensors, such as references, are left out."""
@@ -233,8 +241,7 @@ def adapt(
             no_gap = found.complete and not len(known.effects)
             world, how, trust = grounded, settings.tuning, settings.trust
             if found.complete:
-                # What has a name holds in every state, not near the recorded ones alone, as a residual does.
-                world, how, trust = known, replace(settings.tuning, recorded=0.0), 1.0
+                world, how, trust = known, settings.with_names, 1.0
             if settings.trust < 1:
                 policy.load_state_dict(start, strict=False)
             tuning = [] if no_gap else tune(policy, world, observe, how, drawn[2], windows, progress, partial)

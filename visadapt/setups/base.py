@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -97,9 +97,9 @@ class Setup:
             ValueError: a policy of another kind.
         """
         self.check_policy(policy)
-        settings = replace(self.settings.tuning, recorded=0.0)
         generator = torch.Generator().manual_seed(seed)
-        return tune(policy, self.source, self.observe, settings, generator, progress=staged(report, "tune"))
+        args = (policy, self.source, self.observe, self.settings.with_names, generator)
+        return tune(*args, progress=staged(report, "tune"))
 
     def adapt(
         self,

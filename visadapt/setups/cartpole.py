@@ -81,6 +81,7 @@ def from_frames(source: World) -> SetupSettings:
         source=TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500),
         refinement=refinement,
         tuning=replace(refinement, iterations=300, streams=32, recorded=0.8),
+        named=replace(refinement, iterations=1200, streams=32),
         trust=0.5,
         observations="camera",
         perception=PerceptionSettings(),
@@ -183,6 +184,7 @@ def _narrowed(settings: SetupSettings, renderer: LayeredRenderer) -> SetupSettin
         source=narrowed(settings.source),
         refinement=narrowed(settings.refinement) if settings.refinement else None,
         tuning=narrowed(settings.tuning),
+        named=narrowed(settings.named) if settings.named else None,
         perception=perception,
     )
 
