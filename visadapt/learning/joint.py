@@ -36,6 +36,10 @@ EXPLORATION = 0.05  # Standard deviation of white noise on the commands while da
 FILES = ("recording.h5", "residual.safetensors", "policy.safetensors")  # What the stages of a round leave in its folder
 
 
+Experiment = Callable[[Policy, int], Tensor | None]
+"""What to add to a policy's commands over so many steps, (steps, n_action); None where nothing helps."""
+
+
 @dataclass(frozen=True)
 class Explanation:
     """What a diagnosis says of the gap between source and target."""
@@ -45,6 +49,8 @@ class Explanation:
     """the causes that it names, at their found values"""
     complete: bool
     """whether they leave nothing for a residual to learn"""
+    experiment: Experiment | None = field(default=None, compare=False)
+    """where other causes explain as much: designs what tells them apart in the next round"""
 
 
 NOT_DIAGNOSED = Explanation("", (), complete=False)
@@ -168,7 +174,8 @@ def adapt(
         label: estimates the states from the camera's frames; without it, the target's own states are used.
         explorer: the policy that collects the target's data, in place of the one that is tuned (Algorithm 1).
         explain: names the causes of the gap, which then join the source; the residual learns the gap only where they do
-            not explain it, and where there is no gap the policy is left as it is.
+            not explain it, and where there is no gap the policy is left as it is. Where other causes explain as much,
+            the next round's commands have the experiment that tells them apart.
 
     Raises:
         ValueError: an empty round, or a budget that is smaller than a round.
@@ -182,7 +189,7 @@ def adapt(
             f"the budget N = {budget} is smaller than a round of B = {round_samples} samples: raise N or lower B"
         )
     policy.residual, untrained = residual, copy.deepcopy(residual.network.state_dict())
-    known, learnt = source, False
+    known, learnt, found = source, False, NOT_DIAGNOSED
     ledger = Ledger(budget)
     recorded: list[Episode] = []
     unlabelled: list[Episode] = []
@@ -195,8 +202,9 @@ def adapt(
         # Each stage draws from its own stream, so that a resumed run draws the same.
         drawn = [torch.Generator().manual_seed(1_000_000 * seed + 10 * number + stage) for stage in range(3)]
         if not recording.exists():
-            wanted = min(round_samples, ledger.left)
-            write_recording(recording, collect(explorer or policy, target, wanted, settings.longest_episode, drawn[0]))
+            wanted, longest = min(round_samples, ledger.left), settings.longest_episode
+            added = found.experiment(policy, min(wanted, longest)) if found.experiment else None
+            write_recording(recording, collect(explorer or policy, target, wanted, longest, drawn[0], added))
         new = read_recording(recording)
         for episode in new:
             ledger.count(f"{name}: data", episode.samples)
@@ -263,11 +271,14 @@ def _weights(folder: Path, number: int) -> Path:
     return folder / f"round-{number + 1:02d}" / "policy.safetensors"
 
 
-def collect(policy: Policy, target: Target, wanted: int, longest: int, generator: torch.Generator) -> list[Episode]:
-    """Episodes of `wanted` samples under `policy`, one after the other as on a machine."""
+def collect(
+    policy: Policy, target: Target, wanted: int, longest: int, generator: torch.Generator, added: Tensor | None = None
+) -> list[Episode]:
+    """Episodes of `wanted` samples under `policy`, one after the other as on a machine; `added` (steps, n_action) joins
+    the commands of each."""
     episodes: list[Episode] = []
     while wanted > 0:
-        episodes.append(run(target, policy, 1, min(wanted, longest), generator, EXPLORATION)[0].episode)
+        episodes.append(run(target, policy, 1, min(wanted, longest), generator, EXPLORATION, added)[0].episode)
         if episodes[-1].samples == 0:
             raise TargetError(f"{target.name}: the episode is over before its first step")
         wanted -= episodes[-1].samples
