@@ -78,6 +78,7 @@ def _blind(name: str, options: str, minutes: int, table: str = "blind_diagnosis.
 
 COMMANDS = (
     Command("renderers", "renderers.csv", ("benchmarks.renderers",), 1),
+    Command("action_times", "action_times.csv", ("benchmarks.action_times",), 1, extra="onnx"),
     Command("power_loop", "power_loop.csv", ("benchmarks.power_loop",), 10),
     Command("residual_samples", "residual_samples.csv", ("benchmarks.residual_samples",), 5),
     Command("cartpole_states", "cartpole_states.csv", ("benchmarks.cartpole_states",), 10, work="--work"),
@@ -122,6 +123,13 @@ COMMANDS = (
     ),
     Command("named_effects", "named_effects.csv", ("benchmarks.named_effects",), 30, work="--work"),
     Command("named_control", "named_control.csv", ("benchmarks.named_control",), 60, work="--work"),
+    Command(
+        "named_control_frames",
+        "named_control_frames.csv",
+        ("benchmarks.named_control", "--shown", "frames", "--out", "results/named_control_frames.csv"),
+        60,
+        work="--work",
+    ),
     Command("baselines", "baselines.csv", ("benchmarks.baselines",), 40, work="--work", extra="baselines"),
     Command(
         "rotorpy",
@@ -186,7 +194,7 @@ COMMANDS = (
 )
 """In an order in which each finds what it reads."""
 
-INSTALLED_BY = {"baselines": "casadi", "mujoco": "mujoco", "rotorpy": "rotorpy"}
+INSTALLED_BY = {"baselines": "casadi", "mujoco": "mujoco", "onnx": "onnxruntime", "rotorpy": "rotorpy"}
 """Of an extra: the package whose absence says that the extra is not installed."""
 
 

@@ -62,9 +62,11 @@ TABLES = {
     "collection": Table(adaptation.collection, ("data_collection",)),
     "named": Table(adaptation.named, ("named_effects",)),
     "named control": Table(adaptation.named_control, ("named_control",)),
+    "named control, frames": Table(adaptation.named_control, ("named_control_frames",)),
     "rotorpy": Table(adaptation.rotorpy, ("rotorpy",)),
     "loops": Table(adaptation.loops, ("power_loop",)),
     "swing": Table(adaptation.swing, ("swing_up",)),
+    "action times": Table(adaptation.action_times, ("action_times",)),
     "renderers": Table(adaptation.renderers, ("renderers",)),
     "blind": Table(diagnosis.blind, ("blind_hard", "blind_easy", "blind_2029")),
     "blind rigs": Table(diagnosis.blind_rigs, ("blind_rig", "blind_large", "blind_table")),
@@ -83,7 +85,7 @@ TABLES = {
     "paper: figures 2 and 6": Table(paper.collection, ("data_collection",)),
     "paper: figure 3": Table(paper.figure_3, ("baselines",)),
     "paper: figure 8": Table(paper.figure_8, ("residual_samples",)),
-    "paper: A.4": Table(paper.runtime, ("baselines",)),
+    "paper: A.4": Table(paper.runtime, ("baselines", "action_times")),
     "paper: A.5": Table(paper.swing, ("swing_up",)),
 }
 """By name in the pages."""

@@ -137,7 +137,7 @@ def named_control(rows: Rows) -> Lines:
     for experiment in dict.fromkeys(row["experiment"] for row in rows):
         own = {row["method"]: _speed_cells(row) for row in rows if row["experiment"] == experiment}
         cells = [f"{own[method][0]} ({own[method][1]})" for method in METHODS]
-        lines.append([experiment.removeprefix("CartPole, states, ").replace("_", " "), *cells])
+        lines.append([experiment.split(", ", 2)[2], *cells])
     return lines
 
 
@@ -196,6 +196,16 @@ def renderers(rows: Rows) -> Lines:
         )
     unread = [max(row["failed"] for row in rows if row["method"] == kind) for kind in kinds]
     return [*lines, ["frames from which no angle can be read", *unread]]
+
+
+def action_times(rows: Rows) -> Lines:
+    """PyTorch beside the exported file."""
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    lines = [["one action, one core, ms", *methods, "ratio"]]
+    for experiment in dict.fromkeys(row["experiment"] for row in rows):
+        times = [float(row["mean"]) for row in rows if row["experiment"] == experiment]
+        lines.append([experiment, *(f"{each:.2g}" for each in times), f"{times[0] / times[-1]:.1f}"])
+    return lines
 
 
 def headline(pixels: Rows, states: Rows, flights: Rows, crazyflie: Rows, diagnosed: Rows) -> Lines:

@@ -9,10 +9,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from benchmarks.baselines.table import ACTION_TIME, BASELINES
+from benchmarks.action_times import ONNX, RESIDUAL
+from benchmarks.baselines.table import BASELINES
 from benchmarks.cartpole_pixels import EXPERIMENT as PIXELS, OURS as FRAMES_ALONE
 from benchmarks.cartpole_states import CONSTANT, OURS, SINE
 from benchmarks.tables_adaptation import LOOP_SPEEDS, Lines, Rows
+from experiments.result_tables import ACTION_TIME
 
 SPEED = "mean cart speed"
 HEAD = ["paper", "here", "samples: paper, here", "kept up", "seeds", "verdict"]
@@ -207,8 +209,8 @@ def _speed(row: dict[str, str] | None) -> str:
     return f"{float(row['mean']):.3f} ± {float(row['std']):.3f}{lost}"
 
 
-def runtime(baselines: Rows) -> Lines:
-    """A.4: the time of one action, and its ratio to ours."""
+def runtime(baselines: Rows, exported: Rows) -> Lines:
+    """A.4: the time of one action and its ratio to ours, of one run; then those of exported policies, of another."""
     said = {BASELINES["ours"]: 0.27, BASELINES["mpc"]: 5.0, BASELINES["pets"]: 2200.0}
     times = {
         row["method"]: float(row["mean"])
@@ -223,6 +225,12 @@ def runtime(baselines: Rows) -> Lines:
         cells.append("" if paper is None else f"{paper / 0.27:.0f}")
         cells.append("" if here is None or not ours else f"{here / ours:.0f}")
         lines.append([method, *cells, "" if paper is None or here is None else verdict(f"{paper:g}", here)])
+    for row in exported:
+        if row["method"] == ONNX:
+            said_there = "0.27" if row["experiment"] == f"CartPole, states{RESIDUAL}" else ""
+            judged = verdict(said_there, float(row["mean"])) if said_there else ""
+            what = f"ours as ONNX: {row['experiment']}"
+            lines.append([what, said_there, f"{float(row['mean']):.2g}", "", "", judged])
     return lines
 
 

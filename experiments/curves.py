@@ -58,7 +58,7 @@ def plot_losses(path: str | os.PathLike[str], rounds: Sequence[Round]) -> None:
         axes.set_ylabel(name)
     upper.legend(loc="upper right")
     lower.set(xlabel="iterations so far (grounding, then policy, round by round)", xlim=(0, max(start, 1.0)))
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 @matplotlib.rc_context(STYLE)
@@ -107,7 +107,7 @@ def plot_curve(
     axes.set_ylabel("mean cart speed, m/s")
     axes.set_ylim(0, axes.get_ylim()[1] * 1.15)
     axes.legend(loc="best")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def plot_charts(path: str | os.PathLike[str], charts: Sequence[Chart], columns: 
         figure.delaxes(spare)
     keys = {name: line for axes in places for line, name in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(keys.values(), keys, loc="outside lower center", ncols=min(len(keys), 5))
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _draw_chart(axes: Axes, chart: Chart, colours: Mapping[str, str]) -> None:
@@ -195,7 +195,8 @@ def _level(axes: Axes, height: float, label: str, colour: str, style: str = "--"
     axes.axhline(height, color=colour, linewidth=1.2, linestyle=style, label=label, zorder=1)
 
 
-def _save(figure: Figure, path: str | os.PathLike[str]) -> None:
+def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Write a figure as a PNG."""
     FigureCanvasAgg(figure)
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png")

@@ -12,6 +12,9 @@ import numpy as np
 from visadapt.evaluation.scoring import CartPoleScore, FlightScore
 from visadapt.storage.atomic_files import replacing
 
+ACTION_TIME = "CPU time of an action"
+"""A measure, of methods that control."""
+
 
 @dataclass(frozen=True)
 class Row:

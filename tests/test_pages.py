@@ -13,6 +13,7 @@ import pytest
 import torch
 import tyro
 
+import visadapt as va
 import visadapt.diagnosis
 from benchmarks.all import COMMANDS
 from benchmarks.pages import BLOCK, GENERATED, PAGES, RESULTS_PAGES, TABLES, filled
@@ -64,7 +65,7 @@ def test_every_table_is_on_a_page():
 
 def test_a_changed_number_is_put_right(tmp_path):
     page = tmp_path / "README.md"
-    page.write_text(text_of("README.md").replace("0.058", "0.028"))
+    page.write_text(text_of("README.md").replace("± 0.", "± 9.", 1))
     assert filled(page) == text_of("README.md") != page.read_text()
 
 
@@ -189,6 +190,25 @@ def test_the_target_of_the_page_is_made():
     scope: dict = {}
     exec(compile(code, "my_rig.py", "exec"), scope)
     assert isinstance(scope["make"](), Target)
+
+
+def test_the_loop_of_the_page_balances_a_cart_pole(tmp_path):
+    """As `visadapt.run` does, in a simulator of its own."""
+    (code,) = (block for block in PYTHON.findall(text_of("own_rig.md")) if "def control" in block)
+    scope: dict = {}
+    exec(compile(code, "machine.py", "exec"), scope)
+    va.export_policy(tmp_path / "policy.onnx", va.load_policy(va.shipped("cartpole_states")))
+    world = va.World(CartPole())
+    at = [world.start(torch.tensor([[0.2, 0.0, 0.1, 0.0]]))]
+
+    def send(action):
+        at.append(world.step(at[-1], torch.as_tensor(action)[None]))
+
+    scope["control"](tmp_path / "policy.onnx", lambda: at[-1].state[0].numpy(), send, 200)
+    assert len(at) == 201
+    _, speed, angle, _ = at[-1].state[0].abs().tolist()
+    assert speed < 0.01
+    assert angle < 0.01
 
 
 def test_the_rig_and_the_map_of_the_page_load(tmp_path):

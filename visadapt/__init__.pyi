@@ -20,6 +20,7 @@ from .recordings.episode import Episode as Episode, Recording as Recording
 from .recordings.hdf5 import read_recording as read_recording, write_recording as write_recording
 from .recordings.loading import load_recording as load_recording
 from .setups.base import Setup as Setup
+from .setups.onnx_file import export_policy as export_policy
 from .setups.policy_file import load_policy as load_policy, load_source as load_source, save_policy as save_policy
 from .setups.training import adapt as adapt, setup_for as setup_for, train as train
 from .systems.base import System as System, Variable as Variable

@@ -26,7 +26,7 @@ import torch
 from benchmarks.baselines.problem import PROBLEMS, SMOKE, Sizes, score_path, source_policy
 from experiments.curves import Chart, plot_charts
 from experiments.kept_scores import kept_score
-from experiments.result_tables import Row, print_speed, read_rows, speed_row, write_rows
+from experiments.result_tables import ACTION_TIME, Row, print_speed, read_rows, speed_row, write_rows
 from visadapt.evaluation import CartPoleScore
 from visadapt.policies import Policy
 from visadapt.storage.run_folder import open_run, read_json, write_json
@@ -44,7 +44,6 @@ BASELINES = {
     "randomised": "domain randomisation",
 }
 """Module of this room: method in the table"""
-ACTION_TIME = "CPU time of an action"
 ACTION, DONE = "action.json", "done.json"
 SMOKE_STEPS = 10
 """of an episode that is scored, where the numbers mean nothing"""

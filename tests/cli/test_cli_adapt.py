@@ -72,6 +72,19 @@ def test_the_causes_of_the_gap_are_named_and_put_into_the_simulator(here, capsys
     assert "starts from the bare system" in refused(capsys, *again, *SMALL[:-1], "other")
 
 
+def test_from_frames_the_camera_is_named_beside_what_moves(here, capsys):
+    (here / "filmed.py").write_text(
+        "import visadapt as va\nfrom renderers import DrawnCartPole\n\n\ndef target():\n"
+        "    faults = [va.effects.CameraRotation(angle=0.06), va.effects.ActuatorGain(scale=0.6)]\n"
+        "    return va.SyntheticTarget(lambda batch, generator: faults, DrawnCartPole())\n"
+    )
+    policy = ("--policy", va.shipped("cartpole_frames"), "--target", "filmed:target", "--diagnose")
+    assert run("adapt", *policy, "--samples", 60, "--round", 60, "--iterations", 2, "--out", "run") == 0
+    assert "camera_rotation (angle 0.06" in capsys.readouterr().out
+    rotation, gain = sorted(va.load_source("run/policy.safetensors").effects, key=lambda effect: effect.name)[::-1]
+    assert (rotation.name, gain.name) == ("camera_rotation", "actuator_gain")
+
+
 def test_without_a_gap_the_policy_is_left_as_it_is(here, capsys):
     (here / "same.py").write_text("import visadapt as va\n\n\ndef target():\n    return va.SyntheticTarget()\n")
     policy = ("--policy", SHIPPED, "--target", "same:target", "--diagnose")

@@ -31,8 +31,6 @@ def run(options: argparse.Namespace) -> None:
         raise InputError("--diagnose names the effects itself: leave --diagnosis and --effect out")
     if options.diagnose and len(source.effects):
         raise InputError(f"{options.policy}: was made in a world with effects; --diagnose starts from the bare system")
-    if options.diagnose and isinstance(policy, ImagePolicy):
-        raise InputError(f"{options.policy}: is shown frames; --diagnose needs a policy that is shown states")
     if effects:
         source = source.with_effects(effects)
     _check_renderer(options, policy)

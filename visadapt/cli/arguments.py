@@ -159,6 +159,16 @@ def score(parser: argparse.ArgumentParser) -> None:
     add("--effects", metavar="FILE.py", help="a file that defines effects the policy was trained with")
 
 
+def export(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `visadapt export`."""
+    parser.description = (
+        "Writes a policy, with the residual that it reads, as an ONNX file: the last five observations and actions to "
+        "the next ten actions in [-1, 1], of which the first is executed. Its actions are checked against the policy's."
+    )
+    parser.add_argument("policy", metavar="P.safetensors", help="as `visadapt train` or `visadapt adapt` wrote it")
+    parser.add_argument("--out", metavar="P.onnx", required=True, help="the file to write")
+
+
 def _add_system(parser: argparse.ArgumentParser) -> None:
     system_help = f"the source physics: {SYSTEMS_HELP}, {OWN_HELP}"
     parser.add_argument("--system", required=True, type=_system, metavar="NAME", help=system_help)

@@ -20,6 +20,7 @@ COMMANDS = {
     asked.renderer: "learn from a camera's frames how a cart-pole looks in each state",
     asked.train: "train a policy in the simulator, with the effects of a diagnosis if there are any",
     asked.adapt: "adapt a policy to a target from few counted samples of it",
+    asked.export: "write a policy as ONNX, which a machine runs without PyTorch",
     asked.score: "run a policy on a target: its score, failed episodes counted apart, and a film",
 }
 """Each subcommand's arguments, and what it does; it is carried out by `run` of the module of its name."""

@@ -10,7 +10,7 @@ from itertools import chain
 import torch
 
 from visadapt.cli.inputs import InputError, describe, find_factory, own_code
-from visadapt.policies import ImagePolicy, Policy
+from visadapt.policies import Policy
 from visadapt.setups.policy_file import load_policy, load_source
 from visadapt.targets import Target
 from visadapt.targets.env_map import EnvMap
@@ -72,10 +72,10 @@ def _check(path: str, policy: Policy, source: World, target: Target) -> None:
     own = getattr(target, "system", system)
     if own.name != system.name:
         raise InputError(f"{path}: a policy of a {system.name}; {target.name} is a {own.name}")
-    if isinstance(policy, ImagePolicy):
+    if policy.shown == "frame":
         # Only a picture says how large it is. A reset is no step: it is not counted.
         shown = see_frames(target.reset(1, torch.Generator().manual_seed(0)))[0].shape
-        height, width = policy.perception.background.shape
+        height, width = policy.observation_shape
         if shown != (height, width):
             raise InputError(
                 f"{target.name} shows frames of {shown[1]} x {shown[0]} px; {path} was trained on {width} x {height}"

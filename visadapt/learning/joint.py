@@ -36,6 +36,10 @@ EXPLORATION = 0.05  # Standard deviation of white noise on the commands while da
 FILES = ("recording.h5", "residual.safetensors", "policy.safetensors")  # What the stages of a round leave in its folder
 
 
+Experiment = Callable[[Policy, int], Tensor | None]
+"""What to add to a policy's commands over so many steps, (steps, n_action); None where nothing helps."""
+
+
 @dataclass(frozen=True)
 class Explanation:
     """What a diagnosis says of the gap between source and target."""
@@ -45,6 +49,8 @@ class Explanation:
     """the causes that it names, at their found values"""
     complete: bool
     """whether they leave nothing for a residual to learn"""
+    experiment: Experiment | None = field(default=None, compare=False)
+    """where other causes explain as much: designs what tells them apart in the next round"""
 
 
 NOT_DIAGNOSED = Explanation("", (), complete=False)
@@ -63,6 +69,8 @@ class SetupSettings:
     """the policy in the source"""
     tuning: TuneSettings
     """the policy in the grounded source, in each round"""
+    named: TuneSettings | None = None
+    """the policy in the source with effects that have names; without it, as `tuning`"""
     ground: GroundSettings = field(default_factory=GroundSettings)
     """the residual"""
     observations: str = "state"
@@ -85,6 +93,12 @@ class SetupSettings:
         if finer is not None:
             finer = replace(finer, iterations=min(iterations, finer.iterations))
         return replace(self, source=replace(self.source, iterations=iterations), refinement=finer)
+
+    @property
+    def with_names(self) -> TuneSettings:
+        """How the policy is tuned where all effects have names: they hold in every state, not in the recorded ones
+        alone, as a residual does."""
+        return replace(self.named or self.tuning, recorded=0.0)
 
     def numbers(self) -> dict[str, Any]:
         """All of them as JSON takes them, for a run's folder; a task's tensors, such as references, are left out."""
@@ -160,7 +174,8 @@ def adapt(
         label: estimates the states from the camera's frames; without it, the target's own states are used.
         explorer: the policy that collects the target's data, in place of the one that is tuned (Algorithm 1).
         explain: names the causes of the gap, which then join the source; the residual learns the gap only where they do
-            not explain it, and where there is no gap the policy is left as it is.
+            not explain it, and where there is no gap the policy is left as it is. Where other causes explain as much,
+            the next round's commands have the experiment that tells them apart.
 
     Raises:
         ValueError: an empty round, or a budget that is smaller than a round.
@@ -174,8 +189,10 @@ def adapt(
             f"the budget N = {budget} is smaller than a round of B = {round_samples} samples: raise N or lower B"
         )
     policy.residual, untrained = residual, copy.deepcopy(residual.network.state_dict())
-    known, learnt = source, False
+    known, learnt, found = source, False, NOT_DIAGNOSED
     ledger = Ledger(budget)
+    recorded: list[Episode] = []
+    unlabelled: list[Episode] = []
     episodes: list[Episode] = []
     rounds: list[Round] = []
     count = math.ceil(budget / round_samples)
@@ -185,21 +202,28 @@ def adapt(
         # Each stage draws from its own stream, so that a resumed run draws the same.
         drawn = [torch.Generator().manual_seed(1_000_000 * seed + 10 * number + stage) for stage in range(3)]
         if not recording.exists():
-            wanted = min(round_samples, ledger.left)
-            write_recording(recording, collect(explorer or policy, target, wanted, settings.longest_episode, drawn[0]))
+            wanted, longest = min(round_samples, ledger.left), settings.longest_episode
+            added = found.experiment(policy, min(wanted, longest)) if found.experiment else None
+            write_recording(recording, collect(explorer or policy, target, wanted, longest, drawn[0], added))
         new = read_recording(recording)
         for episode in new:
             ledger.count(f"{name}: data", episode.samples)
-        episodes += new if label is None else label(new)
-        windows = Windows.cut(episodes, settings.observations, observe)
-        found = explain(episodes, recording.with_name("diagnosis.json")) if explain else NOT_DIAGNOSED
+        recorded += new
+        unlabelled += new
+        found = explain(recorded, recording.with_name("diagnosis.json")) if explain else NOT_DIAGNOSED
+        windows: Windows | None = None
+        if not found.complete:
+            # Not before: from what a faulty camera shows no states are estimated, and what has names needs none.
+            episodes += unlabelled if label is None else label(unlabelled)
+            unlabelled = []
+            windows = Windows.cut(episodes, settings.observations, observe)
         known = source.with_effects([*source.effects, *found.effects])
         grounded = known.with_effects([*known.effects, residual])
         first, learnt = not (learnt or found.complete), learnt or not found.complete
         if not fitted.exists():
             losses: list[GroundLoss] = []
             states = None
-            if found.complete:
+            if windows is None:
                 residual.network.load_state_dict(untrained)
             else:
                 true = fit_named(known, windows)
@@ -212,7 +236,7 @@ def adapt(
         with fitting(fitted):
             load_weights(grounded, tree["weights"], fitted)
             grounding = [GroundLoss(*each) for each in tree["losses"]]
-            if tree.get("states") is not None:
+            if windows is not None and tree.get("states") is not None:
                 windows = replace(windows, states=tree["states"])
         if number == 0:
             own = policy.state_dict().items()
@@ -223,17 +247,15 @@ def adapt(
         if not tuned.exists():
             partial, progress = tuned.with_suffix(".partial.safetensors"), staged(report, f"{name}: tune")
             no_gap = found.complete and not len(known.effects)
-            world, how = grounded, settings.tuning
-            starts: Windows | None = windows
+            world, how, trust = grounded, settings.tuning, settings.trust
             if found.complete:
-                # What has a name holds in every state, not near the recorded ones alone, as a residual does.
-                world, how, starts = known, replace(settings.tuning, recorded=0.0), None
+                world, how, trust = known, settings.with_names, 1.0
             if settings.trust < 1:
                 policy.load_state_dict(start, strict=False)
-            tuning = [] if no_gap else tune(policy, world, observe, how, drawn[2], starts, progress, partial)
-            if settings.trust < 1:
+            tuning = [] if no_gap else tune(policy, world, observe, how, drawn[2], windows, progress, partial)
+            if trust < 1:
                 reached = policy.state_dict()
-                way = {key: torch.lerp(start[key], reached[key], settings.trust) for key in start}
+                way = {key: torch.lerp(start[key], reached[key], trust) for key in start}
                 policy.load_state_dict(way, strict=False)
             save_tree(tuned, {"weights": policy.state_dict(), "losses": tuning})
             partial.unlink(missing_ok=True)
@@ -241,7 +263,7 @@ def adapt(
         with fitting(tuned):
             load_weights(policy, tree["weights"], tuned)
             rounds.append(Round(ledger.used, grounding, tree["losses"], found))
-    return Adapted(policy, ledger, rounds, episodes, folder, known)
+    return Adapted(policy, ledger, rounds, [*episodes, *unlabelled], folder, known)
 
 
 def _weights(folder: Path, number: int) -> Path:
@@ -249,11 +271,14 @@ def _weights(folder: Path, number: int) -> Path:
     return folder / f"round-{number + 1:02d}" / "policy.safetensors"
 
 
-def collect(policy: Policy, target: Target, wanted: int, longest: int, generator: torch.Generator) -> list[Episode]:
-    """Episodes of `wanted` samples under `policy`, one after the other as on a machine."""
+def collect(
+    policy: Policy, target: Target, wanted: int, longest: int, generator: torch.Generator, added: Tensor | None = None
+) -> list[Episode]:
+    """Episodes of `wanted` samples under `policy`, one after the other as on a machine; `added` (steps, n_action) joins
+    the commands of each."""
     episodes: list[Episode] = []
     while wanted > 0:
-        episodes.append(run(target, policy, 1, min(wanted, longest), generator, EXPLORATION)[0].episode)
+        episodes.append(run(target, policy, 1, min(wanted, longest), generator, EXPLORATION, added)[0].episode)
         if episodes[-1].samples == 0:
             raise TargetError(f"{target.name}: the episode is over before its first step")
         wanted -= episodes[-1].samples

@@ -34,12 +34,20 @@ class Policy(nn.Module):
     shown: ClassVar[str] = "state"
     """what it is shown of a target: state, frame, or state and goal (`targets.rollout.SHOWN`)"""
 
-    def __init__(self, n_state: int, n_action: int, arguments: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self,
+        n_state: int,
+        n_action: int,
+        arguments: Mapping[str, Any] | None = None,
+        observation_shape: tuple[int, ...] | None = None,
+    ) -> None:
         super().__init__()
         self.arguments = dict(arguments or {})
         """the constructor's, from which a file that holds the policy makes it again"""
         self.grounded_in: dict[str, Any] | None = None
         """the world that its residual completes, as `setups.policy_file.describe` puts it; None without a residual"""
+        self.observation_shape = observation_shape or (n_state,)
+        """of what it is shown: one state, state and goal, or frame"""
         self.n_state = n_state
         self.n_action = n_action
         self.feedforward = nn.Linear(n_state, HORIZON * n_action, bias=False)

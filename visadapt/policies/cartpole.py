@@ -24,7 +24,7 @@ class ImagePolicy(Policy):
         # Drawn first, as it was when it was a network of its own: the same seed gives the same weights.
         perception = FrameEncoder(background, contrast, n_action).requires_grad_(False)
         given = {"background": background, "contrast": contrast, "n_state": n_state, "n_action": n_action}
-        super().__init__(n_state, n_action, given)
+        super().__init__(n_state, n_action, given, tuple(background.shape))
         self.perception = perception
         self.encoder = FrameEncoder(background, contrast, n_action)
         self.hidden = nn.Linear(N_FEATURES, 64)

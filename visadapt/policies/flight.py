@@ -23,9 +23,9 @@ class FlightPolicy(Policy):
 
     shown = "state and goal"
 
-    def __init__(self, n_aim: int, arguments: Mapping[str, Any] | None = None) -> None:
-        n_action, width = 4, 128
-        super().__init__(len(RigidBody.states), n_action, arguments)
+    def __init__(self, n_goal: int, n_aim: int, arguments: Mapping[str, Any] | None = None) -> None:
+        n_action, width, n_state = 4, 128, len(RigidBody.states)
+        super().__init__(n_state, n_action, arguments, (n_state + n_goal,))
         self.first = nn.Linear(15 + n_aim + self.n_state, width)
         self.rest = mlp(width, width, width)
         self.out = nn.Linear(width, HORIZON * n_action)
@@ -69,7 +69,7 @@ class FollowPolicy(FlightPolicy):
     """Follows a reference, whose next HORIZON positions and velocities (6 each), `period` s apart, are its goal."""
 
     def __init__(self, period: float) -> None:
-        super().__init__(6 * HORIZON, {"period": period})
+        super().__init__(6 * HORIZON, 6 * HORIZON, {"period": period})
         self.period = period
 
     def aim(self, state: Tensor, goal: Tensor) -> Tensor:
@@ -84,7 +84,7 @@ class ReachPolicy(FlightPolicy):
     """Flies a fixed wing through a point (3), its goal."""
 
     def __init__(self) -> None:
-        super().__init__(10)
+        super().__init__(3, 10)
 
     def aim(self, state: Tensor, goal: Tensor) -> Tensor:
         """The distance, the direction to the point in body axes, and how far the path points aside, near and far."""

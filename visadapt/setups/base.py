@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import torch
+from torch import nn
 
 from visadapt.effects import Residual
 from visadapt.learning.joint import Adapted, Label, SetupSettings, adapt
@@ -48,6 +49,8 @@ class Setup:
     residual: Callable[[Policy, World], Residual]
     """makes a new residual for a policy in the source"""
     settings: SetupSettings
+    renderer: nn.Module | None = None
+    """of the frames that a policy is shown: cart position (B,) in m and pole angle (B,) in rad to frames (B, H, W)"""
     observe: Observe | None = None
     """the camera of simulated states (B, n_state), a learnt renderer; None where sensors' readings are seen"""
     label: Label | None = None
@@ -94,9 +97,9 @@ class Setup:
             ValueError: a policy of another kind.
         """
         self.check_policy(policy)
-        settings = replace(self.settings.tuning, recorded=0.0)
         generator = torch.Generator().manual_seed(seed)
-        return tune(policy, self.source, self.observe, settings, generator, progress=staged(report, "tune"))
+        args = (policy, self.source, self.observe, self.settings.with_names, generator)
+        return tune(*args, progress=staged(report, "tune"))
 
     def adapt(
         self,
@@ -126,9 +129,7 @@ class Setup:
         torch.manual_seed(seed)
         residual = self.residual(policy, self.source)
         args = (policy, residual, self.source, target, self.settings, folder, budget, round_samples, seed)
-        if diagnose and self.observe is not None:
-            raise ValueError("the causes of a gap are named from states: a policy that is shown frames has none")
-        explain = explained(self.source, report) if diagnose else None
+        explain = explained(self.source, self.renderer, report) if diagnose else None
         adapted = adapt(*args, self.observe, self.label, report, explorer, explain)
         policy.grounded_in = describe(adapted.source)
         return adapted

@@ -81,6 +81,7 @@ def from_frames(source: World) -> SetupSettings:
         source=TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500),
         refinement=refinement,
         tuning=replace(refinement, iterations=300, streams=32, recorded=0.8),
+        named=replace(refinement, iterations=1200, streams=32),
         trust=0.5,
         observations="camera",
         perception=PerceptionSettings(),
@@ -123,7 +124,7 @@ def cartpole_frames(
     source = source or World(CartPole())
     seen = renderer if isinstance(renderer, LayeredRenderer) else _load(Path(renderer or shipped("renderer")))
     seen.requires_grad_(False).eval()
-    tracker = Tracker(seen, source)
+    tracker = Tracker(seen, source.with_effects(()))
     settings = settings or _narrowed(from_frames(source), seen)
     perception = settings.perception or PerceptionSettings()
 
@@ -156,6 +157,7 @@ def cartpole_frames(
         policy=lambda: ImagePolicy(seen.background.sigmoid().detach(), CONTRAST),
         residual=partial(residual_for, perception=perception),
         settings=settings,
+        renderer=seen,
         observe=observe,
         label=label,
         prepare=prepare,
@@ -182,6 +184,7 @@ def _narrowed(settings: SetupSettings, renderer: LayeredRenderer) -> SetupSettin
         source=narrowed(settings.source),
         refinement=narrowed(settings.refinement) if settings.refinement else None,
         tuning=narrowed(settings.tuning),
+        named=narrowed(settings.named) if settings.named else None,
         perception=perception,
     )
 

@@ -3,42 +3,65 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
+import torch
+from torch import Tensor, nn
+
 from visadapt.diagnosis import diagnose
+from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED
 from visadapt.diagnosis.saved import load_effects
 from visadapt.learning.joint import Explain, Explanation
-from visadapt.progress import Report
+from visadapt.policies import Policy
+from visadapt.progress import Report, staged
 from visadapt.recordings import Episode, Recording
 from visadapt.recordings.loading import SHORTEST_EPISODE_S
 from visadapt.storage.run_folder import read_json, write_json
 from visadapt.world import World
 
 
-def explained(source: World, report: Report | None = None) -> Explain:
-    """Diagnoses episodes with all states; each diagnosis is kept as `visadapt diagnose --json` writes it.
+def explained(source: World, renderer: nn.Module | None = None, report: Report | None = None) -> Explain:
+    """Diagnoses episodes with all states or, given the renderer of their scene, by their frames alone.
 
-    Episodes too short for a diagnosis are left out. Of causes that the episodes cannot tell apart the likeliest is
-    taken. Where no cause is named the whole gap is left to a residual.
+    Each diagnosis is kept as `visadapt diagnose --json` writes it. Episodes too short for one are left out. Of causes
+    that the episodes cannot tell apart the likeliest is taken, and an experiment designed for the next round; of frames
+    none is. Where no cause is named the whole gap is left to a residual.
 
     Raises:
         ValueError: the source has effects, which a diagnosis would have to know.
     """
     if len(source.effects):
         raise ValueError("a diagnosis starts from the bare system: give the source without effects")
-    names = tuple(state.name for state in source.system.states)
+    measured = () if renderer else tuple(state.name for state in source.system.states)
 
     def explain(episodes: Sequence[Episode], path: Path) -> Explanation:
         long = tuple(e for e in episodes if e.time[-1] - e.time[0] >= SHORTEST_EPISODE_S)
         if not long:
             return Explanation(UNEXPLAINED, [], complete=False)
+        sources = tuple(f"episode {number}" for number in range(len(long)))
+        recording = Recording(long, measured, source.period, sources)
+        diagnosed = partial(diagnose, recording, source, progress=report, renderer=renderer)
+        found = None
         if not path.exists():
-            sources = tuple(f"episode {number}" for number in range(len(long)))
-            recording = Recording(long, names, source.period, sources)
-            write_json(path, diagnose(recording, source, progress=report).to_json())
+            found = diagnosed()
+            write_json(path, found.to_json())
         verdict = read_json(path)["verdict"]
         effects = load_effects(path)[1] if verdict in (IDENTIFIED, AMBIGUOUS) else []
-        return Explanation(verdict, effects, verdict != UNEXPLAINED)
+
+        def experiment(policy: Policy, steps: int) -> Tensor | None:
+            """The plan that settles it, kept beside the diagnosis; None where none does."""
+            try:
+                planned = plan(found or diagnosed(), recording, source, policy, steps, progress=staged(report, "plan"))
+            except ValueError:  # every excitation leaves the ranges, or the causes cannot be exchanged
+                return None
+            if not planned.settles:
+                return None
+            planned.write(path.with_name("plan.csv"))
+            return torch.as_tensor(planned.added)
+
+        settles = experiment if verdict == AMBIGUOUS and renderer is None else None
+        return Explanation(verdict, effects, verdict != UNEXPLAINED, settles)
 
     return explain

@@ -182,7 +182,8 @@ def adapt(
     if iterations is not None:
         own = setup.settings
         ground = replace(own.ground, steps=min(own.ground.steps, iterations))
-        settings = replace(own, tuning=replace(own.tuning, iterations=iterations), ground=ground)
+        named = replace(own.named or own.tuning, iterations=iterations)
+        settings = replace(own, tuning=replace(own.tuning, iterations=iterations), named=named, ground=ground)
         setup = replace(setup, settings=settings)
     policy = copy.deepcopy(policy)
     if target is None:

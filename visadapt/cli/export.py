@@ -1,0 +1,16 @@
+"""visadapt export: a policy as ONNX, and what its inputs and output are."""
+
+from __future__ import annotations
+
+import argparse
+
+from visadapt.setups.onnx_file import about, export_policy
+from visadapt.setups.policy_file import load_policy, load_source
+
+
+def run(options: argparse.Namespace) -> None:
+    """Write the file, print its metadata."""
+    policy, source = load_policy(options.policy), load_source(options.policy)
+    export_policy(options.out, policy, source)
+    for name, value in about(policy, source).items():
+        print(f"{name:13} {value}")
