@@ -1,0 +1,44 @@
+import numpy as np
+import torch
+
+import visadapt as va
+from visadapt.diagnosis import planning
+from visadapt.effects import EFFECTS
+from visadapt.recordings import read_recording
+from visadapt.storage.run_folder import read_json
+
+NOISE = torch.tensor([0.005, 0.02, 0.009, 0.05])
+
+
+class ReadingNoise(va.SensingEffect):
+    """White noise on all readings, as sensors have it."""
+
+    name = "reading_noise"
+    table = ()
+
+    def apply_to(self, measured, memory, period, generator):
+        return measured + NOISE.to(measured) * torch.randn(measured.shape, generator=generator).to(measured), memory
+
+
+EFFECTS.pop("reading_noise")  # no cause that a diagnosis may name
+
+
+def rivals(folder):
+    """What each cause that a diagnosis named cannot be told from."""
+    causes = read_json(folder / "diagnosis.json")["causes"]
+    return {cause["effect"]: cause["indistinguishable_from"] for cause in causes}
+
+
+def test_what_two_causes_explain_is_settled_by_an_experiment_in_the_next_round(tmp_path, monkeypatch):
+    monkeypatch.setattr(planning, "FREQUENCIES", (0.8,))  # one of six, for the time it takes
+    effects = [va.effects.ViscousFriction(coefficient=0.5), ReadingNoise()]
+    target = va.SyntheticTarget(lambda batch, generator: effects)
+    policy, source = va.load_policy(va.shipped("cartpole_states")), va.World(va.CartPole())
+    run = va.adapt(policy, source, target, 300, tmp_path, round_samples=150, iterations=1, diagnose=True)
+    assert run.rounds[0].explanation.verdict == "ambiguous"
+    assert rivals(tmp_path / "round-01")["viscous_friction"] == ["stribeck_friction"]
+    assert "stribeck_friction" not in rivals(tmp_path / "round-02")["viscous_friction"]
+    added = np.loadtxt(tmp_path / "round-01" / "plan.csv", delimiter=",", skiprows=1)[:, 1]
+    (episode,) = read_recording(tmp_path / "round-02" / "recording.h5")
+    assert np.corrcoef(added, episode.action[:-1, 0])[0, 1] > 0.5
+    assert run.ledger.used == 300
