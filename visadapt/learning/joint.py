@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from visadapt.learning.perception import PerceptionSettings
 from visadapt.learning.policy import TuneSettings, initialise_feedforward, tune
 from visadapt.learning.windows import Observe, Windows
 from visadapt.policies import Policy
-from visadapt.progress import Report, staged
+from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, read_recording, write_recording
 from visadapt.storage.checkpoints import fitting, load_tree, load_weights, save_tree
 from visadapt.targets import Target, TargetError
@@ -218,52 +218,92 @@ def adapt(
             unlabelled = []
             windows = Windows.cut(episodes, settings.observations, observe)
         known = source.with_effects([*source.effects, *found.effects])
-        grounded = known.with_effects([*known.effects, residual])
         first, learnt = not (learnt or found.complete), learnt or not found.complete
-        if not fitted.exists():
-            losses: list[GroundLoss] = []
-            states = None
-            if windows is None:
-                residual.network.load_state_dict(untrained)
-            else:
-                true = fit_named(known, windows)
-                if first:
-                    rescale(residual, known, true, settings.ground.negligible)
-                losses = ground(residual, known, true, settings.ground, drawn[1], staged(report, f"{name}: ground"))
-                states = None if true is windows else true.states
-            save_tree(fitted, {"weights": grounded.state_dict(), "losses": losses, "states": states})
-        tree = load_tree(fitted)
-        with fitting(fitted):
-            load_weights(grounded, tree["weights"], fitted)
-            grounding = [GroundLoss(*each) for each in tree["losses"]]
-            if windows is not None and tree.get("states") is not None:
-                windows = replace(windows, states=tree["states"])
+        if found.complete:
+            residual.network.load_state_dict(untrained)
+        grounded = known.with_effects([*known.effects, residual])
+        progress = staged(report, f"{name}: ground")
+        grounding, windows = _ground(fitted, grounded, known, residual, windows, first, settings, drawn[1], progress)
         if number == 0:
             own = policy.state_dict().items()
             start = {key: value.clone() for key, value in own if not key.startswith("residual.")}
         if first and settings.feedforward:
             initialise_feedforward(policy, source, residual.scale)
             start["feedforward.weight"] = policy.feedforward.weight.detach().clone()
-        if not tuned.exists():
-            partial, progress = tuned.with_suffix(".partial.safetensors"), staged(report, f"{name}: tune")
-            no_gap = found.complete and not len(known.effects)
-            world, how, trust = grounded, settings.tuning, settings.trust
-            if found.complete:
-                world, how, trust = known, settings.with_names, 1.0
-            if settings.trust < 1:
-                policy.load_state_dict(start, strict=False)
-            tuning = [] if no_gap else tune(policy, world, observe, how, drawn[2], windows, progress, partial)
-            if trust < 1:
-                reached = policy.state_dict()
-                way = {key: torch.lerp(start[key], reached[key], trust) for key in start}
-                policy.load_state_dict(way, strict=False)
-            save_tree(tuned, {"weights": policy.state_dict(), "losses": tuning})
-            partial.unlink(missing_ok=True)
-        tree = load_tree(tuned)
-        with fitting(tuned):
-            load_weights(policy, tree["weights"], tuned)
-            rounds.append(Round(ledger.used, grounding, tree["losses"], found))
+        if settings.trust < 1:
+            policy.load_state_dict(start, strict=False)
+        world, how, trust = grounded, settings.tuning, settings.trust
+        if found.complete:
+            # Without a gap there is nothing to tune for.
+            how = settings.with_names if len(known.effects) else replace(settings.with_names, iterations=0)
+            world, trust = known, 1.0
+        progress = staged(report, f"{name}: tune")
+        tuning = _tune(tuned, policy, start, trust, world, observe, how, drawn[2], windows, progress)
+        rounds.append(Round(ledger.used, grounding, tuning, found))
     return Adapted(policy, ledger, rounds, [*episodes, *unlabelled], folder, known)
+
+
+def _ground(
+    path: Path,
+    grounded: World,
+    known: World,
+    residual: Residual,
+    windows: Windows | None,
+    first: bool,
+    settings: SetupSettings,
+    generator: torch.Generator,
+    progress: Progress | None,
+) -> tuple[list[GroundLoss], Windows | None]:
+    """Fit the named effects and the residual of `grounded` to the windows, or read what is in `path`.
+
+    Returns the residual's losses, and the windows with the true states behind faulty sensors. Without windows nothing
+    is fitted.
+    """
+    if not path.exists():
+        losses: list[GroundLoss] = []
+        states = None
+        if windows is not None:
+            true = fit_named(known, windows)
+            if first:
+                rescale(residual, known, true, settings.ground.negligible)
+            losses = ground(residual, known, true, settings.ground, generator, progress)
+            states = None if true is windows else true.states
+        save_tree(path, {"weights": grounded.state_dict(), "losses": losses, "states": states})
+    tree = load_tree(path)
+    with fitting(path):
+        load_weights(grounded, tree["weights"], path)
+        if windows is not None and tree.get("states") is not None:
+            windows = replace(windows, states=tree["states"])
+        return [GroundLoss(*each) for each in tree["losses"]], windows
+
+
+def _tune(
+    path: Path,
+    policy: Policy,
+    start: Mapping[str, Tensor],
+    trust: float,
+    world: World,
+    observe: Observe | None,
+    settings: TuneSettings,
+    generator: torch.Generator,
+    windows: Windows | None,
+    progress: Progress | None,
+) -> list[float]:
+    """Tune the policy in `world`, then go the share `trust` of the way there from `start`, or read what is in `path`;
+    returns the losses."""
+    if not path.exists():
+        partial = path.with_suffix(".partial.safetensors")
+        losses = tune(policy, world, observe, settings, generator, windows, progress, partial)
+        if trust < 1:
+            reached = policy.state_dict()
+            way = {key: torch.lerp(start[key], reached[key], trust) for key in start}
+            policy.load_state_dict(way, strict=False)
+        save_tree(path, {"weights": policy.state_dict(), "losses": losses})
+        partial.unlink(missing_ok=True)
+    tree = load_tree(path)
+    with fitting(path):
+        load_weights(policy, tree["weights"], path)
+        return list(tree["losses"])
 
 
 def _weights(folder: Path, number: int) -> Path:
