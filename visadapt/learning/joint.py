@@ -69,8 +69,6 @@ class SetupSettings:
     """the policy in the source"""
     tuning: TuneSettings
     """the policy in the grounded source, in each round"""
-    named: TuneSettings | None = None
-    """the policy in the source with effects that have names; without it, as `tuning`"""
     ground: GroundSettings = field(default_factory=GroundSettings)
     """the residual"""
     observations: str = "state"
@@ -84,6 +82,8 @@ class SetupSettings:
     begins anew; 1: all of it, from those of the round before. The imagined target is not the real one"""
     refinement: TuneSettings | None = None
     """the policy in the source once more, after `source`: near rest, say, where what counts is decided"""
+    named: TuneSettings | None = None
+    """the policy in the source with effects that have names; without it, as `tuning`"""
     perception: PerceptionSettings | None = None
     """how an encoder learns to see, where the policy is shown frames"""
 
