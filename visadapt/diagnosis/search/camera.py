@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -129,20 +129,43 @@ def find_camera(
         alike[chosen] = tuple(
             kind.name for kind, fit in tried.items() if kind is not chosen and fit.misfit < (1 + ALIKE) * best.misfit
         )
+
+    def without_each(best: CameraFit) -> dict[type[CameraEffect], CameraFit]:
+        rests = {kind: _without(best, {kind}) for kind in best.camera}
+        return {kind: fitted(*rest, best.place) if rest[0] else unchanged for kind, rest in rests.items()}
+
     while True:
-        without = {}
-        for kind in best.camera:
-            rest = tuple(other for other in best.camera if other is not kind)
-            keep = torch.cat([torch.full((len(k.table),), k is not kind) for k in best.camera])
-            without[kind] = fitted(rest, best.values[keep], best.place) if rest else unchanged
+        without = without_each(best)
         idle = [kind for kind, fit in without.items() if best.misfit > (1 - MIN_CLOSED) * fit.misfit]
         if not idle:
             break
         best = without[idle[0]]
     if best.camera:
         best = fit_camera(renderer, shown, best.camera, best.values, best.place, fixed, smooth=True)
+        # A picture that is turned is softer than what is drawn, which a move by a part of a pixel seems to explain.
+        still = _still(best, fixed)
+        if 0 < len(still) < len(best.camera):
+            best = fit_camera(renderer, shown, *_without(best, still), best.place, fixed, smooth=True)
+            without = without_each(best)
     alone = {kind: alone.get(kind, unchanged) for kind in best.camera}
     return CameraFindings(unchanged, best, alone, without, alike, fixed)
+
+
+def _without(fit: CameraFit, left_out: Collection[type[CameraEffect]]) -> tuple[Camera, Tensor]:
+    """The other effects of a fit, and their values."""
+    keep = torch.cat([torch.full((len(kind.table),), kind not in left_out) for kind in fit.camera])
+    return tuple(kind for kind in fit.camera if kind not in left_out), fit.values[keep]
+
+
+def _still(fit: CameraFit, fixed: frozenset[str]) -> set[type[CameraEffect]]:
+    """The effects that do nothing at some values within the 90 % intervals of all their parameters."""
+    parameters = [(kind, p) for kind in fit.camera for p in kind.table]
+    away = {
+        kind
+        for (kind, p), value, variance in zip(parameters, fit.values, fit.covariance.diagonal(), strict=True)
+        if p.name not in fixed and (p.neutral is None or (value - p.neutral).abs() > Z_90 * variance.sqrt())
+    }
+    return set(fit.camera) - away
 
 
 def _start(
