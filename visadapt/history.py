@@ -31,6 +31,11 @@ class History(Batch):
         repeated = observation[:, None].expand(-1, LENGTH, *observation.shape[1:])
         return cls(repeated.clone(), observation.new_zeros(len(observation), LENGTH, n_action))
 
+    @property
+    def begins(self) -> Tensor:
+        """(B,) whether an episode begins: before it all actions are zero, which is nobody's command."""
+        return ~self.actions.flatten(1).any(1)
+
     def acting(self, action: Tensor) -> History:
         """The same observations, with `action` (B, n_action) as the last action."""
         return History(self.observations, torch.cat((self.actions[:, 1:], action[:, None]), 1))

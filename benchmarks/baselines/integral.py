@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage, begins, drawn, source_policy
+from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage, drawn, source_policy
 from visadapt.evaluation import score
 from visadapt.history import History
 from visadapt.policies import Policy
@@ -39,7 +39,7 @@ class IntegralFeedback(Policy):
     def act(self, history: History) -> Tensor:
         velocity = history.observations[:, -1, 1:2]
         before = self.command if len(self.command) == len(velocity) else torch.zeros_like(velocity)
-        before = torch.where(begins(history)[:, None], 0.0, before)
+        before = torch.where(history.begins[:, None], 0.0, before)
         self.command = (before - self.gain * self.period * velocity).clamp(-LARGEST, LARGEST)
         return (self.policy.act(history) + self.command).clamp(-1, 1)
 

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from benchmarks.baselines.problem import Problem, Sizes, Stage, begins, grounded
+from benchmarks.baselines.problem import Problem, Sizes, Stage, grounded
 from visadapt.effects import Residual
 from visadapt.history import HORIZON, LENGTH, History
 from visadapt.policies import Policy
@@ -63,7 +63,7 @@ class ModelPredictive(Policy):
     def act(self, history: History) -> Tensor:
         if len(self.warm) != len(history.actions):
             self.warm = [None] * len(history.actions)
-        first = begins(history).tolist()
+        first = history.begins.tolist()
         past = torch.cat((history.observations.flatten(1), history.actions[:, 1:].flatten(1)), 1).double().numpy()
         commands = [self._solve(b, past[b], fresh) for b, fresh in enumerate(first)]
         return torch.tensor(commands, dtype=history.actions.dtype)[:, None]

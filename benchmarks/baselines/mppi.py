@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from benchmarks.baselines.problem import Problem, Sizes, Stage, begins, grounded
+from benchmarks.baselines.problem import Problem, Sizes, Stage, grounded
 from visadapt.effects import Residual
 from visadapt.history import HORIZON, History
 from visadapt.learning.policy import imagine
@@ -55,7 +55,7 @@ def carried(last: Tensor, history: History) -> Tensor:
     if len(last) != len(history.actions):
         return torch.zeros(len(history.actions), last.shape[1], width)
     onward = torch.cat((last[:, 1:], last[:, -1:]), 1)
-    return torch.where(begins(history)[:, None, None], 0.0, onward)
+    return torch.where(history.begins[:, None, None], 0.0, onward)
 
 
 def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:

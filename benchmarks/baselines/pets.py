@@ -11,7 +11,8 @@ NOISE (0.1, 0.3) and PLANS (40, 64) were chosen in the source; the fits' updates
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,13 +20,10 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks.baselines.mppi import carried
-from benchmarks.baselines.problem import Problem, Sizes, Stage
+from benchmarks.baselines.problem import Problem, Sizes, Stage, in_rounds
 from visadapt.history import HORIZON, LENGTH, History
-from visadapt.learning.joint import collect
-from visadapt.learning.ledger import Ledger
 from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
-from visadapt.recordings import Episode
 from visadapt.tasks.balance import PAPER_CARTPOLE
 from visadapt.world import World
 
@@ -158,22 +156,17 @@ def source_ensemble(world: World, with_history: bool, updates: int, seed: int) -
 
 def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:
     """The ensemble of the source, then fitted to all samples of the target so far, round after round."""
-    setup = problem.setup(sizes)
-    source = source_ensemble(setup.source, problem.with_history, sizes.updates, seed)
-    yield Stage("source", 0, EnsemblePlanner(source, problem.with_history))
-    yield Stage("target", 0, EnsemblePlanner(source, problem.with_history))
-    for budget, round_samples in sizes.plans:
-        ledger, ensemble, episodes = Ledger(budget), source, list[Episode]()
-        generator = torch.Generator().manual_seed(seed)
-        while ledger.left:
-            planner = EnsemblePlanner(ensemble, problem.with_history)
-            wanted, longest = min(round_samples, ledger.left), setup.settings.longest_episode
-            episodes += (new := collect(planner, problem.target(), wanted, longest, generator))
-            ledger.count("data", sum(episode.samples for episode in new))
-            windows = Windows.cut(episodes, "state")
-            history = windows.history(torch.arange(len(windows))).acting(windows.action)
-            ensemble = copy.deepcopy(source)
-            seen = model_inputs(history, problem.with_history)
-            ensemble.fit(seen, windows.next_state - windows.state, TARGET_UPDATES, TARGET_RATE, generator)
-            if ledger.used in sizes.scored:
-                yield Stage("adapted", ledger.used, EnsemblePlanner(ensemble, problem.with_history))
+    world, with_history = problem.setup(sizes).source, problem.with_history
+    source = source_ensemble(world, with_history, sizes.updates, seed)
+    unfitted = partial(EnsemblePlanner, source, with_history)
+    yield Stage("source", 0, unfitted())
+    yield Stage("target", 0, unfitted())
+
+    def learn(windows: Windows, generator: torch.Generator) -> Callable[[], Policy]:
+        history = windows.history(torch.arange(len(windows))).acting(windows.action)
+        ensemble = copy.deepcopy(source)
+        seen = model_inputs(history, with_history)
+        ensemble.fit(seen, windows.next_state - windows.state, TARGET_UPDATES, TARGET_RATE, generator)
+        return partial(EnsemblePlanner, ensemble, with_history)
+
+    yield from in_rounds(problem, sizes, seed, lambda: (unfitted, learn))

@@ -9,15 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from benchmarks.cartpole_states import CONSTANT, FORCE, SINE
 from visadapt.effects import ActuatorDelay, ConstantForce, CoulombFriction, Effect, PeriodicForce, Residual
 from visadapt.effects.base import Role
-from visadapt.history import History
 from visadapt.learning.grounding import ground, rescale
 from visadapt.learning.joint import collect
 from visadapt.learning.ledger import Ledger
@@ -114,6 +113,31 @@ def score_path(folder: Path, stage: Stage) -> Path:
     return folder / f"score-{stage.domain}-{stage.samples}.json"
 
 
+Learn = Callable[[Windows, torch.Generator], Callable[[], Policy]]
+"""All samples of the target so far to what makes the policy that has learnt from them, anew each time."""
+
+
+def in_rounds(
+    problem: Problem, sizes: Sizes, seed: int, begin: Callable[[], tuple[Callable[[], Policy], Learn]]
+) -> Iterator[Stage]:
+    """A baseline that collects its samples itself, round after round, and learns from all of them.
+
+    `begin` gives, for each budget, what makes the policy of the first round, and how it learns.
+    """
+    longest = problem.setup(sizes).settings.longest_episode
+    for budget, round_samples in sizes.plans:
+        ledger, generator = Ledger(budget), torch.Generator().manual_seed(seed)
+        made, learn = begin()
+        episodes: list[Episode] = []
+        while ledger.left:
+            new = collect(made(), problem.target(), min(round_samples, ledger.left), longest, generator)
+            ledger.count("data", sum(episode.samples for episode in new))
+            episodes += new
+            made = learn(Windows.cut(episodes, "state"), generator)
+            if ledger.used in sizes.scored:
+                yield Stage("adapted", ledger.used, made())
+
+
 def grounded(
     problem: Problem, sizes: Sizes, seed: int, planner: Callable[[Residual | None], Policy]
 ) -> Iterator[Stage]:
@@ -121,24 +145,23 @@ def grounded(
     yield Stage("source", 0, planner(None))
     yield Stage("target", 0, planner(None))
     setup = problem.setup(sizes)
-    for budget, round_samples in sizes.plans:
-        ledger = Ledger(budget)
-        generator = torch.Generator().manual_seed(seed)
+
+    def begin() -> tuple[Callable[[], Policy], Learn]:
         torch.manual_seed(seed)
         residual = setup.residual(setup.policy(), setup.source)
-        episodes: list[Episode] = []
-        while ledger.left:
-            collector = planner(residual if episodes else None)
-            wanted, longest = min(round_samples, ledger.left), setup.settings.longest_episode
-            new = collect(collector, problem.target(), wanted, longest, generator)
-            ledger.count("data", sum(episode.samples for episode in new))
-            windows = Windows.cut(episodes + new, "state")
-            if not episodes:
+        scaled = False
+
+        def learn(windows: Windows, generator: torch.Generator) -> Callable[[], Policy]:
+            nonlocal scaled
+            if not scaled:
                 rescale(residual, setup.source, windows, setup.settings.ground.negligible)
-            episodes += new
+                scaled = True
             ground(residual, setup.source, windows, setup.settings.ground, generator)
-            if ledger.used in sizes.scored:
-                yield Stage("adapted", ledger.used, planner(residual))
+            return partial(planner, residual)
+
+        return partial(planner, None), learn
+
+    yield from in_rounds(problem, sizes, seed, begin)
 
 
 def drawn(kind: type[Effect], batch: int, generator: torch.Generator) -> Effect:
@@ -152,11 +175,6 @@ def drawn(kind: type[Effect], batch: int, generator: torch.Generator) -> Effect:
         else:
             values[parameter.name] = low + (high - low) * share
     return kind(**values)
-
-
-def begins(history: History) -> Tensor:
-    """(B,) whether an episode begins: before it all commands are zero."""
-    return ~history.actions.flatten(1).any(1)
 
 
 def source_policy(problem: Problem, sizes: Sizes, work: Path, seed: int) -> Policy:

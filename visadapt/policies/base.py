@@ -101,9 +101,8 @@ class AutoregressivePolicy(Policy):
         self.keep = keep
 
     def forward(self, history: History) -> Tensor:
-        # Before an episode all actions are zero, which is nobody's command: it begins at rest.
-        begun = history.actions.flatten(1).any(1, keepdim=True)
-        away = torch.where(begun, history.actions[:, -1] - self.rest, 0.0)
+        # An episode begins at rest.
+        away = torch.where(history.begins[:, None], 0.0, history.actions[:, -1] - self.rest)
         lasting = self.keep ** torch.arange(1, HORIZON + 1).to(away)
         return self.rest + away[:, None] * lasting[:, None]
 
