@@ -24,7 +24,7 @@ from experiments.result_tables import print_speed, speed_row, write_rows
 from renderers import DrawnCartPole
 from visadapt.effects import ActuatorDelay, ActuatorGain, ConstantForce, CoulombFriction
 from visadapt.evaluation import CartPoleScore
-from visadapt.learning.joint import SetupSettings
+from visadapt.learning.setup_settings import SetupSettings
 from visadapt.setups.cartpole import cartpole_frames
 from visadapt.storage.run_folder import open_run
 from visadapt.systems import CartPole

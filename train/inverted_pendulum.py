@@ -37,9 +37,9 @@ from renderers.training import fit
 from visadapt.evaluation import CartPoleScore
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.learning.grounding import gap
-from visadapt.learning.joint import SetupSettings
 from visadapt.learning.perception import Paths, PerceptionSettings
 from visadapt.learning.policy import TuneSettings
+from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
 from visadapt.progress import Report, reporting, staged

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from datasets.blind.camera_faults import CAMERA, FOREIGN_IN_FILMS, NOISE, clean, recorded, with_losses
 from datasets.blind.drafts import POLE_REACH, RECORDING_SUBSTEPS, draw_case
-from datasets.blind.kinds import LATER, NAMED, Kind, Shape
+from datasets.blind.kinds import LATER, NAMED, Kind, Shape, evenly_mixed
 from datasets.blind.plant import PERIOD, Array
 from datasets.blind.rigs import Rig
 from datasets.blind.scene import LOOKS
@@ -100,8 +100,7 @@ def make(settings: Settings) -> list[FilmDraft]:
         raise ValueError(f"count is {settings.count}, must be at least 1")
     seeds = np.random.SeedSequence([settings.seed, list(LOOKS).index(settings.look)]).spawn(settings.count + 1)
     # Shares as exact as the count allows, in random order.
-    places = (np.arange(settings.count) + 0.5) / settings.count
-    mixtures = np.array(list(MIX))[np.searchsorted(np.cumsum(list(MIX.values())), places)]
+    mixtures = evenly_mixed(MIX, settings.count)
     drafts = [
         FilmDraft(np.random.default_rng(seed), str(mixture), number % 2 == 0, {})
         for number, (seed, mixture) in enumerate(zip(seeds[1:], mixtures, strict=True))

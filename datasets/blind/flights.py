@@ -24,7 +24,7 @@ import tyro
 from datasets.blind.flight_control import CONTROLLERS, PERIODS, Chain, Flyers, starts
 from datasets.blind.flight_kinds import FOREIGN, NEUTRAL, named
 from datasets.blind.flight_plants import PLANTS, RESTING, Array, Motion, step
-from datasets.blind.kinds import Effects, Kind, Shape
+from datasets.blind.kinds import Effects, Kind, Shape, evenly_mixed
 from datasets.blind.sealing import as_csv, key_path, names, seal
 
 System = Literal["quadrotor", "fixed_wing"]
@@ -114,8 +114,7 @@ def make(settings: Settings) -> list[Draft]:
     seeds = np.random.SeedSequence([settings.seed, place, 17]).spawn(settings.count + 1)
     # Shares and kinds as even as the count allows, in random order.
     order = np.random.default_rng(seeds[0])
-    places = (np.arange(settings.count) + 0.5) / settings.count
-    mixtures = np.array(list(MIX))[np.searchsorted(np.cumsum(list(MIX.values())), places)]
+    mixtures = evenly_mixed(MIX, settings.count)
     order.shuffle(mixtures)
     drafts = [Draft(np.random.default_rng(seed), str(m)) for seed, m in zip(seeds[1:], mixtures, strict=True)]
     foreign = [kind for kind, systems in FOREIGN if settings.system in systems]

@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 
 from datasets.blind.drafts import RECORDING_SUBSTEPS, Draft, draw_case, lines, stayed
-from datasets.blind.kinds import AS_ONE, INSEPARABLE, REST, Effects, drawn
+from datasets.blind.kinds import AS_ONE, INSEPARABLE, REST, Effects, drawn, evenly_mixed
 from datasets.blind.plant import PERIOD, Array
 from datasets.blind.rigs import Rig, draw_rig
 from datasets.blind.sealing import as_csv, key_path, names, seal
@@ -143,9 +143,7 @@ def make(settings: Settings) -> list[Draft]:
         difficulty = replace(difficulty, mix={"none": 1.0})
     seeds = np.random.SeedSequence([settings.seed, list(DIFFICULTIES).index(settings.kind)]).spawn(settings.count + 1)
     # Shares as exact as the count allows, in random order.
-    edges = np.cumsum(list(difficulty.mix.values()))
-    places = (np.arange(settings.count) + 0.5) / settings.count
-    mixtures = np.array(list(difficulty.mix))[np.searchsorted(edges, places)]
+    mixtures = evenly_mixed(difficulty.mix, settings.count)
     np.random.default_rng(seeds[0]).shuffle(mixtures)
     drafts = [Draft(np.random.default_rng(seed), str(m)) for seed, m in zip(seeds[1:], mixtures, strict=True)]
     for attempt in range(80):

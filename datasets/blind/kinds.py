@@ -6,12 +6,13 @@ its strength grows. Names and parameters of the named kinds are those of docs/ef
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 Shape = dict[str, float]
 Draw = Callable[[np.random.Generator, float], Shape]
@@ -259,6 +260,12 @@ FOREIGN: tuple[Kind, ...] = (
 
 STRIBECK = "stribeck_friction"
 """foreign when the sets 2028 and 2029 were made; in the catalogue since"""
+
+
+def evenly_mixed(mix: Mapping[str, float], count: int) -> NDArray[np.str_]:
+    """(count,) mixtures in shares as close to `mix` as the count allows, in its order."""
+    places = (np.arange(count) + 0.5) / count
+    return np.array(list(mix))[np.searchsorted(np.cumsum(list(mix.values())), places)]
 
 
 def drawn(mixture: str, effects: Effects) -> tuple[Kind, ...]:

@@ -6,9 +6,10 @@ import torch
 from tests.scenes import state_residual_network
 from visadapt.effects import AngleOffset, Residual
 from visadapt.learning.grounding import GroundSettings
-from visadapt.learning.joint import SetupSettings, adapt
+from visadapt.learning.joint import adapt
 from visadapt.learning.ledger import BudgetExceeded, Ledger
 from visadapt.learning.policy import TuneSettings
+from visadapt.learning.setup_settings import SetupSettings
 from visadapt.policies import StatePolicy
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import read_recording

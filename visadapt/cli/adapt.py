@@ -14,7 +14,7 @@ from visadapt.cli.inputs import InputError, checked, fingerprint, given_effects,
 from visadapt.cli.target import load_both
 from visadapt.diagnosis.report.text import number, with_unit
 from visadapt.effects import Effect, Parameter
-from visadapt.learning.joint import Explanation
+from visadapt.learning.explanation import Explanation
 from visadapt.policies import ImagePolicy, Policy
 from visadapt.setups.training import adapt, setup_for
 from visadapt.storage.run_folder import open_run, write_json

@@ -40,10 +40,10 @@ def size_of(left: Tensor) -> float:
     return float(left.mean().clamp_min(0).sqrt())
 
 
-def spread(count: int, most: int) -> Tensor:
+def evenly_spaced(count: int, most: int) -> Tensor:
     """Which of `count` frames to look at: at most `most`, spread evenly from the first to the last.
 
-    >>> spread(9, 3)
+    >>> evenly_spaced(9, 3)
     tensor([0, 4, 8])
     """
     return torch.linspace(0, count - 1, min(most, count)).long()

@@ -10,18 +10,18 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from visadapt.effects import Effect, Residual
-from visadapt.learning.grounding import GroundLoss, GroundSettings, fit_named, ground, rescale
+from visadapt.effects import Residual
+from visadapt.learning.explanation import NOT_DIAGNOSED, Explain, Explanation
+from visadapt.learning.grounding import GroundLoss, fit_named, ground, rescale
 from visadapt.learning.ledger import Ledger
-from visadapt.learning.perception import PerceptionSettings
 from visadapt.learning.policy import TuneSettings, initialise_feedforward, tune
+from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.windows import Observe, Windows
 from visadapt.policies import Policy
 from visadapt.progress import Progress, Report, staged
@@ -36,73 +36,7 @@ EXPLORATION = 0.05  # Standard deviation of white noise on the commands while da
 FILES = ("recording.h5", "residual.safetensors", "policy.safetensors")  # What the stages of a round leave in its folder
 
 
-Experiment = Callable[[Policy, int], Tensor | None]
-"""What to add to a policy's commands over so many steps, (steps, n_action); None where nothing helps."""
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """What a diagnosis says of the gap between source and target."""
-
-    verdict: str
-    effects: Sequence[Effect]
-    """the causes that it names, at their found values"""
-    complete: bool
-    """whether they leave nothing for a residual to learn"""
-    experiment: Experiment | None = field(default=None, compare=False)
-    """where other causes explain as much: designs what tells them apart in the next round"""
-
-
-NOT_DIAGNOSED = Explanation("", (), complete=False)
-
-Explain = Callable[[Sequence[Episode], Path], Explanation]
-"""Diagnoses episodes of the target, or reads the diagnosis that is in the file."""
-
 Label = Callable[[list[Episode]], list[Episode]]  # Gives the episodes of a round the states that grounding learns from
-
-
-@dataclass(frozen=True)
-class SetupSettings:
-    """How a policy is trained and adapted."""
-
-    source: TuneSettings
-    """the policy in the source"""
-    tuning: TuneSettings
-    """the policy in the grounded source, in each round"""
-    ground: GroundSettings = field(default_factory=GroundSettings)
-    """the residual"""
-    observations: str = "state"
-    """what grounding shows the residual: one of `learning.windows.SOURCES`"""
-    longest_episode: int = 250
-    """steps of an episode of the target while data are collected"""
-    feedforward: bool = True
-    """begin with a policy that opposes what the residual expects; False where one command cannot undo it in a period"""
-    trust: float = 1.0
-    """share of the way to the tuned weights that the policy goes from those before the first round, where each round
-    begins anew; 1: all of it, from those of the round before. The imagined target is not the real one"""
-    refinement: TuneSettings | None = None
-    """the policy in the source once more, after `source`: near rest, say, where what counts is decided"""
-    named: TuneSettings | None = None
-    """the policy in the source with effects that have names; without it, as `tuning`"""
-    perception: PerceptionSettings | None = None
-    """how an encoder learns to see, where the policy is shown frames"""
-
-    def shortened(self, iterations: int) -> SetupSettings:
-        """The same with so many iterations of the source policy, and at most as many of its refinement."""
-        finer = self.refinement
-        if finer is not None:
-            finer = replace(finer, iterations=min(iterations, finer.iterations))
-        return replace(self, source=replace(self.source, iterations=iterations), refinement=finer)
-
-    @property
-    def with_names(self) -> TuneSettings:
-        """How the policy is tuned where all effects have names: they hold in every state, not in the recorded ones
-        alone, as a residual does."""
-        return replace(self.named or self.tuning, recorded=0.0)
-
-    def numbers(self) -> dict[str, Any]:
-        """All of them as JSON takes them, for a run's folder; a task's tensors, such as references, are left out."""
-        return asdict(self, dict_factory=lambda each: {k: value for k, value in each if not isinstance(value, Tensor)})
 
 
 @dataclass(frozen=True)
@@ -192,8 +126,8 @@ def adapt(
     known, learnt, found = source, False, NOT_DIAGNOSED
     ledger = Ledger(budget)
     recorded: list[Episode] = []
-    unlabelled: list[Episode] = []
     episodes: list[Episode] = []
+    labelled = 0
     rounds: list[Round] = []
     count = math.ceil(budget / round_samples)
     for number in range(count):
@@ -209,13 +143,12 @@ def adapt(
         for episode in new:
             ledger.count(f"{name}: data", episode.samples)
         recorded += new
-        unlabelled += new
         found = explain(recorded, recording.with_name("diagnosis.json")) if explain else NOT_DIAGNOSED
         windows: Windows | None = None
         if not found.complete:
             # Not before: from what a faulty camera shows no states are estimated, and what has names needs none.
-            episodes += unlabelled if label is None else label(unlabelled)
-            unlabelled = []
+            episodes += label(recorded[labelled:]) if label else recorded[labelled:]
+            labelled = len(recorded)
             windows = Windows.cut(episodes, settings.observations, observe)
         known = source.with_effects([*source.effects, *found.effects])
         first, learnt = not (learnt or found.complete), learnt or not found.complete
@@ -240,7 +173,7 @@ def adapt(
         progress = staged(report, f"{name}: tune")
         tuning = _tune(tuned, policy, start, trust, world, observe, how, drawn[2], windows, progress)
         rounds.append(Round(ledger.used, grounding, tuning, found))
-    return Adapted(policy, ledger, rounds, [*episodes, *unlabelled], folder, known)
+    return Adapted(policy, ledger, rounds, [*episodes, *recorded[labelled:]], folder, known)
 
 
 def _ground(

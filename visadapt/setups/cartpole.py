@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from renderers import LayeredRenderer, RendererError, load_renderer
-from visadapt.learning.joint import SetupSettings
 from visadapt.learning.perception import PerceptionSettings, learn_to_see
 from visadapt.learning.policy import TuneSettings
+from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.tracking import Tracker
 from visadapt.learning.training_state import train_or_load
 from visadapt.policies import ImagePolicy, Policy, StatePolicy

@@ -13,7 +13,7 @@ from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED
 from visadapt.diagnosis.saved import load_effects
-from visadapt.learning.joint import Explain, Explanation
+from visadapt.learning.explanation import Explain, Explanation
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
 from visadapt.recordings import Episode, Recording

@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import partial
 
 from visadapt.learning.grounding import GroundSettings
-from visadapt.learning.joint import SetupSettings
 from visadapt.learning.policy import TuneSettings
+from visadapt.learning.setup_settings import SetupSettings
 from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.setups.base import Setup
 from visadapt.setups.policy_file import residual_for

@@ -17,7 +17,7 @@ from visadapt.effects import Blur, Brightness, CameraEffect, CameraRotation, Cam
 from visadapt.effects.camera import moved
 from visadapt.estimation.camera_fit import Camera, CameraFit, fit_camera, made, through
 from visadapt.estimation.poses import PoseFinder
-from visadapt.estimation.structure import spread, white_noise
+from visadapt.estimation.structure import evenly_spaced, white_noise
 from visadapt.progress import Progress
 
 SEARCHED: Camera = (CameraRotation, CameraZoom, CameraShift, Occlusion, Blur, Gamma, Brightness)
@@ -86,7 +86,7 @@ def find_camera(
     renderer: nn.Module, finder: PoseFinder, frames: Tensor, progress: Progress | None = None
 ) -> CameraFindings:
     """Search the camera of frames (T, H, W) uint8."""
-    rows = spread(len(frames), FRAMES)
+    rows = evenly_spaced(len(frames), FRAMES)
     shown = frames[rows].float() / 255
     place = finder(frames[rows]).place
     unchanged = fit_camera(renderer, shown, (), torch.zeros(0), place, frozenset())
@@ -178,7 +178,7 @@ def _start(
         return None if box is None else (box, _nearest(finder, [*best.effects, *made((kind,), box)], shown)[0])
     if kind is Blur:
         return neutral + 0.7, best.place  # its slope at 0 is 0
-    few = shown[spread(len(shown), FRAMES_AT_FIRST)]
+    few = shown[evenly_spaced(len(shown), FRAMES_AT_FIRST)]
     if kind is Brightness:
         gains = torch.logspace(math.log2(0.35), math.log2(1.9), 11, base=2)
         points = torch.stack((gains, few.mean() - gains * finder.grey), 1)

@@ -14,7 +14,7 @@ from visadapt.diagnosis.result import Box, Pixels
 from visadapt.effects import CameraEffect, CameraShift
 from visadapt.effects.camera import moved
 from visadapt.estimation.camera_fit import within_frame
-from visadapt.estimation.structure import size_of, spread, structure
+from visadapt.estimation.structure import evenly_spaced, size_of, structure
 
 OF_ANOTHER_KIND, FEW = 10.0, 0.1
 """Mean squares of a frame, over their median, above which it is left out, and share of the frames that may be."""
@@ -35,7 +35,7 @@ def left_over(seen: nn.Module, camera: Sequence[CameraEffect], frames: Tensor, p
 
     `seen` is the renderer through `camera`. A few frames that are far worse than most, such as flashes, are left out.
     """
-    rows = spread(len(frames), FRAMES)
+    rows = evenly_spaced(len(frames), FRAMES)
     rows = rows[place[rows].isfinite().all(1)]
     x, theta = place[rows].float().T
     drawn = seen(x, theta)
