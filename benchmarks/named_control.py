@@ -47,7 +47,7 @@ from visadapt.evaluation import CartPoleScore
 from visadapt.learning.tracking import TrackingError
 from visadapt.policies import Policy
 from visadapt.setups.base import Setup
-from visadapt.setups.cartpole import FROM_STATES, cartpole_frames, cartpole_states
+from visadapt.setups.cartpole import cartpole_frames, cartpole_states, from_states
 from visadapt.storage.run_folder import open_run
 from visadapt.systems import CartPole, System
 from visadapt.targets import SyntheticTarget
@@ -105,8 +105,8 @@ class Settings:
     """counted, in one round"""
     source_iterations: int = 3000
     """of the source policy, from states"""
-    iterations: int = 400
-    """of the tuning, from states"""
+    iterations: int = 300
+    """of the tuning with a residual, from states"""
     jobs: int = 2
     """seeds at once, one core each"""
     work: Path = Path("runs/named_control")
@@ -139,11 +139,8 @@ def _hidden(settings: Settings) -> Hidden:
 def _setup(settings: Settings) -> Setup:
     if settings.shown == "frames":
         return cartpole_frames()
-    own = replace(
-        FROM_STATES,
-        source=replace(FROM_STATES.source, iterations=settings.source_iterations),
-        tuning=replace(FROM_STATES.tuning, iterations=settings.iterations),
-    )
+    own = from_states(World(CartPole())).shortened(settings.source_iterations)
+    own = replace(own, tuning=replace(own.tuning, iterations=settings.iterations))
     return cartpole_states(with_history=True, settings=own)
 
 

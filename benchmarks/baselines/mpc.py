@@ -164,7 +164,6 @@ def correction(system: CartPole, residual: Residual, states: Any, commands: Any,
     """What the residual adds: `StateResidualNetwork` as an expression of its `weights`."""
     network = residual.network
     assert isinstance(network, StateResidualNetwork)
-    assert isinstance(network.head, nn.Sequential)
     out = ca.vertcat(states[-4:], commands[-1])
     if network.system is not None:
         each, unexplained = [states[4 * k : 4 * (k + 1)] for k in range(LENGTH)], []
@@ -174,15 +173,17 @@ def correction(system: CartPole, residual: Residual, states: Any, commands: Any,
             unexplained += [missing[1] / ACCELERATION_UNIT, missing[3] / ACCELERATION_UNIT]
         out = ca.vertcat(states, commands, *unexplained)
     first = len(residual.scale)
-    for layer in network.head:
+    for layer in network.head if isinstance(network.head, nn.Sequential) else [network.head]:
         if not isinstance(layer, nn.Linear):
             out = ca.tanh(out)
             continue
         rows, columns = layer.weight.shape
         weight = ca.reshape(learnt[first : first + rows * columns], rows, columns)
         first += rows * columns
-        out = weight @ out + learnt[first : first + rows]
-        first += rows
+        out = weight @ out
+        if layer.bias is not None:
+            out += learnt[first : first + rows]
+            first += rows
     return learnt[: len(residual.scale)] * out
 
 

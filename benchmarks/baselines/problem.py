@@ -24,8 +24,10 @@ from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
 from visadapt.recordings import Episode
 from visadapt.setups.base import Setup
-from visadapt.setups.cartpole import FROM_STATES, cartpole_states
+from visadapt.setups.cartpole import cartpole_states, from_states
+from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, constant_force, sine_force
+from visadapt.world import World
 
 TUNING_SEED = 100
 """Of whatever chooses a setting: neither that of a training, which counts from 0, nor that of the scores."""
@@ -42,7 +44,7 @@ class Sizes:
     """counted samples after which a policy is scored"""
     iterations: int = 3000
     """of the source policies"""
-    tuning: int = 400
+    tuning: int = 300
     """iterations of a round of ours"""
     source_steps: int = 200_000
     """of PPO in the source"""
@@ -69,7 +71,7 @@ class Problem:
 
     def setup(self, sizes: Sizes) -> Setup:
         """Ours: source, policy, residual and settings."""
-        settings = FROM_STATES.shortened(sizes.iterations)
+        settings = from_states(World(CartPole())).shortened(sizes.iterations)
         settings = replace(settings, tuning=replace(settings.tuning, iterations=sizes.tuning))
         return cartpole_states(with_history=self.with_history, settings=settings)
 

@@ -50,7 +50,7 @@ def ambiguous(*causes):
 
 
 def test_it_tells_drag_from_friction_where_the_recording_did_not(policy):
-    truth = va.effects.ViscousFriction(coefficient=0.4)
+    truth = va.effects.ViscousFriction(coefficient=0.3)
     catalogue = [va.effects.ViscousFriction, va.effects.QuadraticDrag]
     gentle = recorded(policy, truth, 120, 0, exploration=0.1)
     found = va.diagnose(gentle, SOURCE, catalogue)

@@ -31,7 +31,7 @@ def rivals(folder):
 
 def test_what_two_causes_explain_is_settled_by_an_experiment_in_the_next_round(tmp_path, monkeypatch):
     monkeypatch.setattr(planning, "FREQUENCIES", (0.8,))  # one of six, for the time it takes
-    effects = [va.effects.ViscousFriction(coefficient=0.5), ReadingNoise()]
+    effects = [va.effects.ViscousFriction(coefficient=0.8), ReadingNoise()]
     target = va.SyntheticTarget(lambda batch, generator: effects)
     policy, source = va.load_policy(va.shipped("cartpole_states")), va.World(va.CartPole())
     run = va.adapt(policy, source, target, 300, tmp_path, round_samples=150, iterations=1, diagnose=True)

@@ -178,16 +178,19 @@ class ImageResidualNetwork(ResidualNetwork):
 
 
 class StateResidualNetwork(ResidualNetwork):
-    """The paper's MLP with two hidden layers of 64, tanh (3.2.1), on state and action, or on 5 of each (3.2.2).
+    """The residual of what is shown its states.
 
-    On a history, for which it needs the source's `system` and the `period` in s, it also reads the accelerations
-    between the states that the source does not explain, the only inputs that show a force that changes.
+    On the last state and action it is the paper's MLP with two hidden layers of 64, tanh (3.2.1). On 5 of each (3.2.2),
+    for which it needs the source's `system` and the `period` in s, it also reads the accelerations between the states
+    that the source does not explain, the only inputs that show a force that changes. It is linear then, without a bias,
+    for the reason that `ImageResidualNetwork` gives.
     """
 
     def __init__(self, n_state: int, n_action: int = 1, system: System | None = None, period: float = 0.0) -> None:
-        history = 0 if system is None else LENGTH
-        inputs = max(1, history) * (n_state + n_action) + max(0, history - 1) * n_state // 2
-        super().__init__(mlp(inputs, 64, 64, n_state))
+        inputs = LENGTH * (n_state + n_action) + (LENGTH - 1) * n_state // 2
+        of_history = nn.Linear(inputs, n_state, bias=False)
+        super().__init__(of_history if system else mlp(n_state + n_action, 64, 64, n_state))
+        self.n_state = n_state
         self.system = system
         self.period = period
 
@@ -198,15 +201,35 @@ class StateResidualNetwork(ResidualNetwork):
         unexplained = self.unexplained(self.system, states, actions) / ACCELERATION_UNIT
         return torch.cat((states.flatten(1), actions.flatten(1), unexplained.flatten(1)), 1)
 
+    def informed(self, inputs: Tensor) -> Tensor:
+        """All rows but, of a history, the first LENGTH - 1 of an episode, whose history is incomplete."""
+        if self.system is None:
+            return super().informed(inputs)
+        states = inputs[:, : LENGTH * self.n_state].unflatten(1, (LENGTH, self.n_state))
+        return states.diff(dim=1).any(2).all(1)
+
     def unexplained(self, system: System, states: Tensor, actions: Tensor) -> Tensor:
         """Mean accelerations minus the source's over the periods between states, (B, LENGTH - 1, n_state / 2).
 
-        The source's is the mean of those at both ends of a period, under the action held in between.
+        The source's is the mean of those at both ends of a period, under the action held in between. `held_back` says
+        what periods before an episode take.
         """
         load = states.new_zeros(*states.shape[:-1], len(system.loads))[:, 1:]
         ends = [system.derivative(part, actions[:, :-1], load) for part in (states[:, :-1], states[:, 1:])]
         measured = states.diff(dim=1) / self.period
-        return (measured - (ends[0] + ends[1]) / 2)[..., 1::2]
+        left = (measured - (ends[0] + ends[1]) / 2)[..., 1::2]
+        return held_back(left, states.diff(dim=1).any(2, keepdim=True))
+
+
+def held_back(values: Tensor, known: Tensor) -> Tensor:
+    """Values (B, periods, n), in which periods before an episode begins take those of its first period.
+
+    They are not `known` (B, periods, 1), since the first state is repeated over them; without any period all are 0.
+    """
+    past = [values[:, -1] * known[:, -1]]
+    for k in range(values.shape[1] - 2, -1, -1):
+        past.append(torch.where(known[:, k], values[:, k], past[-1]))
+    return torch.stack(past[::-1], 1)
 
 
 class FlightResidualNetwork(ResidualNetwork):
@@ -263,8 +286,7 @@ class FlightResidualNetwork(ResidualNetwork):
     def unexplained(self, predict: Predict, states: Tensor, actions: Tensor) -> Tensor:
         """Changes of velocity and rates minus the source's over the periods between states, (B, 6 (LENGTH - 1)).
 
-        In units of HISTORY_ACCELERATION_UNIT times a period. Periods before a flight begins, over which its first state
-        is repeated, take the values of the flight's first period.
+        In units of HISTORY_ACCELERATION_UNIT times a period. See `held_back` for the periods before a flight begins.
         """
         predicted = predict(states[:, :-1], actions[:, :-1]).flatten(0, 1)
         before, after = states[:, :-1].flatten(0, 1), states[:, 1:].flatten(0, 1)
@@ -272,8 +294,4 @@ class FlightResidualNetwork(ResidualNetwork):
         moving = torch.cat((left[:, VELOCITY], left[:, RATES]), 1) / (HISTORY_ACCELERATION_UNIT * self.period)
         known = (after != before).any(1, keepdim=True)
         periods = (len(states), LENGTH - 1)
-        changes, flying = moving.unflatten(0, periods).unbind(1), known.unflatten(0, periods).unbind(1)
-        past = [changes[-1] * flying[-1]]
-        for change, is_flying in zip(changes[-2::-1], flying[-2::-1], strict=True):
-            past.append(torch.where(is_flying, change, past[-1]))
-        return torch.cat(past[::-1], 1)
+        return held_back(moving.unflatten(0, periods), known.unflatten(0, periods)).flatten(1)

@@ -25,43 +25,20 @@ from visadapt.tasks.balance import CENTRED_CARTPOLE, PAPER_CARTPOLE, Balance, Co
 from visadapt.weights import shipped
 from visadapt.world import World
 
-UNLIMITED = 1e9  # m, of the cart's position: nothing depends on it, and no camera loses the cart
-
-FROM_STATES = SetupSettings(
-    source=TuneSettings(
-        Balance(PAPER_CARTPOLE, divergence=(UNLIMITED, 4.0, 0.5, 10.0)),
-        iterations=3000,
-        learning_rate=3e-3,
-        observation_noise=0.0,
-    ),
-    tuning=TuneSettings(
-        Balance(
-            PAPER_CARTPOLE,
-            start_spread=(0.3, 0.2, 0.1, 0.2),
-            kick=(0.0, 0.0, 0.0, 0.0),
-            divergence=(UNLIMITED, 2.0, 0.25, 3.0),
-            first_divergence=0.4,
-        ),
-        iterations=400,
-        learning_rate=2e-3,
-        longest=25,
-        recorded=0.8,
-        observation_noise=0.0,
-    ),
-)
-
 CONTRAST = 0.2  # Grey levels, of 1, that frames are divided by before the networks see them
 
 REACH = 1.45  # m to either side that a camera has to see for `from_frames`, of the drawn cart-pole, which sees 1.5 m
+
+UNLIMITED = 1e9  # m, of the cart's position: without a camera nothing depends on it
 
 REST_WEIGHTS = (1.0, 6.0, 1.0, 0.1)
 """of the squared distances from rest in tuning: above all the cart, which is scored by its speed, is not to move"""
 
 
-def from_frames(source: World) -> SetupSettings:
-    """How the cart-pole that is shown frames learns, tuned for a source."""
+def _near_rest(source: World) -> TuneSettings:
+    """How a policy that balances is refined where it is scored: near rest, with what plans leave behind valued."""
     to_go = cost_to_go(source, REST_WEIGHTS, Cost.action)
-    refinement = TuneSettings(
+    return TuneSettings(
         Balance(
             RegulatorCost(REST_WEIGHTS, to_go=to_go),
             start_spread=(0.3, 0.1, 0.1, 0.1),
@@ -77,19 +54,35 @@ def from_frames(source: World) -> SetupSettings:
         every=5,
         curriculum=False,
     )
+
+
+def _settings(source: TuneSettings, refinement: TuneSettings) -> SetupSettings:
     return SetupSettings(
-        source=TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500),
+        source=source,
         refinement=refinement,
         tuning=replace(refinement, iterations=300, streams=32, recorded=0.8),
         named=replace(refinement, iterations=1200, streams=32),
         trust=0.5,
-        observations="camera",
-        perception=PerceptionSettings(),
     )
 
 
+def from_states(source: World) -> SetupSettings:
+    """How the cart-pole that is shown its states learns, tuned for a source."""
+    wide = Balance(PAPER_CARTPOLE, divergence=(UNLIMITED, 4.0, 0.5, 10.0))
+    return _settings(
+        TuneSettings(wide, iterations=3000, learning_rate=3e-3, observation_noise=0.0),
+        replace(_near_rest(source), observation_noise=0.0),
+    )
+
+
+def from_frames(source: World) -> SetupSettings:
+    """How the cart-pole that is shown frames learns, tuned for a source."""
+    own = _settings(TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500), _near_rest(source))
+    return replace(own, observations="camera", perception=PerceptionSettings())
+
+
 def cartpole_states(
-    source: World | None = None, with_history: bool = False, settings: SetupSettings = FROM_STATES
+    source: World | None = None, with_history: bool = False, settings: SetupSettings | None = None
 ) -> Setup:
     """The cart-pole that is shown its states.
 
@@ -97,11 +90,12 @@ def cartpole_states(
         source: the physics known beforehand; without it, the paper's CartPole, 0.05 s between commands.
         with_history: whether policy and residual read 5 states and actions, or the last alone.
     """
+    source = source or World(CartPole())
     return Setup(
-        source=source or World(CartPole()),
+        source=source,
         policy=partial(StatePolicy, 4, with_history=with_history),
         residual=residual_for,
-        settings=settings,
+        settings=settings or from_states(source),
     )
 
 
