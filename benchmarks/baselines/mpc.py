@@ -2,7 +2,7 @@
 
 At each step, by multiple shooting over the horizon of 10, warm-started with the last plan,
 
-    minimise   C(s_1..s_K, a_0..a_{K-1})                 of `PAPER_CARTPOLE`, the cost of all
+    minimise   C(s_1..s_K, a_0..a_{K-1})                 of `COST`, the cost of all
     subject to s_{k+1} = f(s_k, a_k) + Delta(history_k)   and |a_k| <= 1
 
 f is the source (Runge-Kutta, a step a period); Delta is the residual, on the past and the planned states and commands,
@@ -20,13 +20,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from benchmarks.baselines.problem import Problem, Sizes, Stage, grounded
+from benchmarks.baselines.problem import COST, Problem, Sizes, Stage, grounded
 from visadapt.effects import Residual
 from visadapt.history import HORIZON, LENGTH, History
 from visadapt.policies import Policy
 from visadapt.policies.networks import ACCELERATION_UNIT, StateResidualNetwork
 from visadapt.systems import CartPole
-from visadapt.tasks.balance import PAPER_CARTPOLE, Cost
+from visadapt.tasks.balance import RegulatorCost
 from visadapt.world import World
 
 OPTIONS = {
@@ -97,18 +97,18 @@ class Program:
     residual's `weights`, so that a residual that has learnt more needs no other program.
     """
 
-    def __init__(self, source: World, cost: Cost, residual: Residual | None = None) -> None:
+    def __init__(self, source: World, cost: RegulatorCost, residual: Residual | None = None) -> None:
         model = step(source, residual)
         commands, states = ca.MX.sym("a", HORIZON), ca.MX.sym("s", 4, HORIZON)
         past, learnt = ca.MX.sym("past", 4 * LENGTH + LENGTH - 1), ca.MX.sym("weights", len(weights(residual)))
         seen = [past[4 * k : 4 * (k + 1)] for k in range(LENGTH)]
         done = [past[4 * LENGTH + k] for k in range(LENGTH - 1)]
-        now, total, gaps = seen[-1], 0, []
+        total, gaps = 0, []
         for k in range(HORIZON):
             seen, done = [*seen[-LENGTH:], states[:, k]], [*done[1 - LENGTH :], commands[k]]
             gaps.append(model(ca.vertcat(*seen[:-1]), ca.vertcat(*done), learnt) - states[:, k])
-            off = states[:, k] - (1 - (k + 1) / HORIZON) * now
-            total += ca.dot(ca.DM(cost.state) * off, off) + cost.action * commands[k] ** 2
+            total += ca.dot(ca.DM(cost.state) * states[:, k], states[:, k]) + cost.action * commands[k] ** 2
+        total += ca.dot(ca.DM(cost.to_go) @ states[:, -1], states[:, -1])
         variables, given, gap = ca.vertcat(commands, ca.vec(states)), ca.vertcat(past, learnt), ca.vertcat(*gaps)
         options = {**OPTIONS, "hess_lag": _curvature(cost, given, gap)}
         self.solver = ca.nlpsol("plan", "ipopt", {"x": variables, "p": given, "f": total, "g": gap}, options)
@@ -116,12 +116,13 @@ class Program:
         self.bounds = {"lbx": low, "ubx": -low, "lbg": 0, "ubg": 0}
 
 
-def _curvature(cost: Cost, given: Any, gap: Any) -> Any:
+def _curvature(cost: RegulatorCost, given: Any, gap: Any) -> Any:
     """The Hessian of the cost alone (Gauss-Newton): of the constraints' curvature little is left where they hold."""
-    diagonal = ca.DM([2 * cost.action] * HORIZON + [2 * weight for weight in cost.state] * HORIZON)
+    hessian = 2 * np.diag([cost.action] * HORIZON + list(cost.state) * HORIZON)
+    hessian[-4:, -4:] += 2 * np.array(cost.to_go)
     symbols = [ca.MX.sym(name, size) for name, size in (("x", 5 * HORIZON), ("p", given.numel()), ("lam_f", 1))]
     symbols.append(ca.MX.sym("lam_g", gap.numel()))
-    return ca.Function("curvature", symbols, [symbols[2] * ca.diag(diagonal)])
+    return ca.Function("curvature", symbols, [symbols[2] * ca.sparsify(ca.DM(np.triu(hessian)))])
 
 
 def step(source: World, residual: Residual | None) -> Any:
@@ -190,14 +191,14 @@ def correction(system: CartPole, residual: Residual, states: Any, commands: Any,
 def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:
     """On the source, then with the residual."""
     source = problem.setup(sizes).source
-    bare = Program(source, PAPER_CARTPOLE)
+    bare = Program(source, COST)
     learning: list[Program] = []
 
     def planner(residual: Residual | None) -> Policy:
         if residual is None:
             return ModelPredictive(bare)
         if not learning:
-            learning.append(Program(source, PAPER_CARTPOLE, residual))
+            learning.append(Program(source, COST, residual))
         return ModelPredictive(learning[0], residual)
 
     yield from grounded(problem, sizes, seed, planner)

@@ -20,11 +20,10 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks.baselines.mppi import carried
-from benchmarks.baselines.problem import Problem, Sizes, Stage, in_rounds
+from benchmarks.baselines.problem import COST, Problem, Sizes, Stage, in_rounds
 from visadapt.history import HORIZON, LENGTH, History
 from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
-from visadapt.tasks.balance import PAPER_CARTPOLE
 from visadapt.world import World
 
 MEMBERS = 5
@@ -117,7 +116,7 @@ class EnsemblePlanner(Policy):
             change = mean + (log_variance / 2).exp() * torch.randn(mean.shape, generator=self.generator)
             states.append(many.observations[:, -1] + (change * self.ensemble.unit).flatten(0, 1))
             many = many.observing(states[-1])
-        cost = PAPER_CARTPOLE(torch.stack(states, 1), commands, now)
+        cost = COST(torch.stack(states, 1), commands, now)
         return cost.nan_to_num(1e9, 1e9).unflatten(0, (MEMBERS, -1, PLANS)).mean(0)
 
 

@@ -1,11 +1,10 @@
 """PPO of stable-baselines3 (Raffin et al. 2021), pretrained in the source, then fine-tuned in the target.
 
-The reward of a step is minus its cost, the squared distances from rest with the weights of `PAPER_CARTPOLE`; an episode
-that ends in a fall is charged its last cost for ever after (discounted), or falling soon would pay. Settings are the
-library's defaults, but for many machines at once, larger batches for speed, and a smaller first deviation of the
-commands, whose full range throws the pole; none is tuned further. The cart's position is not shown, since nothing
-depends on it. In the source the checkpoint that does best there is kept (A.3); in the target the policy is scored as
-it stands. Its first update is after 2,048 samples: before, it is the source's.
+The reward of a step is minus its cost, the squared distances from rest with the weights of `COST`; an episode that ends
+in a fall is charged its last cost for ever after (discounted), or falling soon would pay. Settings are the library's
+defaults, but for many machines at once, larger batches for speed, and a smaller first deviation of the commands, whose
+full range throws the pole; none is tuned further. In the source the checkpoint that does best there is kept (A.3); in
+the target the policy is scored as it stands. Its first update is after 2,048 samples: before, it is the source's.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from benchmarks.baselines.pets import model_inputs
-from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage, score_path
+from benchmarks.baselines.problem import COST, TUNING_SEED, Problem, Sizes, Stage, score_path
 from visadapt.effects import Effect
 from visadapt.evaluation import score
 from visadapt.evaluation.scoring import EPISODE_STEPS
@@ -33,7 +32,6 @@ from visadapt.storage.run_folder import read_json
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget
 from visadapt.targets.synthetic import no_effects
-from visadapt.tasks.balance import PAPER_CARTPOLE
 from visadapt.world import World
 
 MACHINES = 64
@@ -43,8 +41,8 @@ BATCH = 256
 """samples of a gradient step"""
 LOOKS = 5
 """at the policy in the source, evenly over the pretraining"""
-SCALE = (1.0, 0.1, 1.0)
-"""of velocity, angle and angular velocity as shown"""
+SCALE = (1.0, 1.0, 0.1, 1.0)
+"""of position, velocity, angle and angular velocity as shown"""
 GAMMA = 0.99
 LOG_STD = -1.5
 CURVE = (2048, 4096, 10240, 20480, 51200, 102400, 200704)
@@ -92,8 +90,8 @@ class Machines(VecEnv):
         seen, self.at = self.world.measure(self.at, self.generator)
         self.history = self.history.acting(self.action.clamp(-1, 1)).observing(seen)
         self.age += 1
-        weights, state = torch.tensor(PAPER_CARTPOLE.state), self.at.state
-        cost = (weights * state.square()).sum(1) + PAPER_CARTPOLE.action * self.action[:, 0].square()
+        weights, state = torch.tensor(COST.state), self.at.state
+        cost = (weights * state.square()).sum(1) + COST.action * self.action[:, 0].square()
         fallen = state[:, 2].abs() > 0.3
         ended = fallen | (self.age >= EPISODE_STEPS)
         reward = -torch.where(fallen, cost / (1 - GAMMA), cost)
@@ -151,9 +149,9 @@ class Trained(Policy):
 
 
 def shown(history: History, with_history: bool) -> Tensor:
-    """What PPO sees (B, inputs): as the ensemble of PETS, in units of SCALE."""
-    states = history.observations / torch.tensor((1.0, *SCALE))
-    return model_inputs(History(states, history.actions), with_history)
+    """What PPO sees (B, inputs): the position, and what the ensemble of PETS sees; in units of SCALE."""
+    states = history.observations / torch.tensor(SCALE)
+    return torch.cat((states[:, -1, :1], model_inputs(History(states, history.actions), with_history)), 1)
 
 
 def pretrained(problem: Problem, sizes: Sizes, path: Path, seed: int) -> PPO:

@@ -1,7 +1,7 @@
 """The problems that every baseline is set, and what several baselines share.
 
 A baseline is a module with `stages(problem, sizes, folder, seed)`, which yields the policies that are scored. What they
-have in common: the paper's CartPole as source, the hidden effects, the cost (`PAPER_CARTPOLE` over a horizon of 10),
+have in common: the paper's CartPole as source, the hidden effects, the cost (`COST` over a horizon of 10),
 the starts, and a ledger that counts every step of the target.
 """
 
@@ -24,11 +24,14 @@ from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
 from visadapt.recordings import Episode
 from visadapt.setups.base import Setup
-from visadapt.setups.cartpole import cartpole_states, from_states
+from visadapt.setups.cartpole import REST_WEIGHTS, cartpole_states, from_states
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, constant_force, sine_force
+from visadapt.tasks.balance import Cost, RegulatorCost, cost_to_go
 from visadapt.world import World
 
+COST = RegulatorCost(REST_WEIGHTS, to_go=cost_to_go(World(CartPole()), REST_WEIGHTS, Cost.action))
+"""What ours is tuned with: the distances from rest, and what coming to rest costs after the last planned state."""
 TUNING_SEED = 100
 """Of whatever chooses a setting: neither that of a training, which counts from 0, nor that of the scores."""
 

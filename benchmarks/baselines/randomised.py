@@ -25,7 +25,10 @@ def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[
     setup = cartpole_states(with_history=True)
     effect = drawn(problem.kind, DRAWS, torch.Generator().manual_seed(seed))
     settings = setup.settings.shortened(sizes.iterations)
-    settings = replace(settings, source=replace(settings.source, batch=DRAWS))
+    assert settings.refinement is not None
+    # Each stream keeps its draw, so that no batch can be drawn from what other streams passed through.
+    refinement = replace(settings.refinement, batch=DRAWS, streams=None, every=1)
+    settings = replace(settings, source=replace(settings.source, batch=DRAWS), refinement=refinement)
     trained = replace(setup, source=setup.source.with_effects([effect]), settings=settings)
     policy = trained.pretrain(folder / "policy.safetensors", seed)
     yield Stage("source", 0, policy)

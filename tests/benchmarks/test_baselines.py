@@ -5,14 +5,13 @@ import csv
 import pytest
 import torch
 
-from benchmarks.baselines.problem import PROBLEMS, drawn
+from benchmarks.baselines.problem import COST, PROBLEMS, drawn
 from benchmarks.baselines.table import BASELINES, Settings, main
 from benchmarks.cartpole_states import SINE
 from visadapt.effects import ConstantForce, PeriodicForce, Residual
 from visadapt.history import LENGTH, History
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.systems import CartPole
-from visadapt.tasks.balance import PAPER_CARTPOLE
 from visadapt.world import World
 
 
@@ -59,9 +58,7 @@ def test_the_mpc_pushes_against_what_the_residual_expects():
     residual.scale.copy_(pushed)
     residual.network.head[-1].bias.data.fill_(1.0)
     still = History.start(torch.zeros(1, 4), 1)
-    without, with_it = (
-        ModelPredictive(Program(World(CartPole()), PAPER_CARTPOLE, r), r).act(still) for r in (None, residual)
-    )
+    without, with_it = (ModelPredictive(Program(World(CartPole()), COST, r), r).act(still) for r in (None, residual))
     assert abs(float(without)) < 1e-3
     assert float(with_it) < -0.01
 
