@@ -42,7 +42,7 @@ def test_200_samples_of_a_drag_lower_its_error_by_half_or_more(references, tmp_p
     setup = quadrotor(*references)
     policy, dragged = setup.load(shipped("quadrotor")), flight_target(setup, drag(0.3))
     before = score(policy, dragged, 20, 0)
-    brief = trained_as(setup, iterations=40, learning_rate=1e-3, batch=64)
+    brief = trained_as(setup, iterations=40, learning_rate=1e-3, batch=32)
     adapted = brief.adapt(policy, flight_target(setup, drag(0.3), test=False), tmp_path, 200, 200, seed=0)
     after = score(policy, dragged, 20, 0)
     assert adapted.ledger.used == 200
@@ -60,7 +60,7 @@ def test_200_samples_of_a_force_that_changes_lower_its_error_by_half_or_more(ref
     setup = quadrotor(references[0], references[1], with_history=True)
     policy, pushed = setup.load(shipped("quadrotor")), flight_target(setup, swaying)
     before = score(policy, pushed, 20, 0)
-    brief = trained_as(setup, iterations=60, learning_rate=2e-3, batch=64)
+    brief = trained_as(setup, iterations=60, learning_rate=2e-3, batch=32)
     brief.adapt(policy, flight_target(setup, swaying, test=False), tmp_path, 200, 200, seed=0)
     after = score(policy, pushed, 20, 0)
     assert after.mean < 0.5 * before.mean
