@@ -130,6 +130,13 @@ COMMANDS = (
         60,
         work="--work",
     ),
+    Command(
+        "planned_experiments",
+        "planned_experiments.csv",
+        ("benchmarks.planned_experiments", "--seeds", "1"),
+        15,
+        work="--work",
+    ),
     Command("baselines", "baselines.csv", ("benchmarks.baselines",), 40, work="--work", extra="baselines"),
     Command(
         "rotorpy",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from benchmarks.planned_experiments import OUTCOMES
 from benchmarks.tables_adaptation import Lines, Rows
 
 DIAGNOSERS = ("ours", "afternoon", "greedy", "refit", "pysindy", "chance")
@@ -72,6 +73,17 @@ def crazyflie(rows: Rows) -> Lines:
         # In calm air, or in none, some of them are 0.
         published = max((row["published"] for row in own), key=lambda value: float(value or 0))
         lines.append([name, *map(_estimate, own), published])
+    return lines
+
+
+def planned(rows: Rows) -> Lines:
+    """What the gentle recordings leave open, then what each kind of 200 more rows makes of it."""
+    lines = [["one hidden effect", "recordings", *OUTCOMES]]
+    for method in dict.fromkeys(row["method"] for row in rows):
+        own = {row["measure"]: row for row in rows if row["method"] == method}
+        first = next(iter(own.values()))
+        shares = [f"{100 * float(own[name]['mean']):.0f} %" if name in own else "" for name in OUTCOMES]
+        lines.append([method, first["episodes"], *shares])
     return lines
 
 
