@@ -1,10 +1,11 @@
-"""What each part of adapting from frames is worth, on six targets, at 200 counted samples.
+"""What each part of an adaptation is worth, on six targets, at 200 counted samples.
 
     python -m benchmarks.ablations
+    python -m benchmarks.ablations --shown states --out results/ablations_states.csv
 
-Each seed adapts the shipped policy anew, as shipped and with a part left out, and is scored on episodes whose starts
-no training saw. No score chooses anything. Writes results/ablations.csv. Interrupt it anywhere; started again, it
-goes on.
+Each seed adapts the source policy anew, as shipped and with a part left out, and is scored on episodes whose starts
+no training saw. No score chooses anything. From frames the source policy is the shipped one; from states, where the
+networks see 5 states and actions, it is trained first. Interrupt it anywhere; started again, it goes on.
 """
 
 from __future__ import annotations
@@ -15,21 +16,26 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import torch
 import tyro
+from torch import nn
 
 from experiments.kept_scores import kept_score
 from experiments.result_tables import print_speed, speed_row, write_rows
 from renderers import DrawnCartPole
-from visadapt.effects import ActuatorDelay, ActuatorGain, ConstantForce, CoulombFriction
+from visadapt.effects import ActuatorDelay, ActuatorGain, ConstantForce, CoulombFriction, Residual
 from visadapt.evaluation import CartPoleScore
-from visadapt.learning.setup_settings import SetupSettings
-from visadapt.setups.cartpole import cartpole_frames
+from visadapt.policies import Policy
+from visadapt.policies.networks import ResidualNetwork, mlp
+from visadapt.setups.base import Setup
+from visadapt.setups.cartpole import cartpole_frames, cartpole_states
 from visadapt.storage.run_folder import open_run
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, no_effects, sine_force
 from visadapt.weights import shipped
+from visadapt.world import World
 
 SAMPLES = 200
 ROUND_SAMPLES = 100
@@ -46,16 +52,51 @@ TARGETS: dict[str, Callable[..., SyntheticTarget]] = {
 }
 
 
-def untuned(settings: SetupSettings) -> SetupSettings:
+Variant = Callable[[Setup], Setup]
+
+
+def untuned(setup: Setup) -> Setup:
     """The feed-forward on the residual, in closed form, and no backpropagation."""
-    return replace(settings, tuning=replace(settings.tuning, iterations=0))
+    return _tuned(setup, iterations=0)
 
 
-VARIANTS: dict[str, Callable[[SetupSettings], SetupSettings]] = {
-    "as shipped": lambda settings: settings,
+def through_the_residual(setup: Setup) -> Setup:
+    """Gradients that flow through the residual as well; nothing that streams pass through is kept."""
+    return _tuned(setup, streams=None, every=1, batch=64, iterations=400, longest=25, learning_rate=2e-3)
+
+
+def with_an_mlp(setup: Setup) -> Setup:
+    """The paper's head of the residual: two hidden layers of 64, fitted by gradient descent."""
+
+    def residual(policy: Policy, source: World) -> Residual:
+        made = setup.residual(policy, source)
+        network = made.network
+        assert isinstance(network, ResidualNetwork)
+        assert isinstance(network.head, nn.Linear)
+        network.head = mlp(network.head.in_features, 64, 64, network.head.out_features)
+        for weight in network.head[-1].parameters():
+            nn.init.zeros_(weight)
+        return made
+
+    return replace(setup, residual=residual)
+
+
+def _tuned(setup: Setup, **changed: object) -> Setup:
+    tuning = replace(setup.settings.tuning, **changed)  # type: ignore[arg-type]
+    return replace(setup, settings=replace(setup.settings, tuning=tuning))
+
+
+def _with(**changed: object) -> Variant:
+    return lambda setup: replace(setup, settings=replace(setup.settings, **changed))  # type: ignore[arg-type]
+
+
+VARIANTS: dict[str, Variant] = {
+    "as shipped": lambda setup: setup,
     "no tuning": untuned,
-    "no feed-forward": lambda settings: replace(settings, feedforward=False),
-    "no averaging of weights": lambda settings: replace(settings, trust=1.0),
+    "no feed-forward": _with(feedforward=False),
+    "no averaging of weights": _with(trust=1.0),
+    "gradients through the residual": through_the_residual,
+    "MLP residual": with_an_mlp,
 }
 
 
@@ -63,6 +104,8 @@ VARIANTS: dict[str, Callable[[SetupSettings], SetupSettings]] = {
 class Settings:
     """What is run, and where."""
 
+    shown: Literal["frames", "states"] = "frames"
+    """what the policy sees"""
     seeds: int = 3
     episodes: int = 60
     targets: tuple[str, ...] = tuple(TARGETS)
@@ -78,6 +121,8 @@ class Settings:
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
     rows = []
+    if settings.shown == "states":
+        _source(settings)
     jobs = [
         (settings, name, variant, seed)
         for name in settings.targets
@@ -88,7 +133,7 @@ def main(settings: Settings) -> None:
         unadapted = [pool.submit(_before, settings, name) for name in settings.targets]
         found = dict(zip(jobs, pool.map(_after, *zip(*jobs, strict=True)), strict=True))
     for name, before in zip(settings.targets, unadapted, strict=True):
-        experiment = f"CartPole, pixels, {name}"
+        experiment = f"CartPole, {'pixels' if settings.shown == 'frames' else 'states'}, {name}"
         rows.append(speed_row(experiment, "unadapted", "target", 0, [before.result()]))
         for variant in settings.variants:
             scores = [found[settings, name, variant, seed] for seed in range(settings.seeds)]
@@ -98,21 +143,33 @@ def main(settings: Settings) -> None:
         print_speed(row)
 
 
+def _source(settings: Settings) -> tuple[Setup, Policy]:
+    if settings.shown == "frames":
+        setup = cartpole_frames()
+        return setup, setup.load(shipped("cartpole_frames"))
+    setup = cartpole_states(with_history=True)
+    return setup, setup.pretrain(settings.work / "source.safetensors", seed=0)
+
+
+def _target(settings: Settings, name: str) -> SyntheticTarget:
+    return TARGETS[name](camera=DrawnCartPole() if settings.shown == "frames" else None)
+
+
 def _before(settings: Settings, name: str) -> CartPoleScore:
     torch.set_num_threads(1)
     folder = settings.work / "unadapted"
-    open_run(folder, {"episodes": settings.episodes})
-    policy = cartpole_frames().load(shipped("cartpole_frames"))
-    return kept_score(folder / f"{name}.json", policy, TARGETS[name](camera=DrawnCartPole()), settings.episodes)
+    open_run(folder, {"shown": settings.shown, "episodes": settings.episodes})
+    _, policy = _source(settings)
+    return kept_score(folder / f"{name}.json", policy, _target(settings, name), settings.episodes)
 
 
 def _after(settings: Settings, name: str, variant: str, seed: int) -> CartPoleScore:
     torch.set_num_threads(1)
-    setup, target = cartpole_frames(), TARGETS[name](camera=DrawnCartPole())
-    setup = replace(setup, settings=VARIANTS[variant](setup.settings))
+    shipped_setup, policy = _source(settings)
+    setup, target = VARIANTS[variant](shipped_setup), _target(settings, name)
     folder = settings.work / name / variant / f"seed-{seed}"
-    open_run(folder, {"seed": seed, "episodes": settings.episodes, **setup.settings.numbers()})
-    policy = setup.load(shipped("cartpole_frames"))
+    about = {"shown": settings.shown, "seed": seed, "episodes": settings.episodes}
+    open_run(folder, {**about, **setup.settings.numbers()})
     setup.adapt(policy, target, folder, SAMPLES, ROUND_SAMPLES, seed)
     return kept_score(folder / "score.json", policy, target, settings.episodes)
 

@@ -98,6 +98,17 @@ COMMANDS = (
         work="--work",
     ),
     Command(
+        "ablations_states",
+        "ablations_states.csv",
+        (
+            "benchmarks.ablations",
+            *("--shown", "states", "--out", "results/ablations_states.csv"),
+            *("--variants", "as shipped", "no tuning", "gradients through the residual", "MLP residual"),
+        ),
+        25,
+        work="--work",
+    ),
+    Command(
         "inverted_pendulum",
         "inverted_pendulum.csv",
         ("train.inverted_pendulum", "--seeds", "0", "1", "2"),

@@ -56,6 +56,7 @@ TABLES = {
     "curve": Table(adaptation.curve, ("cartpole_pixels", "cartpole_states")),
     "grounding": Table(adaptation.grounding, ("cartpole_pixels",)),
     "ablations": Table(adaptation.ablations, ("ablations",)),
+    "ablations, states": Table(adaptation.ablations, ("ablations_states",)),
     "pendulum": Table(adaptation.pendulum, ("inverted_pendulum",)),
     "vehicles": Table(adaptation.vehicles, ("flight",)),
     "residual": Table(adaptation.residual, ("residual_samples",)),

@@ -70,13 +70,13 @@ def grounding(pixels: Rows) -> Lines:
 
 
 def ablations(rows: Rows) -> Lines:
-    """What each part of adapting from frames is worth, one target a line, in m/s."""
+    """What each part of an adaptation is worth, one target a line, in m/s."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     lines = [["mean cart speed in m/s (episodes up)", *methods]]
     for experiment in dict.fromkeys(row["experiment"] for row in rows):
         found = {row["method"]: _speed_cells(row) for row in rows if row["experiment"] == experiment}
         cells = [f"{found[method][0]} ({found[method][1]})" for method in methods]
-        lines.append([experiment.removeprefix("CartPole, pixels, "), *cells])
+        lines.append([experiment.split(", ", 2)[2], *cells])
     return lines
 
 
