@@ -102,7 +102,8 @@ COMMANDS = (
         "ablations_states.csv",
         (
             "benchmarks.ablations",
-            *("--shown", "states", "--out", "results/ablations_states.csv"),
+            *("--shown", "states", "--out", "results/ablations_states.csv", "--seeds", "2"),
+            *("--targets", "2(sin t + 1) N", "dry friction 4 N", "delay 0.05 s and 1 N"),
             *("--variants", "as shipped", "no tuning", "gradients through the residual", "MLP residual"),
         ),
         25,
@@ -133,7 +134,7 @@ COMMANDS = (
         reads=(("--cartpole", "cartpole_states"), ("--flight", "flight")),
     ),
     Command("named_effects", "named_effects.csv", ("benchmarks.named_effects",), 30, work="--work"),
-    Command("named_control", "named_control.csv", ("benchmarks.named_control",), 60, work="--work"),
+    Command("named_control", "named_control.csv", ("benchmarks.named_control", "--seeds", "2"), 30, work="--work"),
     Command(
         "named_control_frames",
         "named_control_frames.csv",

@@ -2,8 +2,7 @@
 
     python -m benchmarks.planned_experiments
 
-The source policy runs gently on a cart-pole with one hidden effect: two episodes of 120 noisy rows, diagnosed with the
-whole catalogue. Where the diagnosis is ambiguous, 200 more rows are recorded in three ways: with the excitation of
+The source policy runs gently on a cart-pole with one hidden effect: 80 noisy rows, diagnosed with the whole catalogue. Where the diagnosis is ambiguous, 200 more rows are recorded in three ways: with the excitation of
 `visadapt.plan` added to the policy's commands, with white noise of the same root mean square, and with neither. Each is
 diagnosed together with the first recording, and is right where the hidden effect alone is then identified. Ambiguities
 that no excitation is expected to settle, as that of a force with a bias of the motor, are left as they are.
@@ -35,28 +34,28 @@ from visadapt.weights import shipped
 STATES = ("x", "x_dot", "theta", "theta_dot")
 NOISE = np.array([0.005, 0.02, 0.009, 0.05])
 """m, m/s, rad, rad/s: standard deviations of the measurement noise"""
-EPISODES, ROWS, MORE_ROWS = 2, 120, 200
-GENTLE = 0.1
+EPISODES, ROWS, MORE_ROWS = 1, 80, 200
+GENTLE = 0.05
 """standard deviation of white noise on the commands of the first recording, in [-1, 1]"""
 
 HIDDEN: Mapping[str, Callable[[], va.Effect]] = {
-    "viscous friction 0.4 N s/m": lambda: effects.ViscousFriction(coefficient=0.4),
-    "viscous friction 1 N s/m": lambda: effects.ViscousFriction(coefficient=1.0),
-    "drag 1 N s2/m2": lambda: effects.QuadraticDrag(coefficient=1.0),
-    "drag 3 N s2/m2": lambda: effects.QuadraticDrag(coefficient=3.0),
-    "dry friction 0.3 N": lambda: effects.CoulombFriction(force=0.3),
+    "viscous friction 0.6 N s/m": lambda: effects.ViscousFriction(coefficient=0.6),
+    "viscous friction 1.5 N s/m": lambda: effects.ViscousFriction(coefficient=1.5),
+    "drag 2 N s2/m2": lambda: effects.QuadraticDrag(coefficient=2.0),
+    "drag 5 N s2/m2": lambda: effects.QuadraticDrag(coefficient=5.0),
+    "dry friction 0.5 N": lambda: effects.CoulombFriction(force=0.5),
     "dry friction 1 N": lambda: effects.CoulombFriction(force=1.0),
     "gear friction 0.3": lambda: effects.LoadDependentFriction(share=0.3),
     "Stribeck friction 0.5 to 1 N": lambda: effects.StribeckFriction(force=0.5, breakaway=1.0, velocity=0.1),
     "dry friction 1 N forward, 0.4 N back": lambda: effects.DirectionalFriction(forward=1.0, backward=0.4),
-    "friction patch 3 N s/m": lambda: effects.FrictionPatch(start=-0.1, end=0.3, coefficient=3.0),
-    "hinge damping 0.005": lambda: effects.PoleDamping(coefficient=0.005),
-    "hinge friction 0.01 N m": lambda: effects.PoleFriction(torque=0.01),
-    "hinge spring 0.1 N m/rad": lambda: effects.PoleSpring(stiffness=0.1),
-    "cart 1.2 times as heavy": lambda: effects.CartMass(scale=1.2),
-    "pole 1.5 times as heavy": lambda: effects.PoleMass(scale=1.5),
-    "pole 1.1 times as long": lambda: effects.PoleLength(scale=1.1),
-    "gain 0.85": lambda: effects.ActuatorGain(scale=0.85),
+    "friction patch 5 N s/m": lambda: effects.FrictionPatch(start=-0.1, end=0.3, coefficient=5.0),
+    "hinge damping 0.02": lambda: effects.PoleDamping(coefficient=0.02),
+    "hinge friction 0.02 N m": lambda: effects.PoleFriction(torque=0.02),
+    "hinge spring 0.3 N m/rad": lambda: effects.PoleSpring(stiffness=0.3),
+    "cart 1.4 times as heavy": lambda: effects.CartMass(scale=1.4),
+    "pole 3 times as heavy": lambda: effects.PoleMass(scale=3.0),
+    "pole 1.3 times as long": lambda: effects.PoleLength(scale=1.3),
+    "gain 0.7": lambda: effects.ActuatorGain(scale=0.7),
     "lag 0.03 s": lambda: effects.ActuatorLag(time_constant=0.03),
     "delay 0.02 s": lambda: effects.ActuatorDelay(delay=0.02),
     "dead zone 0.03": lambda: effects.ActuatorDeadzone(width=0.03),
