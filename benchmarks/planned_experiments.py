@@ -2,10 +2,11 @@
 
     python -m benchmarks.planned_experiments
 
-The source policy runs gently on a cart-pole with one hidden effect: 80 noisy rows, diagnosed with the whole catalogue. Where the diagnosis is ambiguous, 200 more rows are recorded in three ways: with the excitation of
-`visadapt.plan` added to the policy's commands, with white noise of the same root mean square, and with neither. Each is
-diagnosed together with the first recording, and is right where the hidden effect alone is then identified. Ambiguities
-that no excitation is expected to settle, as that of a force with a bias of the motor, are left as they are.
+The source policy runs gently on a cart-pole with one hidden effect: 80 noisy rows, diagnosed with the whole catalogue.
+Where the diagnosis is ambiguous, 200 more rows are recorded in three ways: with the excitation of `visadapt.plan` added
+to the policy's commands, with white noise of the same root mean square, and with neither. Each is diagnosed together
+with the first recording, and is right where the hidden effect alone is then identified. Ambiguities that no excitation
+is expected to settle, as that of a force with a bias of the motor, are left as they are.
 
 Writes results/planned_experiments.csv. Interrupt it anywhere; started again, it goes on.
 """
