@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from experiments.curves import save_figure
 from experiments.kept_scores import kept_score
 from renderers import DrawnCartPole
-from visadapt.diagnosis.report.text import estimate, interval, plain
+from visadapt.diagnosis.report.text import estimate, interval, plain, with_unit
 from visadapt.diagnosis.result import Estimate
 from visadapt.effects import ActuatorGain, CameraRotation
 from visadapt.evaluation import CartPoleScore
@@ -81,7 +81,7 @@ def draw(path: Path, runs: list[Run], scores: list[CartPoleScore], found: dict[s
     titles = ("Before", f"After {samples} samples")
     width = 0.155
     for bottom, title, run, score in zip((0.63, 0.05), titles, runs, scores, strict=True):
-        figure.text(0.02, bottom + 0.29, f"{title}: {score}", va="bottom", size=12, weight="bold", color=INK)
+        figure.text(0.02, bottom + 0.29, f"{title}: {_in_words(score)}", va="bottom", size=12, weight="bold", color=INK)
         for column, at in enumerate(SHOWN_AT):
             _frame(figure.add_axes((0.02 + column * (width + 0.006), bottom, width, 0.27)), run, at)
     figure.text(
@@ -109,11 +109,18 @@ def _frame(axes: Axes, run: Run, at: float) -> None:
     axes.set_xlabel(f"{at:g} s" if lasts else f"ended at {episode.time[-1]:.1f} s", color=MUTED)
 
 
+def _in_words(score: CartPoleScore) -> str:
+    up = f"{score.survived} of {score.episodes} episodes last"
+    return up if score.mean_speed is None else f"{up}, mean cart speed {score.mean_speed:.3f} m/s"
+
+
 def _cause(cause: dict[str, Any]) -> str:
     """A cause as JSON holds it, in a line, beside what was hidden."""
     found = {name: Estimate(**value) for name, value in cause["parameters"].items()}
     parts = [f"{name} {estimate(one)} (90 %: {interval(one)})" for name, one in found.items()]
-    return f"{plain(cause['effect'])}: {', '.join(parts)}; hidden: {HIDDEN[cause['effect']]:g}"
+    unit = next(iter(found.values())).unit
+    hidden = with_unit(f"{HIDDEN[cause['effect']]:g}", unit)
+    return f"{plain(cause['effect'])}: {', '.join(parts)}; hidden: {hidden}"
 
 
 if __name__ == "__main__":
