@@ -60,9 +60,12 @@ def untuned(setup: Setup) -> Setup:
     return _tuned(setup, iterations=0)
 
 
-def through_the_residual(setup: Setup) -> Setup:
-    """Gradients that flow through the residual as well; nothing that streams pass through is kept."""
-    return _tuned(setup, streams=None, every=1, batch=64, iterations=400, longest=25, learning_rate=2e-3)
+def held_over_a_plan(setup: Setup) -> Setup:
+    """From states: the residual's correction is constant over a plan, as from frames, so that no gradient flows."""
+    settings = setup.settings
+    assert settings.refinement is not None
+    held = replace(settings.refinement, iterations=300, streams=32, recorded=settings.tuning.recorded)
+    return replace(setup, settings=replace(settings, tuning=held))
 
 
 def with_an_mlp(setup: Setup) -> Setup:
@@ -95,7 +98,7 @@ VARIANTS: dict[str, Variant] = {
     "no tuning": untuned,
     "no feed-forward": _with(feedforward=False),
     "no averaging of weights": _with(trust=1.0),
-    "gradients through the residual": through_the_residual,
+    "correction held over a plan": held_over_a_plan,
     "MLP residual": with_an_mlp,
 }
 

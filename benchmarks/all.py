@@ -104,7 +104,7 @@ COMMANDS = (
             "benchmarks.ablations",
             *("--shown", "states", "--out", "results/ablations_states.csv", "--seeds", "2"),
             *("--targets", "2(sin t + 1) N", "dry friction 4 N", "delay 0.05 s and 1 N"),
-            *("--variants", "as shipped", "no tuning", "gradients through the residual", "MLP residual"),
+            *("--variants", "as shipped", "no tuning", "correction held over a plan", "MLP residual"),
         ),
         25,
         work="--work",

@@ -105,7 +105,7 @@ class Settings:
     """counted, in one round"""
     source_iterations: int = 3000
     """of the source policy, from states"""
-    iterations: int = 300
+    iterations: int = 400
     """of the tuning with a residual, from states"""
     jobs: int = 2
     """seeds at once, one core each"""

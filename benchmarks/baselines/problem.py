@@ -47,7 +47,7 @@ class Sizes:
     """counted samples after which a policy is scored"""
     iterations: int = 3000
     """of the source policies"""
-    tuning: int = 300
+    tuning: int = 400
     """iterations of a round of ours"""
     source_steps: int = 200_000
     """of PPO in the source"""

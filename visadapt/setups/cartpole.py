@@ -67,12 +67,18 @@ def _settings(source: TuneSettings, refinement: TuneSettings) -> SetupSettings:
 
 
 def from_states(source: World) -> SetupSettings:
-    """How the cart-pole that is shown its states learns, tuned for a source."""
+    """How the cart-pole that is shown its states learns, tuned for a source.
+
+    With a residual, gradients flow through it: held over a plan, what it corrects for a late motor would not change
+    with the plan's commands.
+    """
     wide = Balance(PAPER_CARTPOLE, divergence=(UNLIMITED, 4.0, 0.5, 10.0))
-    return _settings(
+    own = _settings(
         TuneSettings(wide, iterations=3000, learning_rate=3e-3, observation_noise=0.0),
         replace(_near_rest(source), observation_noise=0.0),
     )
+    tuning = replace(own.tuning, streams=None, every=1, batch=64, iterations=400, longest=25, learning_rate=2e-3)
+    return replace(own, tuning=tuning)
 
 
 def from_frames(source: World) -> SetupSettings:
