@@ -72,6 +72,7 @@ def test_effects_of_one_s_own(here, diagnosis):
 
 
 def test_interrupted_it_goes_on_to_the_same_policy(here, monkeypatch):
+    """Once while it is trained and once while it is refined: both go on from the last checkpoint."""
     monkeypatch.setattr("visadapt.learning.training_state.CHECKPOINT_ITERATIONS", 4)
     command = (*CARTPOLE[:3], "--iterations", 9)
     assert run(*command, "--out", "whole.safetensors") == 0
@@ -79,17 +80,19 @@ def test_interrupted_it_goes_on_to_the_same_policy(here, monkeypatch):
 
     def log(self, stage, done, total, loss):
         calls.append(done)
-        if len(calls) == 6:
+        if len(calls) in (6, 17):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(progress._Log, "__call__", log)
-    assert run(*command, "--out", "p.safetensors") == 130
-    assert not (here / "p.safetensors").exists()
+    for _ in range(2):
+        assert run(*command, "--out", "p.safetensors") == 130
+        assert not (here / "p.safetensors").exists()
     assert run(*command, "--out", "p.safetensors") == 0
-    assert calls == [1, 2, 3, 4, 5, 6, 5, 6, 7, 8, 9]
+    trained, refined = [*range(1, 7), *range(5, 10)], [*range(1, 7), *range(5, 10)]
+    assert calls == trained + refined
     whole, resumed = (va.load_policy(f"{name}.safetensors").state_dict() for name in ("whole", "p"))
     assert all(torch.equal(value, resumed[name]) for name, value in whole.items())
-    assert not list(here.glob("*.unfinished"))
+    assert not list(here.glob("*.unfinished")) + list(here.glob("*.rough.safetensors"))
 
 
 @pytest.mark.parametrize(
