@@ -8,6 +8,7 @@ class of at most 3 contains it; several true effects need a class each.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from itertools import permutations
 from typing import Any
@@ -118,20 +119,20 @@ def region_of(effect: str) -> tuple[str, str, str] | None:
 
 def matches(effects: set[str], groups: list[set[str]]) -> bool:
     """Whether every effect is in a class of its own that is small enough."""
-    small = [group for group in groups if len(group) <= LARGEST_CLASS]
-    names = sorted(effects)
-    return any(
-        all(name in group for name, group in zip(names, order, strict=True))
-        for order in permutations(small, len(names))
-    )
+    return _one_each(sorted(effects), [group for group in groups if len(group) <= LARGEST_CLASS])
 
 
 def stages_match(effects: set[str], groups: list[set[str]]) -> bool:
     """Whether the classes are of the stages of the effects, one each."""
-    stages = [EFFECTS[name].stage for name in effects]
-    possible = [{EFFECTS[name].stage for name in group} for group in groups]
-    return len(possible) == len(stages) and any(
-        all(stage in own for stage, own in zip(stages, order, strict=True)) for order in permutations(possible)
+    stages = [{EFFECTS[name].stage for name in group} for group in groups]
+    return len(groups) == len(effects) and _one_each([EFFECTS[name].stage for name in effects], stages)
+
+
+def _one_each(wanted: Sequence[str], groups: Sequence[Collection[str]]) -> bool:
+    """Whether each of `wanted` is in a group of its own."""
+    return any(
+        all(each in group for each, group in zip(wanted, order, strict=True))
+        for order in permutations(groups, len(wanted))
     )
 
 

@@ -10,7 +10,9 @@ from experiments.flights import flight_target
 from tests.flying import drag, trained_as
 from visadapt.effects import PeriodicForce
 from visadapt.evaluation import score
+from visadapt.history import History
 from visadapt.setups.flight import fixed_wing, quadrotor
+from visadapt.systems.rigid_body import POSITION, VELOCITY
 from visadapt.tasks.references import Reference
 from visadapt.weights import shipped
 
@@ -25,9 +27,14 @@ def shortened(references):
 
 
 @pytest.fixture(scope="module")
-def references():
+def whole():
     settings = quadrotor_references.Settings(train=30, test=20, seed=7)  # the policies were trained on seed 0
-    train, test = quadrotor_references.make(settings)
+    return quadrotor_references.make(settings)
+
+
+@pytest.fixture(scope="module")
+def references(whole):
+    train, test = whole
     return shortened(train), shortened(test)
 
 
@@ -36,6 +43,23 @@ def test_the_quadrotor_stays_within_3_cm_of_references_it_was_not_trained_on(ref
     found = score(setup.load(shipped("quadrotor")), flight_target(setup), 20, 0)
     assert found.failed == 0
     assert found.mean < 0.03
+
+
+def test_thrown_far_off_its_reference_the_quadrotor_comes_back(whole):
+    """Its body rates are limited: one that leans by all of such an error swings further each time, and is lost."""
+    setup = quadrotor(*whole)
+    policy, task, generator = setup.load(shipped("quadrotor")), setup.test, torch.Generator().manual_seed(0)
+    state, task_state = task.evaluation_start(20, generator)
+    for part, size in ((POSITION, 2.0), (VELOCITY, 2.0)):
+        away = torch.randn(20, 3, generator=generator)
+        state[:, part] += size * away / away.norm(dim=1, keepdim=True)
+    at, history = setup.source.start(state), History.start(task.show(state, task_state), 4)
+    with torch.no_grad():
+        for _ in range(task.steps):
+            action = policy.act(history)
+            at, task_state = setup.source.step(at, action), task.advance(task_state)
+            history = history.acting(action).observing(task.show(at.state, task_state))
+    assert task.distance_off(at.state, task_state).max() < 0.2
 
 
 def test_200_samples_of_a_drag_lower_its_error_by_half_or_more(references, tmp_path):

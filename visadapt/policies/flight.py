@@ -13,6 +13,9 @@ from visadapt.policies.base import Policy, ignore_correction
 from visadapt.policies.networks import N_DISTURBANCE, FlightResidualNetwork, mlp
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY, RigidBody, rotation, times
 
+FARTHEST, FASTEST = 0.5, 1.0
+"""m and m/s off its reference, the most that a policy that follows answers"""
+
 
 class FlightPolicy(Policy):
     """A policy for a rigid body that is shown its state (13) and, after it, its goal; after A.1.1 and A.1.2.
@@ -73,11 +76,24 @@ class FollowPolicy(FlightPolicy):
         self.period = period
 
     def aim(self, state: Tensor, goal: Tensor) -> Tensor:
-        """What is left of the reference after going on at the present velocity."""
-        reference, velocity = goal.unflatten(1, (HORIZON, 6)), state[:, None, VELOCITY]
+        """What is left of the reference after going on at the present velocity.
+
+        A vehicle further off in position or velocity than FARTHEST and FASTEST is taken to be as far off as that. Its
+        turns are slow: if it leant by all of a large error, it would swing back too late, further each time.
+        """
+        reference = goal.unflatten(1, (HORIZON, 6))
+        next_velocity = reference[:, :1, 3:]
+        now = reference[:, :1, :3] - self.period * next_velocity
+        position = now - _at_most(FARTHEST, now - state[:, None, POSITION])
+        velocity = next_velocity - _at_most(FASTEST, next_velocity - state[:, None, VELOCITY])
         steps = torch.arange(1, HORIZON + 1).to(state)[:, None]
-        away = reference[..., :3] - state[:, None, POSITION] - self.period * steps * velocity
+        away = reference[..., :3] - position - self.period * steps * velocity
         return torch.cat((away, reference[..., 3:] - velocity), -1).flatten(1)
+
+
+def _at_most(limit: float, vectors: Tensor) -> Tensor:
+    """Vectors (..., 3), those that are longer shortened to `limit`."""
+    return vectors * (limit / vectors.norm(dim=-1, keepdim=True).clamp_min(limit))
 
 
 class ReachPolicy(FlightPolicy):
