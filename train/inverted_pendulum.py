@@ -37,9 +37,6 @@ from renderers.training import fit
 from visadapt.evaluation import CartPoleScore
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.learning.grounding import gap
-from visadapt.learning.perception import Paths, PerceptionSettings
-from visadapt.learning.policy import TuneSettings
-from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
 from visadapt.progress import Report, reporting, staged
@@ -52,28 +49,12 @@ from visadapt.targets import Observation, SyntheticTarget, Target, TargetError
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.targets.inverted_pendulum import MAP, REACH_M, SOURCE, START, inverted_pendulum
 from visadapt.targets.rollout import Run, film_run
-from visadapt.tasks.balance import Balance, Cost
 from visadapt.world import World
 
 ANGLE_LIMIT = 0.2
 """rad, beyond which the environment ends an episode"""
 GUESS = (59.5, 68.8, 60.0, 0.75)
 """Where a look at the frames puts the hinge at x = 0 (px), a metre (px) and, generously, the pole's tip (m)."""
-COST = Cost(state=(50.0, 3.0, 100.0, 0.3))
-"""Receding over 10 steps of 0.04 s, the linearised source has eigenvalues of at most 0.967 under it; a force of 10 N
-that swings at 1 rad/s moves the cart by 0.12 m/s."""
-SEE = PerceptionSettings(iterations=2000, cart=Paths(0.8, 0.3, 3.0), pole=Paths(0.15, 0.4, 6.0))
-INSIDE = (REACH_M - 0.05, 1.0, ANGLE_LIMIT - 0.01, 1.5)
-LEARN = TuneSettings(Balance(COST, (0.4, 0.2, 0.12, 0.2), (0.0, 0.1, 0.0, 0.2), INSIDE, first_divergence=0.3), 1500)
-ADAPT = TuneSettings(
-    Balance(COST, (0.3, 0.1, 0.08, 0.1), (0.0,) * 4, INSIDE, first_divergence=0.4),
-    iterations=50,
-    batch=32,
-    learning_rate=2e-4,
-    longest=25,
-    recorded=0.8,
-)
-TRAINING = SetupSettings(LEARN, ADAPT, observations="camera", perception=SEE)
 
 
 @dataclass(frozen=True)
@@ -115,7 +96,7 @@ def main(settings: Settings) -> None:
     """Do the whole job in `settings.out`, going on from what is there."""
     out = settings.out
     chosen = {key: value for key, value in asdict(settings).items() if key not in ("out", "results", "seeds")}
-    about = open_run(out, {**chosen, "training": TRAINING.numbers()})
+    about = open_run(out, chosen)
     target = inverted_pendulum()
     scores: dict[str, CartPoleScore] = {}
     adaptations: dict[int, dict[str, Any]] = {}
@@ -127,7 +108,7 @@ def main(settings: Settings) -> None:
 
     with reporting() as report:
         world = World(SOURCE, period=target.period)
-        setup = cartpole_frames(world, _renderer(settings, target, report), TRAINING)
+        setup = cartpole_frames(world, _renderer(settings, target, report))
         source = out / "source" / "policy.safetensors"
         policy = setup.pretrain(source, 0, report)
         look("source", SeenSource(setup), policy)

@@ -13,6 +13,7 @@ from visadapt.evaluation import score
 from visadapt.history import History
 from visadapt.setups.flight import fixed_wing, quadrotor
 from visadapt.systems.rigid_body import POSITION, VELOCITY
+from visadapt.tasks.follow import Follow
 from visadapt.tasks.references import Reference
 from visadapt.weights import shipped
 
@@ -49,6 +50,7 @@ def test_thrown_far_off_its_reference_the_quadrotor_comes_back(whole):
     """Its body rates are limited: one that leans by all of such an error swings further each time, and is lost."""
     setup = quadrotor(*whole)
     policy, task, generator = setup.load(shipped("quadrotor")), setup.test, torch.Generator().manual_seed(0)
+    assert isinstance(task, Follow)
     state, task_state = task.evaluation_start(20, generator)
     for part, size in ((POSITION, 2.0), (VELOCITY, 2.0)):
         away = torch.randn(20, 3, generator=generator)
