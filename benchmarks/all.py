@@ -117,6 +117,14 @@ COMMANDS = (
         work="--out",
         extra="mujoco",
     ),
+    Command(
+        "dm_control",
+        "dm_control.csv",
+        ("benchmarks.dm_control_balance",),
+        60,
+        work="--work",
+        extra="dm_control",
+    ),
     Command("flight", "flight.csv", ("benchmarks.flight",), 60, work="--work"),
     Command(
         "data_collection",
@@ -213,7 +221,13 @@ COMMANDS = (
 )
 """In an order in which each finds what it reads."""
 
-INSTALLED_BY = {"baselines": "casadi", "mujoco": "mujoco", "onnx": "onnxruntime", "rotorpy": "rotorpy"}
+INSTALLED_BY = {
+    "baselines": "casadi",
+    "dm_control": "dm_control",
+    "mujoco": "mujoco",
+    "onnx": "onnxruntime",
+    "rotorpy": "rotorpy",
+}
 """Of an extra: the package whose absence says that the extra is not installed."""
 
 

@@ -58,6 +58,7 @@ TABLES = {
     "ablations": Table(adaptation.ablations, ("ablations",)),
     "ablations, states": Table(adaptation.ablations, ("ablations_states",)),
     "pendulum": Table(adaptation.pendulum, ("inverted_pendulum",)),
+    "dm_control": Table(adaptation.dm_control, ("dm_control",)),
     "vehicles": Table(adaptation.vehicles, ("flight",)),
     "residual": Table(adaptation.residual, ("residual_samples",)),
     "collection": Table(adaptation.collection, ("data_collection",)),

@@ -28,6 +28,9 @@ VEHICLES = {
 LOOP_SPEEDS = {"2.6": "0.05", "3.4": "0.09", "4.1": "0.12", "4.6": "0.21", "5.0": "0.31"}
 """Speeds of the power loop in m/s, and the paper's mean errors in m."""
 
+DM_CONTROL = (("DreamerV3", "100,000", "945"), ("DrQ-v2", "100,000", "987"), ("PPO", "1,000,000", "507"))
+"""Of dm_control's cart-pole, balance, from pixels: who published a return, after how many steps, and the return."""
+
 
 def cartpole(pixels: Rows, states: Rows) -> Lines:
     """The paper's CartPole numbers beside ours."""
@@ -87,6 +90,15 @@ def pendulum(rows: Rows) -> Lines:
     return lines + [
         [f"{row['method']}, {row['domain']}", f"{int(row['samples']):,}", *_speed_cells(row)] for row in speeds
     ]
+
+
+def dm_control(rows: Rows) -> Lines:
+    """dm_control's cart-pole, balance, beside what others have published."""
+    lines = [["dm_control, balance, from pixels: return of at most 1,000", "steps of the suite", "return"]]
+    for row in rows:
+        spread = f" ± {float(row['std']):.0f}, {row['episodes']} episodes, seeds: {row['seeds']}"
+        lines.append([f"ours, {row['domain']}", f"{int(row['samples']):,}", f"{float(row['mean']):.0f}{spread}"])
+    return lines + [[f"{name} (published)", steps, earned] for name, steps, earned in DM_CONTROL]
 
 
 def vehicles(rows: Rows) -> Lines:

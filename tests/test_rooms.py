@@ -10,7 +10,7 @@ MAY_IMPORT = {
     "renderers": set(),
     "visadapt": {"renderers"},
     "datasets": {"renderers", "visadapt"},
-    "experiments": {"visadapt"},
+    "experiments": {"renderers", "visadapt"},
     "train": {"renderers", "visadapt", "datasets", "experiments"},
     "benchmarks": {"renderers", "visadapt", "datasets", "experiments"},
 }

@@ -26,14 +26,13 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
-from PIL import Image
 from torch import Tensor
 
 from experiments.curves import plot_losses
 from experiments.kept_scores import kept_score
+from experiments.learnt_camera import learnt_renderer
 from experiments.result_tables import Row, speed_row, write_rows
-from renderers import LayeredRenderer, load_renderer, save_renderer
-from renderers.training import fit
+from renderers import LayeredRenderer
 from visadapt.evaluation import CartPoleScore
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.learning.grounding import gap
@@ -43,7 +42,6 @@ from visadapt.progress import Report, reporting, staged
 from visadapt.recordings import Episode
 from visadapt.setups.base import Setup
 from visadapt.setups.cartpole import cartpole_frames
-from visadapt.storage.atomic_files import replacing
 from visadapt.storage.run_folder import open_run, write_json
 from visadapt.targets import Observation, SyntheticTarget, Target, TargetError
 from visadapt.targets.gymnasium import GymnasiumTarget
@@ -54,7 +52,7 @@ from visadapt.world import World
 ANGLE_LIMIT = 0.2
 """rad, beyond which the environment ends an episode"""
 GUESS = (59.5, 68.8, 60.0, 0.75)
-"""Where a look at the frames puts the hinge at x = 0 (px), a metre (px) and, generously, the pole's tip (m)."""
+"""Of the camera, from a look at the frames."""
 
 
 @dataclass(frozen=True)
@@ -134,29 +132,11 @@ def main(settings: Settings) -> None:
 
 
 def _renderer(settings: Settings, target: GymnasiumTarget, report: Report) -> LayeredRenderer:
-    """Learnt from the environment's frames at set states, or as an earlier run left it."""
-    path = settings.out / "renderer.safetensors"
-    if path.exists():
-        found = load_renderer(path)
-        assert isinstance(found, LayeredRenderer)
-        return found
-    generator = torch.Generator().manual_seed(0)
+    """Learnt from the environment's frames at set states."""
     reach = torch.tensor([1.0, 0.0, 0.35, 0.0])
-    states = reach * (2 * torch.rand(settings.frames, 4, generator=generator) - 1)
-    frames = torch.from_numpy(target.show(states.double().numpy()))
-    torch.manual_seed(0)
-    height, width = frames.shape[1:]
-    renderer = LayeredRenderer(height, width, *GUESS)
-    x, theta = states[:, 0], states[:, 2]
-    fit(renderer, x, theta, frames, settings.renderer_steps, generator, 32, staged(report, "renderer"))
-    with torch.no_grad():
-        learnt = (255 * renderer(x[:4], theta[:4])).round().clamp(0, 255).byte()
-    picture = np.vstack([np.hstack(list(row)) for row in (frames[:4].numpy(), learnt.numpy())])
-    with replacing(settings.out / "renderer.png") as temporary:
-        Image.fromarray(picture).save(temporary, "PNG")
-    with replacing(path) as temporary:
-        save_renderer(temporary, renderer, {"frames": settings.frames, "steps": settings.renderer_steps, "seed": 0})
-    return renderer
+    states = reach * (2 * torch.rand(settings.frames, 4, generator=torch.Generator().manual_seed(0)) - 1)
+    path = settings.out / "renderer.safetensors"
+    return learnt_renderer(path, states, target.show, GUESS, settings.renderer_steps, report)
 
 
 def _panels(films: Sequence[tuple[str, Run]]) -> list[CartPolePanel]:
