@@ -16,7 +16,7 @@ from torch import Tensor
 from benchmarks.baselines.problem import COST, Problem, Sizes, Stage, grounded
 from visadapt.effects import Residual
 from visadapt.history import HORIZON, History
-from visadapt.learning.policy import imagine
+from visadapt.learning.plans import imagine
 from visadapt.policies import Policy
 from visadapt.world import World
 

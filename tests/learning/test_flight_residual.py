@@ -12,7 +12,7 @@ from tests.scenes import stir
 from visadapt.effects import ActuatorLag, LinearDrag, PeriodicForce, Residual
 from visadapt.history import LENGTH, History
 from visadapt.learning.grounding import GroundSettings, gap, ground, rescale
-from visadapt.learning.policy import imagine
+from visadapt.learning.plans import imagine
 from visadapt.learning.windows import Windows
 from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.recordings import Episode

@@ -12,7 +12,8 @@ from tests.scenes import (
 from visadapt.effects import ActuatorDelay, ConstantForce, Residual
 from visadapt.evaluation import score
 from visadapt.history import History
-from visadapt.learning.policy import DivergedError, TuneSettings, imagine, initialise_feedforward, tune
+from visadapt.learning.plans import imagine
+from visadapt.learning.policy import DivergedError, TuneSettings, initialise_feedforward, tune
 from visadapt.learning.windows import Windows
 from visadapt.policies import ImagePolicy, StatePolicy
 from visadapt.policies.networks import StateResidualNetwork

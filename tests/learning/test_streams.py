@@ -7,7 +7,7 @@ import torch
 from visadapt.effects import EFFECTS, ActuatorDelay, AngleOffset, ConstantForce, Dropout, MeasurementDelay, Residual
 from visadapt.history import History
 from visadapt.learning.grounding import gap
-from visadapt.learning.policy import imagine
+from visadapt.learning.plans import imagine
 from visadapt.learning.streams import Streams
 from visadapt.learning.windows import Windows
 from visadapt.policies.networks import StateResidualNetwork

@@ -9,7 +9,8 @@ from tests.flying import PERIOD, push, seeded, straight, waves
 from tests.scenes import stir
 from visadapt.effects import LinearDrag, Residual
 from visadapt.history import HORIZON, LENGTH, History
-from visadapt.learning.policy import TuneSettings, imagine, tune
+from visadapt.learning.plans import imagine
+from visadapt.learning.policy import TuneSettings, tune
 from visadapt.learning.streams import Streams
 from visadapt.learning.windows import Windows
 from visadapt.policies import FollowPolicy, ReachPolicy

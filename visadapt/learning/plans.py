@@ -1,0 +1,147 @@
+"""Plans that a policy is tuned by: carried out in the world, so that the gradient of their cost flows back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from visadapt.history import History
+from visadapt.learning.streams import Streams, StreamState, Visited, look
+from visadapt.learning.windows import Observe
+from visadapt.policies import Policy
+from visadapt.world import World, WorldState
+
+
+class Plans:
+    """Plans from where the streams are now; the gradient flows through physics, effects, residual and camera.
+
+    Args:
+        noise: standard deviation of white noise on what the policy sees.
+    """
+
+    def __init__(self, policy: Policy, streams: Streams, noise: float, generator: torch.Generator) -> None:
+        self.policy = policy
+        self.streams = streams
+        self.noise = noise
+        self.generator = generator
+
+    def loss(self, iteration: int, progress: float) -> Tensor:
+        """The mean cost of the plans; then every stream takes the first step. `progress` is the curriculum's."""
+        streams, now = self.streams, self.streams.now
+        plan = self.policy(self.seen(now.history))
+        show = partial(streams.task.show, task_state=now.task_state)
+        states, first = imagine(streams.world, streams.observe, now.at, now.history, plan, show, self.generator)
+        loss = streams.task.cost(states, plan, now.at.state, now.task_state).mean()
+        streams.advance(first, plan[:, 0].detach(), progress, self.generator)
+        return loss
+
+    def seen(self, history: History) -> History:
+        """The history with noise, as the policy sees it."""
+        noise = self.noise * torch.randn(history.observations.shape, generator=self.generator)
+        return History(history.observations + noise.to(history.observations), history.actions)
+
+    def tree(self) -> dict[str, Any]:
+        """All that plans depend on, as a tree of tensors, for a checkpoint."""
+        return {"now": self.streams.now.tree(), "age": self.streams.age}
+
+    def restore(self, tree: dict[str, Any]) -> None:
+        """Go on from a `tree`."""
+        self.streams.now, self.streams.age = StreamState.of(tree["now"]), tree["age"]
+
+
+class KeptPlans(Plans):
+    """Plans from all that the streams have passed through, so that few steps are simulated and few frames rendered.
+
+    The gradient flows through physics and effects alone: the residual's correction is held over a plan, and no frame is
+    rendered along it.
+
+    Args:
+        batch: plans drawn in an iteration.
+        every: iterations between two steps of the streams.
+    """
+
+    def __init__(
+        self, policy: Policy, streams: Streams, noise: float, generator: torch.Generator, batch: int, every: int
+    ) -> None:
+        super().__init__(policy, streams, noise, generator)
+        self.batch = batch
+        self.every = every
+        self.past: Visited | None = None
+
+    def loss(self, iteration: int, progress: float) -> Tensor:
+        """The mean cost of the plans, before which the streams take a step where it is time for one."""
+        streams = self.streams
+        if iteration % self.every == 0:
+            visited, action, first = visit(self.policy, streams.world, streams.now, self.seen(streams.now.history))
+            self.past = visited if self.past is None else self.past.joined(visited)
+            streams.advance(first, action, progress, self.generator)
+        assert self.past is not None
+        drawn = self.past[torch.randint(len(self.past.inputs), (self.batch,), generator=self.generator)]
+        plan = self.policy.decide(drawn.inputs, drawn.expected)
+        states = held(streams.world, drawn.at, plan, drawn.correction)
+        return streams.task.cost(states, plan, drawn.at.state, drawn.task_state).mean()
+
+    def tree(self) -> dict[str, Any]:
+        return super().tree() if self.past is None else {**super().tree(), "past": self.past.tree()}
+
+    def restore(self, tree: dict[str, Any]) -> None:
+        super().restore(tree)
+        self.past = Visited.of(tree["past"])
+
+
+def imagine(
+    world: World,
+    observe: Observe | None,
+    at: WorldState,
+    history: History,
+    plan: Tensor,
+    show: Callable[[Tensor], Tensor] = lambda seen: seen,
+    generator: torch.Generator | None = None,
+) -> tuple[Tensor, WorldState]:
+    """Carry out a plan (B, K, n_action): the states that follow (B, K, n_state), and the world after the first step.
+
+    Args:
+        observe: the camera; None where the sensors' measurements are seen.
+        at: where the plan begins, its row read; that of the world returned is not.
+        show: adds to what is seen what the task shows beside it.
+        generator: for random sensing effects.
+    """
+    states = []
+    first = at
+    for k in range(plan.shape[1]):
+        at = world.step(at, plan[:, k], history)
+        states.append(at.state)
+        if k == 0:
+            first = at
+        if world.has_residual and k + 1 < plan.shape[1]:
+            seen, at = look(world, observe, at, generator)
+            history = history.acting(plan[:, k]).observing(show(seen))
+    return torch.stack(states, 1), first
+
+
+@torch.no_grad()
+def visit(policy: Policy, world: World, stream: StreamState, shown: History) -> tuple[Visited, Tensor, WorldState]:
+    """What is kept of a stream, the action (B, n_action) that the policy takes, and the world after it.
+
+    `shown` is the stream's history with what the policy sees instead of it, noise included.
+    """
+    inputs, expected = policy.embed(shown), policy.correction(shown)
+    action = policy.decide(inputs, expected)[:, 0]
+    correction = torch.zeros_like(stream.at.state)
+    if world.has_residual:
+        correction = world.correction(action, stream.history)
+    visited = Visited(stream.at, stream.task_state, inputs, expected, correction)
+    return visited, action, world.step(stream.at, action, correction=correction)
+
+
+def held(world: World, at: WorldState, plan: Tensor, correction: Tensor) -> Tensor:
+    """The states (B, K, n_state) that follow a plan (B, K, n_action) under a constant correction (B, n_state)."""
+    states = []
+    for k in range(plan.shape[1]):
+        at = world.step(at, plan[:, k], correction=correction)
+        states.append(at.state)
+    return torch.stack(states, 1)
