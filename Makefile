@@ -43,7 +43,7 @@ format: $(INSTALLED)
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "visadapt needs Python 3.11 or later: make PYTHON=/path/to/python3.11")'
 	$(PYTHON) -m venv $(VENV)
-	$(RUN) -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e '.[camera,onnx,mujoco,dev]'
+	$(RUN) -m pip install --quiet $(PIP_ARGS) -c constraints.txt -e '.[camera,logs,onnx,mujoco,dev]'
 	@touch $@
 
 clean:

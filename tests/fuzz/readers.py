@@ -14,8 +14,10 @@ from random import Random
 
 import numpy as np
 import torch
+from rosbags.rosbag2 import StoragePlugin
 
 from renderers import LayeredRenderer, MLPRenderer, load_renderer, save_renderer
+from tests import logs
 from tests.fuzz import damage
 from tests.recorded import STATES, a_table, write
 from visadapt import policies
@@ -96,6 +98,17 @@ def _hdf5(frames: bool, folder: Path) -> list[Path]:
     write_recording(folder / "two", episodes, names, ["command"])
     write_recording(folder / "one", episodes[:1])
     return [folder / "two", folder / "one"]
+
+
+def _bags(version: int, folder: Path) -> list[Path]:
+    if version == 1:
+        return [logs.ros_bag(folder / "run.bag", 1)]
+    bag = logs.ros_bag(folder / "run", 2, stamped=False, plugin=StoragePlugin.MCAP)
+    return [next(bag.glob("*.mcap"))]
+
+
+def _read_log(columns: dict[str, str], path: Path) -> None:
+    load_recording(path, CartPole(), columns)
 
 
 def _policies(folder: Path) -> list[Path]:
@@ -191,6 +204,14 @@ READERS = {
     "reference": Reader("line.csv", _text(LINE), (damage.damaged_text,), read_reference),
     "hdf5": Reader("run.h5", partial(_hdf5, False), (damage.odd_hdf5,), partial(_read_hdf5, False)),
     "frames": Reader("film.h5", partial(_hdf5, True), (damage.odd_hdf5,), partial(_read_hdf5, True)),
+    "bag": Reader(
+        "run.bag",
+        partial(_bags, 1),
+        (),
+        partial(_read_log, logs.ROS | {"command": "/motor/command.temperature"}),
+    ),
+    "mcap": Reader("run.mcap", partial(_bags, 2), (), partial(_read_log, logs.ROS)),
+    "ulog": Reader("run.ulg", lambda folder: [logs.ulog(folder / "run")], (), partial(_read_log, logs.PX4)),
     "parameters": Reader(
         "rig.toml", _text(PARAMETERS), (damage.damaged_text,), lambda path: load_parameters(path, CartPole)
     ),

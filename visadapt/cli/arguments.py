@@ -24,7 +24,9 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
         "close. The verdict goes to the terminal; exit status 0: a diagnosis was made, 2: bad input."
     )
     add = parser.add_argument
-    add("recording", nargs="+", metavar="RECORDING", help="a CSV or HDF5 file, several, or a folder of them")
+    add(
+        "recording", nargs="+", metavar="RECORDING", help="CSV, HDF5, a log of ROS or PX4, several, or a folder of them"
+    )
     _add_system(parser)
     columns_help = "our name=the file's, as in x=position,theta=phi"
     add("--columns", metavar="A=B,...", type=_columns, default={}, help=columns_help)

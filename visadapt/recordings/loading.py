@@ -17,14 +17,18 @@ from visadapt.recordings.clock import Note, RawEpisode, alike, check_forward, ch
 from visadapt.recordings.csv import match, read_rows
 from visadapt.recordings.episode import Episode, Recording, RecordingError
 from visadapt.recordings.hdf5 import read_names, read_stretches
+from visadapt.recordings.logs import read_log
 from visadapt.recordings.sensors import check_sensors, without_outliers
 from visadapt.recordings.thinning import thinned
+from visadapt.recordings.topics import reader
 from visadapt.systems import System
 
 SHORTEST_EPISODE_S = 0.5
 """s; shorter episodes hold too few predictions several steps ahead and are left out."""
 MOST_BYTES = 2**28
 """Of the values of all files together: 4.8 million rows of a cart-pole. The checks take some copies of them."""
+SUFFIXES = (".csv", ".h5", ".hdf5", ".bag", ".mcap", ".ulg")
+"""Of the files in a folder that are read."""
 UPRIGHT_RAD = 1.0
 """rad from 0 up to which an angle counts as upright when it is unwrapped."""
 
@@ -37,16 +41,16 @@ def load_recording(
     frames: bool = False,
     progress: Report | None = None,
 ) -> Recording:
-    """Read states and actions from CSV and HDF5 files, or frames and actions from HDF5 files.
+    """Read states and actions from CSV and HDF5 files and logs, or frames and actions from HDF5 files.
 
-    Names are matched by `csv.py`. Clocks are checked by `clock.py`; rows of an unsteady one keep their stamps. Angles
-    are unwrapped within an episode so that upright is 0 (if the pole turns over, in the turn in which it is upright
-    most often). A command in N (a column `force` that exceeds 1) is divided by the system's `max_force`. Of files that
-    are too long for memory stretches of rows are left out (`thinning.py`). The recording's warnings say what was
-    changed or left out.
+    Names are matched by `csv.py`; those of logs, bags of ROS and ULog, are TOPIC.FIELD (`logs.py`). Clocks are checked
+    by `clock.py`; rows of an unsteady one keep their stamps. Angles are unwrapped within an episode so that upright is
+    0 (if the pole turns over, in the turn in which it is upright most often). A command in N (a column `force` that
+    exceeds 1) is divided by the system's `max_force`. Of files that are too long for memory stretches of rows are left
+    out (`thinning.py`). The recording's warnings say what was changed or left out.
 
     Args:
-        paths: one or several: files, or folders whose CSV and HDF5 files are taken in the order of their names.
+        paths: one or several: files, bags of ROS 2, or folders whose recordings are taken in the order of their names.
         system: the source, which defines names and units.
         columns: our names of columns to the file's, where these are not evident.
         frames: whether to read frames in the place of states, which are then not used.
@@ -105,15 +109,15 @@ def _files(paths: Sequence[str | os.PathLike[str]], note: Note) -> list[Path]:
     files: list[Path] = []
     for path in map(Path, paths):
         found = [path]
-        if path.is_dir():
-            suffixes = (".csv", ".h5", ".hdf5")
+        if path.is_dir() and reader(path) is None:
             inside = (file for file in path.iterdir() if not file.name.startswith(".") and file.is_file())
-            found = sorted(file for file in inside if file.suffix.lower() in suffixes)
+            found = sorted(file for file in inside if file.suffix.lower() in SUFFIXES)
             if not found:
-                raise RecordingError(f"{path}: a folder without recordings; files that end in .csv or .h5 are right")
+                right = ", ".join(SUFFIXES)
+                raise RecordingError(f"{path}: a folder without recordings; files that end in {right} are right")
         elif not path.exists():
             raise RecordingError(f"{path}: there is no such file or folder")
-        elif not path.is_file():
+        elif not path.is_file() and not path.is_dir():
             raise RecordingError(f"{path}: no regular file; a CSV or HDF5 file is right")
         for file in found:
             if twin := next((other for other in files if _is_the_same(file, other)), None):
@@ -134,6 +138,10 @@ def _is_the_same(one: Path, other: Path) -> bool:
 def _read(
     path: Path, system: System, given: Mapping[str, str], frames: bool, note: Note, most: float, report: Report | None
 ) -> list[RawEpisode]:
+    if (log := reader(path)) is not None:
+        if frames:
+            raise RecordingError(f"{path}: frames are read from HDF5 alone, as visadapt.write_recording writes them")
+        return [read_log(path, log, system, given, note)]
     try:
         with path.open("rb") as file:
             is_hdf5 = file.read(4) == b"\x89HDF"

@@ -1,0 +1,84 @@
+"""Logs of robots: the same motion as a bag of ROS 1, as one of ROS 2 and as ULog, each topic with its own stamps."""
+
+import numpy as np
+import pytest
+from rosbags import rosbag2
+from rosbags.typesys import Stores, get_typestore
+
+from tests.cli.commands import refused
+from tests.logs import LATE, PERIOD, PX4, ROS, ROWS, START, motion, ros_bag, ulog
+from visadapt.recordings import RecordingError, load_recording
+from visadapt.systems import CartPole
+
+LOGS = {
+    "ROS 1": (lambda folder: ros_bag(folder / "run.bag", 1), ROS | {"command": "/motor/command.temperature"}),
+    "ROS 2": (lambda folder: ros_bag(folder / "run", 2), ROS | {"command": "/motor/command.temperature"}),
+    "ROS 2, a command without header": (lambda folder: ros_bag(folder / "run", 2, stamped=False), ROS),
+    "ULog": (lambda folder: ulog(folder / "run.ulg"), PX4),
+}
+
+
+@pytest.mark.parametrize("kind", LOGS)
+def test_readings_are_rows_and_commands_are_what_was_held_between_them(kind, tmp_path):
+    make, columns = LOGS[kind]
+    found = load_recording(make(tmp_path), CartPole(), columns)
+    (episode,) = found.episodes
+    # The first reading comes before any command, and the last one after all but one.
+    state, _ = motion(PERIOD * np.arange(1, ROWS))
+    commands = np.sin(7 * (PERIOD * np.arange(ROWS) + LATE - LATE))
+    np.testing.assert_allclose(episode.state, state, atol=1e-9)
+    np.testing.assert_allclose(episode.time, PERIOD * np.arange(ROWS - 1), atol=1e-6)
+    share = LATE / PERIOD
+    held = share * commands[:-1] + (1 - share) * commands[1:]
+    np.testing.assert_allclose(episode.action[:-1, 0], held[: ROWS - 2], atol=1e-4)
+    assert "rows are the readings of " in " ".join(found.warnings)
+
+
+def test_a_slower_topic_gives_the_rows_and_the_others_are_interpolated(tmp_path):
+    store = get_typestore(Stores.LATEST)
+    number = store.types["std_msgs/msg/Float64"]
+    rates = {"/x": 0.05, "/theta": 0.005, "/u": 0.05}
+    with rosbag2.Writer(tmp_path / "run", version=9) as writer:
+        for topic, period in rates.items():
+            connection = writer.add_connection(topic, "std_msgs/msg/Float64", typestore=store)
+            for time in np.arange(0, 3, period):
+                # The angle passes the turn at 3 rad, as an encoder's does.
+                angle = (2 * time + 3 + np.pi) % (2 * np.pi) - np.pi
+                value = {"/x": time, "/theta": angle, "/u": 0.5}[topic]
+                raw = store.serialize_cdr(number(value), "std_msgs/msg/Float64")
+                writer.write(connection, int(1e9 * (START + time)), raw)
+    found = load_recording(tmp_path / "run", CartPole(), {"x": "/x.data", "theta": "/theta.data", "command": "/u.data"})
+    (episode,) = found.episodes
+    turned = episode.state[:, 1] - 2 * episode.state[:, 0]
+    np.testing.assert_allclose(turned, turned[0], atol=1e-5)
+    np.testing.assert_allclose(episode.action, 0.5)
+    assert "/theta is interpolated" in " ".join(found.warnings)
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"x": "/joints.position[0]"}, "has no topic '/joints'; it has /joint_states, /motor/command"),
+        ({"x": "/joint_states.place[0]"}, "'place' there are effort, header, name, position, velocity"),
+        ({"x": "/joint_states.position[7]"}, r"no 'position\[7\]': at '\[7\]' there are 2 values"),
+        ({"x": "/joint_states.name[0]"}, "is no number but a str"),
+        ({"x": "position"}, "the column 'position' is not of the form TOPIC.FIELD"),
+        ({"speed": "/joint_states.velocity[0]"}, "cartpole has no 'speed'"),
+    ],
+)
+def test_what_a_bag_does_not_have(changed, says, tmp_path):
+    path = ros_bag(tmp_path / "run", 2, stamped=False)
+    with pytest.raises(RecordingError, match=says):
+        load_recording(path, CartPole(), ROS | changed)
+
+
+def test_columns_that_are_not_given_and_damaged_logs_are_one_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ulog(tmp_path / "run.ulg")
+    assert "run.ulg: say where x, theta, command are" in refused(capsys, "diagnose", "run.ulg", "--system", "cartpole")
+    columns = ",".join(f"{name}={place}" for name, place in PX4.items())
+    content = (tmp_path / "run.ulg").read_bytes()
+    for name, damaged in (("torn.bag", b"#ROSBAG V2.0\n"), ("torn.ulg", content[:20]), ("torn.mcap", b"\x89MCAP0\r\n")):
+        (tmp_path / name).write_bytes(damaged)
+        said = refused(capsys, "diagnose", name, "--system", "cartpole", "--columns", columns)
+        assert said.startswith(f"visadapt: {name}: ") or f"{name}: " in said

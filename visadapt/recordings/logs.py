@@ -1,0 +1,127 @@
+"""Recordings from a robot's own logs: bags of ROS 1 and 2, and PX4's ULog.
+
+The topics of a log have stamps of their own, a recording has rows. A row is one reading of the slowest topic that has
+states. Readings of other topics are interpolated to its stamp, and its command is the mean of what was commanded until
+the next row, each command being held until the next one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visadapt.recordings.clock import Note, RawEpisode
+from visadapt.recordings.csv import needed
+from visadapt.recordings.episode import RecordingError
+from visadapt.recordings.topics import Read, Topic
+from visadapt.systems import System
+
+GAP = 5.0
+"""Median intervals of a topic without a reading, in which none is interpolated: rows are left out."""
+
+
+def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], note: Note) -> RawEpisode:
+    """The rows of a log; `given` maps our names to TOPIC.FIELD.
+
+    Raises:
+        RecordingError: the log cannot be read, lacks a topic or a field, or its topics have no time in common.
+    """
+    ours = [*(state.name for state in system.states), *(action.name for action in system.actions)]
+    for name in given:
+        if name not in ours:
+            raise RecordingError(f"--columns {name}=...: {system.name} has no {name!r}; it has {', '.join(ours)}")
+    if missing := [name for name in needed(system) if name not in ("time", *given)]:
+        raise RecordingError(
+            f"{path}: say where {', '.join(missing)} are: --columns {missing[0]}=TOPIC.FIELD,... "
+            "(`ros2 bag info` and `ulog_info` list topics)"
+        )
+    places = {name: _place(path, given[name]) for name in ours if name in given}
+    wanted: dict[str, set[str]] = {}
+    for topic, field in places.values():
+        wanted.setdefault(topic, set()).add(field)
+    return _rows(path, system, places, _topics(path, read, wanted), note)
+
+
+def _topics(path: Path, read: Read, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
+    try:
+        return read(path, wanted)
+    except RecordingError:
+        raise
+    except Exception as error:  # parsers raise all kinds of a damaged file, MemoryError of a size that is wrong
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+    raise RecordingError(f"{path}: cannot be read as a log, is it cut short or damaged? {reason}")
+
+
+def _rows(
+    path: Path, system: System, places: Mapping[str, tuple[str, str]], topics: Mapping[str, Topic], note: Note
+) -> RawEpisode:
+    measured = tuple(state.name for state in system.states if state.name in places)
+    for name in {topic for topic, _ in places.values()}:
+        stamps = topics[name].time
+        if not len(stamps):
+            raise RecordingError(f"{path}: {name} has no messages")
+        if (back := np.flatnonzero(np.diff(stamps) < 0)).size:
+            raise RecordingError(f"{path}: the clock of {name} runs backwards after its message {back[0] + 1}")
+    read = list(dict.fromkeys(places[name][0] for name in measured))
+    commanded = list(dict.fromkeys(places[action.name][0] for action in system.actions))
+    slowest = min(read, key=lambda name: len(topics[name].time))
+    first = max(topics[name].time[0] for name in (*read, *commanded))
+    last = min(topics[name].time[-1] for name in (*read, *commanded))
+    time = topics[slowest].time
+    used = (time >= first) & (time <= last)
+    for name in read:
+        if name != slowest:
+            used &= _between_readings(time, topics[name].time)
+    if used.sum() < 2:
+        raise RecordingError(f"{path}: {', '.join((*read, *commanded))} have no time in common")
+    rows = np.flatnonzero(used)
+    time = time[rows]
+
+    def state(name: str) -> NDArray[np.float64]:
+        topic, field = places[name]
+        values = topics[topic].values[field]
+        if topic == slowest:
+            return values[rows]
+        angle = system.states[system.index(name)].unit == "rad"
+        return np.interp(time, topics[topic].time, np.unwrap(values) if angle else values)
+
+    def command(name: str) -> NDArray[np.float64]:
+        topic, field = places[name]
+        return _held(time, topics[topic].time, topics[topic].values[field])
+
+    others = "".join(f"; {name} is interpolated to them" for name in read if name != slowest)
+    note(f"rows are the readings of {slowest}{others}; a command is the mean until the next row", str(path))
+    return RawEpisode(
+        path,
+        time - time[0],
+        np.column_stack([command(action.name) for action in system.actions]),
+        np.column_stack([state(name) for name in measured]),
+        measured,
+        lambda row: f"message {rows[row] + 1} of {slowest}",
+        {name: ".".join(place) for name, place in places.items()},
+    )
+
+
+def _between_readings(time: NDArray[np.float64], stamps: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether each time (T,) lies between two readings that are not far apart."""
+    after = np.searchsorted(stamps, time).clip(1, len(stamps) - 1)
+    intervals = np.diff(stamps)
+    near: NDArray[np.bool_] = intervals[after - 1] <= GAP * np.median(intervals)
+    return near
+
+
+def _held(time: NDArray[np.float64], stamps: NDArray[np.float64], commands: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The mean of the held commands (N,) from each time (T,) to the next; of the last the one that holds there."""
+    total = np.concatenate(([0.0], np.cumsum(commands[:-1] * np.diff(stamps))))
+    mean = np.diff(np.interp(time, stamps, total)) / np.maximum(np.diff(time), 1e-12)
+    return np.append(mean, commands[np.searchsorted(stamps, time[-1], side="right") - 1])
+
+
+def _place(path: Path, column: str) -> tuple[str, str]:
+    topic, dot, field = column.partition(".")
+    if not (topic and dot and field):
+        raise RecordingError(f"{path}: the column {column!r} is not of the form TOPIC.FIELD, say /cart/state.position")
+    return topic, field

@@ -1,0 +1,119 @@
+"""Topics of a robot's own logs: bags of ROS 1 and 2, and PX4's ULog."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visadapt.recordings.episode import RecordingError
+
+MOST_NAMES = 40
+"""In a message."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """Some fields of a topic's messages."""
+
+    time: NDArray[np.float64]
+    """(N,) s"""
+    values: Mapping[str, NDArray[np.float64]]
+    """by field, (N,)"""
+
+
+Read = Callable[[Path, Mapping[str, set[str]]], dict[str, Topic]]
+"""(file, fields by topic) to the topics; raises RecordingError where one is not there."""
+
+
+def reader(path: Path) -> Read | None:
+    """What reads `path` if it is a log: a file .bag, a folder of ROS 2 or its file .mcap or .db3, or a file .ulg."""
+    suffix = path.suffix.lower()
+    if suffix == ".ulg":
+        return _read_ulog
+    if suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file():
+        return _read_bag
+    return None
+
+
+def _read_ulog(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
+    """The second instance of a topic is NAME_1, and so on."""
+    with redirect_stdout(StringIO()):  # on which pyulog says what it thinks of a log that a crash cut short
+        log = _import(path, "pyulog").ULog(str(path))
+    there = {f"{each.name}_{each.multi_id}" if each.multi_id else each.name: each.data for each in log.data_list}
+    topics = {}
+    for name, fields in wanted.items():
+        _check(path, name, there)
+        if unknown := fields - there[name].keys():
+            raise RecordingError(f"{path}: {name} has no {min(unknown)!r}; it has {_some(there[name])}")
+        values = {field: np.asarray(there[name][field], float) for field in fields}
+        topics[name] = Topic(np.asarray(there[name]["timestamp"], float) / 1e6, values)
+    return topics
+
+
+def _read_bag(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
+    """Stamps are those of the messages' headers where all topics have them, and else when messages were recorded."""
+    highlevel, stores = _import(path, "rosbags.highlevel"), _import(path, "rosbags.typesys")
+    fields = {name: sorted(each) for name, each in wanted.items()}
+    rows: dict[str, list[list[float]]] = {name: [] for name in wanted}
+    with highlevel.AnyReader([path], default_typestore=stores.get_typestore(stores.Stores.LATEST)) as bag:
+        for name in wanted:
+            _check(path, name, {each.topic for each in bag.connections})
+        for connection, stamp, raw in bag.messages([each for each in bag.connections if each.topic in wanted]):
+            name, message = connection.topic, bag.deserialize(raw, connection.msgtype)
+            numbers = [_number(path, message, name, field) for field in fields[name]]
+            rows[name].append([1e-9 * stamp, _header(message), *numbers])
+    tables = {name: np.array(each).reshape(-1, 2 + len(fields[name])) for name, each in rows.items()}
+    clock = int(all((table[:, 1] > 0).all() for table in tables.values()))
+    return {
+        name: Topic(table[:, clock], dict(zip(fields[name], table[:, 2:].T, strict=True)))
+        for name, table in tables.items()
+    }
+
+
+def _header(message: Any) -> float:
+    """s, of a message's header; 0 where it has none."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    return 0.0 if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
+
+
+def _number(path: Path, message: Any, topic: str, field: str) -> float:
+    """The number in a field such as pose.position.x or position[0]."""
+    value = message
+    for part in re.findall(r"\w+|\[\d+\]", field):
+        try:
+            value = value[int(part[1:-1])] if part.startswith("[") else getattr(value, part)
+        except (AttributeError, IndexError, TypeError):
+            names = getattr(value, "__dataclass_fields__", None)
+            has = _some(set(names) - {"__msgtype__"}) if names else f"{len(value)} values"
+            raise RecordingError(f"{path}: {topic} has no {field!r}: at {part!r} there are {has}") from None
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise RecordingError(f"{path}: {topic}.{field} is no number but a {type(value).__name__}") from None
+
+
+def _check(path: Path, name: str, there: Iterable[str]) -> None:
+    if name not in there:
+        raise RecordingError(f"{path}: has no topic {name!r}; it has {_some(there)}")
+
+
+def _some(names: Iterable[str]) -> str:
+    names = sorted(names)
+    more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+    return ", ".join(names[:MOST_NAMES]) + more
+
+
+def _import(path: Path, module: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise RecordingError(f"{path}: {error}; logs need pip install 'visadapt[logs]'") from None
