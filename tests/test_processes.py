@@ -11,6 +11,7 @@ import torch
 from tests.own_systems import Pendulum
 from visadapt.effects.catalogue import catalogue
 from visadapt.processes import shared_out
+from visadapt.systems import CartPole
 
 
 @pytest.mark.parametrize("jobs", [1, 2, 3, 9])
@@ -71,4 +72,9 @@ except KeyboardInterrupt:
 
 def test_effects_of_a_system_of_ones_own_come_back_from_another_process():
     effects = catalogue(Pendulum())
+    assert shared_out(lambda indices: [effects[k] for k in indices], len(effects), 2) == effects
+
+
+def test_so_do_effects_that_are_searched_in_wider_ranges():
+    effects = catalogue(CartPole(cart_mass=10.0, pole_mass=5.0))
     assert shared_out(lambda indices: [effects[k] for k in indices], len(effects), 2) == effects

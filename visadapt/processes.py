@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from visadapt.effects.base import EFFECTS, Effect
+from visadapt.effects.base import EFFECTS, Effect, Parameter, with_table
 
 ENDING = (signal.SIGINT, signal.SIGTERM)
 
@@ -90,10 +90,13 @@ class _Pickler(pickle.Pickler):
     """Pickles effects by name: those of a system of one's own are in no module."""
 
     def reducer_override(self, obj: Any) -> Any:
-        if isinstance(obj, type) and issubclass(obj, Effect) and EFFECTS.get(getattr(obj, "name", "")) is obj:
-            return _effect, (obj.name,)
+        if isinstance(obj, type) and issubclass(obj, Effect) and (own := EFFECTS.get(getattr(obj, "name", ""))):
+            if own is obj:
+                return _effect, (obj.name,)
+            if obj is with_table(obj.name, obj.table):
+                return _effect, (obj.name, obj.table)
         return NotImplemented
 
 
-def _effect(name: str) -> type[Effect]:
-    return EFFECTS[name]
+def _effect(name: str, table: tuple[Parameter, ...] | None = None) -> type[Effect]:
+    return EFFECTS[name] if table is None else with_table(name, table)

@@ -19,6 +19,8 @@ from visadapt.effects import (
     DynamicsEffect,
     FrictionPatch,
     Parameter,
+    PoleDamping,
+    PoleFriction,
     PoleMass,
     ViscousFriction,
 )
@@ -50,6 +52,19 @@ def test_a_recording_of_the_source_has_no_gap():
     assert result.verdict == "no_gap"
     assert result.causes == ()
     assert result.gap.before == pytest.approx(result.gap.floor, rel=0.05)
+
+
+def test_on_a_heavy_machine_effects_are_found_beyond_the_ranges_of_a_light_one():
+    """Ten times the default's masses: within its ranges a patch of friction and dry friction in the hinge are named."""
+    heavy = CartPole(cart_mass=10.0, pole_mass=1.0, max_force=300.0)
+    hidden = [ViscousFriction(coefficient=40.0), PoleDamping(coefficient=0.5)]
+    rivals = [FrictionPatch, PoleFriction, CoulombFriction]
+    result = diagnose(record(hidden, system=heavy), World(heavy), [ViscousFriction, PoleDamping, *rivals])
+    found = {cause.effect: cause.parameters["coefficient"] for cause in result.causes}
+    assert result.verdict == "identified"
+    assert found.keys() == {"viscous_friction", "pole_damping"}
+    assert found["viscous_friction"].value == pytest.approx(40.0, rel=0.05)
+    assert found["pole_damping"].value == pytest.approx(0.5, rel=0.2)
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,25 @@ def test_twins_are_those_of_a_system():
     assert twins(ActuatorBias, catalogue(), Quadrotor()) == twins(ConstantForce, catalogue(), Quadrotor()) == []
 
 
+@pytest.mark.parametrize(
+    ("default", "large", "changed"),
+    [
+        (CartPole(), CartPole(cart_mass=10.9), {"N": 10.0, "N m": 1.0}),
+        (CartPole(), CartPole(pole_mass=0.3, pole_half_length=0.5), {"N": 1.3 / 1.1, "N m": 3.0}),
+        (CartPole(), CartPole(cart_mass=0.2), {"N": 1.0, "N m": 1.0}),
+        (Quadrotor(), Quadrotor(mass=3.0), {"N": 3.0, "N m": 3.0}),
+    ],
+)
+def test_forces_and_torques_are_searched_in_ranges_that_grow_with_the_system_s_weight(default, large, changed):
+    for effect, grown in zip(catalogue(default), catalogue(large), strict=True):
+        assert (grown.name, grown.stage, issubclass(grown, effect)) == (effect.name, effect.stage, True)
+        assert EFFECTS[effect.name] is effect
+        for before, after in zip(effect.table, grown.table, strict=True):
+            scale = changed["N m" if before.unit.startswith("N m") else "N"] if before.unit.startswith("N") else 1.0
+            assert after.low == pytest.approx(scale * before.low)
+            assert after.high == pytest.approx(scale * before.high)
+
+
 @pytest.mark.parametrize("name", NAMED)
 def test_every_effect_is_on_the_pages_with_all_that_it_states(name):
     effect = EFFECTS[name]

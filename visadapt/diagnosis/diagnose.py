@@ -33,7 +33,7 @@ from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repea
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.verdict import MIN_GAP_CLOSED, at_bounds, left_unexplained, next_step, verdict_of
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
-from visadapt.effects.catalogue import catalogue as all_effects, twins
+from visadapt.effects.catalogue import catalogue as all_effects, sized, twins
 from visadapt.estimation.effect_fit import remembers
 from visadapt.estimation.fit_states import Effects
 from visadapt.estimation.likelihood import FitState
@@ -95,7 +95,7 @@ def diagnose(
         raise ValueError("diagnose: the world is the source and has no effects; give the bare system")
     system = world.system
     profile = profile_of(system)
-    effects = list(all_effects(system) if catalogue is None else catalogue)
+    effects = [sized(effect, system) for effect in (all_effects(system) if catalogue is None else catalogue)]
     films = not recording.measured
     effects = [effect for effect in effects if (effect not in UNSEEN if films else effect.stage is not Stage.CAMERA)]
     film = None

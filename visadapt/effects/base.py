@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cache
 from typing import Any, ClassVar, Self, TypeAlias
 
 import torch
@@ -281,3 +282,10 @@ def inside(place: Tensor, start: Tensor, end: Tensor, width: float) -> Tensor:
 
 
 EFFECTS: dict[str, type[Effect]] = {}  # Every effect by its standard name
+
+
+@cache
+def with_table(name: str, table: tuple[Parameter, ...]) -> type[Effect]:
+    """The effect of a name, searched in other ranges; `EFFECTS` keeps the original."""
+    effect = EFFECTS[name]
+    return type(effect.__name__, (effect,), {"table": table, "__module__": effect.__module__})

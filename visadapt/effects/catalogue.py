@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterable
+from dataclasses import replace
 
 from visadapt.effects.base import (
     EFFECTS,
@@ -12,6 +13,7 @@ from visadapt.effects.base import (
     Effect,
     Parameter,
     SensingEffect,
+    with_table,
 )
 from visadapt.effects.camera import CameraEffect
 from visadapt.effects.own import is_own, own_effects
@@ -33,7 +35,23 @@ def catalogue(system: System | None = None) -> list[type[Effect]]:
         return named
     own = own_effects(type(system)) if is_own(type(system)) else []
     on_all = [effect for effect in named if isinstance(system, effect.systems) and effect not in own]
-    return own + [effect for effect in on_all if not any(issubclass(one, effect) for one in own)]
+    on_all = [effect for effect in on_all if not any(issubclass(one, effect) for one in own)]
+    return own + [sized(effect, system) for effect in on_all]
+
+
+def sized(effect: type[Effect], system: System) -> type[Effect]:
+    """The effect with ranges of its forces and torques that suit a system larger than the default of its kind.
+
+    >>> import visadapt as va
+    >>> from visadapt.effects.catalogue import sized
+    >>> sized(va.effects.CoulombFriction, va.CartPole(cart_mass=2.1)).table[0].high
+    30.0
+    """
+    if EFFECTS.get(getattr(effect, "name", "")) is not effect:
+        return effect
+    scales = [system.load_scale(parameter.unit) for parameter in effect.table]
+    table = [replace(p, low=scale * p.low, high=scale * p.high) for p, scale in zip(effect.table, scales, strict=True)]
+    return with_table(effect.name, tuple(table)) if max(scales, default=1.0) > 1 else effect
 
 
 def separable(one: type[Effect], other: type[Effect], system: System) -> bool:

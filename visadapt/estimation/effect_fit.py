@@ -23,6 +23,7 @@ from visadapt.effects import (
     Role,
     SensingEffect,
 )
+from visadapt.effects.catalogue import sized
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import (
     CAREFUL,
@@ -48,7 +49,9 @@ from visadapt.systems import System
 class EffectFit:
     """Effects fitted to episodes."""
 
-    values: dict[type[Effect], Tensor]  # (P,) parameters of each effect, in the order of its table
+    values: dict[
+        type[Effect], Tensor
+    ]  # (P,) parameters of each effect, `sized` to the system, in the order of its table
     covariance: dict[type[Effect], Tensor]  # (P, P) of each effect's parameters
     states: list[Tensor]  # (T, n_state) of each episode: the true states, smoothed
 
@@ -57,7 +60,7 @@ class EffectFit:
 def fit_effects(
     system: System, effects: Sequence[Effect], measured: Sequence[Tensor], commands: Sequence[Tensor], period: float
 ) -> EffectFit:
-    """Fit the parameters of `effects`, all together, within the ranges that they state.
+    """Fit the parameters of `effects`, all together, within the ranges that they state for this system.
 
     Args:
         system: the source.
@@ -69,7 +72,7 @@ def fit_effects(
     Raises:
         ValueError: an effect that can be neither fitted nor read off, or two effects that stand for each other.
     """
-    kinds = [type(effect) for effect in effects]
+    kinds = [sized(type(effect), system) for effect in effects]
     fitted = tuple(kind for kind in kinds if not kind.repeats_readings)
     for kind in fitted:
         if remembers(kind):
@@ -90,7 +93,12 @@ def fit_effects(
     holds = find_repeats(measured, channels, profile.angle_sensor)
     stamps = [period * torch.arange(len(values)).double() for values in measured]
     rows = cut(measured, holds.used, commands, stamps, channels, period, profile.window_rows)
-    present = [float(getattr(effect, p.name)) for effect in effects if type(effect) in fitted for p in effect.table]
+    present = [
+        float(getattr(effect, p.name))
+        for effect, kind in zip(effects, kinds, strict=True)
+        if kind in fitted
+        for p in kind.table
+    ]
     found = _fitted(system, fitted, rows, present)
     late = [kind for kind in fitted if issubclass(kind, LateSensors)]
     if late:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from visadapt.effects import Effect, Residual, SensingEffect
+from visadapt.effects.catalogue import sized
 from visadapt.estimation.effect_fit import fit_effects
 from visadapt.learning.windows import Windows
 from visadapt.policies.networks import ResidualNetwork
@@ -72,7 +73,8 @@ def fit_named(source: World, windows: Windows) -> Windows:
     measured, commands = (list(values.split(windows.lengths)) for values in (windows.states, windows.actions))
     fit = fit_effects(source.system, named, measured, commands, source.period)
     for effect in named:
-        for parameter, value in zip(effect.table, fit.values[type(effect)].tolist(), strict=True):
+        kind = sized(type(effect), source.system)
+        for parameter, value in zip(kind.table, fit.values[kind].tolist(), strict=True):
             getattr(effect, parameter.name).data.fill_(min(max(value, parameter.low), parameter.high))
     if not any(isinstance(effect, SensingEffect) for effect in named):
         return windows

@@ -88,6 +88,13 @@ class System(ABC):
     def __post_init__(self) -> None:
         self.check_parameters()
 
+    def load_scale(self, unit: str) -> float:
+        """How much larger the effects of a unit are to be expected than on the system with default parameters.
+
+        At least 1: they are searched in ranges as much wider.
+        """
+        return 1.0
+
     def to(self, like: Tensor) -> Self:
         """The same system; parameters that are tensors get the device and dtype of `like`."""
         itself: Any = self  # subclasses are dataclasses, this base is not

@@ -50,6 +50,17 @@ class CartPole(System):
     def __post_init__(self) -> None:
         self.check_parameters()
 
+    def load_scale(self, unit: str) -> float:
+        """In N: as the weight of cart and pole; in N m: as that of the pole at its centre of mass."""
+        default = CartPole()
+
+        def weight(one: CartPole) -> float:
+            if unit.startswith("N m"):
+                return float(one.gravity * one.pole_mass * one.pole_half_length)
+            return float(one.gravity * (one.cart_mass + one.pole_mass)) if unit.startswith("N") else 1.0
+
+        return max(1.0, weight(self) / weight(default))
+
     def motor_loads(self, state: Tensor, command: Tensor) -> Tensor:
         """The loads (B, 2) that would move the system as the command does: a force on the cart alone."""
         force = self.max_force * command[:, 0]

@@ -58,6 +58,12 @@ class RigidBody(System):
     mass: float | Tensor  # kg
     gravity: float | Tensor  # m/s2
 
+    def load_scale(self, unit: str) -> float:
+        """Of forces and torques: as the weight."""
+        default = type(self)()
+        ratio = float(self.mass * self.gravity) / float(default.mass * default.gravity)
+        return max(1.0, ratio) if unit.startswith("N") else 1.0
+
     @abstractmethod
     def wrench(self, velocity: Tensor, rates: Tensor, command: Tensor) -> tuple[Tensor, Tensor]:
         """Force (B, 3) in N and torque (B, 3) in N m on the body, in body axes, without its weight.
