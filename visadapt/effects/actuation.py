@@ -146,7 +146,7 @@ class ActuatorDeadzone(ActuationEffect):
 
 
 class ActuatorSaturation(ActuationEffect):
-    """A limit on the command that the motor follows, from its supply or its current. Every command is limited to 1."""
+    """A limit on the command that the motor follows, from its supply or its current, below the 1 of any command."""
 
     name = "actuator_saturation"
     order = 40
