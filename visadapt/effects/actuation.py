@@ -146,7 +146,7 @@ class ActuatorDeadzone(ActuationEffect):
 
 
 class ActuatorSaturation(ActuationEffect):
-    """A limit on the command that the motor follows, from its supply or its current, below the 1 of any command."""
+    """A limit of the supply or the current on the command that the motor follows; without it the limit is 1."""
 
     name = "actuator_saturation"
     order = 40
