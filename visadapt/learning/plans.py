@@ -30,7 +30,7 @@ class Plans:
         self.generator = generator
 
     def loss(self, iteration: int, progress: float) -> Tensor:
-        """The mean cost of the plans; then each stream takes its plan's first. `progress` drives the curriculum."""
+        """The mean cost of the plans; each stream then takes its first planned step. `progress` is the curriculum's."""
         streams, now = self.streams, self.streams.now
         plan = self.policy(self.seen(now.history))
         show = partial(streams.task.show, task_state=now.task_state)

@@ -65,7 +65,7 @@ class TrainingState:
         self.losses.append(float(loss.detach()))
 
     def keep(self, more: dict[str, Any]) -> None:
-        """Report progress; every `CHECKPOINT_ITERATIONS` write the state, and `more`, what else the loop needs."""
+        """Report progress; every `CHECKPOINT_ITERATIONS` iterations write the state, and `more` for the loop."""
         done = len(self.losses)
         if self.progress is not None:
             self.progress(done, self.iterations, self.losses[-1])

@@ -69,7 +69,7 @@ def _settings(source: TuneSettings, refinement: TuneSettings) -> SetupSettings:
 def from_states(source: World) -> SetupSettings:
     """Settings for the cart-pole that is shown its states, with the cost-to-go of a source.
 
-    In tuning gradients flow through the residual. Held over a plan, its correction for a late motor would not change
+    In tuning, gradients flow through the residual. Held over a plan, its correction for a late motor would not change
     with the plan's commands.
     """
     wide = Balance(PAPER_CARTPOLE, divergence=(UNLIMITED, 4.0, 0.5, 10.0))
