@@ -20,7 +20,7 @@ from visadapt.recordings.topics import Read, Topic
 from visadapt.systems import System
 
 GAP = 5.0
-"""Longest interval between a topic's readings, in median intervals, that is interpolated; rows in it are left out."""
+"""Longest interval between a topic's readings, in median intervals, that is interpolated; longer ones have no rows."""
 
 
 def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], note: Note) -> RawEpisode:

@@ -83,7 +83,7 @@ def _can_decide(raw: RawEpisode, system: System, names: Sequence[str]) -> bool:
 
 
 def _fits(raw: RawEpisode, columns: Columns, system: System, delay: int = 0) -> dict[str, tuple[float, float]]:
-    """For each variable that has a rate: correlation of its acceleration with the source's, and slope of the two.
+    """For each variable with a rate: correlation of its acceleration with the source's, and slope over the source's.
 
     `columns` are the measured states, in the units and under the names to be tried; `delay` is the number of rows by
     which the commands act late.

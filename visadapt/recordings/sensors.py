@@ -34,7 +34,7 @@ STILL_RANGES = 1e-9
 MOVING_RANGES = 1e-3
 """Rate of change, in ranges per s, by the source, above which a state must be seen to move."""
 NOISE_RATIO, FEWEST_NOISY = 1.5, 30
-"""Variance of changes over that of values above which a column is like white noise (2); and fewest rows to judge."""
+"""Variance of changes over that of values above which a column resembles white noise (2.0); and fewest rows for it."""
 FROZEN_ROWS = 20
 """Fewest equal readings in a row at which a position is compared with its measured rate."""
 
