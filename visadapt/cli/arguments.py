@@ -206,7 +206,8 @@ def _add_target(parser: argparse.ArgumentParser, required: bool) -> None:
         required=required,
         metavar="TARGET",
         help="the machine: a gymnasium id with --map, or package.module:factory, a function without arguments that "
-        "returns a visadapt.Target, or, with --map, a gymnasium environment; modules in this folder are found too",
+        "returns a visadapt.Target, or, with --map, a gymnasium environment; modules in the current folder are found "
+        "too",
     )
     parser.add_argument("--map", metavar="MAP.toml", help="what the numbers and frames of a gymnasium environment mean")
 

@@ -202,7 +202,7 @@ def _noise_and_start(effects: Sequence[Effect], recording: Recording, system: Sy
 
 
 def _excitations(system: System, period: float, samples: int, generator: torch.Generator) -> tuple[list[str], Tensor]:
-    """Excitations of one command each, in words, and their values (N, samples, n_action) of the size 1 in `SIZES`."""
+    """Excitations of one command each, in words, and their values (N, samples, n_action) for a size of 1 (`SIZES`)."""
     time = period * torch.arange(samples, dtype=torch.float64)
     names, shapes = [], []
     for k, action in enumerate(system.actions):
@@ -252,7 +252,7 @@ def _simulate(
         at = world.step(at, command)
         measured, at = world.measure(at, generator)
         inside &= (at.state.abs() <= MARGIN * ranges).all(1)
-        at = replace(at, state=torch.where(inside[:, None], at.state, first))  # what left must not diverge
+        at = replace(at, state=torch.where(inside[:, None], at.state, first))  # a run that left must stay finite
         history = history.acting(command).observing(read(measured))
         readings.append(history.observations[:, -1])
         commands.append(command)

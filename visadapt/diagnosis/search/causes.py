@@ -53,7 +53,7 @@ def alternatives(
 def causes(
     search: Search, comparison: ModelComparison, groups: Sequence[Sequence[Alternative]], gap_closed: GapClosed
 ) -> list[Cause]:
-    """Every alternative as a cause; `gap_closed` holds each effect alone, the best set, and it without each effect."""
+    """Every alternative as a cause; `gap_closed` holds each effect alone, and the best set, whole and without each."""
     out = []
     best = frozenset(comparison.best.names)
     reopens = {e: gap_closed[best] - gap_closed[best - {e.name}] for e in comparison.best.effects}

@@ -248,7 +248,7 @@ def _moved(state: Tensor, column: int) -> Tensor:
 
 
 def _smoothed(values: Tensor, deviation: float, edge: int = 0, stride: int = 1) -> Tensor:
-    """Values (T, M) smoothed by a Gaussian of this deviation in rows; beyond the ends they are reflected.
+    """Values (T, M) smoothed by a Gaussian of this deviation in rows; beyond the ends, point-reflected.
 
     Of the rows, every `stride`-th from `edge` on, up to as far from the end.
     """
