@@ -19,7 +19,7 @@ class MLPRenderer(nn.Module):
 
     input_gain = (10.0, 5.0, 5.0)
     error: float | None = None
-    """root mean square of what it draws wrongly in a grey of [0, 1], noise left aside; None where nobody measured it"""
+    """root mean square of its frames' error without noise, grey levels of [0, 1]; None where it was not measured"""
 
     def __init__(self, height: int, width: int) -> None:
         super().__init__()
@@ -102,7 +102,7 @@ class LayeredRenderer(nn.Module):
 
     guess: Tensor
     error: float | None = None
-    """root mean square of what it draws wrongly in a grey of [0, 1], noise left aside; None where nobody measured it"""
+    """root mean square of its frames' error without noise, grey levels of [0, 1]; None where it was not measured"""
 
     def __init__(
         self, height: int, width: int, column: float, row: float, scale: float, reach: float, detail: float = 2.0

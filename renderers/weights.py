@@ -44,7 +44,7 @@ def sealed(text: str, tensors: Mapping[str, Tensor]) -> str:
 
 
 def unsealed(entry: str, tensors: Mapping[str, Tensor]) -> str | None:
-    """The JSON of what `sealed` gave; None where it or a tensor is not what it was. Older files have no checksum."""
+    """The JSON of what `sealed` gave; None where the checksum does not fit. Older files have none."""
     if entry.startswith("{"):
         return entry
     checksum, _, text = entry.partition(" ")
@@ -67,7 +67,7 @@ def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRen
             or frame size.
     """
     try:
-        path.open("rb").close()  # since safetensors says of every other reason that there is no such file
+        path.open("rb").close()  # since safetensors reports any failure to open as a missing file
         with safe_open(path, framework="pt") as file:
             entry = (file.metadata() or {}).get(HEADER_KEY)
             weights = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118

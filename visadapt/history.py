@@ -33,7 +33,7 @@ class History(Batch):
 
     @property
     def begins(self) -> Tensor:
-        """(B,) whether an episode begins: before it all actions are zero, which is nobody's command."""
+        """(B,) whether an episode begins: all actions before it are exactly zero, which no policy commands."""
         return ~self.actions.flatten(1).any(1)
 
     def acting(self, action: Tensor) -> History:

@@ -19,7 +19,7 @@ ENDING = (signal.SIGINT, signal.SIGTERM)
 
 Result = TypeVar("Result")
 Work = Callable[[Sequence[int]], Sequence[Result]]
-"""Gives a result for each index that it is handed, whichever others it is handed along with it."""
+"""Gives a result for each of its indices, which does not depend on the others."""
 
 
 @contextmanager
@@ -52,7 +52,7 @@ def shared_out(work: Work[Result], count: int, jobs: int) -> list[Result]:
     for share in shares[1:]:
         receiver, sender = context.Pipe(duplex=False)
         process = context.Process(target=_run, args=(work, share, sender), daemon=True)
-        # What hooks of a fork raise is lost, so a signal has to wait until they are through.
+        # An exception in a hook of the fork would be lost, so signals wait until the fork is done.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
         try:
             process.start()

@@ -113,7 +113,7 @@ class World(nn.Module):
     def start(
         self, state: Tensor, time: Tensor | None = None, commands: Tensor | None = None, states: Tensor | None = None
     ) -> WorldState:
-        """The world in the state (B, n_state), at the start of an episode or within one; its row is not read yet.
+        """The world in the state (B, n_state), at the start of an episode or within one, before the sensors read it.
 
         Args:
             time: (B,) s since the episode began; 0 without it.
@@ -167,8 +167,8 @@ class World(nn.Module):
     ) -> WorldState:
         """One period on, with `action` (B, n_action), limited to its range, held over it.
 
-        A world with a residual needs the `history`, what the observer has seen up to now, or the `correction`
-        (B, n_state) that is to stand for the residual's; no other reads them.
+        A world with a residual needs the `history` of observations and actions so far, or a `correction` (B, n_state)
+        in place of the residual's; other worlds use neither.
         """
         acting, *others = self._split(at.memory)
         system = self.altered(at.state)
@@ -195,7 +195,7 @@ class World(nn.Module):
         return self._integrate(self.altered(state), time, state, commands, duration)
 
     def measure(self, at: WorldState, generator: torch.Generator | None = None) -> tuple[Tensor, WorldState]:
-        """What sensors read (B, n_state) of the row `at`, and the world with that row read.
+        """What sensors read (B, n_state) of the row `at`, and the world after they have read it.
 
         A row is read once: after `start`, then after each `step`. Without sensing effects the reading is the state.
         `generator` is needed by random effects alone.
@@ -207,7 +207,7 @@ class World(nn.Module):
     def show(
         self, at: WorldState, draw: Callable[[Tensor], Tensor], generator: torch.Generator | None = None
     ) -> tuple[Tensor, WorldState]:
-        """What the camera shows (B, H, W) of the row `at`, and the world with that row shown.
+        """What the camera shows (B, H, W) of the row `at`, and the world after it has shown it.
 
         `draw` makes frames of states (B, n_state). A row is shown once: after `start`, then after each `step`. Without
         camera effects the frame is what is drawn.
@@ -222,8 +222,8 @@ class World(nn.Module):
         return self._read(state, self._split(self._at_rest(state))[1], None)[0]
 
     def load(self, at: WorldState) -> Tensor:
-        """Sum of the loads (B, n_load) of all effects at an instant without a command, with dry friction on what
-        moves."""
+        """Sum of the loads (B, n_load) of all effects at an instant without a command, with dry friction of the
+        coordinates that move."""
         system = self.system_at(at)
         idle = at.state.new_zeros(len(at.state), len(system.actions))
         load, limits = self._load(at.time, at.state, system), self._dry_friction(at.time, at.state, idle, system)
@@ -234,7 +234,7 @@ class World(nn.Module):
         return self._varied(self.altered(at.state), at.time, at.state)
 
     def altered(self, like: Tensor) -> System:
-        """The system with the parameters that effects give it for good, with the device and dtype of `like`."""
+        """The system with the parameters that effects change permanently, with the device and dtype of `like`."""
         system = self.system
         for effect in self._dynamics:
             system = effect.alter(system)

@@ -153,7 +153,7 @@ class TestBadFiles:
     def test_another_version(self, recording):
         with h5py.File(recording, "a") as file:
             file.attrs["version"] = 3
-        self.rejects(recording, "version 3 of the format; this visadapt reads version 2")
+        self.rejects(recording, "version 3 of the format; this visadapt reads versions 1 to 2")
 
     def test_files_of_the_version_before_are_read(self, recording):
         with h5py.File(recording, "a") as file:

@@ -14,7 +14,7 @@ SYSTEMS_HELP = "cartpole, quadrotor or fixed_wing"
 OWN_HELP = "or my_rig.py:Class, a system of your own (docs/own_system.md)"
 LONGEST_NUMBER = 18  # Digits of a whole number
 SCORE_SEED = 2026
-"""`evaluation.SCORE_SEED`, which a test holds it to."""
+"""Equal to `evaluation.SCORE_SEED`, as a test checks."""
 
 
 def diagnose(parser: argparse.ArgumentParser) -> None:
@@ -24,14 +24,12 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
         "close. The verdict goes to the terminal; exit status 0: a diagnosis was made, 2: bad input."
     )
     add = parser.add_argument
-    add(
-        "recording", nargs="+", metavar="RECORDING", help="CSV, HDF5, a log of ROS or PX4, several, or a folder of them"
-    )
+    add("recording", nargs="+", metavar="RECORDING", help="CSV or HDF5 files, logs of ROS or PX4, or folders of these")
     _add_system(parser)
-    columns_help = "our name=the file's, as in x=position,theta=phi"
+    columns_help = "our name=the name in the file, as in x=position,theta=phi"
     add("--columns", metavar="A=B,...", type=_columns, default={}, help=columns_help)
     add("--effects", metavar="FILE.py", help="a file that defines effects of your own")
-    renderer_help = "of a film without states: draws the scene from cart position and pole angle (`visadapt renderer`)"
+    renderer_help = "for a film without states: draws its scene from cart position and pole angle (`visadapt renderer`)"
     add("--renderer", metavar="R.safetensors", help=renderer_help)
     add(
         "--policy",
@@ -39,7 +37,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
         help="a policy on states, as `visadapt train` writes it: the terms of the paper's Theorem 1 are given for it, "
         "on the terminal and in the report, and --plan adds to its commands",
     )
-    add("--json", metavar="F", help="write the result here, as visadapt/diagnosis/schema.json says")
+    add("--json", metavar="F", help="write the result here as JSON (schema: visadapt/diagnosis/schema.json)")
     add("--report", metavar="F.html", help="write a page with figures here")
     plan_help = "where several effects fit equally well, write here what to add to the commands to tell them apart"
     add("--plan", metavar="F.csv", help=plan_help)
@@ -68,8 +66,8 @@ def check(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `visadapt check`."""
     parser.description = (
         "Tests a system of your own, a class that derives from visadapt.System: names, units and ranges, and a "
-        "derivative that is finite, differentiable and batched and fits them. Says what is missing, a line each; exit "
-        "status 0: nothing is, 2: something is."
+        "derivative that is finite, differentiable and batched and fits them. Prints each fault on a line; exit status "
+        "0: no fault, 2: faults."
     )
     parser.add_argument("system", type=_system, metavar="my_rig.py:Class", help="the file and the class")
 
@@ -78,19 +76,19 @@ def renderer(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `visadapt renderer`."""
     parser.description = (
         "Trains a renderer, states to frames, from recordings of a cart-pole that hold both, or from what a gymnasium "
-        "environment shows of chosen states. --hinge and --scale are a first guess of where the camera stands, good "
-        "to some pixels; it is refined. Interrupted, the same command goes on where it was."
+        "environment shows of chosen states. --hinge and --scale are a first guess of the camera, accurate to some "
+        "pixels; training refines it. Interrupted, the same command goes on where it was."
     )
     add = parser.add_argument
     add("recording", nargs="*", metavar="RECORDING.h5", help="HDF5 with frames, as visadapt.write_recording writes it")
     _add_target(parser, required=False)
     add("--show", metavar="N", type=_positive, default=4000, help="states that --target is put into (default: 4000)")
-    within_help = "m and rad to either side of 0 that these states are drawn from (default: 1.0,0.35)"
+    within_help = "largest |x| in m and |theta| in rad of these states (default: 1.0,0.35)"
     add("--within", metavar="X,THETA", type=_pair, default=(1.0, 0.35), help=within_help)
     add("--out", required=True, metavar="R.safetensors", help="write the renderer here")
     add("--hinge", required=True, type=_pair, metavar="COLUMN,ROW", help="px, where the pole's hinge is seen at x = 0")
-    add("--scale", required=True, type=_positive_number, metavar="PX", help="px that a metre is long")
-    pole_help = "m from the hinge to the pole's tip, rather too long than too short (default: 1.05)"
+    add("--scale", required=True, type=_positive_number, metavar="PX", help="px per m")
+    pole_help = "m from the hinge to the pole's tip; better too long than too short (default: 1.05)"
     add("--pole", type=_positive_number, default=1.05, metavar="M", help=pole_help)
     add("--iterations", metavar="N", type=_positive, default=1000, help="(default: 1000)")
     _add_seed(parser)
@@ -99,7 +97,7 @@ def renderer(parser: argparse.ArgumentParser) -> None:
 def train(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `visadapt train`."""
     parser.description = (
-        "Trains a policy by backpropagation through the simulator: on states, or, of a cart-pole, on a camera's "
+        "Trains a policy by backpropagation through the simulator: on states or, for a cart-pole, on a camera's "
         "frames. With --diagnosis or --effect the simulator has these effects. Interrupted, the same command goes on "
         "where it was."
     )
@@ -111,13 +109,13 @@ def train(parser: argparse.ArgumentParser) -> None:
     add(
         "--renderer",
         metavar="R.safetensors",
-        help="the camera, as `visadapt renderer` writes it; implies --frames (default: of a cart-pole that is drawn)",
+        help="the camera, as `visadapt renderer` writes it; implies --frames (default: that of the drawn cart-pole)",
     )
     add("--references", metavar="F.csv", help="what a quadrotor is to follow: columns time, x, y, z in s and m")
-    add("--with-history", action="store_true", help="read the last 5 periods too, as against a force that changes")
+    add("--with-history", action="store_true", help="read the last 5 periods too, which show a changing force")
     _add_effects(parser)
-    add("--iterations", metavar="N", type=_positive, help="of the policy (default: the system's own)")
-    add("--seeing", metavar="N", type=_positive, help="iterations in which an encoder of frames learns to see")
+    add("--iterations", metavar="N", type=_positive, help="iterations of training (default: the system's own)")
+    add("--seeing", metavar="N", type=_positive, help="iterations of the frame encoder's training")
     _add_seed(parser)
 
 
@@ -131,17 +129,17 @@ def adapt(parser: argparse.ArgumentParser) -> None:
     )
     add = parser.add_argument
     _add_policy_and_target(parser)
-    add("--out", required=True, metavar="FOLDER", help="folder of the run; policy.safetensors in it")
+    add("--out", required=True, metavar="FOLDER", help="folder of the run; it gets the policy, policy.safetensors")
     add("--samples", metavar="N", type=_positive, default=1000, help="steps of the target in all (default: 1000)")
     add("--round", metavar="B", type=_positive, help="steps of the target in a round (default: a fifth of --samples)")
-    renderer_help = "the one that the policy was trained with (default: of a cart-pole that is drawn)"
+    renderer_help = "the one that the policy was trained with (default: that of the drawn cart-pole)"
     add("--renderer", metavar="R.safetensors", help=renderer_help)
     add("--references", metavar="F.csv", help="what a quadrotor is to follow, if the target has none")
     add("--with-history", action="store_true", help="let a vehicle's residual read the last periods too")
     diagnose_help = "name the causes of the gap in each round; a residual learns it only where they do not explain it"
     add("--diagnose", action="store_true", help=diagnose_help)
     _add_effects(parser)
-    add("--iterations", metavar="N", type=_positive, help="of tuning in a round (default: the system's)")
+    add("--iterations", metavar="N", type=_positive, help="iterations of tuning in a round (default: the system's)")
     _add_seed(parser)
 
 
@@ -149,14 +147,14 @@ def score(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `visadapt score`."""
     parser.description = (
         "Runs episodes of a policy on a target. Cart-poles are scored by the cart's mean speed in m/s over the "
-        "episodes that stay up, flights by their distance in m from their line; failed episodes are counted apart."
+        "episodes that stay up, flights by their mean error in m; failed episodes are counted apart."
     )
     add = parser.add_argument
     _add_policy_and_target(parser)
     add("--episodes", metavar="N", type=_positive, default=100, help="(default: 100)")
-    seed_help = f"of the starts and hidden effects (default: {SCORE_SEED})"
+    seed_help = f"seed of the starts and hidden effects (default: {SCORE_SEED})"
     add("--seed", metavar="N", type=_seed, default=SCORE_SEED, help=seed_help)
-    add("--film", metavar="F.mp4", help="film one more episode")
+    add("--film", metavar="F.mp4", help="write a film of one more episode here")
     add("--json", metavar="F", help="write the score here")
     add("--effects", metavar="FILE.py", help="a file that defines effects the policy was trained with")
 
@@ -178,12 +176,12 @@ def _add_system(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_seed(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seed", metavar="N", type=_seed, default=0, help="of everything random (default: 0)")
+    parser.add_argument("--seed", metavar="N", type=_seed, default=0, help="seed of everything random (default: 0)")
 
 
 def _add_effects(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--diagnosis", metavar="D.json", help="put the effects into the simulator that `visadapt diagnose --json` named"
+        "--diagnosis", metavar="D.json", help="put the effects that `visadapt diagnose --json` named into the simulator"
     )
     parser.add_argument(
         "--effect",
@@ -208,7 +206,8 @@ def _add_target(parser: argparse.ArgumentParser, required: bool) -> None:
         required=required,
         metavar="TARGET",
         help="the machine: a gymnasium id with --map, or package.module:factory, a function without arguments that "
-        "returns a visadapt.Target, or, with --map, a gymnasium environment; modules here are found too",
+        "returns a visadapt.Target, or, with --map, a gymnasium environment; modules in the current folder are found "
+        "too",
     )
     parser.add_argument("--map", metavar="MAP.toml", help="what the numbers and frames of a gymnasium environment mean")
 
@@ -221,7 +220,7 @@ def _positive(text: str) -> int:
 
 
 def _seed(text: str) -> int:
-    """A whole number that generators take."""
+    """A whole number that a random generator accepts as seed."""
     with suppress(ValueError):
         if len(text) <= LONGEST_NUMBER:
             return int(text)

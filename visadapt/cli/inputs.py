@@ -54,7 +54,7 @@ def progress() -> Iterator[Report]:
 
 @contextmanager
 def unfinished(out: Path, settings: Mapping[str, Any]) -> Iterator[Path]:
-    """The folder `<out>.unfinished` that a training works in, and goes on from; removed once the block is through.
+    """The folder `<out>.unfinished` that a training works in, and goes on from; removed when the block ends.
 
     Raises:
         InputError: `out` is there already, or is a folder.
@@ -204,7 +204,7 @@ def find_factory(name: str) -> Callable[[], Any]:
 
 
 def own_line(error: BaseException) -> str | None:
-    """What is to be said of an error that the user's own code raised; None where it was ours."""
+    """The message for an error that the user's own code raised; None where it was ours."""
     files = [frame.filename for frame in traceback.extract_tb(error.__traceback__) if frame.filename in OWN_FILES]
     return f"{files[-1]}: {describe(error, files[-1])}" if files else None
 

@@ -1,4 +1,4 @@
-"""The command `visadapt`: one module a subcommand, and what all of them answer to bad input and interruption."""
+"""The command `visadapt`: one module for each subcommand; here, how all of them end on bad input or interruption."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from typing import Any, NoReturn
 from visadapt.cli import arguments as asked
 
 COMMANDS = {
-    asked.diagnose: "where a rig departs from the simulator, which effect causes it, and how far that explains it",
+    asked.diagnose: "where a rig departs from the simulator, which effects cause it, and how much they explain",
     asked.effects: "the effects that a diagnosis can name: equations, parameters, units, ranges",
-    asked.check: "whether a class in a file of yours is a system that all of this works with, and what it lacks",
+    asked.check: "whether a class in a file of yours is a system that visadapt can work with, and what it lacks",
     asked.renderer: "learn from a camera's frames how a cart-pole looks in each state",
     asked.train: "train a policy in the simulator, with the effects of a diagnosis if there are any",
     asked.adapt: "adapt a policy to a target from few counted samples of it",
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"visadapt: interrupted{resumes}", file=sys.stderr)
         return 130  # as of a shell
     except BrokenPipeError:
-        # Whoever read the output has read enough, as `head` does; Python would complain once more at exit.
+        # The reader closed the pipe, as `head` does; without this, Python would complain at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (Exception, SystemExit) as error:
         # The messages of our own exceptions, of the system's and of the user's code are for whoever runs the command.
@@ -68,7 +68,7 @@ def _terminated(number: int, _frame: object) -> NoReturn:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Refuses arguments as ever, but sends no terminal what an argument may hold of control characters."""
+    """The usual parser, whose error messages hold no control characters of an argument."""
 
     def error(self, message: str) -> NoReturn:
         super().error(printable(message))
@@ -83,8 +83,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def printable(message: object) -> str:
-    """A message in one line without control characters, which a name or a cell may hold; in the middle of a very long
-    one something is left out."""
+    """A message in one line without control characters, which a name or a cell may hold; a very long one is cut in
+    the middle."""
     text = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in str(message))
     return (
         text if len(text) <= LONGEST_MESSAGE else f"{text[: LONGEST_MESSAGE // 2]} ... {text[-LONGEST_MESSAGE // 2 :]}"

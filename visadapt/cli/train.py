@@ -28,7 +28,7 @@ from visadapt.weights import shipped
 from visadapt.world import World
 
 LONGEST_STEP = 0.05
-"""s that the simulator integrates at once."""
+"""Longest integration step of the simulator, s."""
 
 
 def run(options: argparse.Namespace) -> None:

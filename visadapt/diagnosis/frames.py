@@ -40,9 +40,9 @@ from visadapt.systems import System
 POSE = ("x", "theta")  # What a frame shows of a cart-pole
 
 RESOLUTION = (0.002, 0.005)
-"""m and rad, the smallest differences of poses that mean anything (0.08 px, and 0.2 px at the pole's tip): what a
-renderer draws wrongly is alike in neighbouring frames, so that the scatter of poses does not tell how far they are off.
-Those of the shipped renderer are off by 0.14 mm and 0.23 mrad (root mean square), with scales off by up to 0.1 %."""
+"""m and rad, the smallest meaningful differences of poses (0.08 px, and 0.2 px at the pole's tip). The errors of a
+renderer are alike in neighbouring frames, so the scatter of poses underestimates them. Poses by the shipped renderer
+are off by 0.14 mm and 0.23 mrad (root mean square), with scales off by up to 0.1 %."""
 
 MISFIT = "root mean square of frames less those drawn by the renderer, in grey levels of 255"
 
@@ -50,22 +50,22 @@ UNSEEN = (Dropout, FrozenZone, MeasurementDelay, PositionDelay, AngleDelay)
 """Faults of sensors that a camera cannot have: it shows cart and pole in one frame. A late camera is a camera's."""
 
 WITHIN = 1.0
-"""Error of the source's predictions, over the noise of positions, below which motion shows no gap: what a renderer
-draws wrongly, and more where a moved camera's pictures are interpolated, makes small errors that are no noise."""
+"""Error of the source's predictions, over the noise of positions, below which motion shows no gap: errors of the
+renderer, larger where a moved camera's frames are interpolated, also add to it and are not noise."""
 
 LEAN = 0.5  # rad, largest |theta| at which the pole is looked for
 
 HIDDEN = 0.5  # `Poses.contrast` above which a frame does not show cart and pole
 
-VAGUE = 3.0  # Deviation of a pose, over the median, above which a frame does not show it
+VAGUE = 3.0  # Standard deviation of a pose, over the median, above which a frame does not show it
 
 LEAST_EXPLAINED = 0.2
 """Share of the frames that the renderer must explain; below, it is taken to be of another scene."""
 
 LONGEST_MISS = 10
-"""Rows in a row without a usable frame at which an episode is split: upright, errors grow by e in about 5 rows."""
+"""Consecutive rows without a usable frame at which an episode is split: upright, errors grow by e in about 5 rows."""
 
-FEWEST_POSES = 5  # In a part of an episode; shorter ones are left out
+FEWEST_POSES = 5  # Usable frames of a part of an episode; parts with fewer are left out
 
 
 class FramesError(ValueError):
@@ -81,7 +81,7 @@ class Film:
     camera: CameraFindings
     seen: nn.Module  # the renderer, seen by that camera
     pixels: Pixels
-    left: Tensor  # (H, W) mean square of what the frames hold beyond what is drawn and noise
+    left: Tensor  # (H, W) mean square of what neither the drawn frames nor noise explain
 
 
 def watch(recording: Recording, system: System, renderer: nn.Module, report: Report | None = None) -> Film:

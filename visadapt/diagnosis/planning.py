@@ -3,9 +3,9 @@
 An ambiguous diagnosis names effects that fit a recording equally well. Each explanation is simulated, with the noise of
 the recording, under every excitation of a family (square waves, sines, white noise; the largest that keeps all states
 within 0.9 of the system's ranges), and every explanation is fitted to what each shows. The worth of an excitation is
-the log likelihood by which the truth then leads: of all pairs of the first explanation and another, in either role, the
-least. This is the expected information of Box and Hill (1967), Technometrics 9(1), with fits in place of a linear model
-and the worst case in place of the mean.
+the log likelihood ratio of the true to the other explanation: the least over all pairs of the first explanation and
+another, with either of them true. This is the expected information of Box and Hill (1967), Technometrics 9(1), with
+fits in place of a linear model and the worst case in place of the mean.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SIZES = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Amplitudes that are tried, and the standard deviation of white noise, as shares of half the command's range."""
 MARGIN = 0.9  # Share of the states' ranges that an experiment may reach
 SUBSTEP = 0.0125  # s, the longest integration step of a simulation
-WORTH = 3.0  # Log likelihood below which an experiment is said to settle nothing
+WORTH = 3.0  # Log likelihood ratio up to which an experiment is said to settle nothing
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Plan:
     actions: tuple[str, ...]
     """names of the commands"""
     log_odds: float
-    """log likelihood by which the truth is expected to lead the other explanation, in the worst case"""
+    """expected log likelihood ratio of the true to the other explanation, in the worst case"""
     white: float
     """the same for white noise of the largest admissible size; NaN where none is admissible"""
 
@@ -106,7 +106,7 @@ def plan(
         recording: of states; the experiment starts in its first state.
         source: the world that was diagnosed, without effects.
         policy: gives the commands to which the excitation is added; without one these are zero.
-        samples: of the experiment.
+        samples: length of the experiment, in commands.
         seed: of the simulated noise.
         progress: called with (excitations tried, excitations in all, best log odds so far).
 
@@ -167,7 +167,7 @@ def plan(
 
 
 def explanations(found: Diagnosis) -> list[list[Effect]]:
-    """The effects of an ambiguous diagnosis, and these with one exchanged for each that fits equally well."""
+    """The effects of an ambiguous diagnosis, then these with one exchanged for another that fits equally well."""
     values = {cause.effect: {name: one.value for name, one in cause.parameters.items()} for cause in found.causes}
     alternatives = {cause.effect: cause.indistinguishable_from for cause in found.causes}
     first = found.effects()
@@ -183,7 +183,7 @@ def explanations(found: Diagnosis) -> list[list[Effect]]:
 
 
 def _start(source: FitState, effects: Sequence[Effect]) -> FitState:
-    """A start for the fit of a set from the source's, at the effects' values."""
+    """Where the fit of a set starts: the fit of the source, with the effects at their values."""
     fits = source
     for effect in effects:
         fits = with_effect(fits, [float(getattr(effect, parameter.name)) for parameter in effect.table])
@@ -202,7 +202,7 @@ def _noise_and_start(effects: Sequence[Effect], recording: Recording, system: Sy
 
 
 def _excitations(system: System, period: float, samples: int, generator: torch.Generator) -> tuple[list[str], Tensor]:
-    """Excitations of one command each, in words, and their values (N, samples, n_action) for a whole half range."""
+    """Excitations of one command each, in words, and their values (N, samples, n_action) for a size of 1 (`SIZES`)."""
     time = period * torch.arange(samples, dtype=torch.float64)
     names, shapes = [], []
     for k, action in enumerate(system.actions):
@@ -252,7 +252,7 @@ def _simulate(
         at = world.step(at, command)
         measured, at = world.measure(at, generator)
         inside &= (at.state.abs() <= MARGIN * ranges).all(1)
-        at = replace(at, state=torch.where(inside[:, None], at.state, first))  # what left is not followed to infinity
+        at = replace(at, state=torch.where(inside[:, None], at.state, first))  # a run that left must stay finite
         history = history.acting(command).observing(read(measured))
         readings.append(history.observations[:, -1])
         commands.append(command)
@@ -268,7 +268,7 @@ def _recording(like: Recording, system: System, states: Tensor, commands: Tensor
 
 
 def _lead(truth: Sequence[Effect], other: Sequence[Effect], recording: Recording, system: System) -> float:
-    """Log likelihood by which the truth leads another explanation, both fitted to the recording."""
+    """Log likelihood ratio of the truth to another explanation, both fitted to the recording."""
     sets = [tuple(type(effect) for effect in effects) for effects in (truth, other)]
     catalogue = list(dict.fromkeys((*sets[0], *sets[1])))
     prepared = prepare(recording, system)

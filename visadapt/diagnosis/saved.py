@@ -34,7 +34,7 @@ def load_effects(path: str | os.PathLike[str]) -> tuple[str, list[Effect]]:
         raise DiagnosisFileError(f"{path}: not JSON: {error}") from error
     if not isinstance(content, dict) or content.get("schema") not in READABLE:
         raise DiagnosisFileError(
-            f"{path}: no diagnosis of version {SCHEMA_VERSION}, such as `visadapt diagnose --json` writes"
+            f"{path}: no diagnosis of version 1 to {SCHEMA_VERSION}, such as `visadapt diagnose --json` writes"
         )
     try:
         causes = tuple(_cause(each) for each in content["causes"])

@@ -18,14 +18,14 @@ MIN_GAP_CLOSED = 0.95
 """Share of the gap that the causes must close to count as identified although something remains unexplained."""
 
 CLEAR_OF_NOISE = 3.0
-"""Error of predictions over the noise, above which there is a gap, and above which, with the causes, the share of it
-that they close decides the verdict."""
+"""Error of predictions over the noise above which there is a gap. Where the error with the causes is above it, the
+share of the gap that they close decides the verdict."""
 
 AT_BOUND = 1e-3  # Distance from an end of its range, as a share of it, within which a strength is at that end
 
 MIN_CLOSED_TO_EXPLAIN = 0.5
-"""Share of the gap that the best set must close for what it leaves to be the next thing to look into; else it is what
-the source leaves."""
+"""Share of the gap that the best set must close for the next experiment to be about what it leaves unexplained; else it
+is about what the source leaves."""
 
 
 def verdict_of(
@@ -39,7 +39,7 @@ def verdict_of(
     """The verdict where these causes are what explains the gap best.
 
     Args:
-        unexplained: they leave something.
+        unexplained: they leave something unexplained.
         improvable: a black box beside them clearly closes more of the gap.
         repeats: readings are repeated.
     """

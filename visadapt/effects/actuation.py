@@ -51,8 +51,8 @@ class ActuatorDelay(ActuationEffect):
     }
 
     def memory(self, commands: Tensor, substep: float) -> Tensor:
-        # Past commands, how long each was held, and the number of substeps in a period. Twice what the delay reaches,
-        # for substeps down to half as long.
+        # Past commands, how long each was held, and the number of substeps in a period, over twice the delay, so that
+        # it suffices for substeps half as long.
         delay = self.value("delay", commands).detach()
         if not bool((delay >= 0).all()):
             raise ValueError(f"actuator_delay: delay must not be negative, got {float(delay.min()):g} s")
@@ -71,7 +71,7 @@ class ActuatorDelay(ActuationEffect):
         edge = _from_zero(lasting)[..., 0]
         once = _from_zero(command * lasting)
         twice = _from_zero(once[:, :-1] * lasting + 0.5 * command * lasting.square())
-        # ... and up to a delay before each edge of the present substeps: the first one's differences are impulses.
+        # ... and up to a delay before each edge of the present substeps; differences of `once` are impulses.
         wanted = (edge[:, -count - 1 :] - self.value("delay", commands).expand(batch)[:, None]).clamp_min(0)
         left = (torch.searchsorted(edge.detach(), wanted.detach()) - 1).clamp(0, past.shape[1] - 1)
         columns = left[..., None].expand(-1, -1, width)
@@ -80,28 +80,29 @@ class ActuatorDelay(ActuationEffect):
         twice = twice + once * inside + 0.5 * command * inside.square()
         once = once + command * inside
         impulse, lasting = once.diff(dim=1), held[..., None]
-        # How much further the command moves a mass of one than its mean does.
+        # How much further the command moves a unit mass than its mean does.
         excess = twice.diff(dim=1) - lasting * (once[:, :-1] + 0.5 * impulse)
         return (impulse + _shifts(excess, lasting, int(memory[0, -1, -1]))) / lasting, past[:, count:]
 
 
 def _from_zero(values: Tensor) -> Tensor:
-    """Sums (B, S + 1, n) of values (B, S, n) up to each, from none."""
+    """Cumulative sums (B, S + 1, n) of values (B, S, n), from 0 on."""
     return pad(values.cumsum(1), (0, 0, 1, 0))
 
 
 def _shifts(excess: Tensor, lasting: Tensor, period: int) -> Tensor:
-    """Impulses (B, S, n), of sum zero in a period of `period` substeps, that move a mass of one further by `excess`.
+    """Impulses (B, S, n), of sum zero in a period of `period` substeps, that move a unit mass further by `excess`.
 
-    A substep gives what its neighbour takes: the one before it the last of a period, the others the one after.
+    Each excess takes two opposite impulses: in its substep and the next one, or, in the last substep of a period, in
+    the one before and in this one.
     """
     count = excess.shape[1]
     if period == 1 or not bool(excess.any()):
         return torch.zeros_like(excess)
     apart = 0.5 * (lasting[:, 1:] + lasting[:, :-1])
     last = (torch.arange(count, device=excess.device) % period == period - 1)[:, None]
-    given = torch.where(last[:-1], 0.0, excess[:, :-1]) / apart  # by the substep after
-    taken = torch.where(last[1:], excess[:, 1:], 0.0) / apart  # from the last one, by that before
+    given = torch.where(last[:-1], 0.0, excess[:, :-1]) / apart  # in this substep, and back in the next
+    taken = torch.where(last[1:], excess[:, 1:], 0.0) / apart  # in the one before the last, and back in the last
     return pad(given + taken, (0, 0, 0, 1)) - pad(given + taken, (0, 0, 1, 0))
 
 
@@ -145,7 +146,7 @@ class ActuatorDeadzone(ActuationEffect):
 
 
 class ActuatorSaturation(ActuationEffect):
-    """A limit on the command that the motor follows: of its supply or its current. Commands are limited to 1 anyway."""
+    """A limit of the supply or the current on the command that the motor follows; without it the limit is 1."""
 
     name = "actuator_saturation"
     order = 40

@@ -97,7 +97,7 @@ class Effect(nn.Module):
     settled_by: ClassVar[Mapping[str, str]] = {}
     """The experiment that tells this effect from another one, by the other's name; stated on one of the two."""
     caveat: ClassVar[str] = ""
-    """What else may be meant where a recording shows this effect: a warning of the diagnosis."""
+    """What else could explain a recording that shows this effect; the diagnosis adds it as a warning."""
     order: ClassVar[int] = 1000
     """Position among the effects of its stage, which act in ascending order; without one, it acts last."""
     abrupt: ClassVar[bool] = False
@@ -142,12 +142,12 @@ class Effect(nn.Module):
 
     def value(self, name: str, like: Tensor) -> Tensor:
         """The parameter `name` with the device and dtype of `like`."""
-        # Not get_parameter, which torch.func.functional_call's tensors do not pass.
+        # Not get_parameter, which refuses the tensors of torch.func.functional_call.
         values: Tensor = getattr(self, name)
         return values.to(like)
 
     def column(self, name: str, like: Tensor) -> Tensor:
-        """The parameter `name` so that it multiplies what is (B, time, n): () or (B, 1, 1)."""
+        """The parameter `name`, () or (B, 1, 1), to multiply tensors (B, time, n)."""
         values = self.value(name, like)
         return values if values.dim() == 0 else values[:, None, None]
 
@@ -161,7 +161,7 @@ class ActuationEffect(Effect):
     """
 
     stage = Stage.ACTUATION
-    # Commands jump between periods, and a delay, a lag or a play turns that into a change within one.
+    # Commands jump between periods; a delay, a lag or a play turns such a jump into a change within a period.
     abrupt = True
 
     def acting_on(self, system: System) -> Self:
@@ -210,14 +210,14 @@ class DynamicsEffect(Effect):
         return system
 
     def vary(self, system: System, time: Tensor, state: Tensor) -> System:
-        """The altered system at the time (B,) since the start of the episode, in a state (B, n_state).
+        """The altered system at the time (B,) in s since the start of the episode, in a state (B, n_state).
 
         For parameters that change within an episode: called at every derivative, `alter` only once a period.
         """
         return system
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        """Load (B, n_load) at the time (B,) since the start of the episode, in a state (B, n_state).
+        """Load (B, n_load) at the time (B,) in s since the start of the episode, in a state (B, n_state).
 
         `system` has been altered and varied by all effects. Dry friction is no load: see `dry_friction`.
         """
@@ -262,10 +262,10 @@ class SensingEffect(Effect):
 
 
 def expect(system: System, effect: Effect | type[Effect]) -> Any:
-    """The system, which has the parameters of those that the effect acts on.
+    """The system, where it is one that the effect acts on.
 
     Raises:
-        TypeError: it is another.
+        TypeError: it is not.
     """
     if not isinstance(system, effect.systems):
         kinds = " or a ".join(getattr(kind, "name", kind.__name__) for kind in effect.systems)

@@ -17,9 +17,9 @@ from visadapt.effects.base import Effect, Parameter, Reading, Stage
 from visadapt.effects.lossy import Lossy
 from visadapt.systems import CartPole
 
-FAINTEST = 1e-12  # Grey level below which a power is not taken, whose slope has no limit at 0
+FAINTEST = 1e-12  # Grey level up to which gamma does nothing: at 0 the slope of a power may be infinite
 
-SHARPEST = 0.05  # px, below which a blur changes no grey level, and has a slope of 0
+SHARPEST = 0.05  # px, least sigma that is computed: at this one a blur changes no grey level
 
 BLUR_REACH = 4.0
 """Largest blur in px; its kernel reaches three times as far."""
@@ -48,12 +48,12 @@ class CameraEffect(Effect):
         return state, memory
 
     def motion(self, like: Tensor) -> Tensor | None:
-        """The affine map (3, 3) or (B, 3, 3) of (column, row, 1) in px from the frame's centre; None where none is
-        moved."""
+        """The affine map (3, 3) or (B, 3, 3) of (column, row, 1) in px from the frame's centre; None where
+        nothing moves."""
         return None
 
     def apply_to(self, frame: Tensor, memory: Tensor, generator: torch.Generator | None) -> Reading:
-        """The changed frame (B, H, W) of one row, once it is moved, and the new memory.
+        """The changed frame (B, H, W) of one row, after `motion`, and the new memory.
 
         Only random effects need the `generator`.
         """
@@ -88,7 +88,7 @@ def moved(frame: Tensor, motions: Sequence[Tensor]) -> Tensor:
 def seen_by(
     camera: Sequence[CameraEffect], frame: Tensor, memory: Sequence[Tensor], generator: torch.Generator | None
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """Frames (B, H, W) as effects, in their order, show them, and what these then remember."""
+    """Frames (B, H, W) after all effects, in their order, and the effects' new memories."""
     frame = moved(frame, [motion for effect in camera if (motion := effect.motion(frame)) is not None])
     remembered = []
     for effect, own in zip(camera, memory, strict=True):

@@ -1,4 +1,4 @@
-"""The catalogue of effects: which act on a system, which of them data cannot tell apart, and how it reads."""
+"""The catalogue of effects: which act on a system, which of them data cannot tell apart, and its text."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from visadapt.systems import SYSTEMS, System
 
 
 def catalogue(system: System | None = None) -> list[type[Effect]]:
-    """The named effects that act on a system, or on any: those on commands, dynamics, readings and frames.
+    """The named effects on commands, dynamics, readings and frames that act on a system; without one, all of them.
 
     On a system of one's own the library's effects act joint by joint, command by command and sensor by sensor.
 

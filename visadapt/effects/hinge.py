@@ -39,7 +39,7 @@ class PoleSpring(JointLoad):
 
 
 class PoleFriction(CoulombLaw):
-    """Dry friction in the hinge; a pole at rest on it sticks."""
+    """Dry friction in the hinge; a pole at rest sticks."""
 
     name = "pole_friction"
     equation = "Q_theta = -torque sign(theta_dot); at rest, what holds the pole, up to torque"

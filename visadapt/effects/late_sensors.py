@@ -1,4 +1,4 @@
-"""What arrives late: the readings of all sensors together, of one against the clock of the others, or frames."""
+"""Late readings: of all sensors together, of one against the others, or of a camera."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Late(Effect):
         return row[:, None].expand(-1, int(shift.max().floor()) + 1, -1)
 
     def earlier(self, measured: Tensor, memory: Tensor, period: float) -> Reading:
-        """The states (B, n_state) of one row with the late ones among them, and the new memory."""
+        """The states (B, n_state) of one row, the late ones as they were, and the new memory."""
         number = memory[:, -1, -1] + 1
         rows = torch.cat((memory, torch.cat((measured, number[:, None]), 1)[:, None]), 1)
         shift = self._shift(measured, period)

@@ -21,7 +21,7 @@ class JointEffect(DynamicsEffect):
     """Acts on one joint alone."""
 
     joint: ClassVar[int] = 0
-    """index of its load; of all the library's systems the first one is a force along x"""
+    """index of its load; in all the library's systems load 0 is a force along x"""
 
     def joint_position(self, state: Tensor, system: System) -> Tensor:
         """Position of the joint, (B,)."""
@@ -149,7 +149,7 @@ class StribeckLaw(DryFrictionLaw):
 
 
 class _OwnForward:
-    """The parameter `forward`, which the method of that name of torch's modules would hide."""
+    """The parameter `forward`, which torch's method of the same name would hide."""
 
     def __get__(self, effect: Effect | None, owner: type[Effect]) -> Any:
         return self if effect is None else effect._parameters["forward"]

@@ -68,7 +68,7 @@ class SensorGain(SensingEffect):
     """A sensor whose counts per unit differ from those assumed; a velocity that is read from it scales too."""
 
     source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (multiplicative sensor fault)"
-    columns: ClassVar[list[int]]  # of the states that it reads
+    columns: ClassVar[list[int]]  # the states that it reads
 
     def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
         out = measured.clone()

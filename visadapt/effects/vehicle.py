@@ -84,7 +84,7 @@ class MotorLag(ActuationEffect):
         return bound
 
     def memory(self, commands: Tensor, substep: float) -> Tensor:
-        """w and d (B, 2, n_action); of a thrust, w is 0."""
+        """w and d (B, 2, n_action); for the thrust, w is 0."""
         return torch.zeros_like(commands[:, :1]).repeat(1, 2, 1)
 
     def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
@@ -107,8 +107,8 @@ class MotorLag(ActuationEffect):
         return commands + ratio[..., None] * (before - after[..., 1]), after[:, -1].movedim(2, 1)
 
     def _of_a_substep(self, ratio: Tensor, length: Tensor, commands: Tensor) -> tuple[Tensor, Tensor]:
-        """Over substeps (B or 1, S or 1) s long: the transitions of (w, d), (..., n_action, 2, 2), and the responses to
-        1, (..., n_action, 2)."""
+        """Transitions of (w, d), (..., n_action, 2, 2), over substeps of `length` (B or 1, S or 1) s, and responses to
+        a command of 1, (..., n_action, 2)."""
         none = (0.0,) * commands.shape[2]
         gain, damping = (
             length[..., None] * beside(values, commands).unsqueeze(-2) for values in self.loops or (none, none)

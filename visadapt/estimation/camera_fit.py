@@ -4,8 +4,8 @@
 
 y_t a frame, Psi the renderer, p_t = (x, theta), C the camera's effects with their parameters phi, the same in all
 frames. Levenberg and Marquardt's steps are taken in phi and all p_t at once; the p_t are eliminated frame by frame
-(Schur complement; Triggs et al. 2000, Bundle adjustment, section 6.1). The covariance of phi holds noise of the pixels
-and what the renderer itself draws wrongly, which no number of frames averages out.
+(Schur complement; Triggs et al. 2000, Bundle adjustment, section 6.1). The covariance of phi covers noise of the pixels
+and errors of the renderer itself, which no number of frames averages out.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ Camera = tuple[type[CameraEffect], ...]
 SMOOTHING = 1.5  # px, standard deviation
 
 ALIKE = 100
-"""Pixels, 10 by 10, in which what is left of the frames beyond noise counts as one error, the same in all frames."""
+"""Pixels, 10 by 10, over which the residual beyond noise counts as one error, the same in all frames."""
 
-STEPS = 12  # At most
+STEPS = 12  # Most steps of a fit
 
 SMALL_GAIN = 1e-4  # Share by which a step must lower the squared misfit for another one to be taken
 
@@ -213,8 +213,8 @@ def _solved(own: Tensor, both: Tensor, whole: Tensor, g: Tensor, b: Tensor, damp
 
 
 def _covariance(by_place: Tensor, by_value: Tensor, error: Tensor, noise: float, wide: Tensor) -> Tensor:
-    """(P, P) of the parameters, `wide` (P,) their variances beforehand: white noise of the pixels, and what else is
-    left, which is alike in many pixels and frames and so counts as few errors."""
+    """Covariance (P, P) of the parameters, with prior variances `wide` (P,): from white noise of the pixels, and from
+    the rest of the residual, which is alike in many pixels and frames and so counts as few errors."""
     if not len(wide):
         return wide.new_zeros(0, 0)
     own = (by_place @ by_place.mT).double()

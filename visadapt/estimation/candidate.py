@@ -26,7 +26,7 @@ SHORT_PERIOD = 0.005
 """s: up to it the midpoint rule is accurate enough for what is not reported, and takes half as long."""
 
 PAST_STEP = 0.0125
-"""s: periods that are shorter are integrated back together, under their mean command, to what late sensors read."""
+"""s: shorter periods are integrated back several at once, under their mean command, to what late sensors read."""
 
 
 class CandidateModel:
@@ -69,7 +69,7 @@ class CandidateModel:
         return self._world.with_values(theta)
 
     def commands(self, theta: Tensor) -> Tensor:
-        """Inputs after the actuation effects, (R, W, T, substeps, n_action), for R parameter vectors (R, P)."""
+        """Commands after the actuation effects, (R, W, T, substeps, n_action), for R parameter vectors (R, P)."""
         return self._acting(theta)[:, self.rows.episode[:, None], self.rows.index]
 
     def _acting(self, theta: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Maximum likelihood of the parameters of given effects, from whole episodes whose states are known with noise.
 
-What a diagnosis computes for one set of effects, without its search. The likelihood does not hold dropout and
-frozen_zone: these are read off readings that repeat, which the fit leaves out.
+What a diagnosis computes for one set of effects, without its search. Dropout and frozen_zone are not in the likelihood:
+they are estimated from repeated readings, which the fit leaves out.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def fit_effects(
         period: s between rows.
 
     Raises:
-        ValueError: an effect that can be neither fitted nor read off, or two effects that stand for each other.
+        ValueError: an effect that cannot be fitted, or effects that passive data cannot tell apart.
     """
     kinds = [sized(type(effect), system) for effect in effects]
     fitted = tuple(kind for kind in kinds if not kind.repeats_readings)
@@ -170,7 +170,7 @@ def _by_episode(rows: Segments, state: Tensor, measured: Sequence[Tensor]) -> li
 
 
 def _lost(holds: RepeatedReadings) -> tuple[Tensor, Tensor]:
-    """The rate at which rows are lost, (1,), and its variance, (1, 1): Bayes' with a uniform prior."""
+    """The rate at which rows are lost, (1,), and its posterior variance, (1, 1), under a uniform prior."""
     lost, rows = sum(int(x.sum()) for x in holds.lost), sum(len(x) - 1 for x in holds.lost)
     variance = (lost + 1) * (rows - lost + 1) / ((rows + 2) ** 2 * (rows + 3))
     return torch.tensor([lost / max(1, rows)]).double(), torch.tensor([[variance]]).double()

@@ -38,8 +38,8 @@ def initial_fit(system: System, rows: Segments) -> FitState:
 
 START_LOG_NOISE = math.log(0.003**2)
 """Least log variance of a measurement, in its unit squared, with which a fit with one more effect starts. Without the
-effect, readings of positions may have been taken as free of noise, and it cannot be told from those of velocities that
-they are not: the likelihood has a second maximum there."""
+effect, a fit may have taken readings of positions as free of noise, which those of velocities do not contradict: the
+likelihood has a second maximum there."""
 
 
 def with_effect(base: FitState, values: Sequence[float]) -> FitState:

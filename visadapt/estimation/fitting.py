@@ -32,8 +32,8 @@ MAX_DAMPING = 100.0  # Damping at which a fit stops, since its steps have become
 
 OUT_OF_REACH = 100.0
 STEPS_TO_COME = 4
-"""Log likelihood short of its rival's at which a fit stops: where it would end if it gained what it gained in the last
-iteration in every one that is left, but as many of them as STEPS_TO_COME, since gains dwindle."""
+"""Log likelihood below its rival's at which a fit stops, if it is expected to end there: with the gain of its last
+successful step in each iteration left, but in STEPS_TO_COME at most, since gains dwindle."""
 
 MAX_LOG_VARIANCE_CHANGE = 1.5  # Largest change of a log variance in one iteration
 
@@ -102,8 +102,8 @@ def _bounds(models: Sequence[CandidateModel], fits: FitState) -> tuple[Tensor, T
 
 
 MAX_REFIT_CHANGE = 2.0
-"""Largest change of a parameter without some windows, in its standard deviations: where these alone inform about it, a
-step from what the others hold would have no bounds."""
+"""Largest change of a parameter without some windows, in its standard deviations: where only these inform about it,
+the step would have no bounds."""
 
 
 def refitted(model: CandidateModel, fits: FitState, window_used: Tensor) -> FitState:

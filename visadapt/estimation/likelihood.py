@@ -111,8 +111,8 @@ def _reading_per_state(sensing: Tensor, model: CandidateModel) -> Tensor:
     """(W, n) change of a state's reading per unit of the state, for derivatives `sensing` (W, m, n) of the readings; of
     a velocity that is not measured, that of its position.
 
-    What is known of a window's first state is known of its reading: in the state's own units it would favour a sensor
-    that reads less than the state is.
+    The prior of a window's first state holds in units of its reading: in the state's own units it would favour a
+    sensor scale below 1.
     """
     out = torch.ones_like(sensing[:, 0])
     for k, channel in enumerate(model.rows.channels):
@@ -126,7 +126,7 @@ def _reading_per_state(sensing: Tensor, model: CandidateModel) -> Tensor:
 def variances(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[Tensor, Tensor]:
     """Process noise covariances (C W, n, n) and measurement variances (C W, m) for the filter of `problem`.
 
-    Process noise too is what it is in the readings: its lower bound would else favour a sensor that reads too little.
+    Process noise is in units of the readings too, since its lower bound would otherwise favour a sensor scale below 1.
     """
     windows = model.rows.shape[0]
     process = torch.full((len(fits.log_process), len(model.system.states)), POSITION_PROCESS_NOISE**2).double()
@@ -163,7 +163,7 @@ class Derivatives(Batch):
     smoothed: Tensor  # (C, W, T, n, 1 + K) smoothed correction of the states, and its derivative by each parameter
 
     def summed(self, window_used: Tensor) -> Derivatives:
-        """Sums over windows with weights (C, W); of a single fit, also with those of C others in its place."""
+        """Sums over windows with weights (C, W); a single fit may have C rows of weights, and then gives C sums."""
 
         def total(each: Tensor) -> Tensor:
             return (each * window_used.reshape(*window_used.shape, *[1] * (each.dim() - 2))).sum(1)

@@ -33,7 +33,7 @@ UNEXPLAINED = 0.35
 
 @dataclass(frozen=True)
 class Poses:
-    """What was found in T frames; on the CPU, whatever drew them."""
+    """What was found in T frames; tensors are on the CPU."""
 
     place: Tensor  # (T, 2) float64: x in m, theta in rad
     covariance: Tensor

@@ -140,7 +140,7 @@ DIAGNOSABLE: dict[str, type[System]] = {system.name: system for system in PROFIL
 
 
 def profile_of(system: System) -> SystemProfile:
-    """The profile of a system, or of the class that it derives from; of a system of one's own, what its class says."""
+    """The profile of a system, or of the class that it derives from; of a system of one's own, made from its class."""
     for kind, profile in PROFILES.items():
         if isinstance(system, kind):
             return profile

@@ -42,7 +42,7 @@ class RepeatedReadings:
     used: list[Tensor]  # (T, m) 1 where a reading is a measurement
     lost: list[Tensor]  # (T,) whether the whole row is repeated
     frozen: list[Tensor]  # (T,) whether the angle is repeated and the rest of the row is not
-    silent: list[Tensor]  # (T,) whether a row says nothing of where the angle sensor stands still
+    silent: list[Tensor]  # (T,) whether a row does not show where the angle sensor stands still
 
 
 def find_repeats(
@@ -114,7 +114,7 @@ def _repeats(readings: Tensor, step: float) -> Tensor:
 
 
 def _equal_by_chance(change: Tensor, step: float) -> float:
-    """How many of the changes (N,) of a moving quantity are expected to be 0 by a resolution of `step`."""
+    """Expected number of the changes (N,) of a moving quantity that a resolution of `step` rounds to 0."""
     size = change[change != 0].abs()
     if not len(size) or step == 0:
         return 0.0

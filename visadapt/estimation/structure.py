@@ -11,8 +11,8 @@ NEIGHBOURS = 3  # px, side of the squares over which noise is averaged away
 def white_noise(residual: Tensor) -> float:
     """Standard deviation of the white noise in frames (N, H, W) less what is drawn, in their unit.
 
-    Immerkaer (1996), Fast noise variance estimation, CVIU 64(2); by the median, which edges in a few pixels leave as it
-    is.
+    Immerkaer (1996), Fast noise variance estimation, CVIU 64(2); by the median, which is robust to edges in a few
+    pixels.
 
     >>> import torch
     >>> noise = torch.randn(8, 40, 40, generator=torch.Generator().manual_seed(0))
@@ -25,7 +25,7 @@ def white_noise(residual: Tensor) -> float:
 
 
 def structure(residual: Tensor) -> Tensor:
-    """(H, W) mean square of what is left in frames (N, H, W), beyond what noise leaves of it in means over 3 by 3 px.
+    """(H, W) mean square over N frames of means over 3 by 3 px of the residual (N, H, W), less the part of white noise.
 
     Its mean over the frame is 0 where noise is all that is left.
     """

@@ -15,11 +15,11 @@ from visadapt.targets import FlightTarget, Target
 from visadapt.targets.rollout import Run, run
 
 SCORE_SEED = 2026
-"""Of the starts and hidden effects that policies are scored on: never that of a training, which counts from 0."""
+"""Seed of the starts and hidden effects that policies are scored on; seeds of trainings count from 0."""
 EPISODE_STEPS = 250
 """Steps of a cart-pole's episode that is scored."""
 FAR = 1.0
-"""m off its task's line at which a flight has failed."""
+"""m, error above which a flight has failed."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class FlightScore:
     failed: int
     """flights that were more than FAR off somewhere, or not finite"""
     mean: float
-    """m, over flights, of the mean over each"""
+    """m, mean over flights of the mean error of each"""
     std: float
-    """m, over flights"""
+    """m, standard deviation over flights of these mean errors"""
     worst: float
-    """m, the greatest distance of all"""
+    """m, the largest error of all"""
 
     def __str__(self) -> str:
         return f"{self.mean:.4f} +- {self.std:.4f} m, {self.flights - self.failed} of {self.flights} stayed near"
@@ -71,8 +71,8 @@ def score(
 ) -> CartPoleScore | FlightScore:
     """Run `policy` for `episodes` episodes on `target`: how well it does, and how many episodes failed.
 
-    Flights are scored by their distance in m from their task's line, cart-poles by the cart's speed in m/s. The steps
-    are those of an evaluation: no ledger counts them.
+    Flights are scored by the errors in m that their task defines (`FlightTask.misses`), cart-poles by the cart's speed
+    in m/s. The steps are those of an evaluation: no ledger counts them.
 
     Args:
         seed: of the starts and of the hidden effects.
@@ -122,7 +122,7 @@ def _score_flights(runs: Sequence[Run], target: FlightTarget) -> FlightScore:
 
 
 def wilson(hits: int, n: int, z: float = 1.959964) -> tuple[float, float]:
-    """Confidence interval of a share, `z` standard deviations to either side (Wilson 1927); NaN of no trials."""
+    """Confidence interval of a share, `z` standard deviations to either side (Wilson 1927); NaN without trials."""
     if n == 0:
         return math.nan, math.nan
     p = hits / n

@@ -107,7 +107,7 @@ class CartPoleFilm(Film):
     Args:
         panels: at least one.
         period: s between frames.
-        due: s, from when on poles that swing up are to be up.
+        due: s, the time by which poles that swing up must be up.
 
     Raises:
         ValueError: no panels, or a period that is not positive.
@@ -232,7 +232,7 @@ class CartPoleFilm(Film):
 
 
 def _picture(axes: Axes, pictures: NDArray[np.uint8]) -> Callable[[int, bool], None]:
-    """Fill axes with one of several pictures (T, H, W) or (T, H, W, 3); what is returned says with which."""
+    """Fill axes with one of several pictures (T, H, W) or (T, H, W, 3); the function returned chooses it by row."""
     image = axes.imshow(pictures[0], "gray", vmin=0, vmax=255, animated=True)
     return lambda row, ended: image.set_data(pictures[row])
 

@@ -49,7 +49,7 @@ def film(
         seconds: length of the policies' episodes; a flight ends with its course.
         seed: of the starts, and of whatever else the target draws.
         see: what policies are shown of an observation; by default what `Policy.shown` names.
-        due: s from when on a pole that swings up is to be up.
+        due: s, the time by which a pole that swings up must be up.
         progress: called after each frame.
 
     Raises:

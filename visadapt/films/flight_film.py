@@ -35,9 +35,9 @@ READINGS_TOP, BARS_TOP, CHART_TOP = 578, 640, 706
 COMMAND_LABELS = {"rate_x": "roll rate", "rate_y": "pitch rate", "rate_z": "yaw rate"}
 """Labels of the commands whose names alone would not say what they are."""
 SECOND = round(1 / INSTANT_PERIOD_S)
-"""instants; so much of the reference ahead is highlighted"""
+"""instants in 1 s, for which the reference ahead is highlighted"""
 OVERVIEW_DIRECTION = (0.55, 1.0, -0.6)
-"""in which the whole course is looked at"""
+"""direction of view of the whole course, in world axes"""
 ERROR_COLOURS = LinearSegmentedColormap.from_list("error", [TEAL, AMBER, RED])
 
 

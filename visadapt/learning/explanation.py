@@ -13,7 +13,7 @@ from visadapt.policies import Policy
 from visadapt.recordings import Episode
 
 Experiment = Callable[[Policy, int], Tensor | None]
-"""What to add to a policy's commands over so many steps, (steps, n_action); None where nothing helps."""
+"""From a policy and a number of steps, the commands (steps, n_action) to add to the policy's; None where none help."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +26,10 @@ class Explanation:
     complete: bool
     """whether they leave nothing for a residual to learn"""
     experiment: Experiment | None = field(default=None, compare=False)
-    """where other causes explain as much: designs what tells them apart in the next round"""
+    """where other causes explain the data as well: designs the excitation that tells them apart in the next round"""
 
 
 NOT_DIAGNOSED = Explanation("", (), complete=False)
 
 Explain = Callable[[Sequence[Episode], Path], Explanation]
-"""Diagnoses episodes of the target, or reads the diagnosis that is in the file."""
+"""Diagnoses episodes of the target and writes the diagnosis to the file, or reads it where the file exists."""

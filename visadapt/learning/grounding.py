@@ -25,18 +25,18 @@ from visadapt.world import World
 
 @dataclass(frozen=True)
 class GroundSettings:
-    """How a residual is fitted; all but the first two are for heads fitted by descent."""
+    """How a residual is fitted. A linear head uses `ridge`, `negligible` and, for the losses it reports, `held_out`."""
 
     ridge: float = 10.0  # weight of the squared coefficients of a linear head, in samples
     negligible: float = 0.0
-    """smallest unit of a gap, as a share of the root mean square by which a state changes in a period"""
+    """least scale of the residual, as a share of the root mean square change of a state in a period"""
     steps: int = 2000  # optimisation steps at most
     batch: int = 64
     learning_rate: float = 2e-3
     weight_decay: float = 1e-2
     held_out: float = 0.2  # share of the samples, whole stretches of time, that only choose when to stop
-    every: int = 25  # steps between looks at the held-out samples
-    patience: int = 12  # looks without a better held-out loss before stopping
+    every: int = 25  # steps between evaluations on the held-out samples
+    patience: int = 12  # most evaluations in a row without a lower held-out loss
 
 
 class GroundLoss(NamedTuple):
@@ -54,7 +54,7 @@ def gap(world: World, windows: Windows) -> Tensor:
 
 
 def left_over(residual: Residual, source: World, windows: Windows) -> Tensor:
-    """What the residual leaves of the gap (N, n_state)."""
+    """The gap minus the residual's correction, (N, n_state)."""
     every = torch.arange(len(windows))
     with torch.no_grad():
         return gap(source, windows) - residual.delta(windows.history(every).acting(windows.action))
@@ -82,10 +82,10 @@ def fit_named(source: World, windows: Windows) -> Windows:
 
 
 def rescale(residual: Residual, source: World, windows: Windows, negligible: float = 0.0) -> None:
-    """Make the root mean square of the gap, state by state, the unit of the residual's corrections.
+    """Set the residual's scale, the unit of its corrections, to the root mean square of the gap in each state.
 
-    The unit is at least `negligible` times the root mean square by which the state changes in a period: gaps that come
-    from rounding or from the integrator must not weigh as much as real ones.
+    The scale is at least `negligible` times the root mean square change of the state in a period: gaps that come from
+    rounding or from the integrator must not weigh as much as real ones.
     """
     missing = gap(source, windows).square().mean(0).sqrt()
     change = (windows.next_state - windows.state).square().mean(0).sqrt()
@@ -100,7 +100,10 @@ def ground(
     generator: torch.Generator,
     progress: Progress | None = None,
 ) -> list[GroundLoss]:
-    """Fit the network of `residual` to all windows so far, in place, in units of its scale."""
+    """Fit the head of the residual's network, in place, to the windows; returns losses in units of its scale.
+
+    Windows with an incomplete history are left out, unless all are incomplete.
+    """
     target = gap(source, windows) / residual.scale
     network = residual.network
     if not isinstance(network, ResidualNetwork):
@@ -121,7 +124,7 @@ def ground(
 def _solve(
     head: nn.Linear, seen: Tensor, target: Tensor, train: Tensor, held_out: Tensor, settings: GroundSettings
 ) -> list[GroundLoss]:
-    """Fit a linear head to all samples. The losses are those before, and of a fit to the training samples alone."""
+    """Fit a linear head to all samples; returns the losses of a head of zeros and of a fit to the training samples."""
     losses = []
     everything = torch.arange(len(seen))
     for step, rows in enumerate((everything[:0], train, everything)):
@@ -143,7 +146,7 @@ def _descend(
     generator: torch.Generator,
     progress: Progress | None,
 ) -> list[GroundLoss]:
-    """Fit a head to the training samples, from what it is, keeping the weights that did best on the held-out ones."""
+    """Fit a head by gradient descent from its present weights; it keeps those with the lowest held-out loss."""
     head.requires_grad_(True)
     optimiser = torch.optim.AdamW(head.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
     best, best_weights, waited = float("inf"), copy.deepcopy(head.state_dict()), 0
@@ -176,7 +179,10 @@ def _descend(
 
 
 def split(count: int, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Rows to train on and rows held out: stretches of 10 samples, since neighbouring ones are correlated."""
+    """Rows to train on and rows held out: stretches of 10 samples, since neighbouring ones are correlated.
+
+    Where no stretch would be left to train on, both are all rows.
+    """
     stretches = torch.arange(count).split(10)
     order = torch.randperm(len(stretches), generator=generator).tolist()
     held = max(1, round(share * len(stretches)))

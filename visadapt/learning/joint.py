@@ -1,8 +1,8 @@
 """Joint learning of residual and policy: Algorithm 1 of the paper, round after round.
 
 Each round executes the policy in the target for B counted samples, grounds the residual on all samples so far, and
-tunes the policy by backpropagation through renderer, residual and physics. Every stage of a round leaves one file,
-under its final name only once it is whole; an interrupted run goes on after the last whole stage.
+tunes the policy by backpropagation through renderer, residual and physics. Every stage of a round writes one file,
+which gets its final name once it is complete; an interrupted run goes on after the last complete stage.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Adapted:
     """the source, with the effects that were fitted, and those that the last diagnosis named"""
 
     def restore(self, policy: Policy, samples: int) -> None:
-        """Give `policy`, and the residual it listens to, the weights they had after `samples` counted samples.
+        """Give `policy`, and the residual it reads, the weights they had after `samples` counted samples.
 
         Raises:
             ValueError: no round ended there.
@@ -101,15 +101,15 @@ def adapt(
     """Run Algorithm 1 in `folder`, going on from what is there.
 
     Args:
-        policy, residual: the networks, changed in place; the policy listens to the residual.
-        source: the physics known beforehand; effects that it has are named guesses, whose parameters are fitted.
+        policy, residual: the networks, changed in place; the policy reads the residual.
+        source: the physics known beforehand; the parameters of its effects, if it has any, are fitted.
         budget, round_samples: N and B, target samples in all and in a round.
-        observe: the camera of simulated states, a learnt renderer; None where the policy sees what sensors measure.
+        observe: renders simulated states as the camera would; None where the policy sees what the sensors measure.
         label: estimates the states from the camera's frames; without it, the target's own states are used.
         explorer: the policy that collects the target's data, in place of the one that is tuned (Algorithm 1).
-        explain: names the causes of the gap, which then join the source; the residual learns the gap only where they do
-            not explain it, and where there is no gap the policy is left as it is. Where other causes explain as much,
-            the next round's commands have the experiment that tells them apart.
+        explain: names the causes of the gap, which are then added to the source. The residual learns the gap only where
+            they do not explain it; where there is no gap, the policy is left as it is. Where other causes explain the
+            data as well, the next round adds to its commands the excitation that tells them apart.
 
     Raises:
         ValueError: an empty round, or a budget that is smaller than a round.
@@ -146,7 +146,7 @@ def adapt(
         found = explain(recorded, recording.with_name("diagnosis.json")) if explain else NOT_DIAGNOSED
         windows: Windows | None = None
         if not found.complete:
-            # Not before: from what a faulty camera shows no states are estimated, and what has names needs none.
+            # Only the residual needs states, and from the frames of a faulty camera none could be estimated.
             episodes += label(recorded[labelled:]) if label else recorded[labelled:]
             labelled = len(recorded)
             windows = Windows.cut(episodes, settings.observations, observe)
@@ -189,8 +189,8 @@ def _ground(
 ) -> tuple[list[GroundLoss], Windows | None]:
     """Fit the named effects and the residual of `grounded` to the windows, or read what is in `path`.
 
-    Returns the residual's losses, and the windows with the true states behind faulty sensors. Without windows nothing
-    is fitted.
+    Returns the residual's losses, and the windows; where sensing effects were fitted, with smoothed true states.
+    Without windows nothing is fitted.
     """
     if not path.exists():
         losses: list[GroundLoss] = []
@@ -222,8 +222,10 @@ def _tune(
     windows: Windows | None,
     progress: Progress | None,
 ) -> list[float]:
-    """Tune the policy in `world`, then go the share `trust` of the way there from `start`, or read what is in `path`;
-    returns the losses."""
+    """Tune the policy in `world`, then set its weights to start + trust * (tuned - start); or read them from `path`.
+
+    Returns the loss of every iteration.
+    """
     if not path.exists():
         partial = path.with_suffix(".partial.safetensors")
         losses = tune(policy, world, observe, settings, generator, windows, progress, partial)
@@ -247,8 +249,8 @@ def _weights(folder: Path, number: int) -> Path:
 def collect(
     policy: Policy, target: Target, wanted: int, longest: int, generator: torch.Generator, added: Tensor | None = None
 ) -> list[Episode]:
-    """Episodes of `wanted` samples under `policy`, one after the other as on a machine; `added` (steps, n_action) joins
-    the commands of each."""
+    """Episodes of `wanted` samples under `policy`, one after the other as on a machine; `added` (steps, n_action) is
+    added to the commands of each."""
     episodes: list[Episode] = []
     while wanted > 0:
         episodes.append(run(target, policy, 1, min(wanted, longest), generator, EXPLORATION, added)[0].episode)

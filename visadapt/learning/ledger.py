@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 
 class BudgetExceeded(RuntimeError):
-    """A step of the target was asked for that the budget does not hold."""
+    """More steps of the target were asked for than the budget has left."""
 
 
 @dataclass
@@ -27,7 +27,7 @@ class Ledger:
         return self.budget - self.used
 
     def count(self, purpose: str, steps: int) -> None:
-        """Enter steps before they are taken; raises BudgetExceeded where they would overdraw the budget."""
+        """Enter `steps` of the target; raises BudgetExceeded, and enters none, where the budget has fewer left."""
         if steps > self.left:
             raise BudgetExceeded(f"{purpose}: {steps} target steps asked for, {self.left} of {self.budget} are left")
         self.entries.append((purpose, steps))

@@ -1,7 +1,7 @@
-"""Learning to see: a frame encoder is taught, in the source alone, where cart and pole are and how they moved.
+"""Perception: a frame encoder is trained, on rendered frames alone, to read where cart and pole are and how they moved.
 
-Windows of frames are rendered along random smooth paths that obey no dynamics at all, so nothing about any target
-and nothing about any force is learnt here: only kinematics.
+The frames follow random smooth paths that obey no dynamics, so the encoder learns kinematics only, and nothing about
+forces or about a target.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from visadapt.progress import Progress
 
 @dataclass(frozen=True)
 class Paths:
-    """The distribution of random paths of one coordinate, and the units that its estimates are given in.
+    """The distribution of random paths of one coordinate, in m or rad, and the units of the encoder's estimates of it.
 
-    Uniform position; normal velocity; at every period a new normal acceleration.
+    The first position is uniform, the first velocity normal, and each period has a normal acceleration of its own.
     """
 
-    reach: float  # half-width of the first position
-    velocity: float  # standard deviation, per s
+    reach: float  # half-width of the range of the first position
+    velocity: float  # standard deviation of the first velocity, per s
     acceleration: float  # standard deviation, per s2
 
     def draw(self, batch: int, length: int, period: float, generator: torch.Generator) -> Tensor:
@@ -46,7 +46,7 @@ class Paths:
 
 @dataclass(frozen=True)
 class PerceptionSettings:
-    """How an encoder learns to see."""
+    """How a frame encoder is trained to read positions and their changes."""
 
     iterations: int = 4000
     streams: int = 32  # paths rendered in an iteration
@@ -58,12 +58,12 @@ class PerceptionSettings:
 
 
 def scale(settings: PerceptionSettings, period: float) -> Tensor:
-    """(N_KINEMATICS,) units in which an encoder taught under `settings` gives positions and changes."""
+    """(N_KINEMATICS,) units, in m and rad, of the positions and changes that an encoder trained so returns."""
     return torch.cat((settings.cart.scale(period), settings.pole.scale(period)))
 
 
 def kinematics(positions: Tensor) -> Tensor:
-    """The latest of positions (..., LENGTH), and their changes, (..., LENGTH)."""
+    """The latest of the positions (..., LENGTH) and their LENGTH - 1 changes, (..., LENGTH)."""
     return torch.cat((positions[..., -1:], positions.diff(dim=-1)), -1)
 
 
@@ -76,9 +76,9 @@ def learn_to_see(
     progress: Progress | None = None,
     checkpoint: Path | None = None,
 ) -> list[float]:
-    """Teach `encoder`, in place, to read positions and changes from 5 rendered frames; returns the losses.
+    """Train `encoder`, in place, to read positions and changes from 5 rendered frames; returns the losses.
 
-    The loss weighs, beside positions and changes, the changes of changes: a force shows in them alone.
+    Beside positions and changes the loss weighs second differences, since only these show a force.
     """
     optimiser = torch.optim.AdamW(encoder.parameters(), weight_decay=1e-4)
     rate, steps = settings.learning_rate, settings.iterations

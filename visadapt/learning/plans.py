@@ -1,4 +1,4 @@
-"""Plans that a policy is tuned by: carried out in the world, so that the gradient of their cost flows back."""
+"""Plans of the policy, simulated in the world, so that the gradient of their cost flows back to the policy."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Plans:
         self.generator = generator
 
     def loss(self, iteration: int, progress: float) -> Tensor:
-        """The mean cost of the plans; then every stream takes the first step. `progress` is the curriculum's."""
+        """The mean cost of the plans; each stream then takes its first planned step. `progress` is the curriculum's."""
         streams, now = self.streams, self.streams.now
         plan = self.policy(self.seen(now.history))
         show = partial(streams.task.show, task_state=now.task_state)
@@ -54,7 +54,7 @@ class Plans:
 
 
 class KeptPlans(Plans):
-    """Plans from all that the streams have passed through, so that few steps are simulated and few frames rendered.
+    """Plans from states drawn from all that the streams visited: few steps are simulated and few frames rendered.
 
     The gradient flows through physics and effects alone: the residual's correction is held over a plan, and no frame is
     rendered along it.
@@ -73,7 +73,7 @@ class KeptPlans(Plans):
         self.past: Visited | None = None
 
     def loss(self, iteration: int, progress: float) -> Tensor:
-        """The mean cost of the plans, before which the streams take a step where it is time for one."""
+        """The mean cost of the plans; in one iteration of every `every` the streams take a step first."""
         streams = self.streams
         if iteration % self.every == 0:
             visited, action, first = visit(self.policy, streams.world, streams.now, self.seen(streams.now.history))
@@ -102,12 +102,12 @@ def imagine(
     show: Callable[[Tensor], Tensor] = lambda seen: seen,
     generator: torch.Generator | None = None,
 ) -> tuple[Tensor, WorldState]:
-    """Carry out a plan (B, K, n_action): the states that follow (B, K, n_state), and the world after the first step.
+    """Simulate a plan (B, K, n_action): the states that follow (B, K, n_state), and the world after the first step.
 
     Args:
         observe: the camera; None where the sensors' measurements are seen.
-        at: where the plan begins, its row read; that of the world returned is not.
-        show: adds to what is seen what the task shows beside it.
+        at: where the plan begins; the sensors have read this row, but not yet that of the world returned.
+        show: appends to an observation what the task shows beside it, such as a goal.
         generator: for random sensing effects.
     """
     states = []
@@ -125,9 +125,9 @@ def imagine(
 
 @torch.no_grad()
 def visit(policy: Policy, world: World, stream: StreamState, shown: History) -> tuple[Visited, Tensor, WorldState]:
-    """What is kept of a stream, the action (B, n_action) that the policy takes, and the world after it.
+    """What is kept of the streams, the action (B, n_action) that the policy takes, and the world after it.
 
-    `shown` is the stream's history with what the policy sees instead of it, noise included.
+    `shown` is the history of the streams as the policy sees it, with noise.
     """
     inputs, expected = policy.embed(shown), policy.correction(shown)
     action = policy.decide(inputs, expected)[:, 0]

@@ -5,8 +5,8 @@ A batch of simulated streams runs under the policy. At each iteration the policy
 Then every stream takes the first planned step. A stream further than delta_div from the reference starts anew, and
 delta_div grows as training goes on, so the policy learns to recover from ever further off.
 
-Where what streams pass through is kept (`TuneSettings.streams`, `KeptPlans`), the feed-forward stays as it is: what is
-tuned sees a noisy correction beside the one that acts, and would learn to oppose less than all of it.
+Where visited states are kept (`TuneSettings.streams`, `KeptPlans`), the feed-forward is not tuned: it reads a noisy
+estimate of the correction that acts, and would learn to oppose only a part of it.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ class TuneSettings:
     learning_rate: float = 1e-3
     longest: int = 150  # steps after which a stream starts anew
     streams: int | None = None
-    """number of streams where that is not `batch`: what they pass through is then kept, and each batch is drawn from
-    all of it, so that few steps are simulated and few frames rendered; a policy's encoder and feed-forward stay as they
-    are, and the residual's correction is constant over a plan"""
+    """number of streams, whose visited states are kept and each batch drawn from them: few steps are simulated and few
+    frames rendered, but a policy's encoder and feed-forward are not tuned, and the residual's correction is constant
+    over a plan; None: as many as `batch`, and nothing is kept"""
     every: int = 1  # iterations between two steps of the streams
     curriculum: bool = True
-    """whether streams start, and are kept, closer to the reference at first; not for a trained policy"""
+    """whether streams start closer to the reference, and restart closer to it, early on; False for a trained policy"""
     recorded: float = 0.0  # share of the starts that are recorded windows of the target, with their histories
     observation_noise: float = 0.01  # standard deviation of white noise on what the policy sees
 
@@ -79,10 +79,10 @@ def tune(
     """Train `policy` in `world`, in place; returns the loss of every iteration.
 
     Args:
-        observe: the camera through which the policy sees, differentiable for the sake of a residual that reads frames;
-            None for a policy on states, which sees what the world's sensors measure.
+        observe: the camera through which the policy sees, differentiable, since a residual may read its frames; None
+            for a policy on states, which sees what the world's sensors measure.
         windows: recorded starts, where settings.recorded asks for them, and the times at which other starts begin.
-        checkpoint: file of the training state, written every so often and resumed from.
+        checkpoint: file of the training state, from which an interrupted training goes on; None: none is written.
 
     Raises:
         DivergedError: the loss is not finite.

@@ -17,29 +17,30 @@ class SetupSettings:
     """How a policy is trained and adapted."""
 
     source: TuneSettings
-    """the policy in the source"""
+    """training of the policy in the source"""
     tuning: TuneSettings
-    """the policy in the grounded source, in each round"""
+    """tuning of the policy in the grounded source, in each round"""
     ground: GroundSettings = field(default_factory=GroundSettings)
-    """the residual"""
+    """fit of the residual"""
     observations: str = "state"
     """what grounding shows the residual: one of `learning.windows.SOURCES`"""
     longest_episode: int = 250
-    """steps of an episode of the target while data are collected"""
+    """most steps of an episode of the target while data are collected"""
     feedforward: bool = True
-    """begin with a policy that opposes what the residual expects; False where one command cannot undo it in a period"""
+    """begin with a feed-forward that opposes the residual's correction; False where no one command can cancel it"""
     trust: float = 1.0
-    """share of the way to the tuned weights that the policy goes from those before the first round, where each round
-    begins anew; 1: all of it, from those of the round before. The imagined target is not the real one"""
+    """share of the way from the weights before the first round to the tuned ones that the policy goes in each round,
+    since the grounded source is not the target. Below 1 each round tunes from the weights before the first round, at 1
+    from those of the round before"""
     refinement: TuneSettings | None = None
-    """the policy in the source once more, after `source`: near rest, say, where what counts is decided"""
+    """second training of the policy in the source, after `source`: near rest, say, where it is scored"""
     named: TuneSettings | None = None
-    """the policy in the source with effects that have names; without it, as `tuning`"""
+    """tuning of the policy in the source with named effects and without a residual; None: as `tuning`"""
     perception: PerceptionSettings | None = None
-    """how an encoder learns to see, where the policy is shown frames"""
+    """training of the frame encoder, where the policy is shown frames"""
 
     def shortened(self, iterations: int) -> SetupSettings:
-        """The same with so many iterations of the source policy, and at most as many of its refinement."""
+        """The same with `iterations` of the source policy's training, and at most as many of its refinement."""
         finer = self.refinement
         if finer is not None:
             finer = replace(finer, iterations=min(iterations, finer.iterations))
@@ -47,8 +48,8 @@ class SetupSettings:
 
     @property
     def with_names(self) -> TuneSettings:
-        """How the policy is tuned where all effects have names: they hold in every state, not in the recorded ones
-        alone, as a residual does."""
+        """Tuning where all effects are named. No start is a recorded one: named effects hold in every state, a residual
+        only near the recorded ones."""
         return replace(self.named or self.tuning, recorded=0.0)
 
     def numbers(self) -> dict[str, Any]:

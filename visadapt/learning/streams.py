@@ -15,7 +15,7 @@ from visadapt.tasks.base import Task
 from visadapt.world import World, WorldState
 
 EPISODE_STEPS = 250
-"""Steps of an episode: over its times starts are spread where the world depends on time and nothing is recorded."""
+"""Steps of an episode; where the world depends on time and there is no recording, streams start anywhere within it."""
 
 PROBE = 0.5
 """Command under which a world is tested for a dependence on time: not zero, since some effects scale commands."""
@@ -49,7 +49,7 @@ class StreamState(Batch):
 
 @dataclass(frozen=True)
 class Visited(Batch):
-    """What streams passed through: all that plans from there need, without the frames that were seen there."""
+    """States that streams visited, with all that plans from there need, but without the frames."""
 
     at: WorldState
     task_state: Tensor  # (B, ...) the task's
@@ -104,7 +104,9 @@ class Streams:
 
     @torch.no_grad()
     def advance(self, at: WorldState, action: Tensor, progress: float, generator: torch.Generator) -> None:
-        """Take the step to `at`, whose row is not read yet, under `action`; restart the streams that have diverged.
+        """Take the step to `at`, whose row the sensors have not read yet, under `action`.
+
+        Streams that have diverged, or have taken `longest` steps, start anew.
 
         `progress` in [0, 1] drives the curriculum.
         """
@@ -126,9 +128,9 @@ class Streams:
         state, task_state = (each[ended] for each in self.task.training_start(count, progress, generator))
         at = self.world.start(state)
         if self._times is not None:
-            # Streams are shorter than episodes: those that all began at time 0 would never meet a gust that comes
-            # late, or all phases of a slow force. So they begin at the times of recorded samples, or, without a
-            # recording, at any time of an episode.
+            # Streams are shorter than episodes: if all began at time 0, none would meet a late gust, or all phases of a
+            # slow force. So they begin at the times of recorded samples, or, without a recording, at any time of an
+            # episode.
             times = self._times[torch.randint(len(self._times), (count,), generator=generator)]
             at = replace(at, time=times[ended].to(state))
         seen, at = look(self.world, self.observe, at, generator)
@@ -137,7 +139,7 @@ class Streams:
         if windows is None or self._recorded is None:
             return fresh
         task_states = windows.task_states[windows.rows].to(task_state)
-        # Recorded falls are left out: a stream that starts beyond delta_div ends at once, at a cost that outweighs all.
+        # Recorded falls are left out: a stream that starts beyond delta_div ends at once, at a cost above all others.
         near = (~self.task.diverged(windows.state, task_states[:, -1], progress)).nonzero()[:, 0]
         if not len(near):
             return fresh
@@ -154,16 +156,16 @@ class Streams:
 def look(
     world: World, observe: Observe | None, at: WorldState, generator: torch.Generator | None
 ) -> tuple[Tensor, WorldState]:
-    """What is seen (B, ...) of the row `at`, and the world with that row read.
+    """What is observed (B, ...) at the row `at`, and the world after that row was read.
 
-    Through a camera, `observe`, which is shown the true state and then altered as the world's camera effects say;
-    without one (None) what the sensors measure.
+    With a camera, `observe`: the frames of the true states, altered by the world's camera effects. Without one (None):
+    what the sensors measure.
     """
     return world.measure(at, generator) if observe is None else world.show(at, observe, generator)
 
 
 def _depends_on_time(world: World, time: Tensor, state: Tensor) -> bool:
-    """Whether the state (1, n_state) under the same command goes on differently at some of the times (T,)."""
+    """Whether a step from the state (1, n_state) under one command differs between the times (T,) in s."""
     state = state.expand(len(time), -1)
     command = torch.full((len(time), world.substeps, len(world.system.actions)), PROBE).to(state)
     after = world.integrate(time, state, command)

@@ -7,12 +7,12 @@ and drifting from one to the next, and shocks e to the cart that come and go wit
     d_{t+1} = d_t + q w_t                   w white; an intensity q for each load
     y_t     = (x_t, theta_t) + c v_t        v_t ~ N(0, R_t), R_t from the fit of the renderer to frame t
 
-The one-step gap of the smoothed states, s_{t+1} - f(s_t, a_t), is the smoothed load and shock, and stays what
-grounding can learn from. q, q_e and c are those of the largest likelihood (Schweppe 1965, IEEE Trans. Inf. Theory
-11(1)) under a wide prior, which decides where an episode is too short to. A load that changes within a period is
-seen in the places alone, so its part of the velocities stays uncertain. The smoother is the extended Kalman
-filter and the recursion of Bryson and Frazier (1963), run again around its own result: the
-Gauss-Newton iteration for the most probable path (Bell 1994, SIAM J. Optim. 4(3)).
+The one-step gap of the smoothed states, s_{t+1} - f(s_t, a_t), is the effect of the smoothed load and shock, and
+grounding learns from it. q, q_e and c maximise the likelihood (Schweppe 1965, IEEE Trans. Inf. Theory 11(1)) times a
+wide prior, which decides where an episode is too short. A change of load within a period is seen in the positions
+alone, so its effect on the velocities stays uncertain. The smoother is the extended Kalman filter and the recursion of
+Bryson and Frazier (1963), run again around its own result: the Gauss-Newton iteration for the most probable path (Bell
+1994, SIAM J. Optim. 4(3)).
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ SHOCK = 0.03
 
 SMOOTHINGS = 4  # Times that the physics are linearised around the path so far; the noise is fitted in the first two
 
-ACCELERATION = 10.0  # m/s2 and rad/s2, what a load may do before anything is seen (standard deviation)
+ACCELERATION = 10.0  # m/s2 and rad/s2, standard deviation of the acceleration by a load before any frame is seen
 
 LEAN = 0.5  # rad, largest |theta| at which the pole is looked for
 
 BRIDGED = 10
-"""Rows in a row without a usable frame that the physics may bridge: upright, errors grow by e in about 5 rows."""
+"""Most consecutive rows without a usable frame: about upright, errors grow by a factor e in about 5 rows."""
 
 
 class TrackingError(ValueError):
@@ -61,7 +61,7 @@ class Tracker:
         world: the source physics, without effects; the cart is looked for within the range of its system's table.
 
     Raises:
-        TrackingError: a world with effects, which would explain away the gap that is looked for.
+        TrackingError: a world with effects, which would hide the gap that is looked for.
     """
 
     def __init__(self, renderer: nn.Module, world: World) -> None:
@@ -78,13 +78,13 @@ class Tracker:
         self.poses = PoseFinder(renderer, max(-across.low, across.high), LEAN)
 
     def track(self, episodes: Sequence[Episode]) -> list[Episode]:
-        """The episodes with states from their frames and actions alone, with one noise fitted to all.
+        """The episodes with states estimated from their frames and actions alone; one noise model is fitted to all.
 
         Raises:
             TrackingError: an episode without frames, with frames of another size or a clock of another period, or
                 whose frames the renderer does not explain, most of them or more than `BRIDGED` in a row.
 
-        An episode of one or two rows does not tell a load from a velocity, so its gap comes out as none.
+        One or two rows cannot tell a load from a velocity: in so short an episode the estimated gap is 0.
         """
         if not episodes:
             return []
@@ -142,7 +142,7 @@ class Tracker:
         return guess
 
     def _problem(self, poses: Poses, command: Tensor, path: Tensor) -> UnknownNoise:
-        """The physics replaced by their tangents along the path (T, n_state + n_load); readings of unit variance."""
+        """The physics linearised along the path (T, n_state + n_load); readings scaled to unit variance."""
         states, n = len(self.world.system.states), path.shape[1]
         before = path[:-1]
         acting = command.clamp(-1, 1)[:, None].expand(-1, self.world.substeps, -1)
@@ -170,10 +170,10 @@ class Tracker:
         return UnknownNoise(system, used.expand(-1, len(self._seen))[None], drift)
 
     def _drifts(self) -> tuple[Tensor, Tensor]:
-        """Loads (n_load,) that accelerate cart and pole, each its own, by 1 m/s2 and 1 rad/s2 in the upright rest.
+        """Unit loads (n_load,), in N and N m: each accelerates its own body at upright rest by 1 m/s2 or 1 rad/s2.
 
-        And the covariances (n_load + 1, n_state + n_load, n_state + n_load) of state and load after a period in which
-        each of these loads drifted by 1 such unit, and after shocks of `SHOCK` on average over the period.
+        And the covariances (n_load + 1, n_state + n_load, n_state + n_load) of the change of state and load in a
+        period: for each load, of a drift by its unit; last, of shocks of `SHOCK` on average over the period.
         """
         system, h = self.world.system, self.world.period
         states, loads = len(system.states), len(system.loads)
@@ -185,8 +185,8 @@ class Tracker:
         drift = torch.zeros(loads + 1, states + loads, states + loads, dtype=torch.float64)
         for k in range(loads):
             drift[k, states + k, states + k] = unit[k].square()
-        # Velocity and place after white acceleration of variance 1 / h (Bar-Shalom, Li and Kirubarajan 2001, section
-        # 6.2.2): their common part, and the part of the place that depends on when in the period it came.
+        # Velocity and position after white acceleration of variance 1 / h (Bar-Shalom, Li and Kirubarajan 2001, section
+        # 6.2.2): their common part, and the part of the position that depends on when in the period it came.
         pushed = SHOCK * unit[0] * change[0, self._rates]
         both, late = torch.zeros(2, states + loads, dtype=torch.float64)
         both[self._rates], both[self._seen], late[self._seen] = pushed * h, pushed * h**2 / 2, pushed * h**2 / 12**0.5
@@ -195,6 +195,6 @@ class Tracker:
 
 
 def _longest(missed: Tensor) -> int:
-    """Most rows (T,) missed one after the other."""
+    """Most consecutive rows that are `missed` (T,)."""
     used = torch.cat((torch.tensor([-1]), (~missed).nonzero()[:, 0], torch.tensor([len(missed)])))
     return int(used.diff().max()) - 1

@@ -29,7 +29,7 @@ class TrainingState:
     progress: Callable[[int, int, float], None] | None
     """called with (iterations done, iterations in total, loss)"""
     path: Path | None
-    """file of the state; None keeps it nowhere"""
+    """file of the state; None: it is not written"""
     losses: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -38,10 +38,10 @@ class TrainingState:
         )
 
     def resume(self) -> dict[str, Any] | None:
-        """Restore what an interrupted training left; returns what else it kept, None where there is nothing.
+        """Restore what an interrupted training wrote; returns the `more` that `keep` was given, None without a file.
 
         Raises:
-            CheckpointError: it does not fit.
+            CheckpointError: the file is of another network or training.
         """
         if self.path is None or not self.path.exists():
             return None
@@ -56,7 +56,7 @@ class TrainingState:
             return more
 
     def descend(self, loss: Tensor) -> None:
-        """One step against the gradient, of a norm of 1 at most."""
+        """One step of optimiser and schedule, with the gradient clipped to a norm of 1."""
         self.optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
@@ -65,7 +65,7 @@ class TrainingState:
         self.losses.append(float(loss.detach()))
 
     def keep(self, more: dict[str, Any]) -> None:
-        """Report the iteration; every `CHECKPOINT_ITERATIONS` of them write the state, and what else the loop needs."""
+        """Report progress; every `CHECKPOINT_ITERATIONS` iterations write the state, and `more` for the loop."""
         done = len(self.losses)
         if self.progress is not None:
             self.progress(done, self.iterations, self.losses[-1])
@@ -82,9 +82,9 @@ class TrainingState:
 
 
 def train_or_load(path: Path, network: nn.Module, about: Mapping[str, Any], train: Callable[[Path], object]) -> None:
-    """Give `network` the weights in `path`; where there are none yet, train it, and keep it there with `about` it.
+    """Give `network` the weights in `path`; where there is no such file, train it and write it, described by `about`.
 
-    `train` is given the file beside `path` that it keeps its state in, and from which an interrupted one goes on.
+    `train` is given the file, beside `path`, of its training state, from which an interrupted training goes on.
     """
     if path.exists():
         load_network(path, network)

@@ -1,4 +1,4 @@
-"""Recorded episodes cut into windows: what was seen, what was done, what came of it."""
+"""Recorded episodes cut into windows: the observations and actions up to a step, and the state after it."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class Windows:
     observations: Tensor  # (R, ...): uint8 frames, or states
     actions: Tensor  # (R, n_action); zero in the last row of an episode
     states: Tensor  # (R, n_state)
-    times: Tensor  # (R,) s from the begin of the episode
+    times: Tensor  # (R,) s since the start of the episode
     task_states: Tensor  # (R, n_task_state); of width 0 where the target has none
     rows: Tensor
-    """(N, LENGTH) rows that a window shows, up to that of s_t; before an episode its first row stands still"""
+    """(N, LENGTH) rows that a window shows, up to that of s_t; before an episode its first row is repeated"""
 
     @classmethod
     def cut(cls, episodes: Sequence[Episode], source: str, observe: Observe | None = None) -> Windows:
@@ -85,13 +85,13 @@ class Windows:
 
     @property
     def time(self) -> Tensor:
-        """(N,) s from the begin of the episode to s_t"""
+        """(N,) s from the start of the episode to s_t"""
         return self.times[self.rows[:, -1]]
 
     def start(self, world: World) -> WorldState:
-        """`world` at s_t of every window (N rows): at its time, with the memory that its episode's past leaves there.
+        """`world` at s_t of every window (N rows): its time, its state, and the effects' memory of what came before.
 
-        Rows are not read yet.
+        The sensors have not read these rows yet.
         """
         commands, states = (
             pad_sequence(values.split(self.lengths), batch_first=True) for values in (self.actions, self.states)
@@ -121,6 +121,6 @@ def _seen(episode: Episode, number: int, state: Tensor, source: str, observe: Ob
         if observe is None:
             raise ValueError("rendered observations need a renderer")
         with torch.no_grad():
-            # Kept as a camera would, in 8 bits, so that both sources weigh the same.
+            # In 8 bits, as the frames of a camera.
             return (observe(state).clamp(0, 1) * 255).round().to(torch.uint8)
     return state

@@ -1,4 +1,4 @@
-"""Policies and networks: what the last observations and actions say to the next HORIZON actions."""
+"""Policies and networks: from the last observations and actions to the next HORIZON actions."""
 
 from visadapt.policies.base import AutoregressivePolicy, Policy
 from visadapt.policies.cartpole import ImagePolicy, StatePolicy

@@ -1,8 +1,8 @@
-"""Policies: what the last observations and actions say to the next HORIZON actions at once, in [-1, 1].
+"""Policies: from the last observations and actions to the next HORIZON actions, in [-1, 1], all at once.
 
-A policy may listen to a residual: the correction that the residual expects, were nothing done now, joins the
-policy's features. It is a function of the same observations and actions, so nothing privileged enters; but the
-policy need not learn to see again what grounding has learnt to see, and adapts in far fewer iterations.
+A policy may read a residual: the correction that the residual predicts for a zero action is one of its inputs. It is a
+function of the same observations and actions, so it adds no privileged information, but the policy need not learn again
+what grounding has learnt, and adapts in far fewer iterations.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from visadapt.history import HORIZON, History
 class Policy(nn.Module):
     """Base of policies; subclasses give the layers that turn a history into a plan.
 
-    The correction enters straight into the plan as a feed-forward, since what is known to push can be pushed against,
-    and in some policies beside the history too; both are of no weight at first.
+    The correction enters the plan directly as a feed-forward, which can oppose a predicted force, and in some policies
+    also as an input beside the history; both have zero weights at first.
     `learning.policy.initialise_feedforward` gives the feed-forward its weights once there is a residual.
 
     >>> import torch, visadapt as va
@@ -43,11 +43,11 @@ class Policy(nn.Module):
     ) -> None:
         super().__init__()
         self.arguments = dict(arguments or {})
-        """the constructor's, from which a file that holds the policy makes it again"""
+        """those of the constructor, with which a policy file makes the policy again"""
         self.grounded_in: dict[str, Any] | None = None
         """the world that its residual completes, as `setups.policy_file.describe` puts it; None without a residual"""
         self.observation_shape = observation_shape or (n_state,)
-        """of what it is shown: one state, state and goal, or frame"""
+        """shape of one observation: a state, a state and a goal, or a frame"""
         self.n_state = n_state
         self.n_action = n_action
         self.feedforward = nn.Linear(n_state, HORIZON * n_action, bias=False)
@@ -55,7 +55,7 @@ class Policy(nn.Module):
         self.residual: Residual | None = None
 
     def embed(self, history: History) -> Tensor:
-        """What a plan is made of beside the correction, (B, inputs): the features of frames, or the history itself."""
+        """Inputs (B, inputs) of `plan` beside the correction: the features of frames, or the history itself."""
         raise NotImplementedError
 
     def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:
@@ -77,7 +77,7 @@ class Policy(nn.Module):
         return plan[:, 0]
 
     def correction(self, history: History) -> Tensor:
-        """What the residual expects if nothing is done, (B, n_state) in units of its scale; 0 without one."""
+        """The residual's correction (B, n_state) of a zero action, in units of its scale; 0 without a residual."""
         observations = history.observations
         if self.residual is None:
             return observations.new_zeros(len(observations), self.n_state)
@@ -87,10 +87,10 @@ class Policy(nn.Module):
 
 
 class AutoregressivePolicy(Policy):
-    """A random policy: commands (n_action,) about `rest` that the noise of `rollout.run` drives, and that last a while.
+    """A random policy: commands of a first-order autoregressive process about `rest` (n_action,).
 
-    Each is the last one, nearer to rest by the factor `keep`: it has nothing to draw, so that a run that is interrupted
-    and goes on draws the same.
+    A command's difference from `rest` is `keep` times that of the last one. The noise is that of `rollout.run`: the
+    policy itself draws nothing, so a resumed run draws the same.
     """
 
     rest: Tensor
@@ -108,6 +108,6 @@ class AutoregressivePolicy(Policy):
 
 
 def ignore_correction(layer: nn.Linear, n_state: int) -> None:
-    """Begin with no weight on the correction: a residual changes nothing until the policy is tuned with it."""
+    """Set the weights on the correction to 0: a residual changes nothing until the policy is tuned with it."""
     with torch.no_grad():
         layer.weight[:, -n_state:] = 0.0

@@ -11,17 +11,17 @@ from visadapt.policies.networks import N_FEATURES, FrameEncoder, mlp
 
 
 class ImagePolicy(Policy):
-    """A 4-layer CNN on the last 5 frames and 5 actions (the paper, section 3.2.3); the feed-forward alone hears the
+    """A 4-layer CNN on the last 5 frames and 5 actions (the paper, section 3.2.3); only the feed-forward reads the
     correction.
 
-    It carries the encoder as it was when it had learnt to see (`learning.perception`), before the policy was trained:
-    the residual begins with that one. No training of the policy changes it.
+    `perception` is the encoder as `learning.perception` trained it, from which a residual starts. Training the policy
+    does not change it.
     """
 
     shown = "frame"
 
     def __init__(self, background: Tensor, contrast: float, n_state: int = 4, n_action: int = 1) -> None:
-        # Drawn first, as it was when it was a network of its own: the same seed gives the same weights.
+        # Made first: the weights that a seed gives depend on the order in which networks are made.
         perception = FrameEncoder(background, contrast, n_action).requires_grad_(False)
         given = {"background": background, "contrast": contrast, "n_state": n_state, "n_action": n_action}
         super().__init__(n_state, n_action, given, tuple(background.shape))

@@ -14,14 +14,14 @@ from visadapt.policies.networks import N_DISTURBANCE, FlightResidualNetwork, mlp
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY, RigidBody, rotation, times
 
 FARTHEST, FASTEST = 0.5, 1.0
-"""m and m/s off its reference, the most that a policy that follows answers"""
+"""m and m/s, the errors of position and velocity above which `FollowPolicy` reacts no more strongly."""
 
 
 class FlightPolicy(Policy):
     """A policy for a rigid body that is shown its state (13) and, after it, its goal; after A.1.1 and A.1.2.
 
-    Like the paper's it reads velocities in world and body axes, two columns of the rotation matrix and the rates, and
-    what a subclass makes of the goal. A linear path past the hidden layers carries what feedback does near the goal.
+    Like the paper's it reads velocities in world and body axes, two columns of the rotation matrix, the rates, and what
+    `aim` makes of the goal. A linear path past the hidden layers carries the feedback near the goal.
     """
 
     shown = "state and goal"
@@ -43,7 +43,7 @@ class FlightPolicy(Policy):
                 layer.weight.zero_()
 
     def aim(self, state: Tensor, goal: Tensor) -> Tensor:
-        """What the goal (B, n_goal) is to a vehicle in a state (B, 13): (B, n_aim)."""
+        """The goal (B, n_goal) relative to a vehicle in a state (B, 13), as inputs (B, n_aim)."""
         raise NotImplementedError
 
     def embed(self, history: History) -> Tensor:
@@ -60,7 +60,7 @@ class FlightPolicy(Policy):
         return out
 
     def disturbance(self, history: History) -> Tensor:
-        """The residual's disturbance estimate and its rate, (B, N_DISTURBANCE), by which a plan foresees a force."""
+        """The residual's disturbance estimate and its rate, (B, N_DISTURBANCE), to anticipate a changing force."""
         network = None if self.residual is None else self.residual.network
         if not isinstance(network, FlightResidualNetwork):
             return history.actions.new_zeros(len(history.actions), N_DISTURBANCE)
@@ -76,10 +76,10 @@ class FollowPolicy(FlightPolicy):
         self.period = period
 
     def aim(self, state: Tensor, goal: Tensor) -> Tensor:
-        """What is left of the reference after going on at the present velocity.
+        """The reference minus the path at constant present velocity, (B, 6 HORIZON): positions in m, velocities in m/s.
 
-        A vehicle further off in position or velocity than FARTHEST and FASTEST is taken to be as far off as that. Its
-        turns are slow: if it leant by all of a large error, it would swing back too late, further each time.
+        Errors of position and velocity are limited to FARTHEST and FASTEST. Since a vehicle tilts slowly, one that
+        tilted in proportion to a large error would tilt back too late, and overshoot further each time.
         """
         reference = goal.unflatten(1, (HORIZON, 6))
         next_velocity = reference[:, :1, 3:]
@@ -103,7 +103,10 @@ class ReachPolicy(FlightPolicy):
         super().__init__(3, 10)
 
     def aim(self, state: Tensor, goal: Tensor) -> Tensor:
-        """The distance, the direction to the point in body axes, and how far the path points aside, near and far."""
+        """(B, 10): distance / 50 m, direction to the point in body axes, heading error, and that error / distance.
+
+        The heading error is 10 times the direction to the point minus that of the velocity, in world axes.
+        """
         to, velocity = goal - state[:, POSITION], state[:, VELOCITY]
         distance = to.norm(dim=1, keepdim=True).clamp_min(1.0)
         way, path = to / distance, velocity / velocity.norm(dim=1, keepdim=True).clamp_min(1.0)

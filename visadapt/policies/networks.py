@@ -178,7 +178,7 @@ class ImageResidualNetwork(ResidualNetwork):
 
 
 class StateResidualNetwork(ResidualNetwork):
-    """The residual of what is shown its states.
+    """The residual of a policy that is shown states.
 
     On the last state and action it is the paper's MLP with two hidden layers of 64, tanh (3.2.1). On 5 of each (3.2.2),
     for which it needs the source's `system` and the `period` in s, it also reads the accelerations between the states
@@ -202,7 +202,7 @@ class StateResidualNetwork(ResidualNetwork):
         return torch.cat((states.flatten(1), actions.flatten(1), unexplained.flatten(1)), 1)
 
     def informed(self, inputs: Tensor) -> Tensor:
-        """All rows but, of a history, the first LENGTH - 1 of an episode, whose history is incomplete."""
+        """(B,) False in the first LENGTH - 1 rows of an episode, whose history is incomplete; True if none is read."""
         if self.system is None:
             return super().informed(inputs)
         states = inputs[:, : LENGTH * self.n_state].unflatten(1, (LENGTH, self.n_state))
@@ -211,8 +211,8 @@ class StateResidualNetwork(ResidualNetwork):
     def unexplained(self, system: System, states: Tensor, actions: Tensor) -> Tensor:
         """Mean accelerations minus the source's over the periods between states, (B, LENGTH - 1, n_state / 2).
 
-        The source's is the mean of those at both ends of a period, under the action held in between. `held_back` says
-        what periods before an episode take.
+        The source's is the mean of those at both ends of a period, under the action held in between. `held_back` fills
+        the periods before an episode.
         """
         load = states.new_zeros(*states.shape[:-1], len(system.loads))[:, 1:]
         ends = [system.derivative(part, actions[:, :-1], load) for part in (states[:, :-1], states[:, 1:])]
@@ -222,9 +222,10 @@ class StateResidualNetwork(ResidualNetwork):
 
 
 def held_back(values: Tensor, known: Tensor) -> Tensor:
-    """Values (B, periods, n), in which periods before an episode begins take those of its first period.
+    """The values (B, periods, n) with those of the episode's first period in the periods before it.
 
-    They are not `known` (B, periods, 1), since the first state is repeated over them; without any period all are 0.
+    The latter are not `known` (B, periods, 1), since the first state is repeated in them. Where no period is known, all
+    values are 0.
     """
     past = [values[:, -1] * known[:, -1]]
     for k in range(values.shape[1] - 2, -1, -1):
@@ -243,7 +244,7 @@ class FlightResidualNetwork(ResidualNetwork):
         system: the vehicle.
         period: s between actions.
         predict: the source's steps (B, T, 13) from consecutive states (B, T, 13) under actions (B, T, n_action); None
-            uses no history.
+            reads no history.
     """
 
     def __init__(self, system: RigidBody, period: float, predict: Predict | None = None) -> None:
@@ -263,7 +264,7 @@ class FlightResidualNetwork(ResidualNetwork):
         return torch.cat((own, self.unexplained(self.predict, states, history.actions)), 1)
 
     def informed(self, inputs: Tensor) -> Tensor:
-        """All rows but the first LENGTH - 1 of a flight, whose history is incomplete."""
+        """(B,) False in the first LENGTH - 1 rows of a flight, whose history is incomplete; True if none is read."""
         if self.predict is None:
             return super().informed(inputs)
         past = inputs[:, -6 * (LENGTH - 1) :].unflatten(1, (LENGTH - 1, 6))
@@ -286,7 +287,7 @@ class FlightResidualNetwork(ResidualNetwork):
     def unexplained(self, predict: Predict, states: Tensor, actions: Tensor) -> Tensor:
         """Changes of velocity and rates minus the source's over the periods between states, (B, 6 (LENGTH - 1)).
 
-        In units of HISTORY_ACCELERATION_UNIT times a period. See `held_back` for the periods before a flight begins.
+        In units of HISTORY_ACCELERATION_UNIT times a period. `held_back` fills the periods before a flight.
         """
         predicted = predict(states[:, :-1], actions[:, :-1]).flatten(0, 1)
         before, after = states[:, :-1].flatten(0, 1), states[:, 1:].flatten(0, 1)

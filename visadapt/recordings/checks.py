@@ -107,7 +107,7 @@ def _rates(time: NDArray[np.float64], values: NDArray[np.float64], angle: bool) 
 
 
 def _check_clock(raw: RawEpisode, system: System) -> None:
-    """Raises RecordingError where all positions change as many times as fast as their rates say, as in another unit."""
+    """Raises RecordingError where all positions change faster than their rates say, by the factor of a unit of time."""
     ratios = {}
     for name, values in raw.states.items():
         rate = raw.states.get(system.rate_of(name) or "")
@@ -115,7 +115,7 @@ def _check_clock(raw: RawEpisode, system: System) -> None:
             change = _rates(raw.time, values, system.states[system.index(name)].unit == "rad")
             ratios[name] = float(np.abs(change).mean() / np.abs(rate).mean())
     for unit, seconds in UNITS_S.items():
-        # One alone may be in another unit itself.
+        # With one ratio alone, the position may be in another unit instead.
         if len(ratios) > 1 and all(0.8 < ratio / seconds < 1.25 for ratio in ratios.values()):
             raise RecordingError(
                 f"{raw.source}: column 'time': by it {', '.join(ratios)} change {seconds:g} times as fast as their "

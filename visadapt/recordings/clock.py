@@ -16,25 +16,25 @@ Note = Callable[[str, str], None]
 """Called with (what was changed or left out, where in the recording)."""
 
 GAP_PERIODS = 1.5
-"""Two rows further apart than this have a missing row between them."""
+"""Step, in periods, above which rows are missing."""
 MOST_GAPS = 0.05
 """Share of gaps among the steps above which a clock is irregular; below it, rows are missing."""
 MOST_DECIMALS = 6
 """Decimals up to which stamps in s may be rounded; a float32 of an hour has about as many."""
 UNSTEADY_PERIODS = 0.1
-"""Difference between the longest and the shortest step above which the clock is reported as unsteady."""
+"""Difference between the longest and the shortest step, in periods, above which a clock is reported as unsteady."""
 LONGEST_STEP_PERIODS = 3.0
-"""Longest step of an irregular clock; at longer ones the episode is split."""
+"""Longest step, in periods, of an irregular clock; at longer ones the episode is split."""
 HARMLESS_GAP_S = 0.01
-"""Step up to which an episode is never split: a loop of a few ms that stalls for as long holds its command."""
+"""Step up to which an episode is never split: a loop of a few ms that stalls for so long holds its command."""
 SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-4, 0.5 / 3
-"""s between rows: the least, and the most, at which the shortest episode, of 0.5 s, has three."""
+"""Least and largest period in s; at the largest, the shortest episode, of 0.5 s, has three steps."""
 LEAST_STEP_PERIODS = 1e-3
 """Step between two rows, in periods, below which the stamps are not those of the readings."""
 UNITS_S = {"nanoseconds": 1e-9, "microseconds": 1e-6, "milliseconds": 1e-3, "minutes": 60, "hours": 3600, "days": 86400}
 """Units that stamps come in by mistake."""
 PERIOD_RATIO = 1.5
-"""Ratio that the periods of two episodes of one recording may have."""
+"""Largest ratio between the periods of two episodes of one recording."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class RawEpisode:
     measured: tuple[str, ...]
     """names of the columns of state, in the system's order"""
     place: Callable[[int], str]
-    """the name in messages of a row, counted from 0"""
+    """names a row, counted from 0, in messages"""
     names: Mapping[str, str] = field(default_factory=dict)
     """the file's names of the variables"""
     number: float | None = None
@@ -88,7 +88,7 @@ class RawEpisode:
 
 
 def check_forward(raw: RawEpisode) -> None:
-    """Raises RecordingError where two rows have the same time or a later row an earlier one."""
+    """Raises RecordingError where the time of a row is not later than that of the row before."""
     backwards = np.flatnonzero(np.diff(raw.time) <= 0)
     if len(backwards):
         row = int(backwards[0])
@@ -104,7 +104,7 @@ def check_steps(episodes: Sequence[RawEpisode]) -> None:
     """Check that the stamps of a file's episodes are in s.
 
     Raises:
-        RecordingError: rows follow each other faster or slower than a machine is controlled, or two as good as at once.
+        RecordingError: the period is not one of a controller, or a step is less than `LEAST_STEP_PERIODS`.
     """
     steps = [np.diff(raw.time) for raw in episodes]
     every = np.concatenate(steps)
@@ -147,7 +147,7 @@ def uninterrupted(raw: RawEpisode, note: Note) -> list[RawEpisode]:
 def _clocked(part: RawEpisode, note: Note) -> RawEpisode:
     """The part on a steady clock where its stamps deviate by no more than their rounding; else with its own stamps.
 
-    Whether unsteady stamps are those of the readings, or of a log that was late to write them, the diagnosis decides.
+    The diagnosis decides whether unsteady stamps are those of the readings, or of a log that wrote them late.
     """
     index = np.arange(len(part.time))
     if len(index) < 3:
@@ -163,7 +163,7 @@ def _clocked(part: RawEpisode, note: Note) -> RawEpisode:
 
 
 def _rounding(time: NDArray[np.float64]) -> float:
-    """The decimal, in s, that all stamps (T,) are rounded to."""
+    """The power of ten, in s, that all stamps (T,) are rounded to."""
     for decimals in range(MOST_DECIMALS):
         ticks = time * 10**decimals
         if np.abs(ticks - np.round(ticks)).max() < 0.01:

@@ -37,7 +37,7 @@ OTHER_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
         "command": ("action", "u", "Q", "control", "input", "force"),
     }
 }
-"""Other common names of a system's variables, in any case."""
+"""Other common names of a system's variables; upper and lower case are the same."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class Rows:
     values: NDArray[np.float64]
     """(N, columns)"""
     numbers: NDArray[np.intp]
-    """(N,) from 1 on, without the header, comments (lines that begin with #) and blank lines"""
+    """(N,) row numbers from 1, not counting the header, comments (lines that begin with #) and blank lines"""
     lines: NDArray[np.intp]
-    """(N,) those of an editor"""
+    """(N,) line numbers, as in an editor"""
     total: int
-    """of the file, where more than N"""
+    """rows of the file, of which N are kept"""
 
     def place(self, row: int) -> str:
         """The name in messages of a row, counted from 0."""
@@ -60,7 +60,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Table:
-    """A file whose header is read, and whose rows are not yet."""
+    """A file of which only the header has been read."""
 
     path: Path
     header: tuple[str, ...]
@@ -96,8 +96,8 @@ class Table:
     def rows(self, columns: Sequence[int], most: float = math.inf, progress: Progress | None = None) -> Rows:
         """The rows' numbers in some columns; the other columns may hold anything.
 
-        The file is read a stretch of rows at a time. Of more than `most` rows every second stretch is kept, or every
-        fourth, and so on.
+        The file is read a stretch of rows at a time. Where it has more than `most` rows, every second stretch is kept,
+        or every fourth, and so on.
 
         Raises:
             RecordingError: no rows, a row with more or fewer cells than the header, or a cell that is not a number;
@@ -120,7 +120,7 @@ class Table:
         return Rows(table[:, 2:], table[:, 0].astype(np.intp), table[:, 1].astype(np.intp), total)
 
     def _parsed(self, lines: Iterator[tuple[int, str]], columns: Sequence[int]) -> Iterator[list[float]]:
-        """Of each row its number, its line, and its numbers in some columns."""
+        """For each row its number, its line number, and its values in `columns`."""
         pulled: list[int] = []
 
         def texts() -> Iterator[str]:
@@ -157,7 +157,7 @@ class Table:
 
 
 def _lines(path: Path, progress: Progress | None = None) -> Generator[tuple[int, str], None, None]:
-    """Number and text of each line that is not blank and no comment."""
+    """Number and text of each line that is neither blank nor a comment."""
     try:
         with path.open("rb") as raw, io.TextIOWrapper(raw, encoding="utf-8-sig") as file:  # line ends become \n
             size = os.fstat(raw.fileno()).st_size
@@ -185,7 +185,7 @@ def read_rows(
 ) -> list[RawEpisode]:
     """The episodes of a file; `given` maps our names of columns to the file's, where these are not evident.
 
-    Of values that take more than `most_bytes` some stretches are left out, which is noted.
+    Where the values take more than `most_bytes`, stretches of rows are left out, with a note.
 
     Raises:
         RecordingError: the file or a column is missing, or a cell is not a number.
@@ -222,7 +222,7 @@ def match(
 ) -> dict[str, int]:
     """The index of each of our variables in a file's header; `given` maps our names to the file's.
 
-    Without `states`, of time and actions alone, as where frames take their place.
+    Without `states` it has no states, as where frames are read in their place.
 
     Raises:
         RecordingError: a needed column is missing, several columns could be one variable, or `given` names a variable
@@ -259,7 +259,7 @@ def match(
 
 
 def _number(cell: str) -> float:
-    """The number in a cell; without the underscores and the foreign digits that Python takes too."""
+    """The number in a cell; raises ValueError also for underscores and non-ASCII digits, which `float` accepts."""
     if "_" in cell or not cell.isascii():
         raise ValueError(cell)
     return float(cell)

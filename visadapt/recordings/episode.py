@@ -93,9 +93,9 @@ class Recording:
     warnings: tuple[str, ...] = ()
     """what was changed or left out, a line each"""
     usable: tuple[NDArray[np.bool_], ...] = ()
-    """(T,) of each episode, which rows are measurements; without it, all are"""
+    """(T,) for each episode, which rows are measurements; without it, all are"""
     resolution: tuple[float, ...] = ()
-    """smallest differences of the measured states that mean anything; without it, those between their numbers"""
+    """smallest meaningful difference of each measured state; without it, the smallest between two of its readings"""
 
     @property
     def samples(self) -> int:

@@ -7,10 +7,9 @@
     /episode_00000/frame    (T, H, W) uint8, gzip
     /episode_00000/task_state  (T, n_task_state) floating point, where the target has a task
 
-All datasets carry a checksum (Fletcher-32) and, since version 2, as the attribute `sha256` that of their type, shape,
-values and names of columns: damage, also of what says how to read the values, is reported and not read as data. Files
-that others write, or edit, may be of version 1, without it. A file is read on its own: links, and values that are
-stored in other files, are refused.
+All datasets carry a checksum (Fletcher-32) and, since version 2, an attribute `sha256`, the hash of their type, shape,
+values and column names, so that damage to any of these is reported and not read as data. Files that other programs
+write or edit may be of version 1, without the hash. Links, and values stored in other files, are refused.
 """
 
 from __future__ import annotations
@@ -38,9 +37,9 @@ Read = TypeVar("Read")
 FORMAT, VERSION = "visadapt recording", 2
 READABLE = (1, VERSION)
 COMPRESSION = 1100
-"""Values over stored bytes that compression reaches at most; a dataset that claims more is damaged."""
+"""Highest ratio of bytes to stored bytes that compression reaches; a dataset that claims more is damaged."""
 READING_S, READING_BYTES_PER_S = 5, 10e6
-"""s of computation that reading a file may take at least, and bytes for which it may take a second more."""
+"""CPU time in s that reading any file may take, and bytes of the file for each second more."""
 DATASETS = ("time", "action", "state", "task_state", "frame")
 PART_BYTES = 2**24
 """Bytes of a dataset that are read at once where not all of its rows are used."""
@@ -130,9 +129,9 @@ def read_recording(path: str | os.PathLike[str], frames: bool = True) -> list[Ep
 def read_stretches(
     path: str | os.PathLike[str], frames: bool = True, most_bytes: float = math.inf
 ) -> tuple[dict[int, Episode], int]:
-    """As `read_recording`: the episodes by their number in the file, and the file's rows.
+    """As `read_recording`: the episodes by their number in the file, and the number of the file's rows.
 
-    Of values that take more than `most_bytes` stretches of rows are left out (`thinning.py`), so that episodes have
+    Where the values take more than `most_bytes`, stretches of rows are left out (`thinning.py`): episodes then have
     gaps, or are missing.
     """
     path = Path(path)
@@ -160,7 +159,7 @@ def read_stretches(
 
 
 def _tried(path: str | os.PathLike[str], read: Callable[[], Read]) -> Read:
-    """What is read, after it was read in a process of its own: damage may keep HDF5 busy for ever, or end the process.
+    """The result of `read`, tried first in a process of its own: a damaged file can make HDF5 hang, or end the process.
 
     Raises:
         RecordingError: that process was ended by either; or whatever `read` raises.
@@ -192,7 +191,9 @@ def _opened(path: Path) -> Iterator[h5py.File]:
             version = file.attrs.get("version")
             if not any(_is(version, each) for each in READABLE):
                 found = " ".join(str(version).split())[:30]
-                raise RecordingError(f"{path}: version {found} of the format; this visadapt reads version {VERSION}")
+                raise RecordingError(
+                    f"{path}: version {found} of the format; this visadapt reads versions 1 to {VERSION}"
+                )
             yield file
     except RecordingError:
         raise
@@ -204,7 +205,7 @@ def _opened(path: Path) -> Iterator[h5py.File]:
 
 
 def _is(value: object, wanted: str | int) -> bool:
-    """Whether an attribute, which may be of any kind and size, is this."""
+    """Whether an attribute, which may have any type and shape, is `wanted`."""
     return isinstance(value, str if isinstance(wanted, str) else np.integer) and value == wanted
 
 
@@ -221,7 +222,7 @@ def _names(file: h5py.File, kind: str) -> list[str] | None:
 
 
 def _about(file: h5py.File, name: str, values: Any, episodes: int, present: Sequence[str]) -> str:
-    """What stands beside a dataset's values: their kind and names, the episodes' number, this one's other datasets."""
+    """What the hash covers beside the values: their type and names, the number of episodes, the episode's datasets."""
     columns = _names(file, name) if name in ("state", "action") else None
     return f"{episodes} {sorted(present)} {name} {columns} {values.dtype.str} {values.shape}"
 
@@ -231,7 +232,7 @@ def _group_name(number: int) -> str:
 
 
 def _datasets(path: Path, file: h5py.File, number: int, frames: bool) -> dict[str, h5py.Dataset]:
-    """The datasets of an episode that are to be read, none of which is evidently damaged or elsewhere."""
+    """The datasets of an episode to read; raises RecordingError where one is evidently damaged or in another file."""
     name = _group_name(number)
     where = f"{path}: {name}"
     _check_own(file, name, where)
@@ -280,7 +281,7 @@ def _read_dataset(dataset: h5py.Dataset, name: str, where: str, rows: NDArray[np
 
 
 def _parts(dataset: h5py.Dataset, rows: NDArray[np.bool_]) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
-    """The values of a dataset, in one part where all rows are used, and of each part those that are."""
+    """The values of a dataset, part by part, each with those of the rows used; in one part where all rows are used."""
     if rows.all():
         values = np.asarray(dataset[()])
         yield values, values
@@ -293,7 +294,7 @@ def _parts(dataset: h5py.Dataset, rows: NDArray[np.bool_]) -> Iterator[tuple[NDA
 
 @contextmanager
 def _undamaged(name: str, where: str) -> Iterator[None]:
-    """Turn what HDF5 raises over what is no dataset, or cannot be read, into RecordingError."""
+    """Turn what HDF5 raises where something is no dataset, or cannot be read, into RecordingError."""
     try:
         yield
     except (OSError, TypeError, AttributeError) as error:  # a group has no values
@@ -303,7 +304,7 @@ def _undamaged(name: str, where: str) -> Iterator[None]:
 
 
 def _check_own(group: h5py.Group, name: str, where: str) -> None:
-    """Raises RecordingError where something of a group is only a link, which may lead out of the file."""
+    """Raises RecordingError where an item of a group is a link, which may lead out of the file."""
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
         raise RecordingError(f"{where}: {name!r} is a link to elsewhere; what it leads to belongs into the file itself")
 

@@ -26,14 +26,14 @@ from visadapt.systems import System
 SHORTEST_EPISODE_S = 0.5
 """s; shorter episodes hold too few predictions several steps ahead and are left out."""
 MOST_BYTES = 2**28
-"""Of the values of all files together: 4.8 million rows of a cart-pole. The checks take some copies of them."""
+"""Most bytes of the values of all files: 4.8 million rows of a cart-pole. The checks make a few copies of them."""
 SUFFIXES = (".csv", ".h5", ".hdf5", ".bag", ".mcap", ".ulg")
-"""Of the files in a folder that are read."""
+"""Suffixes of the files that are read from a folder."""
 UPRIGHT_RAD = 1.0
 """rad from 0 up to which an angle counts as upright when it is unwrapped."""
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of absurd readings, which are refused
+@np.errstate(over="ignore", invalid="ignore")  # by absurd readings, which are refused
 def load_recording(
     paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     system: System,
@@ -46,14 +46,14 @@ def load_recording(
     Names are matched by `csv.py`; those of logs, bags of ROS and ULog, are TOPIC.FIELD (`logs.py`). Clocks are checked
     by `clock.py`; rows of an unsteady one keep their stamps. Angles are unwrapped within an episode so that upright is
     0 (if the pole turns over, in the turn in which it is upright most often). A command in N (a column `force` that
-    exceeds 1) is divided by the system's `max_force`. Of files that are too long for memory stretches of rows are left
+    exceeds 1) is divided by the system's `max_force`. Where files are too long for memory, stretches of rows are left
     out (`thinning.py`). The recording's warnings say what was changed or left out.
 
     Args:
         paths: one or several: files, bags of ROS 2, or folders whose recordings are taken in the order of their names.
         system: the source, which defines names and units.
         columns: our names of columns to the file's, where these are not evident.
-        frames: whether to read frames in the place of states, which are then not used.
+        frames: whether to read frames in place of states.
         progress: called with (stage, MB done, MB in all, nan).
 
     Raises:
@@ -105,7 +105,7 @@ def load_recording(
 
 
 def _files(paths: Sequence[str | os.PathLike[str]], note: Note) -> list[Path]:
-    """The files that are given, each once; of a folder those that are not hidden."""
+    """The files that are given, each once; of a folder, the recordings that are not hidden."""
     files: list[Path] = []
     for path in map(Path, paths):
         found = [path]
@@ -192,7 +192,7 @@ def _read_hdf5(
 
 
 def _shared(episodes: Sequence[RawEpisode], system: System, note: Note) -> list[RawEpisode]:
-    """The episodes with the states alone that all of them have."""
+    """The episodes with only those states that all of them have."""
     shared = []
     for variable in system.states:
         without = [raw.path for raw in episodes if variable.name not in raw.measured]

@@ -20,7 +20,7 @@ from visadapt.recordings.topics import Read, Topic
 from visadapt.systems import System
 
 GAP = 5.0
-"""Median intervals of a topic without a reading, in which none is interpolated: rows are left out."""
+"""Longest interval between a topic's readings, in median intervals, that is interpolated; longer ones have no rows."""
 
 
 def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], note: Note) -> RawEpisode:
@@ -50,7 +50,7 @@ def _topics(path: Path, read: Read, wanted: Mapping[str, set[str]]) -> dict[str,
         return read(path, wanted)
     except RecordingError:
         raise
-    except Exception as error:  # parsers raise all kinds of a damaged file, MemoryError of a size that is wrong
+    except Exception as error:  # parsers raise anything on a damaged file, MemoryError on a wrong size
         reason = " ".join(str(error).split())[:200] or type(error).__name__
     raise RecordingError(f"{path}: cannot be read as a log, is it cut short or damaged? {reason}")
 
@@ -114,7 +114,7 @@ def _between_readings(time: NDArray[np.float64], stamps: NDArray[np.float64]) ->
 
 
 def _held(time: NDArray[np.float64], stamps: NDArray[np.float64], commands: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The mean of the held commands (N,) from each time (T,) to the next; of the last the one that holds there."""
+    """The mean of the held commands (N,) from each time (T,) to the next; for the last time, the command held there."""
     total = np.concatenate(([0.0], np.cumsum(commands[:-1] * np.diff(stamps))))
     mean = np.diff(np.interp(time, stamps, total)) / np.maximum(np.diff(time), 1e-12)
     return np.append(mean, commands[np.searchsorted(stamps, time[-1], side="right") - 1])

@@ -21,7 +21,7 @@ DEGREE = math.pi / 180
 DIFFERENCE_S = 0.05
 """s between rows whose difference is taken: over less, noise would outweigh motion."""
 LONGEST_DELAY_S = 0.25
-"""s of delay of the command that are tried before columns are called exchanged."""
+"""Longest delay of the command, s, that is tried before columns are called exchanged."""
 MOST_ROWS = 20_000
 """Rows of an episode that are used, for speed."""
 EXPLAINED_CORRELATION = 0.5
@@ -83,7 +83,7 @@ def _can_decide(raw: RawEpisode, system: System, names: Sequence[str]) -> bool:
 
 
 def _fits(raw: RawEpisode, columns: Columns, system: System, delay: int = 0) -> dict[str, tuple[float, float]]:
-    """For each variable that has a rate: correlation of its acceleration with the source's, and slope over it.
+    """For each variable with a rate: correlation of its acceleration with the source's, and slope over the source's.
 
     `columns` are the measured states, in the units and under the names to be tried; `delay` is the number of rows by
     which the commands act late.
@@ -125,5 +125,5 @@ def _fit(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> tuple
 
 
 def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """0 where one of the two never changes."""
+    """Correlation coefficient of two columns (T,); 0 where one of them never changes."""
     return 0.0 if a.std() == 0 or b.std() == 0 else float(np.corrcoef(a, b)[0, 1])

@@ -1,6 +1,6 @@
 """Checks of sensors: outliers are set aside, dead, frozen and absurd ones are refused.
 
-What cannot have been measured must not be diagnosed: an effect would be found that imitates a broken sensor.
+Values that cannot have been measured must not be diagnosed: the diagnosis would find an effect that imitates them.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from visadapt.systems import System, Variable
 TURN = 2 * np.pi
 
 OUTLIER_SCALES = 50.0
-"""Jump of a reading, over the usual departure from the mean of its neighbours, above which it may be an outlier."""
+"""Jump of a reading above which it may be an outlier, in usual departures from the mean of its neighbours."""
 OUTLIER_ROWS = 3
-"""Outliers that may follow each other."""
+"""Most consecutive rows that an outlier may last."""
 OUTLIER_RETURN = 0.2
-"""Share of the jump within which the reading after outliers is back at that before them."""
+"""Share of a jump that may remain where the reading after an outlier counts as back at that before it."""
 MOST_OUTLIERS = 0.05
 """Share of outliers among the rows of an episode above which the sensor is refused."""
 ABSURD_RANGES, ABSURD_TURNS = 100.0, 1e5
 """Multiples of the range that the system states, and turns of an angle, beyond which a reading is absurd."""
 STILL_RANGES = 1e-9
-"""Share of the range that the system states within which a column stands still."""
+"""Change, as a share of the range that the system states, up to which a column stands still."""
 MOVING_RANGES = 1e-3
 """Rate of change, in ranges per s, by the source, above which a state must be seen to move."""
 NOISE_RATIO, FEWEST_NOISY = 1.5, 30
-"""Variance of changes over that of values above which these hardly follow each other, as noise; and least rows."""
+"""Variance of changes over that of values above which a column resembles white noise (2.0); and fewest rows for it."""
 FROZEN_ROWS = 20
-"""Equal readings in a row from which a position is compared with its measured rate."""
+"""Fewest equal readings in a row at which a position is compared with its measured rate."""
 
 
 def differences(values: NDArray[np.float64], angle: bool) -> NDArray[np.float64]:
@@ -48,10 +48,10 @@ def differences(values: NDArray[np.float64], angle: bool) -> NDArray[np.float64]
 
 
 def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
-    """The episode without rows in which a reading lies where nothing moves to and back from so fast.
+    """The episode without the rows of outliers: readings that jump away and back faster than the state can move.
 
     Raises:
-        RecordingError: these are so many that the sensor is not to be believed.
+        RecordingError: more than `MOST_OUTLIERS` of a column are outliers.
     """
     if len(raw.time) < FROZEN_ROWS:
         return raw
@@ -86,7 +86,7 @@ def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
 
 
 def _outliers(steps: NDArray[np.float64], values: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
-    """Which rows (T,) lie beyond a jump of more than `reach`, and of much more than is usual, that is soon undone."""
+    """Which rows (T,) follow a jump that is larger than `reach` and than usual, and undone in `OUTLIER_ROWS` rows."""
     apart = np.diff(np.unique(values))
     usual = 1.4826 * float(np.median(np.abs(np.diff(steps)))) / 2
     least = max(reach, OUTLIER_SCALES * max(usual, float(apart.min()) if len(apart) else 0.0))
@@ -100,7 +100,7 @@ def _outliers(steps: NDArray[np.float64], values: NDArray[np.float64], reach: fl
 
 
 def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) -> list[RawEpisode]:
-    """The episodes without rates that never change where they must.
+    """The episodes without measured rates that never change although the source says that they must.
 
     Raises:
         RecordingError: a reading is absurd, or a state that must change stands still.

@@ -1,4 +1,4 @@
-"""Of a recording that is too long to be held, or to be diagnosed: stretches of rows, spread evenly over it."""
+"""Thins a recording that is too long for memory, or for a diagnosis, to stretches of rows spread evenly over it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def thinned(used: int, total: int) -> str:
 
 
 def kept(first: int, last: int, every: int) -> NDArray[np.bool_]:
-    """Which rows of a file from `first` up to, but not including, `last` are used, where every so many stretches are.
+    """Which rows of a file from `first` up to, but not including, `last` are used: one stretch of every `every`.
 
     >>> kept(4999, 5002, 2)
     array([ True, False, False])
@@ -30,7 +30,7 @@ def kept(first: int, last: int, every: int) -> NDArray[np.bool_]:
 def spread(recording: Recording, most: int, length: int) -> Recording:
     """A recording of at most about `most` rows: stretches of about `length` of them, spread evenly over it.
 
-    Each stretch is an episode, whose times still count from where its own began. A warning says what is used.
+    Each stretch becomes an episode, whose times count from the start of its own one. A warning says what is used.
     """
     rows = [len(episode.time) for episode in recording.episodes]
     if sum(rows) <= most:

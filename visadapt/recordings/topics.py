@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from visadapt.recordings.episode import RecordingError
 
 MOST_NAMES = 40
-"""In a message."""
+"""Most names that a message lists."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def reader(path: Path) -> Read | None:
 
 def _read_ulog(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
     """The second instance of a topic is NAME_1, and so on."""
-    with redirect_stdout(StringIO()):  # on which pyulog says what it thinks of a log that a crash cut short
+    with redirect_stdout(StringIO()):  # pyulog prints warnings about a log that a crash cut short
         log = _import(path, "pyulog").ULog(str(path))
     there = {f"{each.name}_{each.multi_id}" if each.multi_id else each.name: each.data for each in log.data_list}
     topics = {}
@@ -60,7 +60,7 @@ def _read_ulog(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
 
 
 def _read_bag(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
-    """Stamps are those of the messages' headers where all topics have them, and else when messages were recorded."""
+    """Stamps are those of the messages' headers where all have one, else the times at which messages were recorded."""
     highlevel, stores = _import(path, "rosbags.highlevel"), _import(path, "rosbags.typesys")
     fields = {name: sorted(each) for name, each in wanted.items()}
     rows: dict[str, list[list[float]]] = {name: [] for name in wanted}
@@ -80,7 +80,7 @@ def _read_bag(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
 
 
 def _header(message: Any) -> float:
-    """s, of a message's header; 0 where it has none."""
+    """Stamp of a message's header in s; 0 where it has none."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     return 0.0 if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
 

@@ -26,15 +26,15 @@ from visadapt.tasks.base import Task
 from visadapt.world import World
 
 Prepare = Callable[[Policy, Path, int, Report | None], None]
-"""Teaches a new policy what it needs before its task, from a seed, going on from what is in a folder."""
+"""Prepares a new policy for training, from (policy, folder, seed, report); goes on from what is in the folder."""
 
 
 @dataclass(frozen=True)
 class Setup:
     """One control problem: a source, what the policy is to do and is shown, and how it learns.
 
-    `cartpole_states`, `cartpole_frames`, `quadrotor` and `fixed_wing` make those of the paper; one's own needs a task
-    in its settings, and the four fields without a default.
+    `cartpole_states`, `cartpole_frames`, `quadrotor` and `fixed_wing` make those of the paper. A setup of one's own
+    needs the four fields without a default, and a task in its settings.
 
     >>> import visadapt as va
     >>> from visadapt.setups.cartpole import cartpole_states
@@ -44,25 +44,25 @@ class Setup:
     """
 
     source: World
-    """the physics known beforehand; effects that it has are named guesses, whose parameters adaptation fits"""
+    """the physics known beforehand; adaptation fits the parameters of its effects, if it has any"""
     policy: Callable[[], Policy]
     """makes a new policy"""
     residual: Callable[[Policy, World], Residual]
     """makes a new residual for a policy in the source"""
     settings: SetupSettings
     renderer: nn.Module | None = None
-    """of the frames that a policy is shown: cart position (B,) in m and pole angle (B,) in rad to frames (B, H, W)"""
+    """makes the frames that a policy is shown: cart position (B,) in m, pole angle (B,) in rad to frames (B, H, W)"""
     observe: Observe | None = None
-    """the camera of simulated states (B, n_state), a learnt renderer; None where sensors' readings are seen"""
+    """renders simulated states (B, n_state) as the camera would; None where the policy sees what the sensors measure"""
     label: Label | None = None
     """estimates the states of recorded episodes from their frames; without it, the target's own states are used"""
     prepare: Prepare | None = None
     """called on a new policy before it is trained"""
     test: Task | None = None
-    """the task that the policy is scored in, where that is not the one it is trained in: other references, say"""
+    """the task that the policy is scored in; None: the one it is trained in"""
 
     def pretrain(self, path: Path, seed: int, report: Report | None = None) -> Policy:
-        """The policy trained in the source, or read from `path` where it is there; interrupted, it goes on.
+        """The policy trained in the source, or read from `path` where that exists; an interrupted training goes on.
 
         Raises:
             CheckpointError: `path` holds another network.
@@ -75,7 +75,7 @@ class Setup:
         about = {"arguments": policy.arguments, "source": describe(self.source), "seed": seed, **numbers}
         rough, fine = path.with_suffix(".rough.safetensors"), self.settings.refinement
         stages = [(path, self.settings.source)] if fine is None else [(rough, self.settings.source), (path, fine)]
-        # Preparing draws from a generator of the seed itself.
+        # `prepare` draws from a generator of `seed` itself, so training uses the seeds after it.
         for draws, (made, settings) in enumerate(stages, seed if self.prepare is None else seed + 1):
             if made == path or not path.exists():
                 generator = torch.Generator().manual_seed(draws)
@@ -86,13 +86,13 @@ class Setup:
         return policy.eval()
 
     def load(self, path: Path) -> Policy:
-        """A policy that `pretrain` left; raises CheckpointError where there is none, or it does not fit."""
+        """A policy that `pretrain` wrote; raises CheckpointError where there is none, or one of another network."""
         policy = self.policy()
         load_network(path, policy)
         return policy.eval()
 
     def tune(self, policy: Policy, seed: int, report: Report | None = None) -> list[float]:
-        """Tune `policy`, in place, in the source with the effects that it has, without a target: losses by iteration.
+        """Tune `policy`, in place, in the source with its effects, without a target; returns the loss by iteration.
 
         Raises:
             ValueError: a policy of another kind.
@@ -145,7 +145,7 @@ class Setup:
             )
 
     def check_target(self, target: Target) -> None:
-        """Raises ValueError where `target` cannot be the source with other physics."""
+        """Raises ValueError where `target` has another period or another number of actions than the source."""
         if abs(target.period - self.source.period) > 1e-6:
             raise ValueError(
                 f"{target.name} has {target.period:g} s between actions, the source {self.source.period:g} s: "

@@ -25,24 +25,24 @@ from visadapt.tasks.balance import CENTRED_CARTPOLE, PAPER_CARTPOLE, Balance, Co
 from visadapt.weights import shipped
 from visadapt.world import World
 
-CONTRAST = 0.2  # Grey levels, of 1, that frames are divided by before the networks see them
+CONTRAST = 0.2  # Grey levels, where white is 1: frames are divided by it before the networks see them
 
-REACH = 1.45  # m to either side that a camera has to see for `from_frames`, of the drawn cart-pole, which sees 1.5 m
+REACH = 1.45  # m to either side that a camera must see for `from_frames` as it is; the drawn cart-pole's sees 1.5 m
 
-UNLIMITED = 1e9  # m, of the cart's position: without a camera nothing depends on it
+UNLIMITED = 1e9  # m, no limit on the cart's position: without a camera nothing depends on it
 
 REST_WEIGHTS = (1.0, 6.0, 1.0, 0.1)
-"""of the squared distances from rest in tuning: above all the cart, which is scored by its speed, is not to move"""
+"""Weights of x, x_dot, theta and theta_dot squared in tuning; x_dot weighs most, since the cart is scored by it."""
 
 
 def _near_rest(source: World) -> TuneSettings:
-    """How a policy that balances is refined where it is scored: near rest, with what plans leave behind valued."""
+    """How a policy is refined near rest, where it is scored, with a cost-to-go at the end of each plan."""
     to_go = cost_to_go(source, REST_WEIGHTS, Cost.action)
     return TuneSettings(
         Balance(
             RegulatorCost(REST_WEIGHTS, to_go=to_go),
             start_spread=(0.3, 0.1, 0.1, 0.1),
-            # A kick would look like a force to the residual, which would go on pushing.
+            # The residual would take a kick for a force that lasts.
             kick=(0.0, 0.0, 0.0, 0.0),
             divergence=(1.2, 2.0, 0.25, 3.0),
         ),
@@ -67,9 +67,9 @@ def _settings(source: TuneSettings, refinement: TuneSettings) -> SetupSettings:
 
 
 def from_states(source: World) -> SetupSettings:
-    """How the cart-pole that is shown its states learns, tuned for a source.
+    """Settings for the cart-pole that is shown its states, with the cost-to-go of a source.
 
-    With a residual, gradients flow through it: held over a plan, what it corrects for a late motor would not change
+    In tuning, gradients flow through the residual. Held over a plan, its correction for a late motor would not change
     with the plan's commands.
     """
     wide = Balance(PAPER_CARTPOLE, divergence=(UNLIMITED, 4.0, 0.5, 10.0))
@@ -82,7 +82,7 @@ def from_states(source: World) -> SetupSettings:
 
 
 def from_frames(source: World) -> SetupSettings:
-    """How the cart-pole that is shown frames learns, tuned for a source."""
+    """Settings for the cart-pole that is shown frames, with the cost-to-go of a source."""
     own = _settings(TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500), _near_rest(source))
     return replace(own, observations="camera", perception=PerceptionSettings())
 
@@ -133,11 +133,11 @@ def cartpole_frames(
         return frame
 
     def label(episodes: list[Episode]) -> list[Episode]:
-        """The same episodes with states estimated from their frames; those of 1 or 2 rows are too short, and left."""
+        """The same episodes with states estimated from their frames; those of 1 or 2 rows are left out."""
         return tracker.track([episode for episode in episodes if len(episode.time) > 2])
 
     def prepare(policy: Policy, folder: Path, seed: int, report: Report | None) -> None:
-        """Teach the policy's encoder to see, in `folder`, or take the one that is there."""
+        """Train the policy's frame encoder and keep it in `folder`, or take the one that is there."""
         assert isinstance(policy, ImagePolicy)
         eyes = policy.perception.requires_grad_(True)
         args = (
@@ -165,7 +165,7 @@ def cartpole_frames(
 
 
 def _narrowed(settings: SetupSettings, renderer: LayeredRenderer) -> SetupSettings:
-    """The settings with all positions of the cart in proportion, where the camera sees less than `REACH`."""
+    """The settings with all positions of the cart scaled down, where the camera sees less than `REACH`."""
     column, scale, width = float(renderer.origin[0]), float(renderer.gain[0]), renderer.size[1]
     share = min(column + 0.5, width - 0.5 - column) / scale / REACH
     if share >= 1:

@@ -23,11 +23,11 @@ from visadapt.world import World
 
 
 def explained(source: World, renderer: nn.Module | None = None, report: Report | None = None) -> Explain:
-    """Diagnoses episodes with all states or, given the renderer of their scene, by their frames alone.
+    """Diagnoses episodes from all their states or, given the renderer of their scene, from their frames alone.
 
-    Each diagnosis is kept as `visadapt diagnose --json` writes it. Episodes too short for one are left out. Of causes
-    that the episodes cannot tell apart the likeliest is taken, and an experiment designed for the next round; of frames
-    none is. Where no cause is named the whole gap is left to a residual.
+    Each diagnosis is written as by `visadapt diagnose --json`. Episodes shorter than `SHORTEST_EPISODE_S` are left out.
+    Where the episodes cannot tell causes apart, the likeliest is taken and, unless they are frames, an experiment is
+    designed for the next round. Where the gap stays unexplained, all of it is left to a residual.
 
     Raises:
         ValueError: the source has effects, which a diagnosis would have to know.
@@ -51,7 +51,7 @@ def explained(source: World, renderer: nn.Module | None = None, report: Report |
         effects = load_effects(path)[1] if verdict in (IDENTIFIED, AMBIGUOUS) else []
 
         def experiment(policy: Policy, steps: int) -> Tensor | None:
-            """The plan that settles it, kept beside the diagnosis; None where none does."""
+            """Commands (steps, n_action) to add that tell the causes apart, also written to plan.csv; or None."""
             try:
                 planned = plan(found or diagnosed(), recording, source, policy, steps, progress=staged(report, "plan"))
             except ValueError:  # every excitation leaves the ranges, or the causes cannot be exchanged

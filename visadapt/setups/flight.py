@@ -19,8 +19,8 @@ from visadapt.world import World
 
 GROUND = GroundSettings(ridge=0.1, negligible=0.1)
 RECORDED = 0.8
-"""Share of the streams that start in a recorded flight, history and all, where the residual reads the history: without
-it, a stream would meet no force that changes, or one that its residual makes up."""
+"""Share of the streams that start in a recorded flight, with its history, where the residual reads the history: in
+other starts it reads no changing force, or one that it made itself."""
 
 _learn = partial(TuneSettings, longest=100, observation_noise=0.0)
 
@@ -31,10 +31,10 @@ def quadrotor(
     """The quadrotor that follows references, (N, T, 3) or a single one, (T, 3).
 
     Args:
-        train, test: references to train on, and to be scored on; the same without the latter.
+        train, test: references to train on, and to be scored on; without `test`, those of `train`.
         source: the physics known beforehand; without it, Flightmare's quadrotor at the references' period.
-        with_history: whether the residual also reads what the source left unexplained over the last periods, in which
-            a force that changes shows.
+        with_history: whether the residual also reads the accelerations that the source left unexplained over the last
+            periods, which show a changing force.
 
     Raises:
         ValueError: a source whose period is not that of the references.

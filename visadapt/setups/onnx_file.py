@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from visadapt.world import World
 
 LARGEST_DIFFERENCE = 1e-4
-"""Of an action, of 1, between the file and the policy; rounding in float32 leaves 1e-6."""
+"""Largest difference of an action, in [-1, 1], between the file and the policy; float32 rounding makes 1e-6."""
 
 
 class ExportError(RuntimeError):
@@ -45,10 +45,11 @@ class _Deployed(nn.Module):
 def export_policy(path: str | Path, policy: Policy, source: World | None = None) -> None:
     """Write a policy, with the residual that it reads, as an ONNX file (extra `visadapt[onnx]`).
 
-    Its inputs are `observations` (5, n_state), after a state its goal, float32, or frames (5, H, W), uint8, and
-    `actions` (5, n_action), float32: the last five of each, oldest first. At the start of an episode the first
-    observation stands five times, and the actions are 0. Its output `plan` (10, n_action) begins with the action to
-    execute now, each in [-1, 1]. The file's metadata name these, and of `source` the states, actions, and period.
+    Its inputs are `observations`, states (5, n_state), with the goal appended where there is one, in float32, or frames
+    (5, H, W) in uint8, and `actions` (5, n_action) in float32: the last five of each, oldest first. At the start of an
+    episode the first observation is repeated five times, and the actions are 0. Its output `plan` (10, n_action), in
+    [-1, 1], begins with the action to execute now. The file's metadata describe these and, of `source`, the states,
+    actions and period.
 
     Args:
         source: the world that the policy was trained in, for the metadata alone.
@@ -70,7 +71,7 @@ def export_policy(path: str | Path, policy: Policy, source: World | None = None)
     deployed = _Deployed(policy).eval()
     examples = _examples(policy)
     with _quiet(), torch.no_grad():
-        # First the policy itself: what physics computes once and keeps is then a constant of the file.
+        # The policy runs first: what the physics computes once and caches then becomes a constant of the file.
         plans = [deployed(*example.values()).cpu().numpy() for example in examples]
         names, given = list(examples[0]), tuple(examples[0].values())
         try:
@@ -80,11 +81,11 @@ def export_policy(path: str | Path, policy: Policy, source: World | None = None)
             raise ExportError(f"{path} was not written: the policy has no form in ONNX: {why}") from error
     assert model is not None
     with replacing(path) as temporary:
-        proto = model.model_proto  # made anew each time that it is asked for
+        proto = model.model_proto  # built anew at each access
         onnx.helper.set_model_props(proto, about(policy, source))
         onnx.save(proto, temporary)
         session = runtime.InferenceSession(temporary, providers=["CPUExecutionProvider"])
-        read = {each.name for each in session.get_inputs()}  # less what the policy does not look at
+        read = {each.name for each in session.get_inputs()}  # without inputs that the policy does not use
         for example, plan in zip(examples, plans, strict=True):
             found = session.run(None, {name: example[name].cpu().numpy() for name in read})[0]
             if not (difference := abs(found - plan).max()) <= LARGEST_DIFFERENCE:
@@ -104,7 +105,7 @@ def _examples(policy: Policy) -> list[dict[str, Tensor]]:
 
 
 def about(policy: Policy, source: World | None = None) -> dict[str, str]:
-    """What whoever runs the file has to know, by name: the metadata of the file."""
+    """The metadata of the file, by name: what one needs to know to run it."""
     shape = " x ".join(map(str, (LENGTH, *policy.observation_shape)))
     kind = "uint8" if policy.shown == "frame" else "float32"
     known = {

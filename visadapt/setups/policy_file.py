@@ -1,7 +1,7 @@
-"""Policies on disk: the network, what made it, and, once it is adapted, the residual that it reads.
+"""Policies on disk: the network, the arguments that made it and, once it is adapted, the residual that it reads.
 
-A file says which class of policy it holds and with which arguments that was made; of a residual, in which world it was
-grounded. So a policy is loaded without knowing where it comes from.
+A file names the class of its policy, the arguments of the constructor and, for a residual, the world in which it was
+grounded, so a policy is loaded from the file alone.
 """
 
 from __future__ import annotations
@@ -135,15 +135,15 @@ def _world(description: Mapping[str, Any], path: Path) -> World:
 def residual_for(
     policy: Policy, source: World, with_history: bool = False, perception: PerceptionSettings | None = None
 ) -> Residual:
-    """A new residual of `source` that begins at zero.
+    """A new residual of `source`, whose correction is zero until it is fitted.
 
     Args:
-        with_history: for flights: whether it also reads what the source left unexplained over the last periods, in
-            which a force that changes shows. Policies on frames and on states say so themselves.
-        perception: for frames: how the policy's encoder learnt to see; the default settings without it.
+        with_history: for flights: whether it also reads the accelerations that the source left unexplained over the
+            last periods, which show a changing force. For frames and for states the policy determines it.
+        perception: for frames: how the policy's encoder was trained; the default settings without it.
 
     Raises:
-        TypeError: a policy of a class that is not known here; give a `Setup` of its own.
+        TypeError: a policy of a class that has no residual here; make a `Setup` with one of your own.
     """
     system, period = source.system, source.period
     network: FlightResidualNetwork | ImageResidualNetwork | StateResidualNetwork
@@ -165,7 +165,7 @@ def residual_for(
 def source_steps(source: World, states: Tensor, actions: Tensor) -> Tensor:
     """The source's step from each of the states (B, T, n) that follow each other, under actions (B, T, n_action).
 
-    Actuators remember the actions before; what was given earlier, and the time in the episode, a history does not hold.
+    Actuation effects remember the actions given here, but none before them; the time in the episode counts as 0.
     """
     memory = source.memories(states[:, 0], actions, states)
     before = tuple(each[:, :-1].flatten(0, 1) for each in memory)

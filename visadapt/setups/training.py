@@ -38,7 +38,7 @@ def setup_for(
         renderer: a cart-pole's states to frames, for a policy that is shown frames; without it, a new policy is shown
             states, and one that is shown frames takes the shipped renderer.
         references: (N, T, 3) or (T, 3), what a quadrotor is to follow.
-        with_history: whether policy or residual also read the last periods, as against a force that changes.
+        with_history: whether policy or residual also read the last periods, which show a changing force.
 
     Raises:
         ValueError: a policy of another system, a system without a setup, or a quadrotor without references.
@@ -82,8 +82,8 @@ def train(
     """A policy trained in `world`, with the effects that it has, by backpropagation through it.
 
     Args:
-        path: where it is kept; an interrupted training goes on from there, a finished one is read. Without it, the
-            policy is not kept.
+        path: file of the policy: an interrupted training goes on, a finished one is read. Without it, the policy is
+            not written.
         iterations: instead of the setup's own.
         renderer, references, with_history: as for `setup_for`.
 

@@ -35,9 +35,9 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     The temporary file is hidden and keeps the suffix, since many writers choose a format by it. Missing folders are
     made. If the block raises or is interrupted, the temporary file is removed and a file at `path` stays as it was.
-    What a process left that was killed while it wrote the same file is removed too. Links are followed, and a file
-    that is replaced keeps its mode. What is no regular file, such as a pipe or a device, is never replaced: the content
-    is written to it.
+    The temporary file of a process that was killed while it wrote the same file is removed too. Links are followed, and
+    a file that is replaced keeps its mode. What is no regular file, such as a pipe or a device, is never replaced: the
+    content is written to it.
 
     Raises:
         DiskFullError: the disk, or the user's quota on it, is full.

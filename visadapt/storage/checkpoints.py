@@ -38,7 +38,7 @@ def save_tree(path: Path, tree: Any) -> None:
 def load_tree(path: Path) -> Any:
     """Read a tree; raises CheckpointError if the file is missing, damaged, or not written by `save_tree`."""
     try:
-        path.open("rb").close()  # since safetensors says of every other reason that there is no such file
+        path.open("rb").close()  # since safetensors reports any failure to open as a missing file
         with safe_open(path, framework="pt") as file:
             entry = (file.metadata() or {}).get(TREE_KEY)
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
@@ -58,7 +58,7 @@ def load_tree(path: Path) -> Any:
 
 @contextmanager
 def fitting(path: Path) -> Iterator[None]:
-    """Turn what a block raises over a checkpoint that lacks something, or holds something else, into CheckpointError.
+    """Turn what a block raises where a checkpoint lacks something, or holds something else, into CheckpointError.
 
     >>> import pathlib
     >>> with fitting(pathlib.Path("a.safetensors")):

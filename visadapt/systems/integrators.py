@@ -1,4 +1,4 @@
-"""One step of dy/dt = f(t, y) for B rows: y (B, n) from the time t (B,), by h s: one number, or (B,) a row's own.
+"""One step of dy/dt = f(t, y) for B rows: y (B, n) at times t (B,) goes on by h s, a number or (B,).
 
 Hairer, Norsett and Wanner (1993), Solving ODEs I, section II.1.
 """

@@ -20,7 +20,7 @@ import torch
 from visadapt.systems import System
 
 LARGEST = float(torch.finfo(torch.float32).max)
-"""Of a parameter, in which policies are trained."""
+"""Largest value of a parameter: that of float32, in which policies are trained."""
 
 SystemT = TypeVar("SystemT", bound=System)
 

@@ -113,7 +113,7 @@ class Quadrotor(RigidBody):
         return (self.gravity * (self.mass / (self.mass - self.payload)) - middle) / half
 
     def _delivered(self, thrust: Tensor, torque: Tensor) -> tuple[Tensor, Tensor]:
-        """Thrust (B,) and torque (B, 3) of rotors that each deliver a share of what the commanded ones need of them."""
+        """Thrust (B,) and torque (B, 3) where each rotor delivers a share of the thrust that is commanded of it."""
         reach = self.arm_length / math.sqrt(2)
         levers = beside((1.0, reach, reach, self.torque_to_thrust), torque)
         mixer = torque.new_tensor(_MIXER)

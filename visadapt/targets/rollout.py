@@ -40,10 +40,10 @@ def see_goals(observation: Observation) -> Tensor:
 
 
 FILM_SEED = 12
-"""Of the episodes that films show."""
+"""Seed of the episodes that films show."""
 
 SHOWN: dict[str, See] = {"state": see_states, "frame": see_frames, "state and goal": see_goals}
-"""What `Policy.shown` names."""
+"""By `Policy.shown`, what a policy is shown of an observation."""
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,10 @@ def run(
     strict: bool = True,
     see: See | None = None,
 ) -> list[Run]:
-    """Run `batch` episodes of at most `steps` steps each; an episode that ends is cut there, and marked.
+    """Run `batch` episodes of at most `steps` steps each; one that ends earlier is cut there, and not `survived`.
 
     Args:
-        exploration: standard deviation of white noise on the commands, so that what they do shows in the data.
+        exploration: standard deviation of white noise on the commands, so that the data show their effect.
         added: (steps, n_action) or more of them, added to the policy's commands, such as those of a `Plan`.
         strict: whether a state that is not finite is an error; if not, its episode ends before it.
         see: what the policy is shown, where that is not what `policy.shown` names.

@@ -132,11 +132,11 @@ class RotorpyTarget(FlightTarget):
         return self._observe()
 
     def published(self) -> dict[str, float]:
-        """What rotorpy's parameters say at the rotor speed of a hover; damping, in 1/s, is that of turns."""
+        """What rotorpy's parameters give at the rotor speed of a hover; damping, in 1/s, is that of rotations."""
         own = self.vehicle
         flow = 4 * float(np.sqrt(own["mass"] * 9.81 / 4 / own["k_eta"])) / own["mass"]
         drag = {"drag_x": own["k_d"] * flow, "drag_y": own["k_d"] * flow, "drag_z": own["k_z"] * flow}
-        # A rotor at (x, y) meets a turn with drags in its place: along z they turn about x and y, level ones about z.
+        # In a rotation a rotor at (x, y) moves: its drag along z damps rotations about x and y, its level drag about z.
         x, y = np.mean([np.square(place[:2]) for place in own["rotor_pos"].values()], 0)
         levers = {
             "x": own["k_z"] * y / own["Ixx"],

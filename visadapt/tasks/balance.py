@@ -1,7 +1,7 @@
 """The cart-pole's tasks: balance, and swing up and balance; and their cost.
 
 The cost is the distance to a reference that is interpolated from the state now to the goal (the paper, section 3.1 and
-A.1.3), which is often infeasible, and works all the same:
+A.1.3); it works although this reference is often infeasible:
 
     C = sum_k |w (s_{t+k} - nu_{t+k})|^2 + r |a_{t+k}|^2 with nu_{t+k} = s_t + k / K (goal - s_t), k = 1..K
 """
@@ -17,7 +17,7 @@ from visadapt.estimation.linearise import linearise_step
 from visadapt.tasks.base import Task, curriculum
 from visadapt.world import World
 
-RICCATI_STEPS = 1000  # 50 s of 0.05 s: what is further ahead costs next to nothing
+RICCATI_STEPS = 1000  # 50 s at 0.05 s: later steps add next to nothing
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,11 @@ class Cost:
 
 @dataclass(frozen=True)
 class SettlingCost(Cost):
-    """As `Cost`, and the last planned state (the reference is at the goal there) costs as much again, `end` times.
+    """As `Cost`, plus `end` times the weighted squared distance of the last planned state from the goal.
 
-    What a plan that ends after K steps leaves behind is else free: near upright, drawing the cart back begins with a
-    step away from the goal, so that a plan too short to gain from it runs away instead, the faster the more x weighs.
+    Otherwise nothing after a plan's end has a cost. The cart's position is non-minimum phase: near upright, drawing the
+    cart back begins with a step away from the goal. A plan too short to gain from it runs away, the faster the more x
+    weighs.
     """
 
     end: float = 0.0
@@ -55,10 +56,10 @@ class SettlingCost(Cost):
 
 @dataclass(frozen=True)
 class RegulatorCost(Cost):
-    """The distances to the goal itself, and what coming to rest from the last planned state costs: s_{t+K}' V s_{t+K}.
+    """Weighted squared distances to the goal itself, and a terminal cost s_{t+K}' V s_{t+K}.
 
-    With the V of `cost_to_go` the plan of K steps that costs least begins like one without end, as K had no end. A
-    plan of half a second that leaves off where it likes lets a force push the cart instead.
+    With the V of `cost_to_go` the best plan of K steps begins like the best one of infinite horizon. Without a terminal
+    cost, a plan of half a second lets a force push the cart.
     """
 
     to_go: tuple[tuple[float, ...], ...] = ()
@@ -109,7 +110,7 @@ class Balance(Task):
     start_spread: tuple[float, ...] = (0.5, 0.3, 0.15, 0.3)
     """half-widths of the uniform distribution of states that streams start from"""
     kick: tuple[float, ...] = (0.0, 0.3, 0.0, 0.5)
-    """standard deviation of a random change of the state, met once in 20 steps: it widens what the policy meets"""
+    """standard deviations of a random change of the state, once in 20 steps: it widens the states seen in training"""
     divergence: tuple[float, ...] = (1.5, 4.0, 0.5, 10.0)
     """delta_div at the end of the curriculum: a stream starts anew where a state is beyond it"""
     first_divergence: float = 0.1

@@ -47,8 +47,8 @@ class RecoverCost(FollowCost):
     sqrt(C + final |e_K + beyond e'_K|^2 + floor), with e_K the distance at the end of the plan and e'_K its rate
 
     A plan that ends on the reference but not with its velocity flies through it and out again, further each time: what
-    counts is where the vehicle would be `beyond` s later. The root changes no best plan, but lets the many streams that
-    are near weigh as much as the few that are far off.
+    counts is where the vehicle would be `beyond` s later. The root changes no best plan, but gives the many streams
+    near their references as much weight as the few that are far off.
     """
 
     final: float = 10.0
@@ -72,7 +72,7 @@ class Follow(FlightTask):
     """m, delta_div at the end of the curriculum: a stream further from its reference starts anew"""
     first_divergence: float = 0.05
     """share of `divergence` that the curriculum begins with; it reaches 1 at half of the iterations"""
-    candidates: int = 64  # rows of references drawn at random, of which `augment` takes the one flown most alike
+    candidates: int = 64  # rows of references drawn at random, of which `augment` takes the most similar one
 
     @property
     def period(self) -> float:
@@ -143,10 +143,10 @@ class Follow(FlightTask):
     def augment(
         self, observed: Tensor, state: Tensor, task_state: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """As far off another reference, at the row of it that is flown most alike.
+        """Shifted to another reference, with the same errors, at its row with the most similar motion.
 
-        A vehicle that feels no air flies alike wherever it is and however fast: position and velocity change by as much
-        in all rows. Of `candidates` rows of references drawn at random, the one with the most similar velocity and
+        Without forces of the air a motion does not depend on position and velocity: these are shifted by the same in
+        all rows. Of `candidates` rows of references drawn at random, the one with the most similar velocity and
         acceleration is taken, so that drag and tilt change little.
         """
         own, batch = self.references, len(observed)

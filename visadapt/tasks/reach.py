@@ -22,7 +22,7 @@ class Reach(FlightTask):
     The reference is the straight line from where the vehicle is to the point, flown at `speed` (A.1.2):
     C = sum_k along |e_k|^2 + (across - along) |e_k off the line|^2 + rates |omega|^2 + action |a|^2
 
-    with e_k = x_{t+k} - nu_{t+k}. The paper weighs both by 10; but what decides is to be on the line, not when.
+    with e_k = x_{t+k} - nu_{t+k}. The paper weighs both by 10; but the score is the miss, not its time.
     """
 
     period: float = 0.05  # s between commands

@@ -58,7 +58,7 @@ def power_loop(speed: float, radius: float = LOOP_RADIUS, period: float = 0.1) -
     """A vertical circle in the x-z plane at a steady speed in m/s, flown into and out of on level straight lines.
 
     The manoeuvre of Kaufmann, Loquercio, Ranftl, Müller, Koltun and Scaramuzza (2020), Deep drone acrobatics, RSS,
-    as gentle as it can be: a step of the curvature would ask for an endless jerk, so it grows and falls smoothly (a
+    as gentle as it can be: a step of the curvature would ask for an infinite jerk, so it grows and falls smoothly (a
     polynomial of degree 5 of the way) while the path turns by `RAMP`. The reference begins at the origin, in motion
     along x, and ends at the same height.
 
@@ -98,13 +98,13 @@ def smallest_loop(speed: float, quadrotor: Quadrotor, margin: float = 0.9) -> fl
     return high
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of absurd numbers, which are too fast
+@np.errstate(over="ignore", invalid="ignore")  # by absurd numbers, which are refused as too fast
 def read_reference(path: str | os.PathLike[str], period: float = 0.1, max_speed: float = 5.0) -> Reference:
     """A reference of one's own: a CSV file with columns time, x, y, z and, if known, x_dot, y_dot, z_dot.
 
-    Seconds, metres and metres per second, z up; rows may be any time apart, and other columns are left alone. They
+    Seconds, metres and metres per second, z up; rows may be any time apart, and other columns are ignored. They
     are interpolated by cubics onto a clock of `period`; derivatives that the file does not give are differences
-    over the period. Two periods are the shortest that have all of them.
+    over the period. It must last two periods at least.
 
     Raises:
         RecordingError: one line that says which file, row and column is wrong, and what would be right.

@@ -17,9 +17,9 @@ must promise: less would not outweigh the prior odds."""
 
 
 def on_all_rows(search: Search, rows: Segments) -> Search:
-    """The best sets of a search, and what they promise there, fitted to all rows.
+    """The best sets of a search, fitted to all rows, then with further effects.
 
-    With more rows weaker effects show, which the rows searched do not hold.
+    All rows show weaker effects than the rows searched do.
     """
     whole = Search(search.system, rows, search.catalogue, search.source.fits, search.jobs)
     close = [each for each in search.close() if each.effects][:FINALISTS]

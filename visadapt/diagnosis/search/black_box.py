@@ -23,24 +23,24 @@ from visadapt.world import World
 
 POINTS = 50  # Rows of the recording at which the kernel's functions are centred
 
-OPTIMISED_ROWS = 500  # Rows, about, of which lengths and amplitudes are the most likely; the weights use every row
+OPTIMISED_ROWS = 500  # Rows, about, to which lengths and amplitudes are fitted; the weights use every row
 
 ITERATIONS, REFINING_ITERATIONS = 15, 7
 """Steps of the optimiser of lengths and amplitudes, and those after a change of the process noise."""
 
-LOG_LENGTH = math.log(2.0)  # Mean of a log length before anything is seen, in standard deviations of the variable
+LOG_LENGTH = math.log(2.0)  # Prior mean of a log length, in standard deviations of the variable
 
-LOG_SPREAD = 3.0  # Standard deviation of log lengths and log amplitudes before anything is seen
+LOG_SPREAD = 3.0  # Prior standard deviation of log lengths and log amplitudes
 
 LOG_REACH = 12.0
-"""Most by which log lengths and log amplitudes leave their mean: a line search that tries e^100 meets no matrix that is
-positive definite in float64."""
+"""Largest departure of log lengths and log amplitudes from their prior mean: at e^100, which a line search may try, no
+matrix is positive definite in float64."""
 
-MAX_DECADES = 4  # Decades at most by which process noise becomes less beside the black box
+MAX_DECADES = 4  # Most decades by which process noise is lowered beside the black box
 
 MIN_GAIN = 3.0
-"""Log likelihood that a black box with less process noise must gain on other windows: it would also follow what does
-not repeat."""
+"""Log likelihood that a black box with less process noise must gain on windows that it was not fitted to: it might
+follow what does not repeat."""
 
 JITTER = 1e-6  # Added to the kernel's diagonal, whose values are 1
 
@@ -83,7 +83,7 @@ def fit_black_box(model: CandidateModel, fits: FitState) -> BlackBox:
     logs = regression.optimised(regression.start(), ITERATIONS)
     best = nominal = first.validated(regression, logs), fits, logs, regression
     for decade in range(1, 1 + MAX_DECADES):
-        # What the black box explains is process noise no more.
+        # What the black box explains is no longer process noise.
         tried = replace(fits, log_process=(fits.log_process - decade * math.log(10)).clamp(min=MIN_LOG_PROCESS))
         regression = _Regression.of(model, tried, gains, values, here)
         logs = regression.optimised(logs, REFINING_ITERATIONS)
@@ -125,7 +125,7 @@ class _Regression:
         return cls(values, here, values[here > 0][chosen], information, gradient)
 
     def start(self) -> Tensor:
-        """Log lengths (D,) and log amplitudes (L,), together, before anything is seen: loads are as large as noise."""
+        """Prior means (D + L,) of log lengths and log amplitudes: loads are as large as noise."""
         known = self.information.diagonal(dim1=1, dim2=2).diagonal(dim1=1, dim2=2).sum((0, 2)) / self.here.sum()
         return torch.cat((torch.full_like(self.values[0, 0], LOG_LENGTH), -0.5 * (known + 1e-300).log()))
 

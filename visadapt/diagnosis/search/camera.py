@@ -28,11 +28,11 @@ FRAMES, FRAMES_AT_FIRST = 16, 6
 MIN_CLOSED = 0.02
 """Share by which an effect must lower the root mean square misfit: the same as that of a gap."""
 
-ALIKE = 0.005  # Share by which the misfit of another effect may be larger than the best one's for both to fit as well
+ALIKE = 0.005  # Share by which another effect's misfit may exceed the best one's and still count as an equal fit
 
 MOST_EFFECTS = 3
 
-ASTRAY = 2.0  # Mean squares of a frame, over their median, above which its pose may be a wrong one
+ASTRAY = 2.0  # Mean square residual of a frame, over the median of frames, above which its pose may be wrong
 
 OF_ANOTHER_KIND = 10.0  # The same above which a frame is left out: a flash, or no picture
 
@@ -40,8 +40,8 @@ COVERED = 10 / 255  # Mean misfit of a pixel above which something may cover it
 COVERED_PIXELS = 6
 
 PROBE, UNSEEN_SHARE = 5.0, 0.5
-"""Pixels by which a camera is moved along the track to see whether that shows, and the share of the pixels' noise below
-which what a position of the cart does not make good does not."""
+"""px by which the camera is moved along the track as a test, and misfit, as a share of that of the frames, below which
+another position of the cart makes up for the move."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class CameraFindings:
     best: CameraFit
     alone: dict[type[CameraEffect], CameraFit]  # each effect of the best by itself
     without: dict[type[CameraEffect], CameraFit]  # the best less one
-    alike: dict[type[CameraEffect], tuple[str, ...]]  # effects that explain the frames as well in the place of another
+    alike: dict[type[CameraEffect], tuple[str, ...]]  # effects that explain the frames as well in its place
     fixed: frozenset[str]  # parameters that these frames do not show
 
     @property
@@ -142,7 +142,7 @@ def find_camera(
         best = without[idle[0]]
     if best.camera:
         best = fit_camera(renderer, shown, best.camera, best.values, best.place, fixed, smooth=True)
-        # A picture that is turned is softer than what is drawn, which a move by a part of a pixel seems to explain.
+        # A turned picture is softer than the drawn one, which a shift by a part of a pixel would seem to explain.
         still = _still(best, fixed)
         if 0 < len(still) < len(best.camera):
             best = fit_camera(renderer, shown, *_without(best, still), best.place, fixed, smooth=True)
@@ -158,7 +158,7 @@ def _without(fit: CameraFit, left_out: Collection[type[CameraEffect]]) -> tuple[
 
 
 def _still(fit: CameraFit, fixed: frozenset[str]) -> set[type[CameraEffect]]:
-    """The effects that do nothing at some values within the 90 % intervals of all their parameters."""
+    """The effects whose parameters all have their neutral value within the 90 % interval, or are fixed."""
     parameters = [(kind, p) for kind in fit.camera for p in kind.table]
     away = {
         kind
@@ -211,7 +211,7 @@ def _nearest(finder: PoseFinder, camera: Sequence[CameraEffect], frames: Tensor)
 
 
 def _covered(residual: Tensor, shown: Tensor) -> Tensor | None:
-    """The box (5,) of the largest patch that is as wrong in all frames, as `Occlusion` has it."""
+    """The values (5,) of an `Occlusion` of the largest patch whose mean misfit exceeds `COVERED`; None without one."""
     wrong = (residual.mean(0).abs() > COVERED).numpy().astype(np.uint8)
     count, _, patches, _ = cv2.connectedComponentsWithStats(wrong)
     if count < 2:

@@ -53,14 +53,14 @@ def alternatives(
 def causes(
     search: Search, comparison: ModelComparison, groups: Sequence[Sequence[Alternative]], gap_closed: GapClosed
 ) -> list[Cause]:
-    """Every alternative as a cause; `gap_closed` holds each effect alone, the best set, and it less each effect."""
+    """Every alternative as a cause; `gap_closed` holds each effect alone, and the best set, whole and without each."""
     out = []
     best = frozenset(comparison.best.names)
     reopens = {e: gap_closed[best] - gap_closed[best - {e.name}] for e in comparison.best.effects}
     alone = {e: gap_closed.get(frozenset({e.name}), math.nan) for e in comparison.best.effects}
     carrying = [effect for effect, reopened in reopens.items() if not reopened < SLIGHT]
     if best and not carrying and gap_closed[best] > SLIGHT:
-        # Each can stand in for another, so that none is missed: then the one carries that closes most by itself.
+        # Effects stand in for each other, so that none is missed: the verdict rests on the one that closes most alone.
         carrying = [max(alone, key=lambda effect: alone[effect])]
     models = {one.compared.model.names: one.compared.model for group in groups for one in group}
     found = {names: estimates(search, model) for names, model in models.items()}

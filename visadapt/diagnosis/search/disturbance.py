@@ -42,7 +42,7 @@ def disturbance(model: CandidateModel, fits: FitState, log_process: Tensor) -> D
     _, adjoint = backward(forward(problem, process, noise))
     added = -(adjoint[..., 0] @ process)[:, 1:, driven]
     by_load = loads_of(model, fits)[:, :, driven]
-    # A coordinate that sticks has no response to a load, nor has the padding: the least load that acts is 0 there.
+    # A coordinate that sticks does not respond to a load, nor does the padding: the pseudo-inverse gives 0 there.
     valid = rows.inside[:, 1:]
     load = (torch.linalg.pinv(by_load, rtol=1e-6) @ added[..., None])[..., 0] * valid[..., None]
     variables = {name: values[:, :-1] for name, values in variables_of(model, fits.state[0]).items()}

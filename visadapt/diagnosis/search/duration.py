@@ -10,16 +10,16 @@ from visadapt.estimation.likelihood import differentiate
 from visadapt.estimation.segments import Segments
 
 SEARCH_STEPS = {0.0: 5, 10.0: 26, FIT_ALL_ABOVE: 38}
-"""By the log likelihood that the best effect promises: a search, for each effect of the catalogue, in steps of a fit of
-the source to the rows searched. Measured on recordings with hidden effects of many sizes."""
+"""Duration of a search per effect of the catalogue, in steps of a fit of the source to the rows searched; by the log
+likelihood that the best effect promises. Measured on recordings with hidden effects of many sizes."""
 
-FINAL_STEPS = {0.0: 60, 10.0: 130}  # The same of the fits to every row, and the predictions
+FINAL_STEPS = {0.0: 60, 10.0: 130}  # Duration of the fits to all rows and of the predictions, in steps on all rows
 
-SHARED = 0.6  # Share of the work that each process beyond the first takes off the first
+SHARED = 0.6  # Speed that each process beyond the first adds, as a share of that of the first
 
 
 def expected(search: Search, rows: Segments) -> float:
-    """Seconds from a step of a fit that is made here, and from how much the best effect promises.
+    """Expected duration in s, from a step of a fit that is timed here, and from what the best effect promises.
 
     Within a factor of about two where one effect or two explain the gap. A real machine that several effects separate
     from its simulator took five times as long.
@@ -41,7 +41,7 @@ def expected(search: Search, rows: Segments) -> float:
 
 
 def announcement(rows: Segments, effects: int, seconds: float, jobs: int) -> str:
-    """The line that says it.
+    """The size of the problem and its expected duration, in one line.
 
     >>> import torch
     >>> from visadapt.estimation.segments import cut

@@ -56,7 +56,7 @@ class FittedModels:
     """The sets of effects of a catalogue fitted so far to one recording, and how to fit more.
 
     Args:
-        source: the fit of the source to these rows, if it is already known, or to some of them, where it then starts.
+        source: the fit of the source to these rows, if known; or to some of them, from which the fit then starts.
         jobs: processes that share the work.
         rival: log likelihood of a fit to the same readings; fits that cannot come near it stop early.
     """

@@ -62,8 +62,8 @@ class RolloutErrors:
     def floor(self, deviation: Tensor) -> Tensor:
         """(H, m) root mean square errors of the estimated states at the rows where these predictions end.
 
-        At least LEAST_FLOOR: readings without noise have the least that a fit takes to be there, and follow the states
-        far closer.
+        At least LEAST_FLOOR: where readings have no noise, a fit assumes a least noise, and the states are far closer
+        to the readings than that.
         """
         return (self._rms(self.left) / deviation).clamp(min=LEAST_FLOOR)
 
@@ -122,7 +122,7 @@ def held_out(
     of: Callable[[RolloutErrors], Result],
     jobs: int = 1,
 ) -> list[Result]:
-    """Something of the cross-validated predictions of each set of effects, given its fit to all rows.
+    """What `of` makes of the cross-validated predictions of each set of effects, given its fit to all rows.
 
     `jobs` processes share the work.
     """

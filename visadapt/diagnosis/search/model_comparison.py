@@ -26,7 +26,7 @@ SLIGHT_SHARE = 0.05
 """Share of the best model's gain in log likelihood below which what it leaves unexplained is negligible."""
 
 CLASS_PROBABILITY = 0.93
-"""Share of the probability of all models that differ in one effect which the listed alternatives reach."""
+"""Share of the probability of all models that differ in one effect, up to which alternatives are listed."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class ModelComparison:
     """for each effect of the best: the models with another effect in its place that fit as well"""
     gained: float  # log likelihood of the best minus that of the source
     threshold: float  # log odds above which a function of a reading counts as something unexplained
-    loads: tuple[str, ...]  # ports of the other functions, loads
+    loads: tuple[str, ...]  # ports of the other functions: the system's loads
 
     @property
     def best(self) -> ScoredModel:
@@ -60,7 +60,7 @@ class ModelComparison:
         better on held-out episodes."""
         if improvable or self.leftover > MIN_LEFTOVER:
             return True
-        # A load that is of no use on held-out episodes must be beyond doubt; of readings the black box has no errors.
+        # A load that improves no held-out prediction must be clear; errors of readings are not in the black box.
         required = {load: max(self.threshold, CLEAR_LOG_ODDS) for load in self.loads}
         return any(each.log_odds > required.get(each.port, self.threshold) for each in self.functions)
 

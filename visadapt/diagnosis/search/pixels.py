@@ -1,4 +1,4 @@
-"""Which pixels of a film nothing explains: neither the renderer nor an effect of the camera."""
+"""Which pixels of a film neither the renderer nor an effect of the camera explains."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ OF_ANOTHER_KIND, FEW = 10.0, 0.1
 FRAMES = 96  # Frames, spread over the film, whose pixels are looked at
 
 USUAL = 1 / 255
-"""What renderers whose file does not say it draw wrongly: root mean square of the structure, of [0, 1]."""
+"""Error of a renderer whose file states none: root mean square of the structure of its residual, where white is 1."""
 
-FACTOR = 1.7  # Structure of a film over what is usual, above which frames are unexplained
+FACTOR = 1.7  # Ratio of a film's structure to the usual one, above which frames are unexplained
 
 STANDS_OUT = 4.0  # Structure of a pixel over the mean, above which it belongs to a box
 MOST_BOXES, LEAST_SHARE = 5, 0.05
@@ -45,8 +45,8 @@ def left_over(seen: nn.Module, camera: Sequence[CameraEffect], frames: Tensor, p
 
 
 def usual(renderer: nn.Module, camera: Sequence[CameraEffect], place: Tensor) -> float:
-    """What is left, root mean square of [0, 1], where nothing is unexplained: the renderer's own errors, and, where the
-    camera is moved, what is lost of drawn frames of places (N, 2) that are moved by half a pixel and back."""
+    """What is left where nothing is unexplained, root mean square of [0, 1]: the renderer's own errors and, where the
+    camera is moved, the loss in frames drawn at places (N, 2) by moving them half a pixel and back."""
     known = getattr(renderer, "error", None)
     own = USUAL if known is None else float(known)
     drawn = renderer(*place.float().T)

@@ -38,7 +38,7 @@ class PreparedRecording:
 
 
 MIN_JITTER = 1e-3
-"""Deviation of stamps from even spacing, in periods, above which it is decided whether it is that of the readings."""
+"""Deviation of stamps from even spacing, in periods, above which a fit decides whether the readings share it."""
 
 
 def _evenly_spaced(stamps: Tensor) -> Tensor:
@@ -49,7 +49,7 @@ def _evenly_spaced(stamps: Tensor) -> Tensor:
 
 
 def _filled(values: Tensor, used: Tensor, stamps: Tensor) -> Tensor:
-    """Readings (T, m), those that are not used on a line between those around them."""
+    """Readings (T, m); those that are not used are interpolated linearly between those that are."""
     columns = [
         np.interp(stamps, stamps[kept], column[kept]) if kept.any() else column
         for column, kept in zip(values.numpy().T, used.numpy().T > 0, strict=True)
@@ -58,19 +58,19 @@ def _filled(values: Tensor, used: Tensor, stamps: Tensor) -> Tensor:
 
 
 MOST_SEARCHES, STRETCH_WINDOWS = 24, 4
-"""Rows of a recording that are used, as a multiple of those that the search uses, and windows of those that follow each
-other: intervals of so many are narrow already, and the time grows with the rows."""
+"""Most rows of a recording that are used, as a multiple of those that the search uses, and windows in a stretch of
+them: the intervals from so many rows are narrow already, and the time grows with the rows."""
 
 
 def limited(recording: Recording, system: System) -> Recording:
-    """The recording; of one with more rows than a diagnosis looks at, stretches that are spread evenly over it."""
+    """The recording; where it has more rows than a diagnosis uses, stretches that are spread evenly over it."""
     profile = profile_of(system)
     stretch = STRETCH_WINDOWS * max(profile.window_rows, round(PREDICTION_TIME / recording.period))
     return spread(recording, MOST_SEARCHES * profile.search_rows, stretch)
 
 
 def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effect]] = ()) -> PreparedRecording:
-    """Prepare a recording of some or all states, and the commands; `catalogue` are the effects that may be there."""
+    """Prepare a recording of some or all states, and the commands; `catalogue` are the effects that may act."""
     profile = profile_of(system)
     channels = tuple(system.index(name) for name in recording.measured)
     quaternion = [k for k, channel in enumerate(channels) if channel in profile.quaternion]

@@ -29,8 +29,8 @@ WIDTHS = (0.06, 0.085, 0.12, 0.17)  # s, deviations of the Gaussian bumps that a
 EDGE = 2.45  # Deviations of a bump from its middle where it has 5 % of its peak: there a push starts and ends
 
 FIRST, CANDIDATE, CLEAR = 3.5, 3.0, 5.0
-"""Height over its deviation from which the first bump on a part is fitted with all else, from which others are, and
-from which they are then called pushes: far more than chance, since errors of a model are not normally distributed."""
+"""Height of a bump, over its standard deviation, from which the first one on a part is fitted with all else, from which
+further ones are, and from which a bump is called a push: high, since errors of a model are not normally distributed."""
 
 SHAPE_ERROR = 0.15  # Deviation of an impulse, as a share of it, because a push need not have the shape of a bump
 
@@ -159,7 +159,7 @@ class _Fit:
         return torch.cat((PRIOR * self.size * columns, *(one[None] for one in bumps)))
 
     def _whitened(self, part: int, values: Tensor) -> Tensor:
-        """Loads (..., N, J) over the errors' deviation, less what the errors before foretell; (..., N J)."""
+        """Loads (..., N, J) over the errors' deviation, less their autoregressive prediction; (..., N J)."""
         values = values / self.spread[part]
         out = values.clone()
         for lag, factor in enumerate(self.autoregression.unbind(1), 1):
@@ -188,7 +188,7 @@ class _Fit:
             normal, gradient = weighted @ design.T, weighted @ target
             problems.append((normal, gradient))
             if several:
-                # Without the bumps, and given that the part's own weights differ from those of all.
+                # With the bumps eliminated, and the part's own weights free to differ from those of all.
                 bumps = normal[count:, count:] + torch.eye(len(normal) - count, dtype=torch.float64)
                 gone = torch.linalg.solve(bumps, normal[count:, :count]).mT
                 normal = normal[:count, :count] - gone @ normal[count:, :count]
@@ -209,7 +209,7 @@ class _Fit:
     def _size_errors(self) -> None:
         """How errors grow with activity, and their autoregression (Yule-Walker), joint by joint.
 
-        What is left is smaller than the errors, by what the weights took of them: their covariance is added.
+        What is left is smaller than the errors, since the weights fit a part of them: the weights' covariance is added.
         """
         taken = [
             torch.linalg.solve_triangular(root, self._design(part).flatten(1), upper=False).unflatten(
@@ -302,5 +302,5 @@ def _log_power(basis: Tensor, power: Tensor) -> Tensor:
 
 
 def _local_mean(values: Tensor, reach: int = 4) -> Tensor:
-    """Values (N,) averaged over so many neighbours on either side."""
+    """Values (N,) averaged over `reach` neighbours on either side."""
     return avg_pool1d(pad(values[None], (reach, reach), mode="replicate"), 2 * reach + 1, 1)[0]

@@ -30,8 +30,8 @@ def repeated_reading_causes(
 ) -> list[tuple[Cause, float]]:
     """The causes of repeated readings; their probability is 1, since noise never repeats a reading.
 
-    `lost_rows` is the effect that repeats whole rows. Each with the log likelihood that would be lost if the readings
-    that it repeats were taken for measurements.
+    `lost_rows` is the effect that repeats whole rows. Each cause comes with the log likelihood that would be lost if
+    the readings that it repeats were taken for measurements.
     """
     out = []
     repeats = recording.repeats

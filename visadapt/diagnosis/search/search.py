@@ -39,8 +39,8 @@ best sets of one and of two effects."""
 
 POLISH_WITHIN, POLISH_SIMPLER_WITHIN = 8.0, 60.0
 POLISH_MODELS = 8
-"""Log posterior odds behind the best within which sets are fitted carefully, sets with fewer parameters within more,
-since a quick fit of a set that is right may not have shed all its process noise; and the most of them."""
+"""Distance from the best, in log posterior odds, within which sets are fitted carefully, the larger one for sets with
+fewer parameters, since a quick fit of the right set may keep too much process noise; and the most of them."""
 
 
 class Search(FittedModels):
@@ -131,11 +131,11 @@ class Search(FittedModels):
 
     def neighbours(self, centre: ScoredModel) -> None:
         """Fit the sets with one effect removed, with one exchanged for another, and with two exchanged for one."""
-        # Sets that were fitted before too: from the larger set's parameters a fit may reach what it did not alone.
+        # Also sets that were fitted before: from the larger set's parameters a fit may reach a better optimum.
         self.fit([less(centre, [removed]) for removed in centre.effects], QUICK)
         exchanges = []
         for removed in (*combinations(centre.effects, 1), *combinations(centre.effects, 2)):
-            # Along the states of the whole set what is removed shows as a disturbance, without a fit of what is left.
+            # Along the states of the whole set a removed effect shows as a disturbance, without a fit of the rest.
             kept, fits = less(centre, removed)
             if (exchange := (key_of(centre.effects), key_of(kept))) in self._exchanged:
                 continue

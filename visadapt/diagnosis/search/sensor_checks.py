@@ -32,7 +32,7 @@ look like a wrong sign; and how many are tried for each."""
 
 
 def continuous_quaternion(measured: Tensor, quaternion: Sequence[int]) -> Tensor:
-    """An episode (T, m) whose quaternion, in these columns, does not jump to the opposite sign."""
+    """An episode (T, m) with the sign of its quaternion, in these columns, made continuous."""
     if not quaternion:
         return measured
     values = measured[:, quaternion]
@@ -80,7 +80,7 @@ def to_source(rows: Segments, convention: Convention, angle_sensor: Sequence[int
 MAX_LAG = 0.2
 """Largest lag, in periods, of a measured velocity behind the slope of its position; backward differences lag by 0.5."""
 
-SURE = 2.0  # Standard errors by which a lag must exceed it: noise of few readings alone gives lags too
+SURE = 2.0  # Standard errors by which a lag must exceed MAX_LAG: noise alone also gives lags in few readings
 
 
 def derived_velocities(system: System, rows: Segments) -> dict[str, float]:

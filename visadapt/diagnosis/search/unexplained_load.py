@@ -2,7 +2,7 @@
 
 Readings of positions are smoothed and differentiated twice; the accelerations less those of the world, over their gain
 by the loads, are the load in question (inverse dynamics; Khalil and Dombre 2002, chapter 12). It is linear in what a
-world may have wrong: friction, the commands' gain and delay, the parameters, the zero of a sensor, a drive that gives.
+world may have wrong: friction, the commands' gain and delay, the parameters, the zero of a sensor, a compliant drive.
 Those columns are taken along the world's own accelerations, not the measured ones: then no factor common to all of
 them explains anything.
 """
@@ -218,7 +218,7 @@ class _Motion:
             friction = (sign, sign * near_rest, sign * driven[:, j].abs(), v, v * v.abs(), torch.ones_like(v))
             dry.append(len(columns))
             columns += [each[:, None] * joints[j] for each in friction]
-            # Added inertia; then errors of the position: of the sensor's zero, and of a drive that gives or has play.
+            # Added inertia; then errors of the position: the sensor's zero, and a drive's compliance and play.
             reactions[len(columns)] = joints[j][:, None] * gain[:, j, None, :]
             columns.append(self.measured[:, j, None] * joints[j])
             moved = [_moved(state, column) for column in (position, velocity)]
@@ -248,7 +248,7 @@ def _moved(state: Tensor, column: int) -> Tensor:
 
 
 def _smoothed(values: Tensor, deviation: float, edge: int = 0, stride: int = 1) -> Tensor:
-    """Values (T, M) smoothed by a Gaussian of this deviation in rows; beyond the ends they go on as they came.
+    """Values (T, M) smoothed by a Gaussian of this deviation in rows; beyond the ends, point-reflected.
 
     Of the rows, every `stride`-th from `edge` on, up to as far from the end.
     """

@@ -1,8 +1,8 @@
 """The effects of a system of one's own: those that make sense on any mechanism, joint by joint.
 
-From what the class states of its states, actions, loads and coordinates, and from its fields, which are parameters,
-this makes one effect for each joint, action, sensor and parameter and each kind. `shoulder.viscous_friction` is that
-of the joint with the load `shoulder`. Units and ranges searched follow from those that the class states.
+They are made from the states, actions, loads and coordinates that the class states, and from its fields, which are its
+parameters: one effect of each kind for each joint, action, sensor and parameter. `shoulder.viscous_friction` is that of
+the joint with the load `shoulder`. Units and searched ranges follow from those that the class states.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def _made(system: type[System]) -> tuple[type[Effect], ...]:
 
 
 def _alike(system: System) -> Iterator[tuple[str, str]]:
-    """Pairs of effects that are the same, by name: they change every rate alike, with some other value."""
+    """Pairs of names of equivalent effects: with suitable values both change every derivative alike."""
     state, command, load = inputs(system)
     rest = torch.zeros_like(load)
     free = system.derivative(state, command, rest)
@@ -69,7 +69,7 @@ def _alike(system: System) -> Iterator[tuple[str, str]]:
 def _named(
     system: type[System], name: str, base: type[Effect], attributes: dict[str, Any], alike: tuple[str, ...]
 ) -> type[Effect]:
-    # The effects of two systems may have the same name: the later ones then take it.
+    # Where effects of two systems have the same name, the later ones replace the earlier in `EFFECTS`.
     own = {"__module__": system.__module__, "__qualname__": name, "name": name, "systems": (system,)}
     settled = {other: _MOTOR_OFF for other in alike if other.endswith(".constant_load")}
     return type(name, (base,), {"indistinguishable_from": alike, "settled_by": settled, **own, **attributes})

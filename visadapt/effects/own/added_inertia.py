@@ -45,7 +45,7 @@ class Inertial(System):
         units = [load + torch.eye(load.shape[1]).to(load)[joint] for joint in joints]
         gains = [super(Inertial, self).derivative(state, command, unit) - after for unit in units]  # type: ignore[safe-super]
         for k, joint in enumerate(joints):
-            # The body's reaction to the acceleration a of its joint, which it changes: a = free + gain (-inertia a).
+            # The body loads its joint by -inertia a, so that the joint's acceleration is a = free + gain (-inertia a).
             own = self.coordinates[joint][1]
             reaction = inertia[joint] / (1 + inertia[joint] * gains[k][:, own])
             after = after - gains[k] * (reaction * after[:, own])[:, None]
@@ -60,7 +60,7 @@ def _inertial(system: type[System]) -> type[Any]:
 
 
 def inertia_of(system: System, joint: int) -> float:
-    """The joint's own inertia in the middle of the states' ranges."""
+    """The joint's own inertia, in units of load per acceleration, in the middle of the states' ranges."""
     state, command, load = (
         torch.tensor([[(one.low + one.high) / 2 for one in variables]], dtype=torch.float64)
         for variables in (system.states, system.actions, system.loads)

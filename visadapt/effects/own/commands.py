@@ -32,7 +32,7 @@ class OneCommand(ActuationEffect):
 
 
 def on_commands(system: type[System]) -> Iterator[Made]:
-    """Those on each command, and a delay of all."""
+    """The effects on each command, and a delay of all commands."""
     twin = f"{ALL_SENSORS}.measurement_delay"
     settled = {twin: actuation.ActuatorDelay.settled_by["measurement_delay"]}
     delay_in_common = {"indistinguishable_from": (twin,), "settled_by": settled}
@@ -60,11 +60,11 @@ _SAYS: dict[type[Effect], str] = {
     actuation.ActuatorSaturation: "A limit on the command that the motor follows, of its supply or its current.",
     actuation.ActuatorBias: "A constant added to every command.",
 }
-"""What an effect does, where the library's words are of a cart-pole."""
+"""Summaries of effects whose docstring is about a cart-pole."""
 
 
 def _in_units_of(parameter: Parameter, action: Variable) -> Parameter:
-    """A parameter in units of the command, in those of an action; a scale and a time stay as they are."""
+    """A parameter in units of the command (of 1), converted to those of an action; scales and times are kept."""
     if parameter.unit != "1" or parameter.name == "scale":
         return parameter
     most = action.largest

@@ -15,7 +15,7 @@ from visadapt.systems import System, Variable
 
 
 def on_joints(system: type[System]) -> Iterator[Made]:
-    """Those on each joint: its loads, and added inertia."""
+    """The effects on each joint: loads, and added inertia."""
     for joint, (load, (position, velocity)) in enumerate(zip(system.loads, system.coordinates, strict=True)):
         kinds = _laws(load, system.states[position], system.states[velocity])
         for kind, (law, equation, table) in kinds.items():
@@ -53,7 +53,7 @@ def _laws(
     def friction(*names: str) -> tuple[Parameter, ...]:
         return tuple(Parameter(name, unit, 0.0, most, 0.0) for name in names)
 
-    # A coefficient is searched up to where a third of the range of motion takes the largest load.
+    # A coefficient is searched up to the one with which a third of the range of motion makes the largest load.
     per_velocity, per_position = 3 * most / fastest, 3 * most / farthest
     return {
         "viscous_friction": (

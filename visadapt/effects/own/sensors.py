@@ -11,7 +11,7 @@ from visadapt.systems import System
 
 
 def on_sensors(system: type[System]) -> Iterator[Made]:
-    """Offset, scale and delay of each sensor, a velocity's with its position's, and one of all."""
+    """Offset, scale and delay of each sensor (velocities share scale and delay of positions), and a delay of all."""
     rates = dict(system.coordinates)
     moving = {"positions": list(rates), "velocities": list(rates.values())}
     yield (

@@ -1,4 +1,4 @@
-"""How the effects of a system of one's own are stated, and what their ranges and units follow from."""
+"""How the effects of a system of one's own are stated, and the names of those on all commands or readings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from visadapt.effects.base import Effect
 from visadapt.systems import System
 
 ALL_COMMANDS, ALL_SENSORS = "commands", "sensors"
-"""Before the dot in the name of an effect on all commands, or on all readings."""
+"""What stands before the dot in the name of an effect on all commands, or on all readings."""
 
 Made = tuple[str, type[Effect], dict[str, Any]]
 """An effect's name, the class it derives from, and its attributes."""
