@@ -8,12 +8,13 @@ that the environment publishes; nothing else. In order:
     1. the renderer learns how the environment looks, from its frames at set states: a calibration of the camera that
        runs no step of the target and is not counted
     2. encoder and policy are trained in the source model alone, seen through that renderer
-    3. for every seed: at most `budget` counted samples of the target, states estimated from their frames alone, a
-       residual grounded on them and the policy tuned through renderer, residual and physics, round by round
-    4. scores before and after, and what viscous friction and pole damping would explain of the gap that was met
+    3. for every seed, with at most `budget` counted samples of the target each, from frames alone:
+       a residual grounded on them and the policy tuned through renderer, residual and physics, round by round;
+       or, in one round, a diagnosis of them and the policy tuned in the source with the effects that it names
+    4. scores before and after
 
-Writes film.mp4, film.png (before, and after with the first seed), losses.png, renderer.png and metrics.json to `out`,
-and the rows of results/inverted_pendulum.csv. Interrupt it anywhere; started again, it goes on.
+Writes film.mp4, film.png (before, and after a diagnosis with the first seed), losses.png, renderer.png and metrics.json
+to `out`, and the rows of results/inverted_pendulum.csv. Interrupt it anywhere; started again, it goes on.
 """
 
 from __future__ import annotations
@@ -23,10 +24,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import tyro
-from torch import Tensor
 
 from experiments.curves import plot_losses
 from experiments.kept_scores import kept_score
@@ -35,11 +34,8 @@ from experiments.result_tables import Row, speed_row, write_rows
 from renderers import LayeredRenderer
 from visadapt.evaluation import CartPoleScore
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
-from visadapt.learning.grounding import gap
-from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
 from visadapt.progress import Report, reporting, staged
-from visadapt.recordings import Episode
 from visadapt.setups.base import Setup
 from visadapt.setups.cartpole import cartpole_frames
 from visadapt.storage.run_folder import open_run, write_json
@@ -53,6 +49,8 @@ ANGLE_LIMIT = 0.2
 """rad, beyond which the environment ends an episode"""
 GUESS = (59.5, 68.8, 60.0, 0.75)
 """Of the camera, from a look at the frames."""
+METHODS = {"ours, frames alone": ("residual", False), "ours, frames alone, diagnosed": ("diagnosed", True)}
+"""By name in the table: the name of its folders, and whether the samples are diagnosed."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ def main(settings: Settings) -> None:
     about = open_run(out, chosen)
     target = inverted_pendulum()
     scores: dict[str, CartPoleScore] = {}
-    adaptations: dict[int, dict[str, Any]] = {}
+    adaptations: dict[str, dict[str, Any]] = {}
     films: list[tuple[str, Run]] = []
 
     def look(name: str, where: Target, policy: Policy) -> None:
@@ -113,21 +111,29 @@ def main(settings: Settings) -> None:
         look("before", target, policy)
         films.append(("InvertedPendulum-v5, before", film_run(target, policy)))
         for seed in settings.seeds:
-            policy = setup.load(source)
-            work, budget, in_round = out / f"seed-{seed}", settings.budget, settings.round_samples
-            adapted = setup.adapt(policy, target, work, budget, in_round, seed, report)
-            look(f"after-{seed}", target, policy)
-            adaptations[seed] = {"ledger": asdict(adapted.ledger), "gap": _gap(world, adapted.episodes)}
-            if len(films) == 1:
-                films.append((f"after {adapted.ledger.used:,} samples", film_run(target, policy)))
-                plot_losses(out / "losses.png", adapted.rounds)
+            for method, (name, diagnose) in METHODS.items():
+                policy, work, budget = setup.load(source), out / f"{name}-{seed}", settings.budget
+                in_round = budget if diagnose else settings.round_samples
+                adapted = setup.adapt(policy, target, work, budget, in_round, seed, report, diagnose=diagnose)
+                look(f"after-{name}-{seed}", target, policy)
+                found = adapted.rounds[-1].explanation
+                named = {one.name: {p.name: float(getattr(one, p.name)) for p in one.table} for one in found.effects}
+                adaptations[f"{method}, seed {seed}"] = {
+                    "ledger": asdict(adapted.ledger),
+                    "verdict": found.verdict,
+                    "effects": named,
+                }
+                if diagnose and len(films) == 1:
+                    films.append((f"after {adapted.ledger.used:,} samples", film_run(target, policy)))
+                if not diagnose and seed == settings.seeds[0]:
+                    plot_losses(out / "losses.png", adapted.rounds)
         film = CartPoleFilm(_panels(films), target.period)
         film.write_still(out / "film.png", t=5.0)
         film.write(out / "film.mp4", staged(report, "film"))
     about = {**about, "seeds": settings.seeds, "not counted": f"{settings.frames} frames at set states"}
     numbers = {name: asdict(each) for name, each in scores.items()}
     write_json(out / "metrics.json", {"scores": numbers, "adaptations": adaptations, **about})
-    write_rows(settings.results, _rows(scores, adaptations))
+    write_rows(settings.results, _rows(settings, scores))
     print(f"film.mp4, film.png, losses.png and metrics.json are in {out}, the table is {settings.results}")
 
 
@@ -152,45 +158,16 @@ def _panels(films: Sequence[tuple[str, Run]]) -> list[CartPolePanel]:
     return panels
 
 
-def _gap(source: World, episodes: list[Episode]) -> dict[str, float]:
-    """Viscous friction and pole damping that explain most of the gap in the velocities, by least squares.
-
-    From states estimated from frames, so nothing privileged; `explained` is the share of its mean square explained.
-    """
-    windows = Windows.cut(episodes, "state")
-    left = gap(source, windows)[:, 1::2]
-    state = (windows.state + windows.next_state) / 2
-
-    def pushed(load: Tensor) -> Tensor:
-        """Velocities (N, 2) gained in a period under a load (N, 2) of force and torque."""
-        with_load, without = (source.system.derivative(state, windows.action, at) for at in (load, 0 * load))
-        return source.period * (with_load - without)[:, 1::2]
-
-    nothing = torch.zeros(len(state))
-    friction = pushed(torch.stack((-state[:, 1], nothing), 1))
-    damping = pushed(torch.stack((nothing, -state[:, 3]), 1))
-    unit = left.square().mean(0).sqrt()
-    design = torch.stack([(part / unit).flatten() for part in (friction, damping)], 1)
-    wanted = (left / unit).flatten()
-    found = torch.linalg.lstsq(design, wanted[:, None]).solution[:, 0]
-    explained = 1 - (wanted - design @ found).square().mean() / wanted.square().mean()
-    return {"viscous_friction": float(found[0]), "pole_damping": float(found[1]), "explained": float(explained)}
-
-
-def _rows(scores: dict[str, CartPoleScore], adaptations: dict[int, dict[str, Any]]) -> list[Row]:
-    """Speeds before and after, and what the gap is: the spread of these is over seeds."""
-    used = max(sum(steps for _, steps in each["ledger"]["entries"]) for each in adaptations.values())
-    what, system, method = "inverted_pendulum", "InvertedPendulum-v5", "ours, frames alone"
-    after = [scores[f"after-{seed}"] for seed in adaptations]
+def _rows(settings: Settings, scores: dict[str, CartPoleScore]) -> list[Row]:
+    """Speeds before and after."""
+    what, system = "inverted_pendulum", "InvertedPendulum-v5"
     rows = [
         speed_row(what, "unadapted", "source", 0, [scores["source"]], system),
         speed_row(what, "unadapted", "target", 0, [scores["before"]], system),
-        speed_row(what, method, "adapted", used, after, system),
     ]
-    for key, unit in {"viscous_friction": "N s/m", "pole_damping": "N m s/rad", "explained": "1"}.items():
-        found = np.array([each["gap"][key] for each in adaptations.values()])
-        mean, std = round(float(found.mean()), 4), round(float(found.std()), 4)
-        rows.append(Row(what, system, method, "target", used, f"gap: {key}", unit, mean, std, None, 0, len(found)))
+    for method, (name, _) in METHODS.items():
+        after = [scores[f"after-{name}-{seed}"] for seed in settings.seeds]
+        rows.append(speed_row(what, method, "adapted", settings.budget, after, system))
     return rows
 
 
