@@ -30,7 +30,7 @@ from visadapt.evaluation import CartPoleScore
 from visadapt.policies import Policy
 from visadapt.policies.networks import ResidualNetwork, mlp
 from visadapt.setups.base import Setup
-from visadapt.setups.cartpole import cartpole_frames, cartpole_states
+from visadapt.setups.cartpole import cartpole_frames, cartpole_states, from_frames
 from visadapt.storage.run_folder import open_run
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, no_effects, sine_force
@@ -57,15 +57,14 @@ Variant = Callable[[Setup], Setup]
 
 def untuned(setup: Setup) -> Setup:
     """The feed-forward on the residual, in closed form, and no backpropagation."""
-    return _tuned(setup, iterations=0)
+    tuning = replace(setup.settings.tuning, iterations=0)
+    return replace(setup, settings=replace(setup.settings, tuning=tuning))
 
 
 def held_over_a_plan(setup: Setup) -> Setup:
     """From states: the residual's correction is constant over a plan, as from frames, so that no gradient flows."""
-    settings = setup.settings
-    assert settings.refinement is not None
-    held = replace(settings.refinement, iterations=300, streams=32, recorded=settings.tuning.recorded)
-    return replace(setup, settings=replace(settings, tuning=held))
+    held = replace(from_frames(setup.source).tuning, observation_noise=0.0)
+    return replace(setup, settings=replace(setup.settings, tuning=held))
 
 
 def with_an_mlp(setup: Setup) -> Setup:
@@ -82,11 +81,6 @@ def with_an_mlp(setup: Setup) -> Setup:
         return made
 
     return replace(setup, residual=residual)
-
-
-def _tuned(setup: Setup, **changed: object) -> Setup:
-    tuning = replace(setup.settings.tuning, **changed)  # type: ignore[arg-type]
-    return replace(setup, settings=replace(setup.settings, tuning=tuning))
 
 
 def _with(**changed: object) -> Variant:

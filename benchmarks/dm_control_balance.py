@@ -51,7 +51,6 @@ GUESS = (59.5, 49.5, 30.0, 1.1)
 """Of the camera, from a look at the frames."""
 REACH, FALLEN = 1.75, 0.3
 """m of the rail and rad, beyond which nothing more is learnt from an episode; its return goes on."""
-RETURN = "return"
 
 
 class DmControlBalance(Target):
@@ -176,7 +175,7 @@ def _row(samples: int, found: list[list[float]]) -> Row:
     earned = [each for seed in found for each in seed]
     mean, std = round(statistics.fmean(earned), 1), round(statistics.pstdev(earned), 1)
     domain = "adapted" if samples else "target"
-    about = ("dm_control, balance", "cartpole", "ours, frames alone", domain, REPEAT * samples, RETURN, "1")
+    about = ("dm_control, balance", "cartpole", "ours, frames alone", domain, REPEAT * samples, "return", "1")
     return Row(*about, mean, std, len(earned), 0, len(found))
 
 

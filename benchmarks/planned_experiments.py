@@ -96,22 +96,11 @@ def main(settings: Settings) -> None:
     about = ("CartPole, states, one hidden effect", "cartpole")
 
     def rows_of(method: str, samples: int, answers: list[str]) -> list[Row]:
-        shares = {outcome: answers.count(outcome) / max(1, len(answers)) for outcome in OUTCOMES}
+        count = max(1, len(answers))
+        shares = {outcome: round(answers.count(outcome) / count, 4) for outcome in OUTCOMES}
+        what, number = (*about, method, "target", samples), len(answers)
         return [
-            Row(
-                *about,
-                method,
-                "target",
-                samples,
-                outcome,
-                "share",
-                round(share, 4),
-                None,
-                len(answers),
-                0,
-                settings.seeds,
-            )
-            for outcome, share in shares.items()
+            Row(*what, outcome, "share", share, None, number, 0, settings.seeds) for outcome, share in shares.items()
         ]
 
     rows = rows_of(GENTLY, EPISODES * ROWS, [each["answer"] for each in found])

@@ -81,9 +81,8 @@ def planned(rows: Rows) -> Lines:
     lines = [["one hidden effect", "recordings", *OUTCOMES]]
     for method in dict.fromkeys(row["method"] for row in rows):
         own = {row["measure"]: row for row in rows if row["method"] == method}
-        first = next(iter(own.values()))
-        shares = [f"{100 * float(own[name]['mean']):.0f} %" if name in own else "" for name in OUTCOMES]
-        lines.append([method, first["episodes"], *shares])
+        shares = [f"{100 * float(own[name]['mean']):.0f} %" for name in OUTCOMES]
+        lines.append([method, own[OUTCOMES[0]]["episodes"], *shares])
     return lines
 
 

@@ -103,8 +103,7 @@ def main(settings: Settings) -> None:
         print(f"{name}: {scores[name]}", flush=True)
 
     with reporting() as report:
-        world = World(SOURCE, period=target.period)
-        setup = cartpole_frames(world, _renderer(settings, target, report))
+        setup = cartpole_frames(World(SOURCE, period=target.period), _renderer(settings, target, report))
         source = out / "source" / "policy.safetensors"
         policy = setup.pretrain(source, 0, report)
         look("source", SeenSource(setup), policy)

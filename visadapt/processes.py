@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from visadapt.effects.base import EFFECTS, Effect, Parameter, with_table
+from visadapt.effects.base import EFFECTS, Effect, with_table
 
 ENDING = (signal.SIGINT, signal.SIGTERM)
 
@@ -90,13 +90,8 @@ class _Pickler(pickle.Pickler):
     """Pickles effects by name: those of a system of one's own are in no module."""
 
     def reducer_override(self, obj: Any) -> Any:
-        if isinstance(obj, type) and issubclass(obj, Effect) and (own := EFFECTS.get(getattr(obj, "name", ""))):
-            if own is obj:
-                return _effect, (obj.name,)
-            if obj is with_table(obj.name, obj.table):
-                return _effect, (obj.name, obj.table)
+        if isinstance(obj, type) and issubclass(obj, Effect) and getattr(obj, "name", "") in EFFECTS:
+            named = (obj.name, obj.table)
+            if with_table(*named) is obj:
+                return with_table, named
         return NotImplemented
-
-
-def _effect(name: str, table: tuple[Parameter, ...] | None = None) -> type[Effect]:
-    return EFFECTS[name] if table is None else with_table(name, table)

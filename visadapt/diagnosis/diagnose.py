@@ -95,7 +95,7 @@ def diagnose(
         raise ValueError("diagnose: the world is the source and has no effects; give the bare system")
     system = world.system
     profile = profile_of(system)
-    effects = [sized(effect, system) for effect in (all_effects(system) if catalogue is None else catalogue)]
+    effects = all_effects(system) if catalogue is None else [sized(effect, system) for effect in catalogue]
     films = not recording.measured
     effects = [effect for effect in effects if (effect not in UNSEEN if films else effect.stage is not Stage.CAMERA)]
     film = None

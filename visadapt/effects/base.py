@@ -284,8 +284,12 @@ def inside(place: Tensor, start: Tensor, end: Tensor, width: float) -> Tensor:
 EFFECTS: dict[str, type[Effect]] = {}  # Every effect by its standard name
 
 
-@cache
 def with_table(name: str, table: tuple[Parameter, ...]) -> type[Effect]:
-    """The effect of a name, searched in other ranges; `EFFECTS` keeps the original."""
+    """The effect of a name, searched in the ranges of `table`; `EFFECTS` keeps the original, returned for its own."""
     effect = EFFECTS[name]
+    return effect if table == effect.table else _derived(effect, table)  # type: ignore[arg-type]  # hashable, as types
+
+
+@cache
+def _derived(effect: type[Effect], table: tuple[Parameter, ...]) -> type[Effect]:
     return type(effect.__name__, (effect,), {"table": table, "__module__": effect.__module__})

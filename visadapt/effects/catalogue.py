@@ -51,7 +51,7 @@ def sized(effect: type[Effect], system: System) -> type[Effect]:
         return effect
     scales = [system.load_scale(parameter.unit) for parameter in effect.table]
     table = [replace(p, low=scale * p.low, high=scale * p.high) for p, scale in zip(effect.table, scales, strict=True)]
-    return with_table(effect.name, tuple(table)) if max(scales, default=1.0) > 1 else effect
+    return with_table(effect.name, tuple(table))
 
 
 def separable(one: type[Effect], other: type[Effect], system: System) -> bool:

@@ -217,6 +217,13 @@ def needed(system: System) -> tuple[str, ...]:
     return ("time", *(name for name in names if name not in rates), *(variable.name for variable in system.actions))
 
 
+def check_given(given: Mapping[str, str], ours: Sequence[str], system: System) -> None:
+    """Raises RecordingError where `given` maps a name that is none of `ours`."""
+    for name in given:
+        if name not in ours:
+            raise RecordingError(f"--columns {name}=...: {system.name} has no {name!r}; it has {', '.join(ours)}")
+
+
 def match(
     path: Path, header: tuple[str, ...], system: System, given: Mapping[str, str], states: bool = True
 ) -> dict[str, int]:
@@ -231,9 +238,7 @@ def match(
     others = {"time": ("t", "timestamp"), **OTHER_NAMES.get(system.name, {})}
     wanted_states = [state.name for state in system.states] if states else []
     ours = ["episode", "time", *wanted_states, *(action.name for action in system.actions)]
-    for name in given:
-        if name not in ours:
-            raise RecordingError(f"--columns {name}=...: {system.name} has no {name!r}; it has {', '.join(ours)}")
+    check_given(given, ours, system)
     found: dict[str, int] = {}
     for name in ours:
         candidates: list[int] = []

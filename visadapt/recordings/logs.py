@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visadapt.recordings.clock import Note, RawEpisode
-from visadapt.recordings.csv import needed
+from visadapt.recordings.csv import check_given, needed
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.topics import Read, Topic
 from visadapt.systems import System
@@ -30,9 +30,7 @@ def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], n
         RecordingError: the log cannot be read, lacks a topic or a field, or its topics have no time in common.
     """
     ours = [*(state.name for state in system.states), *(action.name for action in system.actions)]
-    for name in given:
-        if name not in ours:
-            raise RecordingError(f"--columns {name}=...: {system.name} has no {name!r}; it has {', '.join(ours)}")
+    check_given(given, ours, system)
     if missing := [name for name in needed(system) if name not in ("time", *given)]:
         raise RecordingError(
             f"{path}: say where {', '.join(missing)} are: --columns {missing[0]}=TOPIC.FIELD,... "
@@ -75,9 +73,9 @@ def _rows(
     for name in read:
         if name != slowest:
             used &= _between_readings(time, topics[name].time)
-    if used.sum() < 2:
-        raise RecordingError(f"{path}: {', '.join((*read, *commanded))} have no time in common")
     rows = np.flatnonzero(used)
+    if len(rows) < 2:
+        raise RecordingError(f"{path}: {', '.join((*read, *commanded))} have no time in common")
     time = time[rows]
 
     def state(name: str) -> NDArray[np.float64]:
