@@ -13,10 +13,11 @@ from visadapt.diagnosis.search.search import Search
 from visadapt.effects import ActuatorDelay, CartMass, ConstantForce, SensorScale, ViscousFriction
 from visadapt.estimation.candidate import CandidateModel, linearise
 from visadapt.estimation.fit_states import CAREFUL
-from visadapt.estimation.fitting import fit, refitted
+from visadapt.estimation.fitting import LEAST_NOISE, fit, refitted
 from visadapt.estimation.likelihood import initial_states
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole
+from visadapt.world import World
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +38,19 @@ def test_linearisation_predicts_small_steps(viscous):
     torch.testing.assert_close(there.next_state - at.next_state, change, atol=6e-8, rtol=0)
     seen = (at.sensing @ step[..., None])[..., 0] + at.sensing_by_parameter @ turn
     torch.testing.assert_close(there.measured - at.measured, seen, atol=6e-8, rtol=0)
+
+
+def test_a_step_under_strong_friction_errs_by_less_than_a_good_sensor(viscous):
+    # Where it errs by more, an effect that is integrated in shorter steps fits better, and is named in its place.
+    damping, system = torch.tensor([5.0], dtype=torch.float64), CartPole()
+    generator = torch.Generator().manual_seed(0)
+    state = 0.3 * torch.randn(*viscous.shape, 4, generator=generator, dtype=torch.float64)
+    found = linearise(CandidateModel(system, [ViscousFriction], viscous), damping, state).next_state
+    fine = World(system, [ViscousFriction(coefficient=float(damping)).double()], viscous.period, substeps=50)
+    commands = viscous.command[viscous.episode[:, None], viscous.index][:, :-1]
+    true = fine.step(fine.start(state[:, :-1].flatten(0, 1)), commands.flatten(0, 1)).state
+    least = LEAST_NOISE * torch.tensor([each.largest for each in system.states], dtype=torch.float64)
+    assert bool(((found.flatten(0, 1) - true).abs() < least / 5).all())
 
 
 def test_a_fit_finds_size_and_noise_and_leaves_no_disturbance(viscous):
