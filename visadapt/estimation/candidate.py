@@ -45,7 +45,7 @@ class CandidateModel:
         if any(effect.abrupt for effect in effects):
             longest_step = min(longest_step, self.profile.longest_abrupt_steps[accuracy])
         longest = float(rows.held.max())
-        integrator = "midpoint" if accuracy < FINE and longest <= SHORT_PERIOD else "rk4"
+        integrator = "midpoint" if accuracy < FINE and rows.period <= SHORT_PERIOD else "rk4"
         placeholders = [effect(**{parameter.name: 0.0 for parameter in effect.table}) for effect in effects]
         self._world, self._smooth = (
             World(system, placeholders, rows.period, integrator, max(1, math.ceil(longest / step - 1e-9)))

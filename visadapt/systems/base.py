@@ -101,6 +101,13 @@ class System(ABC):
         values = {field.name: getattr(self, field.name) for field in fields(itself)}
         return replace(itself, **{k: value.to(like) for k, value in values.items() if isinstance(value, Tensor)})
 
+    def of_rows(self, rows: Tensor) -> Self:
+        """The same system for the `rows`, a mask (B,), of a batch alone: with their parameters, where rows differ."""
+        itself: Any = self  # as in `to`
+        values = {field.name: getattr(self, field.name) for field in fields(itself)}
+        differing = {k: value[rows] for k, value in values.items() if isinstance(value, Tensor) and value.dim()}
+        return replace(itself, **differing) if differing else self
+
     def check_parameters(self, either_sign: Collection[str] = (), may_be_zero: Collection[str] = ()) -> None:
         """Raise ValueError if a parameter is not positive or, where it may have either sign, not finite."""
         itself: Any = self

@@ -32,6 +32,23 @@ def stopped(system: System, before: Tensor, after: Tensor, command: Tensor, limi
     `before` and `after` are the states at either end of the step, `command` (B, n_action) acted in it; `limits` as in
     `sliding`.
     """
+    velocities = [velocity for _, velocity in system.coordinates]
+    first, last = before[:, velocities], after[:, velocities]
+    # A row in which nothing reverses is left as it is: computing the response to loads for these too takes longer than
+    # the step itself.
+    rubs = torch.ones_like(first, dtype=torch.bool) if limits.requires_grad else (limits != 0).any(-1)
+    rows = (((first == 0) | (first * last < 0)) & rubs).any(-1)
+    if not bool(rows.any()):
+        return after
+    duration = h[rows] if isinstance(h, Tensor) and h.dim() else h
+    acting = command.expand(len(rows), -1)[rows]
+    out = after.clone()
+    out[rows] = _stopped(system.of_rows(rows), before[rows], after[rows], acting, limits[rows], duration)
+    return out
+
+
+def _stopped(system: System, before: Tensor, after: Tensor, command: Tensor, limits: Tensor, h: Duration) -> Tensor:
+    """`stopped` for rows in each of which something reverses."""
     none = torch.zeros_like(limits[..., 0])
     free = system.derivative(before, command, none)
     for k, (_, own) in enumerate(system.coordinates):
