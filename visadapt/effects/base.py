@@ -223,6 +223,12 @@ class DynamicsEffect(Effect):
         """
         return torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)
 
+    @classmethod
+    def only_loads(cls) -> bool:
+        """Whether it does nothing but add a load."""
+        base = DynamicsEffect
+        return cls.alter is base.alter and cls.vary is base.vary and cls.dry_friction is base.dry_friction
+
     def dry_friction(self, time: Tensor, state: Tensor, command: Tensor, system: System) -> Tensor | None:
         """The largest dry friction (B, n_load, 2) against positive and against negative motion; None without any.
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from visadapt.effects import Effect, SensingEffect
-from visadapt.estimation.candidate import COARSEST, CandidateModel
+from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, SensingEffect
+from visadapt.estimation.candidate import COARSEST, SHORT_PERIOD, CandidateModel
 from visadapt.estimation.kalman import forward, respond
 from visadapt.estimation.likelihood import FitState, linear_problem, variances
-from visadapt.estimation.linearise import integrate
+from visadapt.estimation.linearise import integrate, linearise_step, load_effect
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
 
@@ -98,7 +99,10 @@ class Sensitivity:
         return changes[..., 0], (changes[..., 1:] - changes[..., :1]) / steps
 
     def _changes(self, effect: type[Effect], tried: Tensor) -> Tensor:
-        """Change (N, M) of the innovations with the effect at parameters (M, P)."""
+        """Change (N, M) of the innovations with the effect at parameters (M, P).
+
+        Over short periods loads and commands change a step linearly, which takes no integration.
+        """
         rows, fits = self.rows, self.fits
         model = CandidateModel(self.system, [*self.effects, effect], rows, COARSEST)
         count_own = tried.shape[1]
@@ -109,18 +113,33 @@ class Sensitivity:
         for j, parameter in enumerate(effect.table):
             if parameter.neutral is None:
                 theta[0, j - count_own] = tried[1, j]
+        if issubclass(effect, SensingEffect):
+            state = fits.state[0]
+            read = model.measure(theta, state.expand(len(theta), *state.shape))
+            reading = -(read[1:] - read[:1]).movedim(0, -1) * rows.used[..., None]
+            return self.innovations.response(torch.zeros_like(state[:, 1:, :, None]), reading)
+        acted = model.commands(theta if model.acting_parameters else theta[:1])[:, :, :-1]
+        if rows.period <= SHORT_PERIOD and issubclass(effect, ActuationEffect):
+            mean = acted.mean(3)
+            drive = torch.einsum("wtna,mwta->wtnm", self._slopes[0], mean[1:] - mean[:1])
+        elif rows.period <= SHORT_PERIOD and issubclass(effect, DynamicsEffect) and effect.only_loads():
+            load = self._loads(effect, theta[:, -count_own:])
+            drive = torch.einsum("wtnl,mwtl->wtnm", self._slopes[1], load[1:] - load[:1])
+        else:
+            after = self._after(model, theta, acted)
+            drive = (after[1:] - after[:1]).movedim(0, -1)
+        drive = drive * rows.inside[:, 1:, None, None]
+        return self.innovations.response(drive, torch.zeros_like(rows.measured[..., None]))
+
+    def _after(self, model: CandidateModel, theta: Tensor, acted: Tensor) -> Tensor:
+        """(M, W, T - 1, n) the states a period after each row with parameters (M, P), under what acts."""
+        rows, state, count = self.rows, self.fits.state[0], len(theta)
         windows, length = rows.shape
-        state, count = fits.state[0], len(theta)
 
         def spread(x: Tensor) -> Tensor:
             return x[None].expand(count, *x.shape).reshape(-1, *x.shape[2:])
 
-        if issubclass(effect, SensingEffect):
-            read = model.measure(theta, state.expand(count, *state.shape))
-            reading = -(read[1:] - read[:1]).movedim(0, -1) * rows.used[..., None]
-            return self.innovations.response(torch.zeros_like(state[:, 1:, :, None]), reading)
-        acted = model.commands(theta if model.acting_parameters else theta[:1])[:, :, :-1]
-        after = integrate(
+        return integrate(
             model.at(theta[0]),
             theta.repeat_interleave(windows * (length - 1), 0),
             spread(rows.time[:, :-1]),
@@ -128,5 +147,28 @@ class Sensitivity:
             acted.expand(count, *acted.shape[1:]).flatten(0, 2),
             spread(rows.duration[:, :-1]),
         ).reshape(count, windows, length - 1, -1)
-        drive = (after[1:] - after[:1]).movedim(0, -1) * rows.inside[:, 1:, None, None]
-        return self.innovations.response(drive, torch.zeros_like(rows.measured[..., None]))
+
+    @cached_property
+    def _slopes(self) -> tuple[Tensor, Tensor]:
+        """Change of the state after a period per unit of a command that acts over it, (W, T - 1, n, n_action), and per
+        unit of a load, (W, T - 1, n, n_load)."""
+        loads = load_effect(type(self.system))
+        model = CandidateModel(self.system, [*self.effects, loads], self.rows, COARSEST)
+        count, state = len(loads.table), self.fits.state[0]
+        theta = torch.cat((self.fits.theta[0], torch.zeros(count, dtype=torch.float64)))
+        acted = model.commands(theta[None])[0, :, :-1].flatten(0, 1)
+        time, duration = (x[:, :-1].flatten() for x in (self.rows.time, self.rows.duration))
+        step = linearise_step(
+            model.at(theta), theta, time, state[:, :-1].flatten(0, 1), acted, False, True, duration=duration
+        )
+        shape = (self.rows.shape[0], -1)
+        return step.by_command.unflatten(0, shape), step.by_parameter[..., -count:].unflatten(0, shape)
+
+    def _loads(self, effect: type[DynamicsEffect], values: Tensor) -> Tensor:
+        """(M, W, T - 1, n_load) the loads of an effect with parameters (M, P) in the middle of every period."""
+        rows, state, count = self.rows, self.fits.state[0], len(values)
+        time = (rows.time[:, :-1] + rows.duration[:, :-1] / 2).flatten()
+        middle = ((state[:, :-1] + state[:, 1:]) / 2).flatten(0, 1)
+        acting = effect(**{p.name: 0.0 for p in effect.table}).with_values(values.repeat_interleave(len(time), 0))
+        out = acting.load(time.repeat(count), middle.repeat(count, 1), self.system)
+        return out.unflatten(0, (count, rows.shape[0], -1))
