@@ -157,7 +157,14 @@ COMMANDS = (
         15,
         work="--work",
     ),
-    Command("baselines", "baselines.csv", ("benchmarks.baselines",), 40, work="--work", extra="baselines"),
+    Command(
+        "baselines",
+        "baselines.csv",
+        ("benchmarks.baselines", "--episodes", "20"),
+        60,
+        work="--work",
+        extra="baselines",
+    ),
     Command(
         "rotorpy",
         "rotorpy.csv",
