@@ -6,6 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import torch
+from torch import Tensor
+
 from visadapt.diagnosis.result import Cause, Estimate, Ranked
 from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.model_comparison import ComparedModel, ModelComparison
@@ -21,6 +24,8 @@ Z_90 = 1.6449  # Half-width of a normal distribution's 90 % interval, in standar
 
 SLIGHT = 0.01
 """Share of the gap that must open again without a cause for the verdict to rest on it."""
+
+NEGLIGIBLE = 0.01  # Probability of a set up to which it does not widen the intervals of the others' parameters
 
 GapClosed = Mapping[frozenset[str], float]
 """Share of the gap that a set closes on held-out episodes, by the names of its effects."""
@@ -62,16 +67,17 @@ def causes(
     if best and not carrying and gap_closed[best] > SLIGHT:
         # Effects stand in for each other, so that none is missed: the verdict rests on the one that closes most alone.
         carrying = [max(alone, key=lambda effect: alone[effect])]
-    models = {one.compared.model.names: one.compared.model for group in groups for one in group}
-    found = {names: estimates(search, model) for names, model in models.items()}
+    models = {c.model.names: c.model for c in comparison.models if c.probability > NEGLIGIBLE}
+    models |= {one.compared.model.names: one.compared.model for group in groups for one in group}
+    fitted = {names: _fitted(search, model) for names, model in models.items()}
     for effect, group in zip(comparison.best.effects, groups, strict=True):
         names = [one.effect.name for one in group]
         for one in group:
-            fitted = found[one.compared.model.names][one.canonical]
+            found = _averaged(search, comparison, one, fitted)
             out.append(
                 Cause(
                     one.effect.name,
-                    fitted if one.effect is one.canonical else _twin(search, one, fitted),
+                    found if one.effect is one.canonical else _twin(search, one, found),
                     _probability(comparison, one, group),
                     gap_closed.get(frozenset({one.canonical.name}), math.nan),
                     reopens[effect],
@@ -92,21 +98,69 @@ def _twin(search: Search, one: Alternative, fitted: Mapping[str, Estimate]) -> M
     """The parameters with which a twin has the same effect."""
     if [(p.name, p.unit) for p in one.effect.table] == [(p.name, p.unit) for p in one.canonical.table]:
         return fitted
-    return estimates(search, search.exchange(one.compared.model, one.canonical, one.effect))[one.effect]
+    model = search.exchange(one.compared.model, one.canonical, one.effect)
+    values, spread = _fitted(search, model)[one.effect]
+    return _estimates(search, model, one.effect, values, values - Z_90 * spread, values + Z_90 * spread)
 
 
-def estimates(search: Search, model: ScoredModel) -> dict[type[Effect], dict[str, Estimate]]:
-    """Maximum likelihood estimates of each effect's parameters, with 90 % intervals that hold under misfit as well."""
+Fitted = dict[type[Effect], tuple[Tensor, Tensor]]
+"""Maximum likelihood estimates of each effect's parameters, (P,), and their standard deviations, (P,)"""
+
+
+def _fitted(search: Search, model: ScoredModel) -> Fitted:
+    """The parameters of a set's effects, with standard deviations that hold under misfit as well."""
     deviation = deviations(CandidateModel(search.system, model.effects, search.rows), model.fits)
+    counts = [len(effect.table) for effect in model.effects]
+    values = model.fits.theta[0, : sum(counts)]
+    return dict(zip(model.effects, zip(values.split(counts), deviation.split(counts), strict=True), strict=True))
+
+
+def _averaged(
+    search: Search, comparison: ModelComparison, one: Alternative, fitted: Mapping[tuple[str, ...], Fitted]
+) -> dict[str, Estimate]:
+    """Estimates of the most probable set with the effect, with 90 % intervals over all compared sets with it.
+
+    Which other effects act is uncertain too, and changes what is left for this one (Hoeting, Madigan, Raftery and
+    Volinsky 1999, Bayesian model averaging, Statistical Science 14(4)).
+    """
+    own = fitted[one.compared.model.names][one.canonical][0]
+    having = [c for c in comparison.models if one.canonical in c.model.effects and c.model.names in fitted]
+    known = [fitted[compared.model.names][one.canonical] for compared in having]
+    values, spreads = (torch.stack(each) for each in zip(*known, strict=True))
+    phases = torch.tensor([2 * math.pi * (p.role is Role.PHASE) for p in one.canonical.table], dtype=values.dtype)
+    values = values - phases * ((values - own) / (2 * math.pi)).round()
+    weights = torch.tensor([compared.probability for compared in having], dtype=values.dtype)
+    low, high = (_quantile(values, spreads, weights, level) for level in (0.05, 0.95))
+    return _estimates(search, one.compared.model, one.canonical, own, low, high)
+
+
+def _quantile(values: Tensor, spreads: Tensor, weights: Tensor, level: float) -> Tensor:
+    """Quantile (P,) of mixtures of M normal distributions with means and deviations (M, P) and weights (M,).
+
+    >>> means, equal = torch.tensor([[0.0], [10.0]]), torch.ones(2)
+    >>> round(float(_quantile(means, torch.ones(2, 1), equal, 0.05)), 3)  # the 10 % quantile of the first
+    -1.282
+    """
+    low, high = (values - 5 * spreads).amin(0), (values + 5 * spreads).amax(0)
+    for _ in range(60):
+        middle = (low + high) / 2
+        below = weights @ torch.special.ndtr((middle - values) / spreads) / weights.sum() < level
+        low, high = torch.where(below, middle, low), torch.where(below, high, middle)
+    return (low + high) / 2
+
+
+def _estimates(
+    search: Search, model: ScoredModel, effect: type[Effect], values: Tensor, low: Tensor, high: Tensor
+) -> dict[str, Estimate]:
+    """Parameters (P,) of an effect of a set, with intervals from `low` to `high` (P,), as the result states them."""
     covered = spans(search.system, search.rows, model.fits.state[0])
-    fitted = zip(model.fits.theta[0].tolist(), deviation.tolist(), strict=True)
-    return {e: {p.name: _estimate(p, *next(fitted), covered) for p in e.table} for e in model.effects}
+    numbers = zip(effect.table, values.tolist(), low.tolist(), high.tolist(), strict=True)
+    return {p.name: _estimate(p, value, first, last, covered) for p, value, first, last in numbers}
 
 
 def _estimate(
-    parameter: Parameter, value: float, deviation: float, covered: Mapping[str, tuple[float, float]]
+    parameter: Parameter, value: float, low: float, high: float, covered: Mapping[str, tuple[float, float]]
 ) -> Estimate:
-    low, high = value - Z_90 * deviation, value + Z_90 * deviation
     if parameter.role is Role.PHASE:
         turn = 2 * math.pi * round(value / (2 * math.pi))
         return Estimate(value - turn, parameter.unit, (low - turn, high - turn))
