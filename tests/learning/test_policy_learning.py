@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -9,18 +11,21 @@ from tests.scenes import (
     small_renderer,
     stir,
 )
-from visadapt.effects import ActuatorDelay, ConstantForce, Residual
+from visadapt.effects import ActuatorDelay, ConstantForce, DynamicsEffect, Residual
 from visadapt.evaluation import score
 from visadapt.history import History
-from visadapt.learning.plans import imagine
+from visadapt.learning.plans import ClosedLoop, imagine
 from visadapt.learning.policy import DivergedError, TuneSettings, initialise_feedforward, tune
+from visadapt.learning.streams import Streams
 from visadapt.learning.windows import Windows
 from visadapt.policies import ImagePolicy, StatePolicy
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import Episode
+from visadapt.setups.cartpole import cartpole_states
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget
 from visadapt.tasks.balance import PAPER_CARTPOLE, Balance, Cost
+from visadapt.weights import shipped
 from visadapt.world import World
 
 COST = Cost((5.0, 3.0, 10.0, 1.0))
@@ -242,6 +247,51 @@ class Stepped(Balance):
     def disturb(self, state, generator):
         type(self).steps += len(state)
         return super().disturb(state, generator)
+
+
+class UnevenTrack(DynamicsEffect):
+    """A force that changes along the track, so that no plan made half a second before cancels it."""
+
+    def load(self, time, state, system):
+        force = 2.0 * (6.0 * state[:, 0]).cos() * (3.0 * state[:, 2]).cos()
+        return torch.stack((force, torch.zeros_like(force)), -1)
+
+
+class TestClosedLoop:
+    """The policy decides anew at every step that is imagined."""
+
+    def test_the_gradient_is_the_change_of_the_loss(self):
+        torch.manual_seed(0)
+        policy, world = StatePolicy(4, with_history=True), World(CartPole(), [ConstantForce(force=1.0)])
+        world.requires_grad_(False)
+        task = Balance(PAPER_CARTPOLE, start_spread=(0.1, 0.1, 0.05, 0.1))
+
+        def loss():
+            generator = torch.Generator().manual_seed(1)
+            streams = Streams(world, task, None, None, 8, 100, 0.0)
+            streams.start(1.0, generator)
+            return ClosedLoop(policy, streams, 0.0, generator).loss(0, 1.0)
+
+        weight = policy.first.weight
+        (gradient,) = torch.autograd.grad(loss(), weight)
+        direction, size = gradient / gradient.norm(), 1e-3
+        losses = []
+        with torch.no_grad():
+            for change in (size * direction, -2 * size * direction):
+                weight += change
+                losses.append(float(loss()))
+        assert (losses[0] - losses[1]) / (2 * size) == pytest.approx(float(gradient.norm()), rel=0.02)
+
+    def test_under_a_force_that_no_plan_foresees_the_cart_becomes_slower(self):
+        hidden = UnevenTrack()
+        setup = cartpole_states(World(CartPole(), [hidden]))
+        setup = replace(setup, settings=replace(setup.settings, named=replace(setup.settings.named, iterations=80)))
+        policy, target = setup.load(shipped("cartpole_states")), SyntheticTarget(lambda batch, generator: [hidden])
+        before = score(policy, target, 20)
+        setup.tune(policy, 0)
+        after = score(policy, target, 20)
+        assert after.survived == 20
+        assert after.mean_speed < 0.8 * before.mean_speed
 
 
 class TestReplay:

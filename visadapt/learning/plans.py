@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from visadapt.history import History
+from visadapt.history import HORIZON, History
 from visadapt.learning.streams import Streams, StreamState, Visited, look
 from visadapt.learning.windows import Observe
 from visadapt.policies import Policy
@@ -51,6 +51,31 @@ class Plans:
     def restore(self, tree: dict[str, Any]) -> None:
         """Go on from a `tree`."""
         self.streams.now, self.streams.age = StreamState.of(tree["now"]), tree["age"]
+
+
+class ClosedLoop(Plans):
+    """The policy decides anew at every step that is imagined, and the gradient is of the actions that it executes.
+
+    Of a plan that is carried out whole, most of the cost is of its later actions where a force acts that cannot be
+    foreseen over half a second, and the first action, the only one executed, is learnt from little of the gradient
+    (Xu et al. 2022, Accelerated policy learning with parallel differentiable simulation, ICLR).
+    """
+
+    def loss(self, iteration: int, progress: float) -> Tensor:
+        streams, now = self.streams, self.streams.now
+        at, history, first, states, actions = now.at, now.history, now.at, [], []
+        for k in range(HORIZON):
+            action = self.policy.act(self.seen(history))
+            at = streams.world.step(at, action, history)
+            states.append(at.state)
+            actions.append(action)
+            if k == 0:
+                first = at
+            seen, at = look(streams.world, streams.observe, at, self.generator)
+            history = history.acting(action).observing(streams.task.show(seen, now.task_state))
+        loss = streams.task.cost(torch.stack(states, 1), torch.stack(actions, 1), now.at.state, now.task_state).mean()
+        streams.advance(first, actions[0].detach(), progress, self.generator)
+        return loss
 
 
 class KeptPlans(Plans):

@@ -1,9 +1,10 @@
 """Policy learning by backpropagation through a world: the inner loop of Algorithm 1 and equation 11.
 
 A batch of simulated streams runs under the policy. At each iteration the policy plans K actions, the world
-(physics, effects, residual, renderer) carries them out, and the gradient of the cost flows back through all of it.
-Then every stream takes the first planned step. A stream further than delta_div from the reference starts anew, and
-delta_div grows as training goes on, so the policy learns to recover from ever further off.
+(physics, effects, residual, renderer) carries them out, and the gradient of the cost flows back through all of it; or,
+in closed loop, the policy decides anew at each of K steps. Then every stream takes the first step. A stream further
+than delta_div from the reference starts anew, and delta_div grows as training goes on, so the policy learns to recover
+from ever further off.
 
 Where visited states are kept (`TuneSettings.streams`, `KeptPlans`), the feed-forward is not tuned: it reads a noisy
 estimate of the correction that acts, and would learn to oppose only a part of it.
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from visadapt.estimation.linearise import linearise_step
 from visadapt.history import HORIZON
-from visadapt.learning.plans import KeptPlans, Plans
+from visadapt.learning.plans import ClosedLoop, KeptPlans, Plans
 from visadapt.learning.streams import Streams
 from visadapt.learning.training_state import TrainingState
 from visadapt.learning.windows import Observe, Windows
@@ -47,6 +48,8 @@ class TuneSettings:
     frames rendered, but a policy's encoder and feed-forward are not tuned, and the residual's correction is constant
     over a plan; None: as many as `batch`, and nothing is kept"""
     every: int = 1  # iterations between two steps of the streams
+    closed_loop: bool = False
+    """whether the policy decides anew at every step that is imagined; False: its plan is carried out whole"""
     curriculum: bool = True
     """whether streams start closer to the reference, and restart closer to it, early on; False for a trained policy"""
     recorded: float = 0.0  # share of the starts that are recorded windows of the target, with their histories
@@ -97,7 +100,12 @@ def tune(
     count = settings.streams or settings.batch
     streams = Streams(world, settings.task, observe, windows, count, settings.longest, settings.recorded)
     given = (policy, streams, settings.observation_noise, generator)
-    plans = Plans(*given) if settings.streams is None else KeptPlans(*given, settings.batch, settings.every)
+    if settings.closed_loop:
+        plans: Plans = ClosedLoop(*given)
+    elif settings.streams is None:
+        plans = Plans(*given)
+    else:
+        plans = KeptPlans(*given, settings.batch, settings.every)
     kept = training.resume()
     if kept is not None:
         plans.restore(kept)
