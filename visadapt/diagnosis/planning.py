@@ -1,11 +1,14 @@
 """The experiment that settles an ambiguity: the excitation of the commands that tells two explanations apart best.
 
-An ambiguous diagnosis names effects that fit a recording equally well. Each explanation is simulated, with the noise of
-the recording, under every excitation of a family (square waves, sines, white noise; the largest that keeps all states
-within 0.9 of the system's ranges), and every explanation is fitted to what each shows. The worth of an excitation is
-the log likelihood ratio of the true to the other explanation: the least over all pairs of the first explanation and
-another, with either of them true. This is the expected information of Box and Hill (1967), Technometrics 9(1), with
-fits in place of a linear model and the worst case in place of the mean.
+An ambiguous diagnosis names effects that fit a recording equally well. Each explanation is simulated under every
+excitation of a family (square waves, sines, white noise; the largest that keeps all states within 0.9 of the system's
+ranges), and every explanation is fitted to what each shows. The worth of an excitation is the log posterior odds of the
+true against the other explanation: the least over all pairs of the first explanation and another, with either of them
+true. This is the expected information of Box and Hill (1967), Technometrics 9(1), with fits in place of a linear model
+and the worst case in place of the mean.
+
+The odds are those of readings without noise under the recording's noise, which is what they are on average: drawn noise
+would add a few units at random, and the best of many excitations would be the luckiest.
 """
 
 from __future__ import annotations
@@ -39,7 +42,8 @@ SIZES = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Amplitudes that are tried, and the standard deviation of white noise, as shares of half the command's range."""
 MARGIN = 0.9  # Share of the states' ranges that an experiment may reach
 SUBSTEP = 0.0125  # s, the longest integration step of a simulation
-WORTH = 3.0  # Log likelihood ratio up to which an experiment is said to settle nothing
+WORTH = 3.0  # Log odds up to which an experiment is said to settle nothing
+CERTAIN = 100.0  # Log odds above which more make no difference
 
 
 @dataclass(frozen=True)
@@ -63,7 +67,7 @@ class Plan:
     actions: tuple[str, ...]
     """names of the commands"""
     log_odds: float
-    """expected log likelihood ratio of the true to the other explanation, in the worst case"""
+    """expected log odds of the true against the other explanation, in the worst case"""
     white: float
     """the same for white noise of the largest admissible size; NaN where none is admissible"""
 
@@ -147,7 +151,8 @@ def plan(
     worth = torch.full((len(names),), math.nan)
     for done, k in enumerate(torch.nonzero(largest >= 0)[:, 0].tolist()):
         row = int(largest[k]) * len(names) + k
-        recordings = [_recording(recording, system, states[row], commands[row]) for (states, commands), _ in shown]
+        runs = [(states[row], commands[row]) for (states, commands), _ in shown]
+        recordings = [_recording(recording, system, *each, noise) for each in runs]
         worth[k] = min(
             _lead(sets[truth], sets[other], recordings[truth], system)
             for rival in range(1, len(sets))
@@ -234,8 +239,8 @@ def _simulate(
     first: Tensor,
     generator: torch.Generator,
 ) -> Shown:
-    """Readings (N, T + 1, n) and commands (N, T + 1, n_action) under each of N excitations, and (N,) whether all states
-    stay within their ranges."""
+    """Readings without noise (N, T + 1, n) and commands (N, T + 1, n_action) under each of N excitations, and (N,)
+    whether all states stay within their ranges; the policy sees readings with noise."""
     world = World(system, effects, recording.period, substeps=math.ceil(recording.period / SUBSTEP)).double()
     ranges = torch.tensor([max(-v.low, v.high) for v in system.states], dtype=torch.float64)
 
@@ -245,7 +250,7 @@ def _simulate(
     at = world.start(first.expand(len(added), -1))
     measured, at = world.measure(at, generator)
     history = History.start(read(measured), added.shape[-1])
-    readings, commands, inside = [history.observations[:, -1]], [], (at.state.abs() <= MARGIN * ranges).all(1)
+    readings, commands, inside = [measured], [], (at.state.abs() <= MARGIN * ranges).all(1)
     for t in range(added.shape[1]):
         command = added[:, t] if policy is None else actions(policy, history).to(added) + added[:, t]
         command = system.within_range(command)
@@ -254,21 +259,23 @@ def _simulate(
         inside &= (at.state.abs() <= MARGIN * ranges).all(1)
         at = replace(at, state=torch.where(inside[:, None], at.state, first))  # a run that left must stay finite
         history = history.acting(command).observing(read(measured))
-        readings.append(history.observations[:, -1])
+        readings.append(measured)
         commands.append(command)
     return (torch.stack(readings, 1), torch.stack((*commands, 0 * commands[-1]), 1)), inside
 
 
-def _recording(like: Recording, system: System, states: Tensor, commands: Tensor) -> Recording:
-    """One simulated experiment, with the states that were measured."""
+def _recording(like: Recording, system: System, states: Tensor, commands: Tensor, noise: Tensor) -> Recording:
+    """One simulated experiment, with the states that were measured, which are known to `noise` (n,)."""
     measured = [system.index(name) for name in like.measured]
     time = like.period * np.arange(len(states))
     episode = Episode(time, commands.numpy(), states[:, measured].numpy())
-    return Recording((episode,), like.measured, like.period, ("the simulated experiment",))
+    # A fit takes no noise below that of rounding: the readings have none, so it takes exactly this.
+    rounding = tuple((math.sqrt(12) * noise[measured]).tolist())
+    return Recording((episode,), like.measured, like.period, ("the simulated experiment",), resolution=rounding)
 
 
 def _lead(truth: Sequence[Effect], other: Sequence[Effect], recording: Recording, system: System) -> float:
-    """Log likelihood ratio of the truth to another explanation, both fitted to the recording."""
+    """Log posterior odds of the truth against another explanation, both fitted to the recording."""
     sets = [tuple(type(effect) for effect in effects) for effects in (truth, other)]
     catalogue = list(dict.fromkeys((*sets[0], *sets[1])))
     prepared = prepare(recording, system)
@@ -276,4 +283,6 @@ def _lead(truth: Sequence[Effect], other: Sequence[Effect], recording: Recording
     # In one batch: of two fits in turn, the second would stop where it falls far behind on its way.
     starts = [(own, _start(models.source.fits, effects)) for own, effects in zip(sets, (truth, other), strict=True)]
     first, second = models.fit(starts, QUICK)
-    return float(first.fits.likelihood[0] - second.fits.likelihood[0])
+    if first.log_odds == -math.inf:
+        return -math.inf  # nothing is learnt about the truth
+    return min(first.log_odds - second.log_odds, CERTAIN)
