@@ -168,7 +168,8 @@ def adapt(
         world, how, trust = grounded, settings.tuning, settings.trust
         if found.complete:
             # Without a gap there is nothing to tune for.
-            how = settings.with_names if len(known.effects) else replace(settings.with_names, iterations=0)
+            how = settings.with_names(known)
+            how = how if len(known.effects) else replace(how, iterations=0)
             world, trust = known, 1.0
         progress = staged(report, f"{name}: tune")
         tuning = _tune(tuned, policy, start, trust, world, observe, how, drawn[2], windows, progress)

@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.perception import PerceptionSettings
 from visadapt.learning.policy import TuneSettings
+from visadapt.learning.streams import EPISODE_STEPS, depends_on_time
+from visadapt.world import World
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,8 @@ class SetupSettings:
     """second training of the policy in the source, after `source`: near rest, say, where it is scored"""
     named: TuneSettings | None = None
     """tuning of the policy in the source with named effects and without a residual; None: as `tuning`"""
+    unforeseen: TuneSettings | None = None
+    """tuning with named effects of which some change over time, which no plan foresees; None: as `named`"""
     perception: PerceptionSettings | None = None
     """training of the frame encoder, where the policy is shown frames"""
 
@@ -46,11 +51,15 @@ class SetupSettings:
             finer = replace(finer, iterations=min(iterations, finer.iterations))
         return replace(self, source=replace(self.source, iterations=iterations), refinement=finer)
 
-    @property
-    def with_names(self) -> TuneSettings:
-        """Tuning where all effects are named. No start is a recorded one: named effects hold in every state, a residual
+    def with_names(self, source: World) -> TuneSettings:
+        """Tuning in a source that has named effects alone. No start is recorded: these hold in every state, a residual
         only near the recorded ones."""
-        return replace(self.named or self.tuning, recorded=0.0)
+        own = self.named or self.tuning
+        if self.unforeseen is not None:
+            times = source.period * torch.arange(EPISODE_STEPS)
+            state, _ = own.task.training_start(1, 0.0, torch.Generator().manual_seed(0))
+            own = self.unforeseen if depends_on_time(source, times, state) else own
+        return replace(own, recorded=0.0)
 
     def numbers(self) -> dict[str, Any]:
         """All of them as JSON takes them, for a run's folder; a task's tensors, such as references, are left out."""

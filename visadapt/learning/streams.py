@@ -94,7 +94,7 @@ class Streams:
             else:
                 times, state = self.windows.time, self.windows.state[:1]
                 self._recorded = self.windows.start(self.world) if self.recorded > 0 else None
-            self._times = times if _depends_on_time(self.world, times.unique(), state) else None
+            self._times = times if depends_on_time(self.world, times.unique(), state) else None
 
     @torch.no_grad()
     def start(self, progress: float, generator: torch.Generator) -> None:
@@ -164,7 +164,7 @@ def look(
     return world.measure(at, generator) if observe is None else world.show(at, observe, generator)
 
 
-def _depends_on_time(world: World, time: Tensor, state: Tensor) -> bool:
+def depends_on_time(world: World, time: Tensor, state: Tensor) -> bool:
     """Whether a step from the state (1, n_state) under one command differs between the times (T,) in s."""
     state = state.expand(len(time), -1)
     command = torch.full((len(time), world.substeps, len(world.system.actions)), PROBE).to(state)

@@ -87,9 +87,14 @@ def from_states(source: World) -> SetupSettings:
 
 
 def from_frames(source: World) -> SetupSettings:
-    """Settings for the cart-pole that is shown frames, with the cost-to-go of a source."""
+    """Settings for the cart-pole that is shown frames, with the cost-to-go of a source.
+
+    In closed loop each imagined step is rendered. It pays under forces that change over time; under dry friction plans
+    do better.
+    """
     own = _settings(TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500), _near_rest(source))
-    return replace(own, observations="camera", perception=PerceptionSettings())
+    unforeseen = replace(own.tuning, streams=None, every=1, batch=16, iterations=250, closed_loop=True)
+    return replace(own, unforeseen=unforeseen, observations="camera", perception=PerceptionSettings())
 
 
 def cartpole_states(
@@ -190,6 +195,7 @@ def _narrowed(settings: SetupSettings, renderer: LayeredRenderer) -> SetupSettin
         refinement=narrowed(settings.refinement) if settings.refinement else None,
         tuning=narrowed(settings.tuning),
         named=narrowed(settings.named) if settings.named else None,
+        unforeseen=narrowed(settings.unforeseen) if settings.unforeseen else None,
         perception=perception,
     )
 

@@ -182,8 +182,9 @@ def adapt(
     if iterations is not None:
         own = setup.settings
         ground = replace(own.ground, steps=min(own.ground.steps, iterations))
-        named = replace(own.named or own.tuning, iterations=iterations)
-        settings = replace(own, tuning=replace(own.tuning, iterations=iterations), named=named, ground=ground)
+        named, unforeseen = (each and replace(each, iterations=iterations) for each in (own.named, own.unforeseen))
+        tuning = replace(own.tuning, iterations=iterations)
+        settings = replace(own, tuning=tuning, named=named, unforeseen=unforeseen, ground=ground)
         setup = replace(setup, settings=settings)
     policy = copy.deepcopy(policy)
     if target is None:
