@@ -1,10 +1,10 @@
 """PPO of stable-baselines3 (Raffin et al. 2021), pretrained in the source, then fine-tuned in the target.
 
 The reward of a step is exp(-cost), the cost being the squared distances from rest with the weights of `COST`: between 0
-and 1, so that to stay up always pays. Settings are the library's
-defaults, but for many machines at once, larger batches for speed, and a smaller first deviation of the commands, whose
-full range throws the pole; none is tuned further. In the source the checkpoint that does best there is kept (A.3); in
-the target the policy is scored as it stands. Its first update is after 2,048 samples: before, it is the source's.
+and 1, so that to stay up always pays. Settings are the library's defaults, but for many machines at once, larger
+batches for speed, and a smaller first deviation of the commands, whose full range throws the pole; none is tuned
+further. In the source the checkpoint that does best there is kept (A.3); in the target the policy is scored as it
+stands. Its first update is after 2,048 samples: before, it is the source's.
 """
 
 from __future__ import annotations
