@@ -12,7 +12,13 @@ from torch import Tensor
 from visadapt.effects import ActuationEffect, Effect
 from visadapt.effects.late_sensors import LateSensors
 from visadapt.estimation.late_readings import Past, reading
-from visadapt.estimation.linearise import linearise_reading, linearise_step, parameter_steps, search_range
+from visadapt.estimation.linearise import (
+    linearise_reading,
+    linearise_step,
+    load_effect,
+    parameter_steps,
+    search_range,
+)
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
@@ -122,6 +128,11 @@ class CandidateModel:
         acting = self._acting(every[:1])[0].mean(2)[episode, before].unflatten(2, (-1, together)).mean(3)
         held = rows.held[episode, before].unflatten(2, (-1, together)).sum(3)
         return Past(rows.time[:, chosen].flatten(), acting.flatten(0, 1), held.flatten(0, 1))
+
+
+def with_loads(model: CandidateModel, accuracy: int) -> CandidateModel:
+    """The set of a model with a constant load on each degree of freedom, whose values are its last parameters."""
+    return CandidateModel(model.system, [*model.effects, load_effect(type(model.system))], model.rows, accuracy)
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, SensingEffect
-from visadapt.estimation.candidate import COARSEST, SHORT_PERIOD, CandidateModel
+from visadapt.estimation.candidate import COARSEST, SHORT_PERIOD, CandidateModel, with_loads
 from visadapt.estimation.kalman import forward, respond
 from visadapt.estimation.likelihood import FitState, linear_problem, variances
-from visadapt.estimation.linearise import integrate, linearise_step, load_effect
+from visadapt.estimation.linearise import integrate, linearise_step
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
+from visadapt.world import WorldState
 
 
 class Innovations:
@@ -118,23 +119,29 @@ class Sensitivity:
             read = model.measure(theta, state.expand(len(theta), *state.shape))
             reading = -(read[1:] - read[:1]).movedim(0, -1) * rows.used[..., None]
             return self.innovations.response(torch.zeros_like(state[:, 1:, :, None]), reading)
-        acted = model.commands(theta if model.acting_parameters else theta[:1])[:, :, :-1]
-        if rows.period <= SHORT_PERIOD and issubclass(effect, ActuationEffect):
-            mean = acted.mean(3)
+        linear = rows.period <= SHORT_PERIOD
+        if linear and issubclass(effect, ActuationEffect):
+            mean = self._acted(model, theta).mean(3)
             drive = torch.einsum("wtna,mwta->wtnm", self._slopes[0], mean[1:] - mean[:1])
-        elif rows.period <= SHORT_PERIOD and issubclass(effect, DynamicsEffect) and effect.only_loads():
-            load = self._loads(effect, theta[:, -count_own:])
+        elif linear and issubclass(effect, DynamicsEffect) and effect.only_loads():
+            load = self._loads(model, theta)
             drive = torch.einsum("wtnl,mwtl->wtnm", self._slopes[1], load[1:] - load[:1])
         else:
-            after = self._after(model, theta, acted)
+            after = self._after(model, theta)
             drive = (after[1:] - after[:1]).movedim(0, -1)
         drive = drive * rows.inside[:, 1:, None, None]
         return self.innovations.response(drive, torch.zeros_like(rows.measured[..., None]))
 
-    def _after(self, model: CandidateModel, theta: Tensor, acted: Tensor) -> Tensor:
-        """(M, W, T - 1, n) the states a period after each row with parameters (M, P), under what acts."""
+    def _acted(self, model: CandidateModel, theta: Tensor) -> Tensor:
+        """What acts of the commands after each row with parameters (M, P): (M, W, T - 1, substeps, n_action), or one
+        for all where it does not depend on them."""
+        return model.commands(theta if model.acting_parameters else theta[:1])[:, :, :-1]
+
+    def _after(self, model: CandidateModel, theta: Tensor) -> Tensor:
+        """(M, W, T - 1, n) the states a period after each row with parameters (M, P)."""
         rows, state, count = self.rows, self.fits.state[0], len(theta)
         windows, length = rows.shape
+        acted = self._acted(model, theta)
 
         def spread(x: Tensor) -> Tensor:
             return x[None].expand(count, *x.shape).reshape(-1, *x.shape[2:])
@@ -152,23 +159,21 @@ class Sensitivity:
     def _slopes(self) -> tuple[Tensor, Tensor]:
         """Change of the state after a period per unit of a command that acts over it, (W, T - 1, n, n_action), and per
         unit of a load, (W, T - 1, n, n_load)."""
-        loads = load_effect(type(self.system))
-        model = CandidateModel(self.system, [*self.effects, loads], self.rows, COARSEST)
-        count, state = len(loads.table), self.fits.state[0]
+        bare = CandidateModel(self.system, self.effects, self.rows, COARSEST)
+        model, count, state = with_loads(bare, COARSEST), len(self.system.loads), self.fits.state[0]
         theta = torch.cat((self.fits.theta[0], torch.zeros(count, dtype=torch.float64)))
-        acted = model.commands(theta[None])[0, :, :-1].flatten(0, 1)
+        acted = self._acted(model, theta[None])[0].flatten(0, 1)
         time, duration = (x[:, :-1].flatten() for x in (self.rows.time, self.rows.duration))
-        step = linearise_step(
-            model.at(theta), theta, time, state[:, :-1].flatten(0, 1), acted, False, True, duration=duration
-        )
+        args = (model.at(theta), theta, time, state[:, :-1].flatten(0, 1), acted)
+        step = linearise_step(*args, by_state=False, by_command=True, duration=duration)
         shape = (self.rows.shape[0], -1)
         return step.by_command.unflatten(0, shape), step.by_parameter[..., -count:].unflatten(0, shape)
 
-    def _loads(self, effect: type[DynamicsEffect], values: Tensor) -> Tensor:
-        """(M, W, T - 1, n_load) the loads of an effect with parameters (M, P) in the middle of every period."""
-        rows, state, count = self.rows, self.fits.state[0], len(values)
+    def _loads(self, model: CandidateModel, theta: Tensor) -> Tensor:
+        """(M, W, T - 1, n_load) the loads of all effects with parameters (M, P) in the middle of every period."""
+        rows, state, count = self.rows, self.fits.state[0], len(theta)
         time = (rows.time[:, :-1] + rows.duration[:, :-1] / 2).flatten()
         middle = ((state[:, :-1] + state[:, 1:]) / 2).flatten(0, 1)
-        acting = effect(**{p.name: 0.0 for p in effect.table}).with_values(values.repeat_interleave(len(time), 0))
-        out = acting.load(time.repeat(count), middle.repeat(count, 1), self.system)
+        world = model.at(theta.repeat_interleave(len(time), 0))
+        out = world.load(WorldState(time.repeat(count), middle.repeat(count, 1), ()))
         return out.unflatten(0, (count, rows.shape[0], -1))

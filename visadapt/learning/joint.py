@@ -167,10 +167,9 @@ def adapt(
             policy.load_state_dict(start, strict=False)
         world, how, trust = grounded, settings.tuning, settings.trust
         if found.complete:
-            # Without a gap there is nothing to tune for.
-            how = settings.with_names(known)
-            how = how if len(known.effects) else replace(how, iterations=0)
-            world, trust = known, 1.0
+            world, how, trust = known, settings.with_names(known), 1.0
+            if not len(known.effects):
+                how = replace(how, iterations=0)  # without a gap there is nothing to tune for
         progress = staged(report, f"{name}: tune")
         tuning = _tune(tuned, policy, start, trust, world, observe, how, drawn[2], windows, progress)
         rounds.append(Round(ledger.used, grounding, tuning, found))

@@ -63,16 +63,18 @@ class ClosedLoop(Plans):
 
     def loss(self, iteration: int, progress: float) -> Tensor:
         streams, now = self.streams, self.streams.now
-        at, history, first, states, actions = now.at, now.history, now.at, [], []
+        at, history, first = now.at, now.history, now.at
+        states: list[Tensor] = []
+        actions: list[Tensor] = []
         for k in range(HORIZON):
-            action = self.policy.act(self.seen(history))
-            at = streams.world.step(at, action, history)
+            if k > 0:
+                seen, at = look(streams.world, streams.observe, at, self.generator)
+                history = history.acting(actions[-1]).observing(streams.task.show(seen, now.task_state))
+            actions.append(self.policy.act(self.seen(history)))
+            at = streams.world.step(at, actions[-1], history)
             states.append(at.state)
-            actions.append(action)
             if k == 0:
                 first = at
-            seen, at = look(streams.world, streams.observe, at, self.generator)
-            history = history.acting(action).observing(streams.task.show(seen, now.task_state))
         loss = streams.task.cost(torch.stack(states, 1), torch.stack(actions, 1), now.at.state, now.task_state).mean()
         streams.advance(first, actions[0].detach(), progress, self.generator)
         return loss

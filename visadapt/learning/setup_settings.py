@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.perception import PerceptionSettings
 from visadapt.learning.policy import TuneSettings
-from visadapt.learning.streams import EPISODE_STEPS, depends_on_time
+from visadapt.learning.streams import an_episode, depends_on_time
 from visadapt.world import World
 
 
@@ -55,11 +55,14 @@ class SetupSettings:
         """Tuning in a source that has named effects alone. No start is recorded: these hold in every state, a residual
         only near the recorded ones."""
         own = self.named or self.tuning
-        if self.unforeseen is not None:
-            times = source.period * torch.arange(EPISODE_STEPS)
-            state, _ = own.task.training_start(1, 0.0, torch.Generator().manual_seed(0))
-            own = self.unforeseen if depends_on_time(source, times, state) else own
+        if self.unforeseen is not None and depends_on_time(source, *an_episode(source, own.task)):
+            own = self.unforeseen
         return replace(own, recorded=0.0)
+
+    def with_tuning(self, change: Callable[[TuneSettings], TuneSettings]) -> SetupSettings:
+        """The same with a change to every way in which the policy is tuned after its training in the source."""
+        named, unforeseen = (None if each is None else change(each) for each in (self.named, self.unforeseen))
+        return replace(self, tuning=change(self.tuning), named=named, unforeseen=unforeseen)
 
     def numbers(self) -> dict[str, Any]:
         """All of them as JSON takes them, for a run's folder; a task's tensors, such as references, are left out."""

@@ -89,8 +89,7 @@ class Streams:
         self._recorded: WorldState | None = None
         with torch.no_grad():
             if self.windows is None:
-                times = self.world.period * torch.arange(EPISODE_STEPS)
-                state, _ = self.task.training_start(1, 0.0, torch.Generator().manual_seed(0))
+                times, state = an_episode(self.world, self.task)
             else:
                 times, state = self.windows.time, self.windows.state[:1]
                 self._recorded = self.windows.start(self.world) if self.recorded > 0 else None
@@ -162,6 +161,12 @@ def look(
     what the sensors measure.
     """
     return world.measure(at, generator) if observe is None else world.show(at, observe, generator)
+
+
+def an_episode(world: World, task: Task) -> tuple[Tensor, Tensor]:
+    """Times (T,), in s, of the rows of an episode, and a state (1, n_state) in which one may start."""
+    state, _ = task.training_start(1, 0.0, torch.Generator().manual_seed(0))
+    return world.period * torch.arange(EPISODE_STEPS), state
 
 
 def depends_on_time(world: World, time: Tensor, state: Tensor) -> bool:

@@ -191,12 +191,9 @@ def _narrowed(settings: SetupSettings, renderer: LayeredRenderer) -> SetupSettin
     own = settings.perception or PerceptionSettings()
     perception = replace(own, cart=replace(own.cart, reach=share * own.cart.reach))
     return replace(
-        settings,
+        settings.with_tuning(narrowed),
         source=narrowed(settings.source),
         refinement=narrowed(settings.refinement) if settings.refinement else None,
-        tuning=narrowed(settings.tuning),
-        named=narrowed(settings.named) if settings.named else None,
-        unforeseen=narrowed(settings.unforeseen) if settings.unforeseen else None,
         perception=perception,
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import tempfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import overload
 
@@ -182,10 +183,8 @@ def adapt(
     if iterations is not None:
         own = setup.settings
         ground = replace(own.ground, steps=min(own.ground.steps, iterations))
-        named, unforeseen = (each and replace(each, iterations=iterations) for each in (own.named, own.unforeseen))
-        tuning = replace(own.tuning, iterations=iterations)
-        settings = replace(own, tuning=tuning, named=named, unforeseen=unforeseen, ground=ground)
-        setup = replace(setup, settings=settings)
+        shorter = own.with_tuning(partial(replace, iterations=iterations))
+        setup = replace(setup, settings=replace(shorter, ground=ground))
     policy = copy.deepcopy(policy)
     if target is None:
         setup.tune(policy, seed, report)

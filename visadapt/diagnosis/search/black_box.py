@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from visadapt.diagnosis.search.unexplained import loads_of, variables_of, with_loads
-from visadapt.estimation.candidate import COARSE, CandidateModel
+from visadapt.diagnosis.search.unexplained import loads_of, variables_of
+from visadapt.estimation.candidate import COARSE, CandidateModel, with_loads
 from visadapt.estimation.kalman import forward, respond
 from visadapt.estimation.likelihood import MIN_LOG_PROCESS, FitState, linear_problem, variances
 from visadapt.world import World

@@ -15,9 +15,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from visadapt.estimation.candidate import FINE, CandidateModel, linearise
+from visadapt.estimation.candidate import FINE, CandidateModel, linearise, with_loads
 from visadapt.estimation.likelihood import FitState
-from visadapt.estimation.linearise import load_effect
 from visadapt.estimation.sensitivity import Innovations
 
 BUMPS = 10  # Gaussian bumps of a function
@@ -98,11 +97,6 @@ def loads_of(model: CandidateModel, fits: FitState) -> Tensor:
     count = len(model.system.loads)
     theta = torch.cat((fits.theta[0, : len(model.table)], torch.zeros(count, dtype=torch.float64)))
     return linearise(with_loads(model, FINE), theta, fits.state[0]).by_parameter[..., -count:]
-
-
-def with_loads(model: CandidateModel, accuracy: int) -> CandidateModel:
-    """The set of a model with a constant load on each degree of freedom, whose values are its last parameters."""
-    return CandidateModel(model.system, [*model.effects, load_effect(type(model.system))], model.rows, accuracy)
 
 
 def _bumps(values: Tensor, inside: Tensor) -> Tensor:
