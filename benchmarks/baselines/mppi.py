@@ -1,8 +1,11 @@
 """Model predictive path integral control (Williams et al. 2017) on the source, then with the residual of ours.
 
-At each step N plans are drawn about the last one, carried out in the simulator, and averaged with weights
-exp(-cost / TEMPERATURE). Noise (0.03, 0.1, 0.3) and temperature (1, 0.1, 0.01) were compared in the source, on ten
-episodes of the tuning seed: the slowest cart was kept.
+At each step, ITERATIONS times, PLANS plans are drawn about the last one, carried out in the simulator, and averaged
+with weights exp(-cost / TEMPERATURE). Compared in the source, as it is and under a known force of 5 N, on ten episodes
+of the tuning seed: noise 0.03, 0.06, 0.1 and 0.3, temperature 0.03 to 100, 128 to 2,048 plans, 1, 3 and 5 iterations.
+The slowest cart among those that lose no episode was kept. With one iteration, as usual, 7 of 10 were lost under the
+known force: an episode begins with plans of zeros, and noise that is small enough to rest with takes too long to leave
+them.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from visadapt.learning.plans import imagine
 from visadapt.policies import Policy
 from visadapt.world import World
 
-PLANS = 128
+PLANS, ITERATIONS = 512, 3
 NOISE = 0.03
 TEMPERATURE = 0.1
 
@@ -36,15 +39,16 @@ class PathIntegral(Policy):
 
     @torch.no_grad()
     def act(self, history: History) -> Tensor:
-        self.last = mean = carried(self.last, history)
-        noise = NOISE * torch.randn(len(mean), PLANS, *mean.shape[1:], generator=self.generator)
-        plans = (mean[:, None] + noise).clamp(-1, 1)
+        self.last = carried(self.last, history)
         many = history.map(lambda tensor: tensor.repeat_interleave(PLANS, 0))
         now = many.observations[:, -1]
-        states, _ = imagine(self.world, None, self.world.start(now), many, plans.flatten(0, 1))
-        cost = COST(states, plans.flatten(0, 1), now).unflatten(0, (-1, PLANS))
-        weight = torch.softmax(-cost.nan_to_num(1e9, 1e9) / TEMPERATURE, 1)
-        self.last = (weight[..., None, None] * plans).sum(1)
+        for _ in range(ITERATIONS):
+            noise = NOISE * torch.randn(len(self.last), PLANS, *self.last.shape[1:], generator=self.generator)
+            plans = (self.last[:, None] + noise).clamp(-1, 1)
+            states, _ = imagine(self.world, None, self.world.start(now), many, plans.flatten(0, 1))
+            cost = COST(states, plans.flatten(0, 1), now).unflatten(0, (-1, PLANS))
+            weight = torch.softmax(-cost.nan_to_num(1e9, 1e9) / TEMPERATURE, 1)
+            self.last = (weight[..., None, None] * plans).sum(1)
         return self.last[:, 0]
 
 

@@ -40,7 +40,7 @@ BASELINES = {
     "mppi": "MPPI, residual",
     "pets": "PETS",
     "ppo": "PPO",
-    "integral": "integral feedback",
+    "observer": "disturbance observer",
     "randomised": "domain randomisation",
 }
 """Module of this room: method in the table"""
