@@ -33,7 +33,7 @@ class CameraEffect(Effect):
     >>> import torch, visadapt as va
     >>> world = va.World(va.CartPole(), [va.effects.Brightness(gain=0.5, offset=0.1)])
     >>> frame, _ = world.show(world.start(torch.zeros(1, 4)), lambda state: torch.ones(len(state), 4, 6))
-    >>> frame.shape, round(float(frame[0, 0, 0]), 3)
+    >>> frame.shape, round(frame[0, 0, 0].item(), 3)
     (torch.Size([1, 4, 6]), 0.6)
     """
 
