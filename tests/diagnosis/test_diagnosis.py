@@ -194,12 +194,17 @@ def test_velocities_differentiated_from_positions_are_left_out():
     assert prepared.rows.channels == (0, 2)
 
 
-def test_an_angle_of_opposite_sign_is_inverted():
-    whole = record([ViscousFriction(coefficient=0.8)])
-    turned = tuple(Episode(e.time, e.action, e.state * np.array([1.0, -1.0])) for e in whole.episodes)
-    result = diagnose(dataclasses.replace(whole, episodes=turned), SOURCE)
-    assert any("the angle" in warning for warning in result.warnings)
-    assert names(result) == {"viscous_friction"}
+@pytest.mark.parametrize(
+    ("name", "states", "command"), [("angle", (1, -1), 1), ("command", (1, 1), -1), ("position", (-1, 1), 1)]
+)
+def test_a_quantity_of_opposite_sign_is_inverted_and_the_cause_keeps_its_own(name, states, command):
+    whole = record([ConstantForce(force=1.0)])
+    turned = tuple(Episode(e.time, command * e.action, e.state * np.array(states)) for e in whole.episodes)
+    few = [ConstantForce, ViscousFriction, AngleOffset]
+    result = diagnose(dataclasses.replace(whole, episodes=turned), SOURCE, catalogue=few)
+    assert any(f"the {name} has the opposite sign" in warning for warning in result.warnings)
+    assert names(result) == {"constant_force"}
+    assert result.causes[0].parameters["force"].value == pytest.approx(1.0, rel=0.05)
 
 
 def test_an_effect_of_the_users_own_is_found():

@@ -8,7 +8,7 @@ import torch
 
 from tests.diagnosed import record
 from visadapt.diagnosis.search.preparation import prepare
-from visadapt.diagnosis.search.sensor_checks import derived_velocities
+from visadapt.diagnosis.search.sensor_checks import between, derived_velocities, shortest_arc
 from visadapt.effects import ViscousFriction
 from visadapt.estimation.segments import cut
 from visadapt.recordings import Episode
@@ -87,3 +87,10 @@ def test_whole_episodes_are_in_the_sources_signs_with_lost_readings_filled_in():
         expected[20] = (expected[19] + expected[21]) / 2
         np.testing.assert_allclose(found.state, expected)
         np.testing.assert_array_equal(found.action, episode.action)
+
+
+def test_an_arc_of_angles_may_hold_the_hanging_pole():
+    assert shortest_arc([0, 1, 61, 62], 63) == (61, 64)
+    assert shortest_arc([5, 7], 63) == (5, 7)
+    assert shortest_arc([4], 63) == (4, 4)
+    assert between(torch.tensor([3.1, -3.1, 3.3 + 2 * torch.pi, 2.9, 0.0]), 3.0, 3.4).tolist() == [1, 1, 1, 0, 0]

@@ -18,8 +18,8 @@ class Convention:
     """Signs with which a recording may differ from the source."""
 
     name: str  # the quantity of opposite sign, as the warning calls it
-    angle: float  # factor of the angle and its rate: 1 or -1
-    command: float  # factor of the command: 1 or -1
+    columns: Columns  # states that change sign
+    command: float = 1.0  # factor of the command: 1 or -1
 
 
 @dataclass(frozen=True)
@@ -88,10 +88,9 @@ _CART_POLE = SystemProfile(
     smooth_function_factors={"cart_force": (None, "x_dot", "command"), "pivot_torque": (None, "theta_dot")},
     angle_sensor=(2, 3),
     sign_conventions=(
-        Convention("the angle", -1, 1),
-        Convention("the command", 1, -1),
-        # By the mirror symmetry of the cart-pole, a position of opposite sign is angle and command of opposite sign.
-        Convention("the position", -1, -1),
+        Convention("the angle", (2, 3)),
+        Convention("the command", (), -1.0),
+        Convention("the position", (0, 1)),
     ),
 )
 

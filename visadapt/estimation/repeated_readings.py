@@ -135,9 +135,11 @@ def _unless_by_chance(equal: list[Tensor], expected: float) -> list[Tensor]:
 def zone(repeated: Tensor, angle: Tensor, deviation: float) -> tuple[Tensor, Tensor]:
     """Start and end (2,) in rad of the zone of angles in which a sensor stands still, and their standard deviations.
 
-    Given whether each of N readings is `repeated`, and their estimated angles with a normal error of `deviation` rad.
-    Posterior mean over a grid of both edges, with a uniform prior; then over a finer grid around it.
+    Given whether each of N readings is `repeated`, and their estimated angles, whole turns apart or not, with a normal
+    error of `deviation` rad. Posterior mean over a grid of both edges, with a uniform prior; then over a finer grid
+    around it.
     """
+    angle = torch.atan2(angle.sin(), angle.cos())
     inside = angle[repeated]
     # An edge may lie anywhere between the last angle with a repeated reading and the next without.
     least, most, middle = inside.min(), inside.max(), float(inside.median())

@@ -87,7 +87,9 @@ def cut(
         stretches: the parts to use, as (episode index, first row, row past the last); whole episodes by default.
     """
     pieces = []
-    for index, begin, end in stretches or [(k, 0, len(values)) for k, values in enumerate(measured)]:
+    if stretches is None:
+        stretches = [(k, 0, len(values)) for k, values in enumerate(measured)]
+    for index, begin, end in stretches:
         count = -(-(end - begin) // longest)
         edges = torch.linspace(begin, end, count + 1).round().long().tolist()
         pieces += [(index, a, b) for a, b in pairwise(edges)]

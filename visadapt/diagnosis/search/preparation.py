@@ -14,7 +14,7 @@ from visadapt.diagnosis.search.heldout import PREDICTION_TIME
 from visadapt.diagnosis.search.search import Search
 from visadapt.effects import Effect
 from visadapt.estimation.likelihood import FitState
-from visadapt.estimation.profiles import profile_of
+from visadapt.estimation.profiles import Convention, profile_of
 from visadapt.estimation.repeated_readings import RepeatedReadings, find_repeats
 from visadapt.estimation.segments import Segments, cut
 from visadapt.recordings import Recording
@@ -36,6 +36,8 @@ class PreparedRecording:
     warnings: tuple[str, ...]
     source: FitState | None = None  # the fit of the source to the windows searched, if a check needed it
 
+
+AS_SOURCE = Convention("nothing", ())
 
 MIN_JITTER = 1e-3
 """Deviation of stamps from even spacing, in periods, above which a fit decides whether the readings share it."""
@@ -121,17 +123,17 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
             warnings.append("the stamps jitter, the readings do not: they were taken to be evenly spaced")
         source = fitted if len(kept) == len(channels) else None
 
-    def whole(angle: float = 1.0, command: float = 1.0) -> Recording:
-        signs = torch.tensor([angle if channel in profile.angle_sensor else 1.0 for channel in channels]).double()
+    def whole(convention: Convention) -> Recording:
+        sign = sensor_checks.signs(convention, channels)
         parts = zip(recording.episodes, stamps, commands, states, repeats.used, strict=True)
-        episodes = [
-            replace(e, time=time.numpy(), action=(command * u).numpy(), state=(signs * _filled(x, used, time)).numpy())
-            for e, time, u, x, used in parts
-        ]
+        episodes = []
+        for episode, time, command, state, used in parts:
+            action, filled = (convention.command * command).numpy(), (sign * _filled(state, used, time)).numpy()
+            episodes.append(replace(episode, time=time.numpy(), action=action, state=filled))
         return replace(recording, episodes=tuple(episodes))
 
     if not profile.check_sensors:
-        return PreparedRecording(rows, raw, whole(), searched(rows), repeats, None, tuple(warnings), source)
+        return PreparedRecording(rows, raw, whole(AS_SOURCE), searched(rows), repeats, None, tuple(warnings), source)
     unchecked, first = rows, source or source_fit(rows)
     defect = sensor_checks.angle_defect(system, rows.select(searched(rows)), first)
     band = None
@@ -139,11 +141,12 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
         band, full_turns = defect
         angle = channels.index(profile.angle_sensor[0])
         bad = [sensor_checks.between(values[:, angle], *band) for values in states]
-        if full_turns:
+        stretches = sensor_checks.stretches_without(bad)
+        if full_turns and stretches:
             # A potentiometer's dead zone has an unknown width, so windows end at it, and the angle runs from one of its
             # edges to the other, so that an error of the sensor's scale is symmetric about upright.
             states = [sensor_checks.on_one_turn(values, angle, 0.5 * (band[0] + band[1])) for values in states]
-            rows, raw = windows(states, stamps, sensor_checks.stretches_without(bad))
+            rows, raw = windows(states, stamps, stretches)
         else:
             rows = sensor_checks.without_angles(rows, profile.angle_sensor, *band)
         warnings.append(
@@ -162,11 +165,10 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
     source = first if rows is unchecked else None
     convention = sensor_checks.opposite_signs(system, rows.select(searched(rows)), catalogue, first, source)
     if convention is not None:
-        rows, raw = (sensor_checks.to_source(each, convention, profile.angle_sensor) for each in (rows, raw))
+        rows, raw = (sensor_checks.to_source(each, convention) for each in (rows, raw))
         source = None
-        if band is not None and convention.angle < 0:
+        if band is not None and profile.angle_sensor[0] in convention.columns:
             band = (-band[1], -band[0])
         warnings.append(f"{convention.name} has the opposite sign of the source's; it was inverted")
-    signs = (1.0, 1.0) if convention is None else (convention.angle, convention.command)
-    intact = None if defect is not None else whole(*signs)
+    intact = None if defect is not None else whole(convention or AS_SOURCE)
     return PreparedRecording(rows, raw, intact, searched(rows), repeats, band, tuple(warnings), source)

@@ -93,4 +93,4 @@ def _zone(recording: PreparedRecording, search: Search, comparison: ModelCompari
     channel = rows.channels.index(search.profile.angle_sensor[0])
     deviation = SMOOTHING_RATIO * float((fits.log_noise[0, channel] / 2).exp())
     angle = fits.state[0, ..., search.profile.angle_sensor[0]][inside]
-    return zone(_in_windows(rows, recording.repeats.frozen)[inside], torch.atan2(angle.sin(), angle.cos()), deviation)
+    return zone(_in_windows(rows, recording.repeats.frozen)[inside], angle, deviation)

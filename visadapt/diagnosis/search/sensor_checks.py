@@ -55,7 +55,7 @@ def opposite_signs(
         return None
     required = MIN_GAIN_PER_READING * float(rows.used.sum())
     own = Search(system, rows, catalogue, fitted)
-    conventions = [to_source(rows, convention, profile.angle_sensor) for convention in profile.sign_conventions]
+    conventions = [to_source(rows, convention) for convention in profile.sign_conventions]
     others = [Search(system, each, catalogue, rival=_likelihood(own)) for each in conventions]
     best = max(range(len(others)), key=lambda k: _likelihood(others[k]))
     if _likelihood(others[best]) - _likelihood(own) <= required:
@@ -70,11 +70,15 @@ def _likelihood(search: Search) -> float:
     return float(search.best.fits.likelihood[0])
 
 
-def to_source(rows: Segments, convention: Convention, angle_sensor: Sequence[int]) -> Segments:
+def signs(convention: Convention, channels: Sequence[int]) -> Tensor:
+    """(m,) factors, 1 or -1, of these columns of the state from another convention to that of the source."""
+    return torch.tensor([-1.0 if channel in convention.columns else 1.0 for channel in channels], dtype=torch.float64)
+
+
+def to_source(rows: Segments, convention: Convention) -> Segments:
     """Rows of another convention in that of the source."""
-    signs = [convention.angle if channel in angle_sensor else 1.0 for channel in rows.channels]
-    sign = torch.tensor(signs, dtype=torch.float64)
-    return replace(rows, measured=rows.measured * sign, command=rows.command * convention.command)
+    measured = rows.measured * signs(convention, rows.channels)
+    return replace(rows, measured=measured, command=rows.command * convention.command)
 
 
 MAX_LAG = 0.2
@@ -109,13 +113,15 @@ def derived_velocities(system: System, rows: Segments) -> dict[str, float]:
     return out
 
 
-BAND = 0.1  # rad, width of the bands of angle that are tested
+BANDS = 63  # bands of equal width that the circle is tested in
+BAND = 2 * math.pi / BANDS  # rad, width of one
 
 POWER_RATIO = 25.0
 MIN_BAND_ROWS = 5
 MAX_ROWS_SHARE = 0.15
 """A band is defective if the mean square of the disturbance torque in it exceeds POWER_RATIO times the median
-over bands, on at least MIN_BAND_ROWS rows; all defective bands together hold at most MAX_ROWS_SHARE of the rows."""
+over bands, on at least MIN_BAND_ROWS rows; the arc that holds all defective bands has at most MAX_ROWS_SHARE of the
+rows."""
 
 FULL_TURN_SHARE = 0.8  # Share of the circle's bands that the pole visits, above which it turns all the way round
 
@@ -125,7 +131,8 @@ MIN_STRETCH_ROWS = 15  # Rows between two passes of a defective band for them to
 def angle_defect(system: System, rows: Segments, fits: FitState) -> tuple[tuple[float, float], bool] | None:
     """The band of angles where following the readings takes far greater torques than elsewhere, by the source's fit.
 
-    Its edges in rad, and whether the pole turns all the way round; None where there is no such band.
+    Its edges in rad, and whether the pole turns all the way round; None where there is no such band. The lower edge
+    lies in [-pi, pi], the upper one above it, so beyond pi where the band holds the hanging pole.
     """
     angle_sensor = profile_of(system).angle_sensor
     if not angle_sensor or float(fits.log_process[0, 1]) < SUSPICIOUS_LOG_PROCESS:
@@ -133,22 +140,33 @@ def angle_defect(system: System, rows: Segments, fits: FitState) -> tuple[tuple[
     found = disturbance(CandidateModel(system, (), rows), fits, fits.log_process)
     here = found.valid > 0
     theta = found.variables[system.states[angle_sensor[0]].name][here]
-    band = ((torch.atan2(theta.sin(), theta.cos()) + math.pi) / BAND).long()
+    band = ((theta + math.pi).remainder(2 * math.pi) / BAND).long().clamp(max=BANDS - 1)
     power = found.load[..., 1][here].square()
-    count = torch.zeros(int(2 * math.pi / BAND) + 1, dtype=power.dtype).index_add_(0, band, torch.ones_like(power))
+    count = torch.zeros(BANDS, dtype=power.dtype).index_add_(0, band, torch.ones_like(power))
     mean = torch.zeros_like(count).index_add_(0, band, power) / count.clamp(min=1)
     defective = (mean > POWER_RATIO * mean[count > 0].median()) & (count >= MIN_BAND_ROWS)
-    if not bool(defective.any()) or float(count[defective].sum()) > MAX_ROWS_SHARE * float(count.sum()):
+    if not bool(defective.any()):
         return None
-    bands = defective.nonzero()[:, 0]
-    low, high = (BAND * float(edge) - math.pi for edge in (bands.min(), bands.max() + 1))
-    return (low, high), float((count > 0).double().mean()) > FULL_TURN_SHARE
+    first, last = shortest_arc(defective.nonzero()[:, 0].tolist(), BANDS)
+    if float(count[torch.arange(first, last + 1) % BANDS].sum()) > MAX_ROWS_SHARE * float(count.sum()):
+        return None
+    edges = (BAND * first - math.pi, BAND * (last + 1) - math.pi)
+    return edges, float((count > 0).double().mean()) > FULL_TURN_SHARE
+
+
+def shortest_arc(members: Sequence[int], size: int) -> tuple[int, int]:
+    """First and last place of the shortest run round a circle of `size` places that holds all `members`, in ascending
+    order; the last is `size` or more where the run passes the end."""
+    onward = [*members[1:], members[0] + size]
+    k = max(range(len(members)), key=lambda k: onward[k] - members[k])
+    first = onward[k] % size
+    last = members[k]
+    return first, last if last >= first else last + size
 
 
 def between(theta: Tensor, low: float, high: float) -> Tensor:
-    """Whether angles, wrapped to [-pi, pi], lie between two others."""
-    wrapped = torch.atan2(theta.sin(), theta.cos())
-    return (wrapped >= low) & (wrapped <= high)
+    """Whether angles, whole turns apart or not, lie on the arc from `low` up to `high`, at most a turn above it."""
+    return (theta - low).remainder(2 * math.pi) <= high - low
 
 
 def on_one_turn(measured: Tensor, angle: int, edge: float) -> Tensor:
