@@ -141,18 +141,24 @@ def make(settings: Settings) -> list[Draft]:
 def _seek(searched: list[Draft], drafts: list[Draft], system: System, fly: Flyers, rounds: int = 5) -> None:
     """Bring strengths to their targets: sizes in proportion, within the bounds of their kinds."""
     for _ in range(rounds):
-        flown = _flown(drafts, system, fly, 2 * SUBSTEP)
-        gaps = _gaps(flown, system).reshape(len(drafts), EPISODES)
-        for k, (draft, own) in enumerate(zip(drafts, gaps, strict=True)):
-            draft.strength = float(np.sqrt(np.mean(own)))
-            if draft.loss_draws is not None:
-                states = flown.states[:, k * EPISODES : (k + 1) * EPISODES]
-                draft.strength = float(np.sqrt(np.mean(((_read(draft, states) - states) / NOISE) ** 2)))
+        _measure(drafts, system, fly)
         for draft in searched:
             assert draft.kind is not None
             if draft.strength > 0 and abs(np.log(draft.target / draft.strength)) > 0.1:
                 size = draft.size * draft.target / draft.strength
                 draft.size = float(np.clip(size, draft.size / 8, draft.size * 8).clip(draft.kind.low, draft.kind.high))
+    _measure(drafts, system, fly)
+
+
+def _measure(drafts: list[Draft], system: System, fly: Flyers) -> None:
+    """Set the strengths of drafts to those of their sizes."""
+    flown = _flown(drafts, system, fly, 2 * SUBSTEP)
+    gaps = _gaps(flown, system).reshape(len(drafts), EPISODES)
+    for k, (draft, own) in enumerate(zip(drafts, gaps, strict=True)):
+        draft.strength = float(np.sqrt(np.mean(own)))
+        if draft.loss_draws is not None:
+            states = flown.states[:, k * EPISODES : (k + 1) * EPISODES]
+            draft.strength = float(np.sqrt(np.mean(((_read(draft, states) - states) / NOISE) ** 2)))
 
 
 def _flown(drafts: list[Draft], system: System, fly: Flyers, h: float) -> Flights:

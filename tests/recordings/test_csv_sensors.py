@@ -97,17 +97,19 @@ def test_a_rate_that_never_changes_is_left_out(file, run, name):
 )
 def test_an_outlier_is_set_aside(file, run, name, value):
     recording = load(write(file, changed(run, **{name: at(50, value)})))
-    assert [episode.samples for episode in recording.episodes] == [49, 68]
+    (episode,), (usable,) = recording.episodes, recording.usable
+    assert np.flatnonzero(~usable).tolist() == [50]
     said = f"{file}: row 51 (line 52), column '{name}': {value:g}: lies far off the rows before and after: an outlier"
     assert recording.warnings[0].startswith(said)
-    together = np.concatenate([episode.state for episode in recording.episodes])
-    rest = np.delete(np.column_stack([run[one] for one in STATES]), 50, 0)
-    np.testing.assert_allclose(together, rest)
+    true = np.column_stack([run[one] for one in STATES])
+    np.testing.assert_allclose(episode.state[usable], true[usable])
+    np.testing.assert_allclose(episode.state[50], (true[49] + true[51]) / 2)
+    np.testing.assert_allclose(episode.action[:, 0], run["command"])
 
 
 def test_some_outliers_in_a_row(file, run):
     recording = load(write(file, changed(run, x=at(slice(50, 53), 120))))
-    assert [episode.samples for episode in recording.episodes] == [49, 66]
+    assert [np.flatnonzero(~usable).tolist() for usable in recording.usable] == [[50, 51, 52]]
     assert (
         "row 51 (line 52), column 'x': 120 and 2 more: lies far off the rows before and after" in recording.warnings[0]
     )

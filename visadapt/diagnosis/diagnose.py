@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -43,6 +44,8 @@ from visadapt.progress import Report, staged
 from visadapt.recordings import Recording
 from visadapt.systems import System
 from visadapt.world import World
+
+TOO_SHORT = "too short to hold a part of it out: the gap is that of the rows to which the causes were fitted"
 
 RUNNERS_UP = 2  # Sets after the best for which the share of the gap that they close is computed
 
@@ -141,7 +144,8 @@ def diagnose(
         source = errors_with_repeats(prepared, search)
     errors = Errors(source.rms(noise), reached, corrected.floor(noise), reached, noise)
     gap, improvable = errors.gap(), False
-    if gap.closed < MIN_GAP_CLOSED:  # else a black box cannot close enough of what is left
+    is_held_out = rows.shape[0] > 1
+    if is_held_out and gap.closed < MIN_GAP_CLOSED:  # else a black box cannot close enough of what is left
         black_box = heldout.beside_black_box(system, rows, best.effects, best.fits, jobs)
         best_reached = min((reached, black_box.rms(noise)), key=lambda error: float(heldout.overall(error)[-1]))
         errors = replace(errors, black_box=best_reached)
@@ -174,6 +178,7 @@ def diagnose(
         warnings=(
             *used.warnings,
             *prepared.warnings,
+            *(() if is_held_out else (f"{recording.sources[0]}: {TOO_SHORT}",)),
             *left_unexplained(comparison, verdict, unexplained, system),
             *at_bounds(comparison),
             *(f"{one.name}: {one.caveat}" for one in best.effects if one.caveat and one.name in carrying),
@@ -222,6 +227,6 @@ def _regions(
             start, end = (cause.parameters[edge.name] for edge in edges)
             variable = variables[start.unit]
             share = share_between(disturbance, variable, start.value, end.value)
-            fitted.append(Region(variable, start.value, end.value, share, 1 - cause.probability))
+            fitted.append(Region(variable, start.value, end.value, share, math.nan))
     taken = {region.variable for region in fitted}
     return (*fitted, *(one for one in regions_of(disturbance, seed) if one.variable not in taken))

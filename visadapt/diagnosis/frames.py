@@ -62,8 +62,8 @@ VAGUE = 3.0  # Standard deviation of a pose, over the median, above which a fram
 LEAST_EXPLAINED = 0.2
 """Share of the frames that the renderer must explain; below, it is taken to be of another scene."""
 
-LONGEST_MISS = 10
-"""Consecutive rows without a usable frame at which an episode is split: upright, errors grow by e in about 5 rows."""
+LONGEST_MISS = 0.5
+"""s without a usable frame after which an episode is split: upright, errors grow by e in about 0.25 s."""
 
 FEWEST_POSES = 5  # Usable frames of a part of an episode; parts with fewer are left out
 
@@ -241,7 +241,7 @@ def positions(recording: Recording, found: Sequence[Poses]) -> tuple[Recording, 
     frames: list[NDArray[np.uint8]] = []
     parts = zip(recording.episodes, places, explained, fresh, recording.sources, strict=True)
     for episode, place, used, first_seen, source in parts:
-        for first, last in _stretches(used):
+        for first, last in _stretches(used, recording.period):
             rows = slice(first, last)
             episodes.append(
                 replace(
@@ -277,8 +277,8 @@ def positions(recording: Recording, found: Sequence[Poses]) -> tuple[Recording, 
     return shown_in, frames
 
 
-def _stretches(used: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _stretches(used: NDArray[np.bool_], period: float) -> list[tuple[int, int]]:
     """First row and the row after the last of each part without long misses, from its first usable row to its last."""
     rows = np.flatnonzero(used)
-    cuts = [0, *(np.flatnonzero(np.diff(rows) > LONGEST_MISS) + 1), len(rows)]
+    cuts = [0, *(np.flatnonzero(np.diff(rows) * period > LONGEST_MISS * (1 + 1e-6)) + 1), len(rows)]
     return [(int(rows[a]), int(rows[b - 1]) + 1) for a, b in pairwise(cuts) if b - a >= FEWEST_POSES]

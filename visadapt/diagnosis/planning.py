@@ -136,7 +136,7 @@ def plan(
     if not recording.measured:
         raise ValueError("a plan needs a recording of states, not of frames")
     sets, system = explanations(found), source.system
-    noise, start = _noise_and_start(sets[0], recording, system)
+    noise, start, measured = _noise_and_start(sets[0], recording, system)
     generator = torch.Generator().manual_seed(seed)
     names, added = _excitations(system, recording.period, samples, generator)
     sizes = torch.tensor(SIZES, dtype=added.dtype)[:, None, None, None]
@@ -152,7 +152,7 @@ def plan(
     for done, k in enumerate(torch.nonzero(largest >= 0)[:, 0].tolist()):
         row = int(largest[k]) * len(names) + k
         runs = [(states[row], commands[row]) for (states, commands), _ in shown]
-        recordings = [_recording(recording, system, *each, noise) for each in runs]
+        recordings = [_recording(recording, system, measured, *each, noise) for each in runs]
         worth[k] = min(
             _lead(sets[truth], sets[other], recordings[truth], system)
             for rival in range(1, len(sets))
@@ -168,14 +168,21 @@ def plan(
     labels = tuple(tuple(effect.name for effect in each) for each in sets)
     commands = tuple(action.name for action in system.actions)
     white = [k for k, name in enumerate(names) if name.startswith("white")]
-    return Plan(labels, excitation, time, command, commands, float(worth[best]), float(worth[white].max()))
+    return Plan(labels, excitation, time, command, commands, float(worth[best]), _highest(worth[white]))
+
+
+def _highest(values: Tensor) -> float:
+    """The largest of values (N,) that are not NaN; NaN where none is."""
+    known = values[~values.isnan()]
+    return float(known.max()) if len(known) else math.nan
 
 
 def explanations(found: Diagnosis) -> list[list[Effect]]:
     """The effects of an ambiguous diagnosis, then these with one exchanged for another that fits equally well."""
     values = {cause.effect: {name: one.value for name, one in cause.parameters.items()} for cause in found.causes}
     alternatives = {cause.effect: cause.indistinguishable_from for cause in found.causes}
-    first = found.effects()
+    # Repeated readings are found in the readings themselves: no experiment tells more, and no model has them.
+    first = [effect for effect in found.effects() if not effect.repeats_readings]
     exchanged = [
         [*first[:k], EFFECTS[other](**values[other]), *first[k + 1 :]]
         for k, effect in enumerate(first)
@@ -195,15 +202,18 @@ def _start(source: FitState, effects: Sequence[Effect]) -> FitState:
     return fits
 
 
-def _noise_and_start(effects: Sequence[Effect], recording: Recording, system: System) -> tuple[Tensor, Tensor]:
-    """Standard deviations (n,) of the measurement noise, 0 of what was not measured, and the first state (n,)."""
+def _noise_and_start(
+    effects: Sequence[Effect], recording: Recording, system: System
+) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+    """Standard deviations (n,) of the measurement noise, 0 of what was not measured; the first state (n,); and the
+    columns of the state that were measured, without velocities that were derived."""
     classes = tuple(type(effect) for effect in effects)
     prepared = prepare(limited(recording, system), system, classes)
     models = FittedModels(system, prepared.rows, classes, prepared.source)
     fits = models.fit([(classes, _start(models.source.fits, effects))], CAREFUL)[0].fits
     noise = torch.zeros(len(system.states), dtype=torch.float64)
     noise[list(prepared.rows.channels)] = (fits.log_noise[0] / 2).exp()
-    return noise, fits.state[0, 0, 0]
+    return noise, fits.state[0, 0, 0], prepared.rows.channels
 
 
 def _excitations(system: System, period: float, samples: int, generator: torch.Generator) -> tuple[list[str], Tensor]:
@@ -264,14 +274,17 @@ def _simulate(
     return (torch.stack(readings, 1), torch.stack((*commands, 0 * commands[-1]), 1)), inside
 
 
-def _recording(like: Recording, system: System, states: Tensor, commands: Tensor, noise: Tensor) -> Recording:
-    """One simulated experiment, with the states that were measured, which are known to `noise` (n,)."""
-    measured = [system.index(name) for name in like.measured]
+def _recording(
+    like: Recording, system: System, measured: tuple[int, ...], states: Tensor, commands: Tensor, noise: Tensor
+) -> Recording:
+    """One simulated experiment, with these columns of the state, which are known to `noise` (n,)."""
+    columns = list(measured)
     time = like.period * np.arange(len(states))
-    episode = Episode(time, commands.numpy(), states[:, measured].numpy())
+    episode = Episode(time, commands.numpy(), states[:, columns].numpy())
     # A fit takes no noise below that of rounding: the readings have none, so it takes exactly this.
-    rounding = tuple((math.sqrt(12) * noise[measured]).tolist())
-    return Recording((episode,), like.measured, like.period, ("the simulated experiment",), resolution=rounding)
+    rounding = tuple((math.sqrt(12) * noise[columns]).tolist())
+    names = tuple(system.states[column].name for column in columns)
+    return Recording((episode,), names, like.period, ("the simulated experiment",), resolution=rounding)
 
 
 def _lead(truth: Sequence[Effect], other: Sequence[Effect], recording: Recording, system: System) -> float:

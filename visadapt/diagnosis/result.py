@@ -37,7 +37,9 @@ class Region:
     start: float  # the JSON's "from", in the variable's unit
     end: float  # the JSON's "to", in the variable's unit
     share: float  # of the gap that lies in it
-    p_value: float  # probability that chance concentrates as much of the gap in any interval that was tried
+    p_value: (
+        float  # probability that chance concentrates as much of the gap in any interval; NaN where a cause names it
+    )
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,8 @@ def verdict_of(
         improvable: a black box beside them clearly closes more of the gap.
         repeats: readings are repeated.
     """
+    if math.isnan(gap.closed) and not repeats:
+        return NO_GAP  # the source predicts as well as the noise allows
     if unexplained:
         # Where the noise is low, any model of a real machine leaves something significant: then the share of the gap
         # that is closed decides, otherwise whether what is unexplained is negligible.
@@ -50,8 +52,6 @@ def verdict_of(
         enough = gap.closed >= MIN_GAP_CLOSED if clear else comparison.negligible and not improvable
         if not (comparison.best.effects and enough):
             return UNEXPLAINED
-    elif math.isnan(gap.closed) and not repeats:
-        return NO_GAP  # the source predicts as well as the noise allows
     carrying = without_slight(explaining)
     if not carrying:
         return UNEXPLAINED if unexplained or gap.before > CLEAR_OF_NOISE * gap.floor else NO_GAP

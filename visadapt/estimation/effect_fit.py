@@ -151,7 +151,7 @@ def _best(
     iterations, care = effort
     models = [CandidateModel(system, effects, rows, care) for _ in starts]
     out = fit(models, stacked(starts), iterations)
-    return single_fit(out, int(out.likelihood.argmax()), len(models[0].table))
+    return single_fit(out, int(out.likelihood.nan_to_num(-math.inf).argmax()), len(models[0].table))
 
 
 def _within_a_turn(effect: type[Effect], values: Tensor) -> Tensor:

@@ -93,7 +93,7 @@ class FlightPanel:
             self.reference = self._smooth(places, slopes, np.arange(count) * INSTANT_PERIOD_S)
             self.goal = self.reference[: len(self.times)]
             self.away: Floats = np.linalg.norm(self.position - self.goal, axis=1)
-            at_rows = self.away[:: round(task.period / INSTANT_PERIOD_S)]
+            at_rows = np.linalg.norm(states[:, POSITION] - places[: len(states)], axis=1)
             self.score: Floats = np.concatenate([at_rows[:1], running_mean(at_rows[1:])])[self.rows]
             self.worst, self.passed = float(self.away.max()), self.end
             far = np.flatnonzero(self.away > FAR)

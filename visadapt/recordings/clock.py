@@ -37,6 +37,11 @@ PERIOD_RATIO = 1.5
 """Largest ratio between the periods of two episodes of one recording."""
 
 
+ROUNDING_ERROR = 0.55
+"""Largest deviation of rounded stamps from a steady clock, over the unit that they are rounded to: half of it, and what
+the fit of the clock adds."""
+
+
 @dataclass(frozen=True)
 class RawEpisode:
     """The rows of an episode as they were read: clock, order of columns and units are not checked yet."""
@@ -58,6 +63,8 @@ class RawEpisode:
     """of the episode, if the file has several"""
     frame: NDArray[np.uint8] | None = None
     """(T, H, W), where frames are read in the place of states"""
+    usable: NDArray[np.bool_] | None = None
+    """(T,) which rows are measurements; without it, all are"""
 
     @property
     def source(self) -> str:
@@ -83,8 +90,9 @@ class RawEpisode:
         rows = slice(start, end)
         time, action, state = self.time[rows], self.action[rows], self.state[rows]
         frame = None if self.frame is None else self.frame[rows]
+        usable = None if self.usable is None else self.usable[rows]
         place = lambda row: self.place(start + row)  # noqa: E731
-        return replace(self, time=time, action=action, state=state, frame=frame, place=place)
+        return replace(self, time=time, action=action, state=state, frame=frame, usable=usable, place=place)
 
 
 def check_forward(raw: RawEpisode) -> None:
@@ -154,7 +162,7 @@ def _clocked(part: RawEpisode, note: Note) -> RawEpisode:
         return part
     period, start = np.polyfit(index, part.time, 1)
     off = part.time - (start + period * index)
-    if np.abs(off).max() <= _rounding(part.time):
+    if np.abs(off).max() <= ROUNDING_ERROR * _rounding(part.time):
         return replace(part, time=part.time[0] + period * index)
     steps = np.diff(part.time)
     if np.ptp(steps) > UNSTEADY_PERIODS * period:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from visadapt.progress import Report, staged
 from visadapt.recordings.checks import check_commands, check_finite, check_units
@@ -97,11 +98,16 @@ def load_recording(
         measured=whole[0].measured,
         period=period,
         sources=tuple(part.source for part in parts),
+        usable=() if all(part.usable is None for part in parts) else tuple(map(_usable, parts)),
         warnings=tuple(
             f"{where[0]}{f' and {len(where) - 1} more' if len(where) > 1 else ''}: {text}"
             for text, where in places.items()
         ),
     )
+
+
+def _usable(part: RawEpisode) -> NDArray[np.bool_]:
+    return np.ones(len(part.time), bool) if part.usable is None else part.usable
 
 
 def _files(paths: Sequence[str | os.PathLike[str]], note: Note) -> list[Path]:

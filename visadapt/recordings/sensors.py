@@ -48,7 +48,9 @@ def differences(values: NDArray[np.float64], angle: bool) -> NDArray[np.float64]
 
 
 def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
-    """The episode without the rows of outliers: readings that jump away and back faster than the state can move.
+    """The episode with outliers marked as not usable: readings that jump away and back faster than the state can move.
+
+    Their rows keep time and command; their readings are interpolated.
 
     Raises:
         RecordingError: more than `MOST_OUTLIERS` of a column are outliers.
@@ -74,15 +76,24 @@ def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
             )
         for row in np.flatnonzero(outliers & ~bad).tolist():
             note(
-                "lies far off the rows before and after: an outlier; the row was set aside",
+                "lies far off the rows before and after: an outlier; the row's readings were set aside",
                 f"{raw.cell(row, name)}: {values[row]:g}",
             )
         bad |= outliers
     if not bad.any():
         return raw
-    kept = np.flatnonzero(~bad)
-    time, action, state = raw.time[kept], raw.action[kept], raw.state[kept]
-    return replace(raw, time=time, action=action, state=state, place=lambda row: raw.place(int(kept[row])))
+    # No outlier is first or last, since it jumps away and back.
+    rows, kept, state = np.flatnonzero(bad), np.flatnonzero(~bad), raw.state.copy()
+    later = np.searchsorted(kept, rows)
+    before, after = kept[later - 1], kept[later]
+    share = (rows - before) / (after - before)
+    for column, name in enumerate(raw.measured):
+        values = raw.state[:, column]
+        step = values[after] - values[before]
+        if system.states[system.index(name)].unit == "rad":
+            step -= TURN * np.round(step / TURN)
+        state[rows, column] = values[before] + share * step
+    return replace(raw, state=state, usable=~bad)
 
 
 def _outliers(steps: NDArray[np.float64], values: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:

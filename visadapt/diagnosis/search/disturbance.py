@@ -74,11 +74,14 @@ def regions_of(found: Disturbance, seed: int) -> list[Region]:
     generator = torch.Generator().manual_seed(seed)
     shifts = torch.randint(1, len(power), (SHIFTS,), generator=generator)
     shifted = torch.stack([power, *(power.roll(int(k)) for k in shifts)])
+    binnings = {
+        name: binned(values.flatten()[here])
+        for name, values in found.variables.items()
+        if not name.startswith(PREVIOUS_PREFIX)
+    }
+    tested = {name: (edges, bins) for name, (edges, bins) in binnings.items() if len(edges) >= 4}
     out = []
-    for name, values in found.variables.items():
-        edges, bins = binned(values.flatten()[here])
-        if len(edges) < 4 or name.startswith(PREVIOUS_PREFIX):
-            continue
+    for name, (edges, bins) in tested.items():
         count = torch.zeros(len(edges) - 1, dtype=power.dtype).index_add_(0, bins, torch.ones_like(power))
         total = torch.zeros(len(shifted), len(edges) - 1, dtype=power.dtype).index_add_(1, bins, shifted)
         first, last = torch.triu_indices(len(edges), len(edges), 1)
@@ -89,9 +92,9 @@ def regions_of(found: Disturbance, seed: int) -> list[Region]:
         strongest = excess.max(1).values
         best = int(excess[0].argmax())
         p_value = (1 + int((strongest[1:] >= strongest[0]).sum())) / (1 + SHIFTS)
-        p_value = min(1.0, p_value * len(found.variables))
+        p_value = min(1.0, p_value * len(tested))
         contained = float(total[0, best] / len(power))
-        if p_value <= max(MAX_P_VALUE, len(found.variables) / (1 + SHIFTS)) and contained > REGION_SHARE:
+        if p_value <= max(MAX_P_VALUE, len(tested) / (1 + SHIFTS)) and contained > REGION_SHARE:
             out.append(Region(name, float(edges[first[best]]), float(edges[last[best]]), contained, p_value))
     return sorted(out, key=lambda region: (region.p_value, -region.share))
 

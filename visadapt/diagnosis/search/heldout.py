@@ -93,7 +93,9 @@ def closed(before: float, after: float, floor: float) -> float:
     return (before - after) / (before - floor) if before > floor * MIN_GAP else math.nan
 
 
-CLEAR = 3.0  # Value of t from which one model counts as predicting better than another: p < 0.01 from 10 stretches
+CLEAR = (31.8, 6.96, 4.54, 3.75, 3.36, 3.14, 3.0)
+"""Values of t from which one model counts as predicting better than another, p < 0.01, for 2, 3, ... 8 and more
+stretches (quantiles of Student's t with one degree of freedom less)."""
 
 
 def predicts_better(other: RolloutErrors, one: RolloutErrors, deviation: Tensor) -> bool:
@@ -102,12 +104,15 @@ def predicts_better(other: RolloutErrors, one: RolloutErrors, deviation: Tensor)
     A paired t-test of the log errors at the longest horizon, in stretches of one horizon: those are nearly independent.
     """
     gain = (one.by_stretch(deviation) / other.by_stretch(deviation)).log()
-    return float(gain.mean() / gain.std() * math.sqrt(len(gain))) > CLEAR
+    if len(gain) < 2:
+        return False
+    return float(gain.mean() / gain.std() * math.sqrt(len(gain))) > CLEAR[min(len(gain) - 2, len(CLEAR) - 1)]
 
 
 def folds(rows: Segments, most: int) -> Tensor:
     """(F, W) 1 for the windows that each of at most `most` folds holds out: whole episodes if there are several."""
-    units = rows.episode if int(rows.episode.max()) > 0 else torch.arange(rows.shape[0])
+    episodes = rows.episode.unique(return_inverse=True)[1]
+    units = episodes if int(episodes.max()) > 0 else torch.arange(rows.shape[0])
     count = min(most, int(units.max()) + 1)
     return torch.stack([(units % count == k).double() for k in range(count)])
 

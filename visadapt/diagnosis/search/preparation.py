@@ -89,7 +89,10 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
         repeats = replace(repeats, used=used, lost=lost)
 
     # A window holds predictions from half of its rows, however fast these follow each other.
-    longest = max(profile.window_rows, round(2 * PREDICTION_TIME / recording.period))
+    least = round(2 * PREDICTION_TIME / recording.period)
+    longest = max(profile.window_rows, least)
+    if len(states) == 1:  # of which a part is held out
+        longest = min(longest, max(least, -(-len(states[0]) // 2)))
 
     def windows(
         measured: Sequence[Tensor], clock: Sequence[Tensor], stretches: Sequence[tuple[int, int, int]] | None = None

@@ -26,6 +26,8 @@ from visadapt.world import World
 
 WIDTHS = (0.06, 0.085, 0.12, 0.17)  # s, deviations of the Gaussian bumps that are tried
 
+SPACING = 0.3  # Distance between the bumps of a width that are tried, over that width
+
 EDGE = 2.45  # Deviations of a bump from its middle where it has 5 % of its peak: there a push starts and ends
 
 FIRST, CANDIDATE, CLEAR = 3.5, 3.0, 5.0
@@ -64,7 +66,8 @@ def pushes(recording: Recording, world: World) -> tuple[Push, ...]:
         found = _Fit(tracks).pushes()
     except torch.linalg.LinAlgError:  # type: ignore[attr-defined]
         return ()  # errors too small, or too large, for any push to stand out
-    tries = sum(len(track.time) for track in tracks) * tracks[0].load.shape[1]
+    middles = sum(float(track.time[-1] - track.time[0]) / (SPACING * width) for track in tracks for width in WIDTHS)
+    tries = round(middles) * tracks[0].load.shape[1]
     loads = world.system.loads
     named = [_named(one, tracks[one.part].episode, loads[one.joint], tries) for one in found]
     return tuple(sorted(named, key=lambda push: (push.episode, push.start)))
@@ -270,7 +273,7 @@ class _Fit:
             return _Bump(part, joint, float(middles[k]), width, float(height[k]), float(information[k] ** -0.5))
 
         tried = (
-            best(joint, torch.arange(float(time[0]) + width, float(time[-1]) - width, 0.3 * width).double(), width)
+            best(joint, torch.arange(float(time[0]) + width, float(time[-1]) - width, SPACING * width).double(), width)
             for width in WIDTHS
             for joint in range(joints)
         )
