@@ -206,7 +206,7 @@ def renderers(rows: Rows) -> Lines:
         lines.append(
             [f"{measure}{f', {unit}' if unit else ''}", *(f"{float(row['mean']):.3g}" if row else "" for row in cells)]
         )
-    unread = [max(row["failed"] for row in rows if row["method"] == kind) for kind in kinds]
+    unread = [str(max(int(row["failed"]) for row in rows if row["method"] == kind)) for kind in kinds]
     return [*lines, ["frames from which no angle can be read", *unread]]
 
 

@@ -9,7 +9,7 @@ that the environment publishes; nothing else. In order:
        runs no step of the target and is not counted
     2. encoder and policy are trained in the source model alone, seen through that renderer
     3. for every seed, with at most `budget` counted samples of the target each, from frames alone:
-       a residual grounded on them and the policy tuned through renderer, residual and physics, round by round;
+       a residual grounded on them and the policy tuned with it, round by round;
        or, in one round, a diagnosis of them and the policy tuned in the source with the effects that it names
     4. scores before and after
 

@@ -22,6 +22,7 @@ import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -179,7 +180,9 @@ def _seed(settings: Settings, seed: int) -> Score:
     about = {"seed": seed, "samples": SAMPLES}
     args = (policy, World(CartPole()), None, LEARN, generator, None, None)
     train_or_load(folder / POLICY, policy, about, lambda partial: tune(*args, partial))
-    return Score(**once(folder / "score.json", lambda: asdict(score(policy, settings.episodes))))
+    kept = once(folder / "score.json", lambda: asdict(score(policy, settings.episodes)))
+    missing: dict[str, Any] = {key: math.nan for key, value in kept.items() if value is None}  # JSON has no NaN
+    return Score(**(kept | missing))
 
 
 def score(policy: StatePolicy, episodes: int) -> Score:

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -256,9 +257,18 @@ class TestPretrain:
         assert [each.name for each in tmp_path.iterdir()] == [path.name]
         torch.manual_seed(0)
         assert not torch.equal(FollowPolicy(PERIOD).first.weight, trained.first.weight)
-        read = setup.pretrain(path, 1)
+        read = setup.pretrain(path, 0)
         for key, value in trained.state_dict().items():
             assert torch.equal(value, read.state_dict()[key]), key
+
+    def test_a_policy_of_another_source_or_seed_is_not_taken_for_this_one(self, tmp_path):
+        setup, path = small_quadrotor(rows=11, **SMALL), tmp_path / "quadrotor.safetensors"
+        setup.pretrain(path, 0)
+        with pytest.raises(CheckpointError, match="trained with other values of seed: remove it"):
+            setup.pretrain(path, 1)
+        heavier = replace(setup, source=World(Quadrotor(mass=2.0), period=setup.source.period))
+        with pytest.raises(CheckpointError, match="trained with other values of source: remove it"):
+            heavier.pretrain(path, 0)
 
     def test_another_vehicles_weights_are_refused(self, tmp_path):
         path = tmp_path / "policy.safetensors"

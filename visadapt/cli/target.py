@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 import warnings
-from itertools import chain
 
 import torch
 
@@ -50,7 +49,8 @@ def load_target(options: argparse.Namespace, source: World, frames: bool) -> Tar
             raise InputError(f"{name}: returned a {kind}; a visadapt.Target or a gymnasium environment is needed")
         if mapping is None:
             raise InputError(f"{name}: returned a gymnasium environment, which needs --map MAP.toml")
-        env = chain([made], iter(factory, None)).__next__  # the one that is made already, then new ones
+        ready = [made]
+        env = lambda: ready.pop() if ready else factory()  # noqa: E731  # the one that is made already, then new ones
     if mapping is None:
         raise InputError(f"{name}: a gymnasium id needs --map MAP.toml; a target of your own is package.module:factory")
     with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""Scores, and the tables that hold them."""
+"""Scores of policies."""
 
 from visadapt.evaluation.scoring import SCORE_SEED, CartPoleScore, FlightScore, score
 

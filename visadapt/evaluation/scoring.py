@@ -78,6 +78,9 @@ def score(
         seed: of the starts and of the hidden effects.
         steps: of an episode; without it, those of the task, or 250.
 
+    Raises:
+        ValueError: more steps than the task of a flight has.
+
     >>> import visadapt as va
     >>> found = va.score(va.load_policy(va.shipped("cartpole_states")), va.SyntheticTarget(), episodes=2, steps=20)
     >>> found.survived, found.mean_speed < 1.0  # print(found) says both
@@ -86,6 +89,8 @@ def score(
     policy.eval()
     generator = torch.Generator().manual_seed(seed)
     if isinstance(target, FlightTarget):
+        if steps is not None and steps > target.task.steps:
+            raise ValueError(f"a flight of this task has {target.task.steps} steps, got steps = {steps}")
         runs = run(target, policy, episodes, steps or target.task.steps, generator, strict=False)
         return _score_flights(runs, target)
     return score_runs(run(target, policy, episodes, steps or EPISODE_STEPS, generator))

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from visadapt.effects import Effect, Residual, SensingEffect
+from visadapt.effects import CameraEffect, Effect, Residual, SensingEffect
 from visadapt.effects.catalogue import sized
 from visadapt.estimation.effect_fit import fit_effects
 from visadapt.learning.windows import Windows
@@ -27,7 +27,7 @@ from visadapt.world import World
 class GroundSettings:
     """How a residual is fitted. A linear head uses `ridge`, `negligible` and, for the losses it reports, `held_out`."""
 
-    ridge: float = 10.0  # weight of the squared coefficients of a linear head, in samples
+    ridge: float = 10.0  # weight of the squared coefficients of a linear head; a sample's squared error has weight 1
     negligible: float = 0.0
     """least scale of the residual, as a share of the root mean square change of a state in a period"""
     steps: int = 2000  # optimisation steps at most
@@ -65,9 +65,10 @@ def fit_named(source: World, windows: Windows) -> Windows:
 
     By maximum likelihood over whole episodes (`estimation.effect_fit`). Where the source has sensing effects, the
     windows returned have smoothed true states in place of those recorded: the residual corrects true states, and
-    streams start from them; what policies see stays as recorded.
+    streams start from them; what policies see stays as recorded. Effects of the camera, which states do not show, keep
+    their values.
     """
-    named = [effect for effect in source.effects if isinstance(effect, Effect)]
+    named = [effect for effect in source.effects if isinstance(effect, Effect) and not isinstance(effect, CameraEffect)]
     if not named:
         return windows
     measured, commands = (list(values.split(windows.lengths)) for values in (windows.states, windows.actions))
@@ -125,15 +126,20 @@ def _solve(
     head: nn.Linear, seen: Tensor, target: Tensor, train: Tensor, held_out: Tensor, settings: GroundSettings
 ) -> list[GroundLoss]:
     """Fit a linear head to all samples; returns the losses of a head of zeros and of a fit to the training samples."""
-    losses = []
-    everything = torch.arange(len(seen))
-    for step, rows in enumerate((everything[:0], train, everything)):
-        inputs = seen[rows]
-        penalty = settings.ridge * torch.eye(seen.shape[1]).to(seen)
-        head.weight.copy_(torch.linalg.solve(inputs.T @ inputs + penalty, inputs.T @ target[rows]).T)
-        error = (head(seen) - target).square().mean(1)
-        losses.append(GroundLoss(step, float(error[train].mean()), float(error[held_out].mean())))
-    return losses[:2]
+
+    def loss(step: int, weight: Tensor) -> GroundLoss:
+        error = (seen @ weight - target).square().mean(1)
+        return GroundLoss(step, float(error[train].mean()), float(error[held_out].mean()))
+
+    none = seen.new_zeros(seen.shape[1], target.shape[1])
+    losses = [loss(0, none), loss(1, _ridge(seen[train], target[train], settings.ridge))]
+    head.weight.copy_(_ridge(seen, target, settings.ridge).T)
+    return losses
+
+
+def _ridge(inputs: Tensor, targets: Tensor, penalty: float) -> Tensor:
+    """W (F, n) with the least |inputs W - targets|^2 + penalty |W|^2."""
+    return torch.linalg.solve(inputs.T @ inputs + penalty * torch.eye(inputs.shape[1]).to(inputs), inputs.T @ targets)
 
 
 def _descend(

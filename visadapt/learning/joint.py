@@ -1,8 +1,8 @@
 """Joint learning of residual and policy: Algorithm 1 of the paper, round after round.
 
 Each round executes the policy in the target for B counted samples, grounds the residual on all samples so far, and
-tunes the policy by backpropagation through renderer, residual and physics. Every stage of a round writes one file,
-which gets its final name once it is complete; an interrupted run goes on after the last complete stage.
+tunes the policy by backpropagation through the world so grounded (`learning.plans`). Every stage of a round writes one
+file, which gets its final name once it is complete; an interrupted run goes on after the last complete stage.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ class Adapted:
     ledger: Ledger
     rounds: list[Round]
     episodes: list[Episode]
-    folder: Path
+    folder: Path | None
+    """where the run is kept; None: it is not"""
     source: World
     """the source, with the effects that were fitted, and those that the last diagnosis named"""
 
@@ -73,8 +74,10 @@ class Adapted:
         """Give `policy`, and the residual it reads, the weights they had after `samples` counted samples.
 
         Raises:
-            ValueError: no round ended there.
+            ValueError: no round ended there, or the run was not kept.
         """
+        if self.folder is None:
+            raise ValueError("this run was not kept: give adapt a folder")
         ends = [each.samples for each in self.rounds]
         if samples not in ends:
             raise ValueError(f"no round ended at {samples} samples; rounds ended at {', '.join(map(str, ends))}")
@@ -108,8 +111,9 @@ def adapt(
         label: estimates the states from the camera's frames; without it, the target's own states are used.
         explorer: the policy that collects the target's data, in place of the one that is tuned (Algorithm 1).
         explain: names the causes of the gap, which are then added to the source. The residual learns the gap only where
-            they do not explain it; where there is no gap, the policy is left as it is. Where other causes explain the
-            data as well, the next round adds to its commands the excitation that tells them apart.
+            they do not explain it; where there is no gap, the policy gets its weights from before the first round.
+            Where other causes explain the data as well, the next round adds to its commands the excitation that tells
+            them apart.
 
     Raises:
         ValueError: an empty round, or a budget that is smaller than a round.
@@ -122,8 +126,12 @@ def adapt(
         raise ValueError(
             f"the budget N = {budget} is smaller than a round of B = {round_samples} samples: raise N or lower B"
         )
-    policy.residual, untrained = residual, copy.deepcopy(residual.network.state_dict())
-    known, learnt, found = source, False, NOT_DIAGNOSED
+    policy.residual = residual
+    untrained = copy.deepcopy(residual.network.state_dict())
+    collector = explorer or policy
+    known = source
+    found = NOT_DIAGNOSED
+    learnt = False  # whether the residual has been fitted
     ledger = Ledger(budget)
     recorded: list[Episode] = []
     episodes: list[Episode] = []
@@ -137,8 +145,8 @@ def adapt(
         drawn = [torch.Generator().manual_seed(1_000_000 * seed + 10 * number + stage) for stage in range(3)]
         if not recording.exists():
             wanted, longest = min(round_samples, ledger.left), settings.longest_episode
-            added = found.experiment(policy, min(wanted, longest)) if found.experiment else None
-            write_recording(recording, collect(explorer or policy, target, wanted, longest, drawn[0], added))
+            added = found.experiment(collector, min(wanted, longest)) if found.experiment else None
+            write_recording(recording, collect(collector, target, wanted, longest, drawn[0], added))
         new = read_recording(recording)
         for episode in new:
             ledger.count(f"{name}: data", episode.samples)
@@ -151,7 +159,8 @@ def adapt(
             labelled = len(recorded)
             windows = Windows.cut(episodes, settings.observations, observe)
         known = source.with_effects([*source.effects, *found.effects])
-        first, learnt = not (learnt or found.complete), learnt or not found.complete
+        first = not found.complete and not learnt
+        learnt = learnt or first
         if found.complete:
             residual.network.load_state_dict(untrained)
         grounded = known.with_effects([*known.effects, residual])
@@ -163,13 +172,14 @@ def adapt(
         if first and settings.feedforward:
             initialise_feedforward(policy, source, residual.scale)
             start["feedforward.weight"] = policy.feedforward.weight.detach().clone()
-        if settings.trust < 1:
+        no_gap = found.complete and not len(known.effects)
+        if settings.trust < 1 or no_gap:
             policy.load_state_dict(start, strict=False)
         world, how, trust = grounded, settings.tuning, settings.trust
         if found.complete:
             world, how, trust = known, settings.with_names(known), 1.0
-            if not len(known.effects):
-                how = replace(how, iterations=0)  # without a gap there is nothing to tune for
+        if no_gap:
+            how = replace(how, iterations=0)  # there is nothing to tune for
         progress = staged(report, f"{name}: tune")
         tuning = _tune(tuned, policy, start, trust, world, observe, how, drawn[2], windows, progress)
         rounds.append(Round(ledger.used, grounding, tuning, found))

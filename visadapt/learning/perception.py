@@ -18,6 +18,8 @@ from visadapt.learning.training_state import TrainingState
 from visadapt.policies.networks import FrameEncoder
 from visadapt.progress import Progress
 
+BEND_WEIGHT = 8.0  # Weight in the loss of the second differences of positions: they alone show a force
+
 
 @dataclass(frozen=True)
 class Paths:
@@ -98,6 +100,6 @@ def learn_to_see(
         actions = torch.zeros(len(windows), LENGTH, encoder.n_action)
         error = encoder.kinematics(History(windows, actions)) - truth
         bends = torch.cat([error[:, 1:LENGTH].diff(dim=1), error[:, LENGTH + 1 :].diff(dim=1)], 1)
-        training.descend(error.square().mean() + 8 * bends.square().mean())
+        training.descend(error.square().mean() + BEND_WEIGHT * bends.square().mean())
         training.keep({})
     return training.losses

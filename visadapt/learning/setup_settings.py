@@ -32,9 +32,9 @@ class SetupSettings:
     feedforward: bool = True
     """begin with a feed-forward that opposes the residual's correction; False where no one command can cancel it"""
     trust: float = 1.0
-    """share of the way from the weights before the first round to the tuned ones that the policy goes in each round,
-    since the grounded source is not the target. Below 1 each round tunes from the weights before the first round, at 1
-    from those of the round before"""
+    """after each round the policy gets w0 + trust (w - w0), of the weights w0 before the first round and those tuned in
+    this round, w, since the grounded source is not the target. Below 1 each round tunes from w0, at 1 from the weights
+    of the round before"""
     refinement: TuneSettings | None = None
     """second training of the policy in the source, after `source`: near rest, say, where it is scored"""
     named: TuneSettings | None = None
@@ -60,7 +60,7 @@ class SetupSettings:
         return replace(own, recorded=0.0)
 
     def with_tuning(self, change: Callable[[TuneSettings], TuneSettings]) -> SetupSettings:
-        """The same with a change to every way in which the policy is tuned after its training in the source."""
+        """The same with `change` applied to `tuning`, `named` and `unforeseen`."""
         named, unforeseen = (None if each is None else change(each) for each in (self.named, self.unforeseen))
         return replace(self, tuning=change(self.tuning), named=named, unforeseen=unforeseen)
 

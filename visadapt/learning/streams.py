@@ -11,11 +11,12 @@ from torch import Tensor
 from visadapt.batch import Batch
 from visadapt.history import History
 from visadapt.learning.windows import Observe, Windows
-from visadapt.tasks.base import Task
+from visadapt.tasks.base import FlightTask, Task
 from visadapt.world import World, WorldState
 
 EPISODE_STEPS = 250
-"""Steps of an episode; where the world depends on time and there is no recording, streams start anywhere within it."""
+"""Steps of a cart-pole's episode; where the world depends on time and there is no recording, streams start anywhere in
+an episode."""
 
 PROBE = 0.5
 """Command under which a world is tested for a dependence on time: not zero, since some effects scale commands."""
@@ -166,7 +167,7 @@ def look(
 def an_episode(world: World, task: Task) -> tuple[Tensor, Tensor]:
     """Times (T,), in s, of the rows of an episode, and a state (1, n_state) in which one may start."""
     state, _ = task.training_start(1, 0.0, torch.Generator().manual_seed(0))
-    return world.period * torch.arange(EPISODE_STEPS), state
+    return world.period * torch.arange(task.steps if isinstance(task, FlightTask) else EPISODE_STEPS), state
 
 
 def depends_on_time(world: World, time: Tensor, state: Tensor) -> bool:

@@ -10,7 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from visadapt.storage.checkpoints import fitting, load_network, load_tree, load_weights, save_network, save_tree
+from visadapt.storage.checkpoints import (
+    CheckpointError,
+    fitting,
+    load_network,
+    load_tree,
+    load_weights,
+    save_network,
+    save_tree,
+)
 
 CHECKPOINT_ITERATIONS = 100
 """Iterations between two checkpoints."""
@@ -85,11 +93,27 @@ def train_or_load(path: Path, network: nn.Module, about: Mapping[str, Any], trai
     """Give `network` the weights in `path`; where there is no such file, train it and write it, described by `about`.
 
     `train` is given the file, beside `path`, of its training state, from which an interrupted training goes on.
+
+    Raises:
+        CheckpointError: `path` holds another network, or one that was trained in another way.
     """
     if path.exists():
-        load_network(path, network)
+        kept = load_network(path, network)
+        if other := [key for key, value in about.items() if key not in kept or _plain(kept[key]) != _plain(value)]:
+            raise CheckpointError(
+                f"{path}: was trained with other values of {', '.join(other)}: remove it, or name another file"
+            )
         return
     partial = path.with_suffix(".partial.safetensors")
     train(partial)
     save_network(path, network, about)
     partial.unlink(missing_ok=True)
+
+
+def _plain(value: Any) -> Any:
+    """A value with lists in the place of tensors and tuples, as it may come back from a file."""
+    if isinstance(value, Tensor):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {key: _plain(each) for key, each in value.items()}
+    return [_plain(each) for each in value] if isinstance(value, list | tuple) else value

@@ -26,7 +26,7 @@ from visadapt.tasks.base import Task
 from visadapt.world import World
 
 Prepare = Callable[[Policy, Path, int, Report | None], None]
-"""Prepares a new policy for training, from (policy, folder, seed, report); goes on from what is in the folder."""
+"""Prepares a new policy for training, from (policy, file, seed, report); takes what it has written to the file."""
 
 
 @dataclass(frozen=True)
@@ -65,12 +65,13 @@ class Setup:
         """The policy trained in the source, or read from `path` where that exists; an interrupted training goes on.
 
         Raises:
-            CheckpointError: `path` holds another network.
+            CheckpointError: `path` holds another network, or one that was trained in another way.
         """
         torch.manual_seed(seed)
         policy = self.policy()
+        prepared = path.with_suffix(".prepared.safetensors")
         if self.prepare is not None and not path.exists():
-            self.prepare(policy, path.parent, seed, report)
+            self.prepare(policy, prepared, seed, report)
         numbers = self.settings.numbers()["source"]
         about = {"arguments": policy.arguments, "source": describe(self.source), "seed": seed, **numbers}
         rough, fine = path.with_suffix(".rough.safetensors"), self.settings.refinement
@@ -82,7 +83,8 @@ class Setup:
                 progress = staged(report, f"{self.source.system.name}: source policy")
                 args = (policy, self.source, self.observe, settings, generator, None, progress)
                 train_or_load(made, policy, about, partial(tune, *args))
-        rough.unlink(missing_ok=True)
+        for finished in (prepared, rough):
+            finished.unlink(missing_ok=True)
         return policy.eval()
 
     def load(self, path: Path) -> Policy:

@@ -147,8 +147,8 @@ def cartpole_frames(
         """The same episodes with states estimated from their frames; those of 1 or 2 rows are left out."""
         return tracker.track([episode for episode in episodes if len(episode.time) > 2])
 
-    def prepare(policy: Policy, folder: Path, seed: int, report: Report | None) -> None:
-        """Train the policy's frame encoder and keep it in `folder`, or take the one that is there."""
+    def prepare(policy: Policy, path: Path, seed: int, report: Report | None) -> None:
+        """Train the policy's frame encoder and keep it in `path`, or take the one that is there."""
         assert isinstance(policy, ImagePolicy)
         eyes = policy.perception.requires_grad_(True)
         args = (
@@ -160,7 +160,7 @@ def cartpole_frames(
             staged(report, "perception"),
         )
         about = {"seed": seed, **asdict(perception)}
-        train_or_load(folder / "encoder.safetensors", eyes, about, lambda partial: learn_to_see(*args, partial))
+        train_or_load(path, eyes, about, lambda partial: learn_to_see(*args, partial))
         policy.encoder.load_state_dict(eyes.requires_grad_(False).state_dict())
 
     return Setup(

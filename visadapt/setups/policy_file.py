@@ -15,18 +15,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from visadapt import policies
 from visadapt.effects import EFFECTS, Effect, Residual
 from visadapt.learning.perception import PerceptionSettings, scale
-from visadapt.policies import FlightPolicy, ImagePolicy, Policy, StatePolicy
+from visadapt.policies import FlightPolicy, FollowPolicy, ImagePolicy, Policy, ReachPolicy, StatePolicy
 from visadapt.policies.networks import FlightResidualNetwork, ImageResidualNetwork, StateResidualNetwork
 from visadapt.storage.checkpoints import CheckpointError, fitting, load_tree, load_weights, save_network
 from visadapt.systems import SYSTEMS, RigidBody
 from visadapt.world import World, WorldState
 
-KINDS: dict[str, type[Policy]] = {
-    name: kind for name, kind in vars(policies).items() if isinstance(kind, type) and issubclass(kind, Policy)
-}
+KINDS: dict[str, type[Policy]] = {kind.__name__: kind for kind in (ImagePolicy, StatePolicy, FollowPolicy, ReachPolicy)}
 
 
 def save_policy(path: str | Path, policy: Policy, about: Mapping[str, Any] | None = None) -> None:
@@ -112,7 +109,7 @@ def describe(world: World) -> dict[str, Any]:
         "integrator": world.integrator,
         "substeps": world.substeps,
         "effects": [
-            {"effect": effect.name, **{each.name: getattr(effect, each.name).detach() for each in effect.table}}
+            {"effect": effect.name, **{each.name: getattr(effect, each.name).detach().clone() for each in effect.table}}
             for effect in world.modules()
             if isinstance(effect, Effect)
         ],

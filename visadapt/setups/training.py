@@ -96,7 +96,7 @@ def train(
     >>> policy.n_action
     1
     """
-    setup = setup_for(world, None, renderer, references, with_history)
+    setup = setup_for(copy.deepcopy(world), None, renderer, references, with_history)
     if iterations is not None:
         setup = replace(setup, settings=setup.settings.shortened(iterations))
     with tempfile.TemporaryDirectory() as temporary:
@@ -154,7 +154,8 @@ def adapt(
 
     Args:
         samples: steps of the target in all; every one is counted.
-        folder: where a run is kept, its policy as policy.safetensors; an interrupted run goes on from there.
+        folder: where a run is kept, its policy as policy.safetensors; an interrupted run goes on from there. Without
+            it nothing is kept, and `Adapted.restore` cannot be used.
         round_samples: steps in a round; a fifth of `samples` without it, and at least 20.
         iterations: of tuning (in each round), instead of the setup's own; the residual is fitted in as many at most.
         renderer, references, with_history: as for `setup_for`.
@@ -179,7 +180,7 @@ def adapt(
     """
     if references is None and isinstance(target, FlightTarget) and isinstance(target.task, Follow):
         references = target.task.references
-    setup = setup_for(source, policy, renderer, references, with_history)
+    setup = setup_for(copy.deepcopy(source), policy, renderer, references, with_history)
     if iterations is not None:
         own = setup.settings
         ground = replace(own.ground, steps=min(own.ground.steps, iterations))
@@ -195,4 +196,4 @@ def adapt(
         adapted = setup.adapt(policy, target, place, samples, in_round, seed, report, diagnose=diagnose)
         if folder is not None:
             save_policy(place / "policy.safetensors", policy)
-    return adapted
+    return adapted if folder is not None else replace(adapted, folder=None)

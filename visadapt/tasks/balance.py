@@ -3,7 +3,7 @@
 The cost is the distance to a reference that is interpolated from the state now to the goal (the paper, section 3.1 and
 A.1.3); it works although this reference is often infeasible:
 
-    C = sum_k |w (s_{t+k} - nu_{t+k})|^2 + r |a_{t+k}|^2 with nu_{t+k} = s_t + k / K (goal - s_t), k = 1..K
+    C = sum_k sum_i w_i (s_{t+k} - nu_{t+k})_i^2 + r |a_{t+k}|^2 with nu_{t+k} = s_t + k / K (goal - s_t), k = 1..K
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class Balance(Task):
         return self.cost_of(states, plan, now)
 
     def diverged(self, state: Tensor, task_state: Tensor, progress: float) -> Tensor:
-        return (state.abs() > self._limit(progress)).any(1)
+        return ~(state.abs() <= self._limit(progress)).all(1)  # also where a state is not a number
 
     def disturb(self, state: Tensor, generator: torch.Generator) -> Tensor:
         kicked = torch.rand(len(state), 1, generator=generator) < 0.05

@@ -118,7 +118,8 @@ class Follow(FlightTask):
 
     def misses(self, states: Tensor, task_state: Tensor) -> Tensor:
         """The distance to the reference at every row but the first (the paper's average tracking error)."""
-        return (states[..., POSITION] - self.references.positions[task_state[:, 0]]).norm(dim=-1)[:, 1:]
+        course = self.references.positions[task_state[:, 0], : states.shape[1]]
+        return (states[..., POSITION] - course).norm(dim=-1)[:, 1:]
 
     def distance_off(self, state: Tensor, task_state: Tensor) -> Tensor:
         rows = task_state[:, 1].clamp(max=self.steps)
