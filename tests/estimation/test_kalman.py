@@ -35,7 +35,7 @@ def dense(problem, n, column):
     """Mean and covariance of all states, and the matrix, of system n, as one Gaussian."""
     mean = [problem.start[n, :, column]]
     maps = [torch.eye(STATES, dtype=torch.float64)]
-    sources = [torch.diag(problem.spread[n])]
+    sources = [torch.diag(problem.initial_variance[n])]
     rows = [[maps[0]]]
     for t in range(T - 1):
         a = problem.transition[n, t]
@@ -94,7 +94,7 @@ def test_inputs_pass_through_the_gains_like_columns(problem):
         problem.sensing,
         problem.reading,
         torch.zeros_like(problem.start),
-        problem.spread,
+        problem.initial_variance,
     )
     expected = forward(quiet, torch.diag_embed(PROCESS), MEASUREMENT).white
     torch.testing.assert_close(respond(filtered, problem.drive, problem.reading), expected)

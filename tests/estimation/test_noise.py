@@ -24,7 +24,7 @@ def wander(drift, measurement, seed=0):
         sensing=(used[..., None] * torch.tensor([[1 / STATED, 0.0]], dtype=torch.float64))[None],
         reading=(used * value / STATED)[None, ..., None],
         start=torch.zeros(1, 2, 1, dtype=torch.float64),
-        spread=torch.ones(1, 2, dtype=torch.float64),
+        initial_variance=torch.ones(1, 2, dtype=torch.float64),
     )
     shapes = torch.tensor([[[0.0, 0.0], [0.0, 1.0]]], dtype=torch.float64)
     return UnknownNoise(system, used[None], shapes), value

@@ -24,7 +24,7 @@ Camera = tuple[type[CameraEffect], ...]
 
 SMOOTHING = 1.5  # px, standard deviation
 
-ALIKE = 100
+CORRELATED_PIXELS = 100
 """Pixels, 10 by 10, over which the residual beyond noise counts as one error, the same in all frames."""
 
 STEPS = 12  # Most steps of a fit
@@ -223,6 +223,6 @@ def _covariance(by_place: Tensor, by_value: Tensor, error: Tensor, noise: float,
     clear = by_value - gain.to(by_place) @ by_place  # less what the places take up
     white = max(noise**2, 1e-12)
     left = white_noise(error) ** 2  # of the noise, where frames are smoothed
-    structured = max(0.0, float(error.square().mean()) - left) * len(error) * ALIKE
+    structured = max(0.0, float(error.square().mean()) - left) * len(error) * CORRELATED_PIXELS
     information = (clear @ clear.mT).double().sum(0)
     return torch.linalg.inv(information / (white + structured) + torch.diag(1 / wide))

@@ -145,7 +145,7 @@ def _step(
     groups = fits.log_process.shape[1]
     noise_change = log_change @ noise_members(model)[1]
     # Rounding to a resolution is noise with a deviation of resolution / sqrt(12).
-    resolution = torch.tensor(model.rows.step, dtype=torch.float64)
+    resolution = torch.tensor(model.rows.resolution, dtype=torch.float64)
     least = torch.tensor([LEAST_NOISE * model.system.states[k].largest for k in model.rows.channels]).double()
     lowest_noise = (resolution.square() / 12 + least.square()).log()
     return replace(

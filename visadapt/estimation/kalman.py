@@ -34,7 +34,7 @@ class Linear(Batch):
     sensing: Tensor  # (N, T, m, n) H; zero where nothing was measured
     reading: Tensor  # (N, T, m, M) r; zero where nothing was measured
     start: Tensor  # (N, n, M) the mean of x_0
-    spread: Tensor  # (N, n) p
+    initial_variance: Tensor  # (N, n) p
 
     def data(self) -> Linear:
         """The same systems with the first column, the data, alone."""
@@ -62,7 +62,7 @@ class Filtered:
 
 def forward(problem: Linear, process: Tensor, noise: Tensor) -> Filtered:
     """Filter with process covariances Q (N, n, n) and measurement variances s (N, m)."""
-    covariance = torch.diag_embed(problem.spread)
+    covariance = torch.diag_embed(problem.initial_variance)
     disturbed = torch.diag_embed(noise)
     transitions, sensings = problem.transition.unbind(1), problem.sensing.unbind(1)
     covariances, roots, crosses, failures = [], [], [], []

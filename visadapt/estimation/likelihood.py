@@ -79,7 +79,7 @@ def linear_problem(models: Sequence[CandidateModel], fits: FitState) -> Linear:
     windows, length, n = fits.state.shape[1:]
     columns = 1 + fits.theta.shape[1]
     identity = torch.eye(n, dtype=torch.float64)
-    transition, sensing, spread = [], [], []
+    transition, sensing, initial_variance = [], [], []
     drive = torch.zeros(len(models), windows, length - 1, n, columns, dtype=torch.float64)
     reading = torch.zeros(len(models), windows, length, len(rows.channels), columns, dtype=torch.float64)
     start = torch.zeros(len(models), windows, n, columns, dtype=torch.float64)
@@ -91,7 +91,7 @@ def linear_problem(models: Sequence[CandidateModel], fits: FitState) -> Linear:
         transition.append(torch.where(inside > 0, lin.transition, identity))
         sensing.append(lin.sensing * used)
         per_state = _reading_per_state(lin.sensing[:, 0], models[0])
-        spread.append(variance / per_state.square())
+        initial_variance.append(variance / per_state.square())
         drive[c, ..., 0] = lin.next_state - fits.state[c, :, 1:]
         drive[c, ..., 1 : 1 + count] = lin.by_parameter
         reading[c, ..., 0] = rows.measured - lin.measured
@@ -103,7 +103,7 @@ def linear_problem(models: Sequence[CandidateModel], fits: FitState) -> Linear:
         torch.cat(sensing),
         (reading * used).flatten(0, 1),
         start.flatten(0, 1),
-        torch.cat(spread),
+        torch.cat(initial_variance),
     )
 
 
@@ -132,7 +132,7 @@ def variances(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[T
     process = torch.full((len(fits.log_process), len(model.system.states)), POSITION_PROCESS_NOISE**2).double()
     for k, group in enumerate(model.profile.driven):
         process[:, list(group)] = fits.log_process[:, k, None].exp()
-    per_reading = problem.spread / problem.spread.new_tensor(model.profile.initial_variance)
+    per_reading = problem.initial_variance / problem.initial_variance.new_tensor(model.profile.initial_variance)
     process = process.repeat_interleave(windows, 0) * per_reading
     return torch.diag_embed(process), fits.log_noise.exp().repeat_interleave(windows, 0)
 

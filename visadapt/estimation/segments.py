@@ -27,7 +27,7 @@ class Segments:
     episode: Tensor  # (W,) index of the window's episode
     channels: tuple[int, ...]  # the m columns of the state that were measured
     period: float  # s between rows, the median where the clock is unsteady
-    step: tuple[float, ...]  # resolution of each channel: the smallest difference between two different readings
+    resolution: tuple[float, ...]  # of each channel: the smallest difference between two different readings
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -63,7 +63,7 @@ class Segments:
             measured=self.measured[..., kept],
             used=self.used[..., kept],
             channels=tuple(self.channels[k] for k in kept),
-            step=tuple(self.step[k] for k in kept),
+            resolution=tuple(self.resolution[k] for k in kept),
         )
 
 
@@ -115,8 +115,8 @@ def cut(
         time[w] = stamps[index][a] + period * torch.arange(rows)
         time[w, : b - a] = stamps[index][a:b]
     episode = torch.tensor([index for index, _, _ in pieces])
-    step = tuple(smallest_step(torch.cat([values[:, k] for values in measured])) for k in range(len(channels)))
-    return Segments(out, used, inside, time, command, held, first, episode, channels, period, step)
+    resolution = tuple(smallest_step(torch.cat([values[:, k] for values in measured])) for k in range(len(channels)))
+    return Segments(out, used, inside, time, command, held, first, episode, channels, period, resolution)
 
 
 def smallest_step(readings: Tensor) -> float:

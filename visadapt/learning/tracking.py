@@ -165,7 +165,7 @@ class Tracker:
             sensing=torch.linalg.solve_triangular(root, seen, upper=False)[None],
             reading=torch.linalg.solve_triangular(root, place[..., None], upper=False)[None],
             start=path.new_zeros(1, n, 1),
-            spread=torch.cat((wide, ACCELERATION * unit)).square()[None],
+            initial_variance=torch.cat((wide, ACCELERATION * unit)).square()[None],
         )
         return UnknownNoise(system, used.expand(-1, len(self._seen))[None], drift)
 

@@ -17,7 +17,8 @@ from visadapt.recordings.clock import Note, RawEpisode
 from visadapt.recordings.csv import check_given, needed
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.topics import Read, Topic
-from visadapt.systems import System
+from visadapt.systems import RigidBody, System
+from visadapt.systems.rigid_body import ATTITUDE
 
 GAP = 5.0
 """Longest interval between a topic's readings, in median intervals, that is interpolated; longer ones have no rows."""
@@ -78,11 +79,18 @@ def _rows(
         raise RecordingError(f"{path}: {', '.join((*read, *commanded))} have no time in common")
     time = time[rows]
 
+    if (dropped := int((topics[slowest].time > last).sum())) and last == min(topics[c].time[-1] for c in commanded):
+        note(f"the last {dropped} rows, after the last message of {', '.join(commanded)}, are left out", str(path))
+    quaternion = [state.name for state in system.states[ATTITUDE]] if isinstance(system, RigidBody) else []
+
     def state(name: str) -> NDArray[np.float64]:
         topic, field = places[name]
         values = topics[topic].values[field]
         if topic == slowest:
             return values[rows]
+        if name in quaternion:
+            same = [places[other] for other in quaternion if other in places and places[other][0] == topic]
+            values = values * _signs(np.column_stack([topics[topic].values[field] for _, field in same]))
         angle = system.states[system.index(name)].unit == "rad"
         return np.interp(time, topics[topic].time, np.unwrap(values) if angle else values)
 
@@ -101,6 +109,12 @@ def _rows(
         lambda row: f"message {rows[row] + 1} of {slowest}",
         {name: ".".join(place) for name, place in places.items()},
     )
+
+
+def _signs(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T,) factors, 1 or -1, that make quaternions (T, 4), which mean the same with either sign, continuous."""
+    flips = (quaternions[1:] * quaternions[:-1]).sum(1) < 0
+    return np.cumprod(np.append(1.0, np.where(flips, -1.0, 1.0)))
 
 
 def _between_readings(time: NDArray[np.float64], stamps: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -28,7 +28,7 @@ FRAMES, FRAMES_AT_FIRST = 16, 6
 MIN_CLOSED = 0.02
 """Share by which an effect must lower the root mean square misfit: the same as that of a gap."""
 
-ALIKE = 0.005  # Share by which another effect's misfit may exceed the best one's and still count as an equal fit
+EQUAL_FIT = 0.005  # Share by which another effect's misfit may exceed the best one's and still count as an equal fit
 
 MOST_EFFECTS = 3
 
@@ -127,7 +127,9 @@ def find_camera(
             break
         best = tried[chosen]
         alike[chosen] = tuple(
-            kind.name for kind, fit in tried.items() if kind is not chosen and fit.misfit < (1 + ALIKE) * best.misfit
+            kind.name
+            for kind, fit in tried.items()
+            if kind is not chosen and fit.misfit < (1 + EQUAL_FIT) * best.misfit
         )
 
     def without_each(best: CameraFit) -> dict[type[CameraEffect], CameraFit]:

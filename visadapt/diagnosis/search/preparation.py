@@ -103,7 +103,7 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
             for valid in (repeats.used, usable)
         )
         if recording.resolution:
-            rows, raw = replace(rows, step=recording.resolution), replace(raw, step=recording.resolution)
+            rows, raw = (replace(each, resolution=recording.resolution) for each in (rows, raw))
         return rows, raw
 
     def searched(rows: Segments) -> Tensor:
