@@ -222,7 +222,7 @@ def key_text(settings: Settings, drafts: list[FilmDraft]) -> str:
 
 
 def _content(episodes: list[dict[str, NDArray[Any]]], state_names: tuple[str, ...] = ()) -> bytes:
-    """A recording as HDF5, of version 1 of the format of docs/own_rig.md."""
+    """A recording as HDF5, of version 1 of the format of docs/architecture.md."""
     file = io.BytesIO()
     with h5py.File(file, "w") as out:
         out.attrs["format"], out.attrs["version"], out.attrs["action_names"] = "visadapt recording", 1, ["command"]

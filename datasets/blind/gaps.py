@@ -58,7 +58,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Difficulty:
-    """Settings that differ between the two sets."""
+    """What a set of the cart-pole fixes."""
 
     rows: int
     """rows of a recording at 50 ms, approximately"""

@@ -23,10 +23,11 @@ VERDICTS = (IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP)
 SCHEMA_VERSION = 2  # Version of `schema.json`
 
 KEYS = {"start": "from", "end": "to"}
+"""JSON keys of fields that have another name there."""
 NOT_IN_JSON = ("figures", "policy")
+"""Fields that the report alone shows."""
 SHARES = ("probability", "share", "p_value", "stages", "states")
-"""Fields whose JSON keys differ from their names, fields that only the report shows, and fields with numbers from 0 to
-1, which are rounded to 12 digits so that a rounding error does not exceed 1."""
+"""Fields of numbers from 0 to 1: they are rounded to 12 digits, so that no rounding error exceeds 1."""
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,8 @@ MAX_DAMPING = 100.0  # Damping at which a fit stops, since its steps have become
 
 OUT_OF_REACH = 100.0
 STEPS_TO_COME = 4
-"""Log likelihood below its rival's at which a fit stops, if it is expected to end there: with the gain of its last
-successful step in each iteration left, but in STEPS_TO_COME at most, since gains dwindle."""
+"""A fit stops when the log likelihood that it is expected to end at is more than OUT_OF_REACH below its rival's: its
+present one, plus the gain of its last successful step times the iterations left, STEPS_TO_COME at most."""
 
 MAX_LOG_VARIANCE_CHANGE = 1.5  # Largest change of a log variance in one iteration
 

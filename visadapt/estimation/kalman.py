@@ -52,7 +52,8 @@ class Filtered:
     closed_loop: Tensor  # (N, T - 1, n, n) F
     predicted: Tensor  # (N, T, n, M) x_t given rows before t
     white: Tensor
-    """(N, T, m, M) e: of each channel, given the rows before and the channels before it, over its standard deviation"""
+    """(N, T, m, M) e: innovation of each channel, given all earlier rows and the earlier channels of its row, over its
+    standard deviation"""
 
     @property
     def deviation(self) -> Tensor:
