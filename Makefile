@@ -33,7 +33,7 @@ lint: $(INSTALLED)
 	$(MAKE) --no-print-directory types
 
 types: $(INSTALLED)
-	$(RUN) -m mypy $(TYPED)
+	$(RUN) -m mypy -n auto $(TYPED)
 
 format: $(INSTALLED)
 	$(RUN) -m ruff check --fix .
