@@ -10,29 +10,28 @@ squared error. Ours starts from a guess of the camera that is some pixels off, a
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 import tyro
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from datasets import cartpole_frames
 from renderers import Camera, DrawnCartPole, LayeredRenderer, MLPRenderer, save_renderer
 from renderers.training import fit
+from visadapt.progress import reporting, staged
 from visadapt.storage.atomic_files import replacing
+from visadapt.storage.run_folder import versions
 
 Renderer = LayeredRenderer | MLPRenderer
 Kind = Literal["layered", "mlp"]
 FILES: dict[Kind, str] = {"layered": "renderer.safetensors", "mlp": "renderer_mlp.safetensors"}
-PACKAGES = ("visadapt", "torch", "numpy", "opencv-python-headless")
 GUESS = {"column": 57.0, "row": 72.5, "scale": 38.5, "reach": 1.05}
 """Where a look at the frames puts the hinge at x = 0 (px), a metre (px) and the pole's tip (m): each a little off."""
 MAGNIFIED = 5
@@ -73,35 +72,23 @@ def train(settings: Settings) -> dict[Kind, Renderer]:
     frames = torch.from_numpy(data.frames)
     height, width = data.frames.shape[1:]
     trained: dict[Kind, Renderer] = {}
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}  loss {task.fields[loss]:.1e}  left"),
-        TimeRemainingColumn(),
-    ) as bars:
-        tasks = {
-            kind: bars.add_task(f"renderer {kind}", total=_steps(settings, kind)[0], loss=float("nan"), start=False)
-            for kind in settings.kinds
-        }
+    with reporting() as report:
         for kind in settings.kinds:
             # Seeded for each, so that one renderer does not depend on whether the other is trained too.
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(settings.seed)
                 renderer = LayeredRenderer(height, width, **GUESS) if kind == "layered" else MLPRenderer(height, width)
             steps, batch = _steps(settings, kind)
-            show = _Smooth(bars, tasks[kind])
-            bars.start_task(tasks[kind])
-            started = time.perf_counter()
-            fit(renderer, x, theta, frames, steps, torch.Generator().manual_seed(settings.seed), batch, show)
+            started, progress = time.perf_counter(), staged(report, f"renderer {kind}")
+            fit(renderer, x, theta, frames, steps, torch.Generator().manual_seed(settings.seed), batch, progress)
             training = {
                 **dataclasses.asdict(settings),
                 "data": str(settings.data or "drawn"),
                 "out": str(settings.out),
                 "steps": steps,
                 "batch": batch,
-                "loss": show.loss,
                 "seconds": round(time.perf_counter() - started, 1),
-                "versions": _versions(),
+                "versions": versions(),
             }
             with replacing(settings.out / FILES[kind]) as temporary:
                 save_renderer(temporary, renderer, training)
@@ -111,32 +98,10 @@ def train(settings: Settings) -> dict[Kind, Renderer]:
     return trained
 
 
-class _Smooth:
-    """Shows steps and a running mean of the loss."""
-
-    def __init__(self, bars: Progress, task: Any) -> None:
-        self.bars, self.task, self.loss = bars, task, float("nan")
-
-    def __call__(self, done: int, total: int, loss: float) -> None:
-        self.loss = loss if done == 1 else 0.98 * self.loss + 0.02 * loss
-        if done % 10 == 0 or done == total:
-            self.bars.update(self.task, completed=done, loss=self.loss)
-
-
 def _steps(settings: Settings, kind: Kind) -> tuple[int, int]:
     if kind == "layered":
         return settings.layered_steps, settings.layered_batch
     return settings.mlp_steps, settings.mlp_batch
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for package in PACKAGES:
-        try:
-            found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            found[package] = "not installed"
-    return found
 
 
 @torch.no_grad()
