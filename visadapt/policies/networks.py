@@ -127,8 +127,8 @@ class ImageResidualNetwork(ResidualNetwork):
 
     The encoder reads positions and angles from the frames, which `learning.perception` trained it to do in the source:
     a few hundred target samples are too few to learn that too. The head's inputs are these, the actions, and the
-    accelerations that the source does not explain (`unexplained`). The head is linear without a bias, so that it adds
-    nothing where the source explains everything. An MLP instead learns from a few hundred samples where along the
+    accelerations that the source's system, without its effects, does not explain (`unexplained`). The head is linear
+    without a bias, so that it adds nothing where a bare source explains everything. An MLP instead learns from a few hundred samples where along the
     track the target happened to push, and is wrong in the next episode.
 
     Args:
@@ -155,9 +155,9 @@ class ImageResidualNetwork(ResidualNetwork):
         return torch.cat((kinematics, history.actions.flatten(1), unexplained.flatten(1)), 1)
 
     def unexplained(self, kinematics: Tensor, actions: Tensor) -> Tensor:
-        """Accelerations of cart and pole minus the source's, (B, LENGTH - 2, 2), at all frames but the first and last.
+        """Accelerations of cart and pole minus the system's, (B, LENGTH - 2, 2), at all frames but the first and last.
 
-        The measured acceleration at a frame is the second difference of positions; the source's is the mean of those
+        The measured acceleration at a frame is the second difference of positions; the system's is the mean of those
         under the action before and the action after the frame.
 
         Args:
@@ -209,9 +209,9 @@ class StateResidualNetwork(ResidualNetwork):
         return states.diff(dim=1).any(2).all(1)
 
     def unexplained(self, system: System, states: Tensor, actions: Tensor) -> Tensor:
-        """Mean accelerations minus the source's over the periods between states, (B, LENGTH - 1, n_state / 2).
+        """Mean accelerations minus the system's over the periods between states, (B, LENGTH - 1, n_state / 2).
 
-        The source's is the mean of those at both ends of a period, under the action held in between. `held_back` fills
+        The system's is the mean of those at both ends of a period, under the action held in between. `held_back` fills
         the periods before an episode.
         """
         load = states.new_zeros(*states.shape[:-1], len(system.loads))[:, 1:]
