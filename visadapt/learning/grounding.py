@@ -103,7 +103,7 @@ def ground(
 ) -> list[GroundLoss]:
     """Fit the head of the residual's network, in place, to the windows; returns losses in units of its scale.
 
-    Windows with an incomplete history are left out, unless all are incomplete.
+    Windows whose history the network says is incomplete are left out, unless all are.
     """
     target = gap(source, windows) / residual.scale
     network = residual.network
