@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.diagnosed import record
+from visadapt.diagnosis.search.heldout import folds
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.sensor_checks import between, derived_velocities, shortest_arc
 from visadapt.effects import ViscousFriction
@@ -94,3 +95,14 @@ def test_an_arc_of_angles_may_hold_the_hanging_pole():
     assert shortest_arc([5, 7], 63) == (5, 7)
     assert shortest_arc([4], 63) == (4, 4)
     assert between(torch.tensor([3.1, -3.1, 3.3 + 2 * torch.pi, 2.9, 0.0]), 3.0, 3.4).tolist() == [1, 1, 1, 0, 0]
+
+
+def test_of_one_episode_a_half_is_held_out_where_it_is_long_enough_for_predictions():
+    def first(rows):
+        episode = WHOLE.episodes[0]
+        part = Episode(episode.time[:rows], episode.action[:rows], episode.state[:rows])
+        return prepare(dataclasses.replace(WHOLE, episodes=(part,)), CartPole()).rows
+
+    assert [first(rows).shape[0] for rows in (60, 40, 30)] == [2, 2, 2]
+    assert first(20).shape[0] == 1
+    assert folds(first(60), 4).tolist() == [[1, 0], [0, 1]]
