@@ -246,7 +246,7 @@ class SensingEffect(Effect):
     >>> import torch, visadapt as va
     >>> world = va.World(va.CartPole(), [va.effects.AngleOffset(offset=0.1)])
     >>> measured, _ = world.measure(world.start(torch.zeros(1, 4)))
-    >>> round(float(measured[0, 2]), 3)
+    >>> round(measured[0, 2].item(), 3)
     0.1
     """
 
