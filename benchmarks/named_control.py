@@ -5,11 +5,11 @@
 
 The CartPole under hidden effects of each kind, among them one that no effect of the library describes and none at all;
 from frames, a camera that was turned too. For each method the source policy collects the samples, in one round and
-from the same seed. "diagnosed" is
-`visadapt adapt --diagnose`: what is named is put into the simulator, and a residual learns the gap only where nothing
-is; "residual" is the paper's; "true effect" has the hidden effect in the simulator, and takes no samples. From states
-each seed has its own source policy, from frames all have the shipped one. Scores are of 100 episodes of 12.5 s. Where a
-residual cannot be learnt, since no states are seen in a faulty camera's frames, the source policy is scored.
+from the same seed. "diagnosed" is `visadapt adapt --diagnose`: what is named is put into the simulator, and a residual
+learns the gap only where nothing is; "residual" is the paper's; "true effect" has the hidden effect in the simulator,
+and takes no samples. From states each seed has its own source policy, from frames all have the shipped one. Scores are
+of 100 episodes of 12.5 s. Where a residual cannot be learnt, since no states are seen in a faulty camera's frames, the
+source policy is scored.
 
 Interrupt it anywhere; started again, it goes on.
 """

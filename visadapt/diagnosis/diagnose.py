@@ -24,7 +24,7 @@ from visadapt.diagnosis.result import (
 )
 from visadapt.diagnosis.search import duration, heldout
 from visadapt.diagnosis.search.all_rows import on_all_rows
-from visadapt.diagnosis.search.causes import alternatives, causes, ranking, stage_shares
+from visadapt.diagnosis.search.causes import alternatives, causes, phases_of_episodes, ranking, stage_shares
 from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
 from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.model_comparison import compare
@@ -119,6 +119,8 @@ def diagnose(
     search.run(staged(progress, "search"))
     if len(prepared.searched) < rows.shape[0]:
         search = on_all_rows(search, rows)
+    in_use = {effect.name: effect for effect in search.catalogue}
+    effects = [in_use.get(effect.name, effect) for effect in effects]
     comparison = compare(search)
     best = comparison.best
     groups = alternatives(comparison, effects, system)
@@ -181,6 +183,7 @@ def diagnose(
             *(() if is_held_out else (f"{recording.sources[0]}: {TOO_SHORT}",)),
             *left_unexplained(comparison, verdict, unexplained, system),
             *at_bounds(comparison),
+            *(phases_of_episodes(best) if found else ()),
             *(f"{one.name}: {one.caveat}" for one in best.effects if one.caveat and one.name in carrying),
         ),
         figures=replace(

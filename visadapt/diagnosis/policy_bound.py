@@ -137,8 +137,14 @@ def _steps(model: CandidateModel, theta: Tensor, state: Tensor, acted: Tensor, c
     """
     tried = torch.cat((acted[..., None], _grid().expand(*acted.shape, -1)), -1)[chosen]
     count = 1 + COMMAND_POINTS
-    start = model.started(theta, state)[chosen.flatten()][torch.arange(len(tried)).repeat_interleave(count)]
-    stepped = model.at(theta).step(start, tried.flatten()[:, None]).state.reshape(len(tried), count, -1)
+    row = chosen.flatten().nonzero()[:, 0].repeat_interleave(count)
+    values = model.by_row(theta, state.shape[1])
+    start = model.started(theta, state)[row]
+    stepped = (
+        model.at(values if values.dim() == 1 else values[row])
+        .step(start, tried.flatten()[:, None])
+        .state.reshape(len(tried), count, -1)
+    )
     return stepped[:, 0], stepped[:, 1:]
 
 

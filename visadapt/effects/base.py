@@ -39,6 +39,7 @@ class Role(StrEnum):
     END = "end"  # Where that region ends
     FREQUENCY = "frequency"  # In Hz; searched on a logarithmic grid
     PHASE = "phase"  # In rad; equal modulo a turn
+    EPISODE_PHASE = "episode phase"  # That of one later episode alone, in a fit where each has its own
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,11 @@ class Parameter:
     def is_edge(self) -> bool:
         """Whether it is the start or the end of a region."""
         return self.role in (Role.START, Role.END)
+
+    @property
+    def is_phase(self) -> bool:
+        """Whether it is a phase, of all episodes or of one."""
+        return self.role in (Role.PHASE, Role.EPISODE_PHASE)
 
     @property
     def is_strength(self) -> bool:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from visadapt.effects import ActuationEffect, Effect
 from visadapt.effects.late_sensors import LateSensors
+from visadapt.estimation.episode_phases import phase_columns
 from visadapt.estimation.late_readings import Past, reading
 from visadapt.estimation.linearise import (
     linearise_reading,
@@ -67,12 +68,32 @@ class CandidateModel:
         """columns of the parameters that change what acts of the commands"""
         self.delays = [k for k, effect in enumerate(named) if issubclass(effect, LateSensors)]
         """columns of the delays of late sensors"""
+        self._columns = phase_columns(effects, len(rows.command))
         self.slopes: tuple[Tensor, Tensor] | None = None
         """transition (W, T - 1, n, n) and sensing (W, T, m, n) of an earlier linearisation, reused where given"""
 
     def at(self, theta: Tensor) -> World:
-        """The world with parameters (P,), or (N, P) for a batch of N states."""
+        """The world with parameters (P,), or (N, P) for a batch of N states; `by_row` gives those of rows."""
         return self._world.with_values(theta)
+
+    def by_row(self, theta: Tensor, length: int) -> Tensor:
+        """Parameters (R W length, P), a row for each of `length` rows of every window, from R vectors (R, P); or from
+        one, (P,), which stays as it is where all episodes have the same.
+
+        They differ where an effect has a phase for each episode.
+        """
+        windows = len(self.rows.episode)
+        if self._columns is None:
+            return theta if theta.dim() == 1 else theta.repeat_interleave(windows * length, 0)
+        every = theta.reshape(-1, theta.shape[-1])[:, self._columns[self.rows.episode]]
+        return every.flatten(0, 1).repeat_interleave(length, 0)
+
+    def by_theta(self, by_row: Tensor) -> Tensor:
+        """Derivatives (W, T, n, P) by the parameters, from those by the parameters of each row."""
+        if self._columns is None:
+            return by_row
+        columns = self._columns[self.rows.episode][:, None, None].expand_as(by_row)
+        return torch.zeros_like(by_row).scatter_add(-1, columns, by_row)
 
     def commands(self, theta: Tensor) -> Tensor:
         """Commands after the actuation effects, (R, W, T, substeps, n_action), for R parameter vectors (R, P)."""
@@ -157,8 +178,9 @@ def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised
     world, acting = model.stepping(theta, model.commands(shifted[variants])[:, :, :-1].flatten(1, 2))
     commands = acting[[variants.index(k) if k in variants else 0 for k in range(len(shifted))]]
     time, duration = model.rows.time[:, :-1].flatten(), model.rows.duration[:, :-1].flatten()
+    values = model.by_row(theta, length - 1)
     step = linearise_step(
-        world, theta, time, state[:, :-1].flatten(0, 1), commands, by_state=known is None, duration=duration
+        world, values, time, state[:, :-1].flatten(0, 1), commands, by_state=known is None, duration=duration
     )
     past = model.past(theta)
     read = linearise_reading(world, theta, state.flatten(0, 1), past, by_state=known is None)
@@ -167,7 +189,7 @@ def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised
     out = Linearised(
         step.value.unflatten(0, steps),
         step.by_state.unflatten(0, steps),
-        step.by_parameter.unflatten(0, steps),
+        model.by_theta(step.by_parameter.unflatten(0, steps)),
         read.value[:, channels].unflatten(0, rows),
         read.by_state[:, channels].unflatten(0, rows),
         read.by_parameter[:, channels].unflatten(0, rows),

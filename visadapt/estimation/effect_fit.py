@@ -7,7 +7,7 @@ they are estimated from repeated readings, which the fit leaves out.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -25,6 +25,7 @@ from visadapt.effects import (
 )
 from visadapt.effects.catalogue import sized
 from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.episode_phases import has_episode_phases, in_step, with_episode_phases, with_own_phases
 from visadapt.estimation.fit_states import (
     CAREFUL,
     QUICK,
@@ -49,11 +50,13 @@ from visadapt.systems import System
 class EffectFit:
     """Effects fitted to episodes."""
 
-    values: dict[
-        type[Effect], Tensor
-    ]  # (P,) parameters of each effect, `sized` to the system, in the order of its table
+    values: dict[type[Effect], Tensor]
+    """(P,) parameters of each effect, `sized` to the system, in the order of its table; a phase is that of the first
+    episode"""
     covariance: dict[type[Effect], Tensor]  # (P, P) of each effect's parameters
     states: list[Tensor]  # (T, n_state) of each episode: the true states, smoothed
+    shifts: Tensor
+    """(E,) s to add to the times of each episode for the one phase to be right there too"""
 
 
 @torch.no_grad()
@@ -61,6 +64,8 @@ def fit_effects(
     system: System, effects: Sequence[Effect], measured: Sequence[Tensor], commands: Sequence[Tensor], period: float
 ) -> EffectFit:
     """Fit the parameters of `effects`, all together, within the ranges that they state for this system.
+
+    Phases are fitted for each episode: a disturbance need not begin with it.
 
     Args:
         system: the source.
@@ -72,7 +77,7 @@ def fit_effects(
     Raises:
         ValueError: an effect that cannot be fitted, or effects that passive data cannot tell apart.
     """
-    kinds = [sized(type(effect), system) for effect in effects]
+    kinds = [with_episode_phases(sized(type(effect), system), len(measured)) for effect in effects]
     fitted = tuple(kind for kind in kinds if not kind.repeats_readings)
     for kind in fitted:
         if remembers(kind):
@@ -94,10 +99,10 @@ def fit_effects(
     stamps = [period * torch.arange(len(values)).double() for values in measured]
     rows = cut(measured, holds.used, commands, stamps, channels, period, profile.window_rows)
     present = [
-        float(getattr(effect, p.name))
+        value
         for effect, kind in zip(effects, kinds, strict=True)
         if kind in fitted
-        for p in kind.table
+        for value in with_own_phases(kind, [float(getattr(effect, p.name)) for p in in_step(kind).table])
     ]
     found = _fitted(system, fitted, rows, present)
     late = [kind for kind in fitted if issubclass(kind, LateSensors)]
@@ -110,13 +115,17 @@ def fit_effects(
         found = _best(system, fitted, [found], rows, QUICK)
     covariance = torch.linalg.inv(posterior(fitted, found)[1]) if fitted else torch.zeros(0, 0)
     states = _by_episode(rows, found.state[0], measured)
-    values = {kind: _within_a_turn(kind, found.theta[0, own]) for kind, own in columns.items()}
-    spreads = {kind: covariance[own, own] for kind, own in columns.items()}
+    values, spreads = {}, {}
+    for kind, own in columns.items():
+        plain = in_step(kind)
+        stated = slice(own.start, own.start + len(plain.table))
+        values[plain] = _within_a_turn(plain, found.theta[0, stated])
+        spreads[plain] = covariance[stated, stated]
     if Dropout in kinds:
         values[Dropout], spreads[Dropout] = _lost(holds)
     if FrozenZone in kinds:
         values[FrozenZone], spreads[FrozenZone] = _frozen(holds, states, found, profile.angle_sensor[0])
-    return EffectFit(values, spreads, states)
+    return EffectFit(values, spreads, states, _shifts(fitted, columns, found.theta[0], len(measured)))
 
 
 def remembers(effect: type[Effect]) -> bool:
@@ -156,8 +165,19 @@ def _best(
 
 def _within_a_turn(effect: type[Effect], values: Tensor) -> Tensor:
     """The parameters (P,) with phases between -pi and pi: during a fit they may go further."""
-    turns = torch.tensor([float(p.role is Role.PHASE) for p in effect.table]) * (values / (2 * math.pi)).round()
+    turns = torch.tensor([float(p.is_phase) for p in effect.table]) * (values / (2 * math.pi)).round()
     return values - 2 * math.pi * turns
+
+
+def _shifts(effects: Effects, columns: Mapping[type[Effect], slice], theta: Tensor, episodes: int) -> Tensor:
+    """By how many s the episodes' phases (E,) differ; zeros unless one effect alone depends on time."""
+    timed = [effect for effect in effects if any(p.is_phase or (p.is_edge and p.unit == "s") for p in effect.table)]
+    if len(timed) != 1 or not has_episode_phases(timed[0]):
+        return theta.new_zeros(episodes)
+    pairs = list(zip(timed[0].table, theta[columns[timed[0]]].tolist(), strict=True))
+    frequency = next(value for p, value in pairs if p.role is Role.FREQUENCY)
+    phases = theta.new_tensor([value for p, value in pairs if p.is_phase])
+    return (phases - phases[0]).remainder(2 * math.pi) / (2 * math.pi * frequency)
 
 
 def _by_episode(rows: Segments, state: Tensor, measured: Sequence[Tensor]) -> list[Tensor]:

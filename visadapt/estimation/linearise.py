@@ -57,7 +57,7 @@ def load_effect(system: type[System]) -> type[DynamicsEffect]:
 
 def search_range(table: Sequence[Parameter]) -> tuple[Tensor, Tensor]:
     """Lowest and highest values (P,) that a fit may give the parameters."""
-    margin = torch.tensor([PHASE_MARGIN * (p.role is Role.PHASE) for p in table], dtype=torch.float64)
+    margin = torch.tensor([PHASE_MARGIN * p.is_phase for p in table], dtype=torch.float64)
     low = torch.tensor([p.low for p in table], dtype=torch.float64)
     high = torch.tensor([p.high for p in table], dtype=torch.float64)
     return low - margin, high + margin
@@ -136,7 +136,8 @@ def _columns(world: World, sensing: bool) -> list[int]:
     """The parameters that change readings (`sensing`), or those that change steps: the ones of all other effects."""
     effects = [effect for effect in world.effects if isinstance(effect, Effect)]
     acts = [isinstance(effect, SensingEffect) == sensing for effect in effects for _ in effect.table]
-    return [k for k, each in enumerate(acts) if each]
+    # Rows have the phase of their own episode in the place of the first's.
+    return [k for k, each in enumerate(acts) if each and world.table[k].role is not Role.EPISODE_PHASE]
 
 
 def _tangent(

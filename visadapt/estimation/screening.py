@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from visadapt.effects import Effect, Parameter, Role
+from visadapt.estimation.episode_phases import has_episode_phases, in_step
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
@@ -108,6 +109,9 @@ def spans(system: System, rows: Segments, state: Tensor) -> dict[str, tuple[floa
     return {unit: span(variables[name]) for unit, name in profile_of(system).region_variables.items()}
 
 
+EPISODES_SCREENED = 3
+"""Episodes, the longest first, from each of which alone an effect is screened that has a phase for each episode."""
+
 MAX_STEPS = 6
 MIN_STEP_GAIN = 0.1
 """Number of Gauss-Newton steps at most, and log likelihood gained by a step below which no other is made."""
@@ -143,6 +147,8 @@ def screen(
         return by_stride[stride]
 
     def best(effect: type[Effect]) -> Candidate | None:
+        if has_episode_phases(effect):
+            return _with_episode_phases(sensitivity(1), effect)
         points, columns = starts(effect, covered) if needs_descent(effect) else grid(effect, covered)
         stride = _window_stride(profile_of(system).screening_rows, rows, len(points) * (1 + len(columns)))
         if needs_descent(effect):
@@ -153,6 +159,42 @@ def screen(
 
     found = shared_out(lambda indices: [best(candidates[k]) for k in indices], len(candidates), jobs)
     return sorted((one for one in found if one is not None), key=lambda one: -one.gain)
+
+
+def _with_episode_phases(sensitivity: Sensitivity, effect: type[Effect]) -> Candidate | None:
+    """The candidate that the screening of one long episode alone gives, with the phases that suit the others best."""
+    plain, rows, fits = in_step(effect), sensitivity.rows, sensitivity.fits
+    sizes = torch.zeros(len(rows.command)).index_add(0, rows.episode, rows.inside.sum(1).float())
+    found = []
+    for episode in sizes.argsort(descending=True, stable=True)[:EPISODES_SCREENED].tolist():
+        own = (rows.episode == episode).nonzero()[:, 0]
+        alone = screen(
+            sensitivity.system,
+            sensitivity.effects,
+            replace(fits, state=fits.state[:, own]),
+            rows.select(own),
+            [plain],
+        )
+        found += [_of_episodes(sensitivity, effect, plain, one.values) for one in alone]
+    return max(found, key=lambda one: one.gain, default=None)
+
+
+def _of_episodes(
+    sensitivity: Sensitivity, effect: type[Effect], plain: type[Effect], values: Sequence[float]
+) -> Candidate:
+    """An effect with a phase for each episode: of parameters (P,) with one phase, that which suits each best."""
+    rows, column = sensitivity.rows, next(k for k, p in enumerate(plain.table) if p.role is Role.PHASE)
+    phases = _values(plain.table[column])
+    points = torch.tensor(list(values), dtype=torch.float64).repeat(len(phases), 1)
+    points[:, column] = phases
+    change, _ = sensitivity.around(plain, points, [])
+    error = sensitivity.innovations.error[:, None]
+    gains = 0.5 * (error.square() - (error + change).square())  # (N, phases), window by window
+    by_window = gains.unflatten(0, (len(rows.episode), -1)).sum(1)
+    by_episode = by_window.new_zeros(len(rows.command), len(phases)).index_add(0, rows.episode, by_window)
+    best, chosen = by_episode.max(1)
+    points[0, column] = phases[chosen[0]]
+    return Candidate(effect, (*points[0].tolist(), *phases[chosen[1:]].tolist()), float(best.sum()))
 
 
 def _window_stride(most: float, rows: Segments, points: int) -> int:

@@ -148,7 +148,7 @@ class Sensitivity:
 
         return integrate(
             model.at(theta[0]),
-            theta.repeat_interleave(windows * (length - 1), 0),
+            model.by_row(theta, length - 1),
             spread(rows.time[:, :-1]),
             spread(state[:, :-1]),
             acted.expand(count, *acted.shape[1:]).flatten(0, 2),
@@ -164,7 +164,8 @@ class Sensitivity:
         theta = torch.cat((self.fits.theta[0], torch.zeros(count, dtype=torch.float64)))
         acted = self._acted(model, theta[None])[0].flatten(0, 1)
         time, duration = (x[:, :-1].flatten() for x in (self.rows.time, self.rows.duration))
-        args = (model.at(theta), theta, time, state[:, :-1].flatten(0, 1), acted)
+        values = model.by_row(theta, self.rows.shape[1] - 1)
+        args = (model.at(theta), values, time, state[:, :-1].flatten(0, 1), acted)
         step = linearise_step(*args, by_state=False, by_command=True, duration=duration)
         shape = (self.rows.shape[0], -1)
         return step.by_command.unflatten(0, shape), step.by_parameter[..., -count:].unflatten(0, shape)
@@ -174,6 +175,6 @@ class Sensitivity:
         rows, state, count = self.rows, self.fits.state[0], len(theta)
         time = (rows.time[:, :-1] + rows.duration[:, :-1] / 2).flatten()
         middle = ((state[:, :-1] + state[:, 1:]) / 2).flatten(0, 1)
-        world = model.at(theta.repeat_interleave(len(time), 0))
+        world = model.at(model.by_row(theta, rows.shape[1] - 1))
         out = world.load(WorldState(time.repeat(count), middle.repeat(count, 1), ()))
         return out.unflatten(0, (count, rows.shape[0], -1))

@@ -65,8 +65,9 @@ def fit_named(source: World, windows: Windows) -> Windows:
 
     By maximum likelihood over whole episodes (`estimation.effect_fit`). Where the source has sensing effects, the
     windows returned have smoothed true states in place of those recorded: the residual corrects true states, and
-    streams start from them; what policies see stays as recorded. Effects of the camera, which states do not show, keep
-    their values.
+    streams start from them; what policies see stays as recorded. Where the phase of a periodic effect differs from
+    episode to episode, the windows returned have times at which the first episode's phase is right. Effects of the
+    camera, which states do not show, keep their values.
     """
     named = [effect for effect in source.effects if isinstance(effect, Effect) and not isinstance(effect, CameraEffect)]
     if not named:
@@ -77,6 +78,9 @@ def fit_named(source: World, windows: Windows) -> Windows:
         kind = sized(type(effect), source.system)
         for parameter, value in zip(kind.table, fit.values[kind].tolist(), strict=True):
             getattr(effect, parameter.name).data.fill_(min(max(value, parameter.low), parameter.high))
+    if bool(fit.shifts.any()):
+        later = fit.shifts.repeat_interleave(torch.tensor(windows.lengths))
+        windows = replace(windows, times=windows.times + later.to(windows.times))
     if not any(isinstance(effect, SensingEffect) for effect in named):
         return windows
     return replace(windows, states=torch.cat(fit.states).to(windows.states))

@@ -199,24 +199,23 @@ def _ground(
 ) -> tuple[list[GroundLoss], Windows | None]:
     """Fit the named effects and the residual of `grounded` to the windows, or read what is in `path`.
 
-    Returns the residual's losses, and the windows; where sensing effects were fitted, with smoothed true states.
-    Without windows nothing is fitted.
+    Returns the residual's losses, and the windows as `fit_named` leaves them. Without windows nothing is fitted.
     """
     if not path.exists():
         losses: list[GroundLoss] = []
-        states = None
+        changed = {}
         if windows is not None:
             true = fit_named(known, windows)
             if first:
                 rescale(residual, known, true, settings.ground.negligible)
             losses = ground(residual, known, true, settings.ground, generator, progress)
-            states = None if true is windows else true.states
-        save_tree(path, {"weights": grounded.state_dict(), "losses": losses, "states": states})
+            changed = {} if true is windows else {"states": true.states, "times": true.times}
+        save_tree(path, {"weights": grounded.state_dict(), "losses": losses, "windows": changed})
     tree = load_tree(path)
     with fitting(path):
         load_weights(grounded, tree["weights"], path)
-        if windows is not None and tree.get("states") is not None:
-            windows = replace(windows, states=tree["states"])
+        if windows is not None:
+            windows = replace(windows, **tree["windows"])
         return [GroundLoss(*each) for each in tree["losses"]], windows
 
 

@@ -60,10 +60,11 @@ class BlackBox:
         """Loads (..., L) at variables (..., D), which are those of `inputs`."""
         return _kernel((variables - self.centre) / self.scale, self.points) @ self.weights
 
-    def at(self, variables: Tensor) -> World:
-        """The world in which N states step with the loads at `variables` (N, D), held for a period."""
+    def at(self, variables: Tensor, values: Tensor) -> World:
+        """The world in which N states step with the loads at `variables` (N, D), held for a period; `values` (P,) or
+        (N, P) are the parameters of the set's effects."""
         loads = self.loads(variables)
-        return self.model.at(torch.cat((self.fits.theta.expand(len(loads), -1), loads), -1))
+        return self.model.at(torch.cat((values.expand(len(loads), -1), loads), -1))
 
 
 def inputs(model: CandidateModel, state: Tensor) -> Tensor:

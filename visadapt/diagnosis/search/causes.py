@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from visadapt.effects import Effect, Parameter, Role, Stage
 from visadapt.effects.catalogue import twins
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.covariance import deviations
+from visadapt.estimation.episode_phases import has_episode_phases, in_step
 from visadapt.estimation.screening import spans
 from visadapt.systems import System
 
@@ -26,6 +27,8 @@ SLIGHT = 0.01
 """Share of the gap that must open again without a cause for the verdict to rest on it."""
 
 NEGLIGIBLE = 0.01  # Probability of a set up to which it does not widen the intervals of the others' parameters
+
+SHOWN = 8  # Episodes at most whose phases are stated
 
 GapClosed = Mapping[frozenset[str], float]
 """Share of the gap that a set closes on held-out episodes, by the names of its effects."""
@@ -127,7 +130,7 @@ def _averaged(
     having = [c for c in comparison.models if one.canonical in c.model.effects and c.model.names in fitted]
     known = [fitted[compared.model.names][one.canonical] for compared in having]
     values, spreads = (torch.stack(each) for each in zip(*known, strict=True))
-    phases = torch.tensor([2 * math.pi * (p.role is Role.PHASE) for p in one.canonical.table], dtype=values.dtype)
+    phases = torch.tensor([2 * math.pi * p.is_phase for p in one.canonical.table], dtype=values.dtype)
     values = values - phases * ((values - own) / (2 * math.pi)).round()
     weights = torch.tensor([compared.probability for compared in having], dtype=values.dtype)
     low, high = (_quantile(values, spreads, weights, level) for level in (0.05, 0.95))
@@ -155,13 +158,34 @@ def _estimates(
     """Parameters (P,) of an effect of a set, with intervals from `low` to `high` (P,), as the result states them."""
     covered = spans(search.system, search.rows, model.fits.state[0])
     numbers = zip(effect.table, values.tolist(), low.tolist(), high.tolist(), strict=True)
-    return {p.name: _estimate(p, value, first, last, covered) for p, value, first, last in numbers}
+    out = {p.name: _estimate(p, value, first, last, covered) for p, value, first, last in numbers}
+    if not has_episode_phases(effect):
+        return out
+    # Of another episode the phase is unknown.
+    whole = {p.name: replace(out[p.name], ci90=(p.low, p.high)) for p in effect.table if p.role is Role.PHASE}
+    return {p.name: whole.get(p.name, out[p.name]) for p in in_step(effect).table}
+
+
+def phases_of_episodes(best: ScoredModel) -> list[str]:
+    """For each effect of a set with a phase for each episode, a line that gives them."""
+    table = [(effect, parameter) for effect in best.effects for parameter in effect.table]
+    values = best.fits.theta[0].tolist()
+    out = []
+    for effect in best.effects:
+        if has_episode_phases(effect):
+            pairs = zip(table, values, strict=True)
+            phases = [math.remainder(value, 2 * math.pi) for (own, p), value in pairs if own is effect and p.is_phase]
+            shown = ", ".join(f"{phase:.2f}" for phase in phases[:SHOWN]) + ", ..." * (len(phases) > SHOWN)
+            out.append(
+                f"{effect.name}: its phase differs from episode to episode ({shown} rad); the one given is the first's"
+            )
+    return out
 
 
 def _estimate(
     parameter: Parameter, value: float, low: float, high: float, covered: Mapping[str, tuple[float, float]]
 ) -> Estimate:
-    if parameter.role is Role.PHASE:
+    if parameter.is_phase:
         turn = 2 * math.pi * round(value / (2 * math.pi))
         return Estimate(value - turn, parameter.unit, (low - turn, high - turn))
     if parameter.is_edge:

@@ -3,7 +3,7 @@
 Every set is refitted, by one Gauss-Newton step, without the episodes that it then predicts. A prediction starts from
 the state that the fitted model's smoother estimates in the held-out episode, and simulates with the recorded commands,
 without using measurements (simulation error with estimated initial state; Ljung 1999, System Identification, section
-16.5). Errors are in standard deviations of the measurement noise; the floor is the error of the smoothed states against
+16.5). A phase that is the held-out episode's own stays as it was fitted there. Errors are in standard deviations of the measurement noise; the floor is the error of the smoothed states against
 the same measurements, which is noise if the model is right.
 """
 
@@ -218,15 +218,16 @@ def _rollouts(
 
     commands, duration = padded(model.commands(theta[None])[0]), padded(rows.duration)
     commanded = padded(inputs(model, state)[..., state.shape[-1] : -1])
-    world = model.at(theta)
-    if black_box is None:
-        world, commands = model.stepping(theta, commands)
     time, out = rows.time[:, ::stride], [state[:, ::stride]]
+    values = model.by_row(theta, time.shape[1])
+    world = model.at(values)
+    if black_box is None:
+        world, commands = model.stepping(values, commands)
     for h in range(horizon):
         now = slice(h, h + length, stride)
         if black_box is not None:
             variables = torch.cat((out[-1], commanded[:, now], time[..., None]), -1)
-            world = black_box.at(variables.flatten(0, 1))
+            world = black_box.at(variables.flatten(0, 1), values)
         after = world.integrate(
             time.flatten(), out[-1].flatten(0, 1), commands[:, now].flatten(0, 1), duration[:, now].flatten()
         )

@@ -13,6 +13,7 @@ from dataclasses import replace
 from itertools import combinations
 
 from visadapt.diagnosis.search.fitted_models import FittedModels, ScoredModel, key_of, less
+from visadapt.estimation.episode_phases import has_episode_phases, with_episode_phases
 from visadapt.estimation.fit_states import CAREFUL, QUICK, Effects, neutral, with_effect
 from visadapt.estimation.fitting import OUT_OF_REACH
 from visadapt.estimation.likelihood import FitState
@@ -70,6 +71,7 @@ class Search(FittedModels):
                 bases = [f for f in self.ranked if len(f.effects) == size and f.log_odds > -math.inf]
                 self.extend(bases[:WIDEN_MODELS])
             self._settle()
+            self._phases_of_episodes()
         if progress is not None:
             progress(MAX_EFFECTS, MAX_EFFECTS, -self.best.log_odds)
 
@@ -98,6 +100,25 @@ class Search(FittedModels):
             self.polish()
             if self.best.names == before.names:
                 return
+
+    def _phases_of_episodes(self) -> None:
+        """Where something is unexplained, try periodic effects with a phase for each episode; keep them if they win."""
+        catalogue = tuple(with_episode_phases(effect, len(self.rows.command)) for effect in self.catalogue)
+        if catalogue == self.catalogue or self.leftover([self.best])[0] <= WIDEN_ABOVE:
+            return
+        rival, fitted, in_step = self.best, self.fitted, self.catalogue
+        periodic = {effect.name for effect in catalogue if has_episode_phases(effect)}
+        self._use({names: each for names, each in fitted.items() if not names & periodic}, catalogue)
+        self.extend(list({each.names: each for each in (self.source, self.best)}.values()))
+        self._settle()
+        if self.best.log_odds <= rival.log_odds:
+            self._use(fitted, in_step)
+
+    def _use(self, fitted: dict[frozenset[str], ScoredModel], catalogue: Effects) -> None:
+        """Go on with these fitted sets and this catalogue."""
+        self.fitted, self.catalogue = fitted, catalogue
+        self._screened.clear()
+        self._exchanged.clear()
 
     def extend(self, bases: Sequence[ScoredModel], most: int = MAX_CANDIDATES) -> list[ScoredModel]:
         """Every base with one more effect, fitted unless it was, for the `most` best candidates of its screening."""
