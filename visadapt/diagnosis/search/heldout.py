@@ -3,8 +3,9 @@
 Every set is refitted, by one Gauss-Newton step, without the episodes that it then predicts. A prediction starts from
 the state that the fitted model's smoother estimates in the held-out episode, and simulates with the recorded commands,
 without using measurements (simulation error with estimated initial state; Ljung 1999, System Identification, section
-16.5). A phase that is the held-out episode's own stays as it was fitted there. Errors are in standard deviations of the measurement noise; the floor is the error of the smoothed states against
-the same measurements, which is noise if the model is right.
+16.5). A phase that is the held-out episode's own stays as it was fitted there. Errors are in standard deviations of the
+measurement noise; the floor is the error of the smoothed states against the same measurements, which is noise if the
+model is right.
 """
 
 from __future__ import annotations
