@@ -31,7 +31,7 @@ from visadapt.effects import (
     Stage,
 )
 from visadapt.estimation.camera_fit import SeenBy, within_frame
-from visadapt.estimation.poses import PoseFinder, Poses
+from visadapt.estimation.poses import HIDDEN, PoseFinder, Poses
 from visadapt.estimation.profiles import profile_of
 from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, Recording
@@ -54,8 +54,6 @@ WITHIN = 1.0
 renderer, larger where a moved camera's frames are interpolated, also add to it and are not noise."""
 
 LEAN = 0.5  # rad, largest |theta| at which the pole is looked for
-
-HIDDEN = 0.5  # `Poses.contrast` above which a frame does not show cart and pole
 
 VAGUE = 3.0  # Standard deviation of a pose, over the median, above which a frame does not show it
 
@@ -218,7 +216,7 @@ def positions(recording: Recording, found: Sequence[Poses]) -> tuple[Recording, 
         new[1:] = (episode.frame[1:] != episode.frame[:-1]).any((1, 2))
         shown = np.flatnonzero(new)[np.cumsum(new) - 1]
         places.append(poses.place.nan_to_num().numpy()[shown])
-        explained.append((poses.contrast <= HIDDEN).numpy()[shown])
+        explained.append(poses.explained.numpy()[shown])
         # A late camera repeats its first frame, until it has seen another one: no frame was lost.
         fresh.append(np.ones(len(new), dtype=bool))
         fresh[-1][1 : 1 + int(new[1:].argmax())] = False

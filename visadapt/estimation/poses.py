@@ -27,8 +27,7 @@ FRESH = 3  # Steps taken, and for how many of them the Jacobian is computed anew
 
 CHUNK = 64  # Frames rendered at a time: what fits a processor's cache
 
-UNEXPLAINED = 0.35
-"""A frame is unexplained if its misfit exceeds this share of how much frames differ over the grid of poses."""
+HIDDEN = 0.5  # `Poses.contrast` above which a frame does not show cart and pole where they are drawn
 
 
 @dataclass(frozen=True)
@@ -39,10 +38,10 @@ class Poses:
     covariance: Tensor
     """(T, 2, 2) float64, misfit^2 (J'J)^-1: what white pixel errors of the size of the misfit would do to `place`"""
     misfit: Tensor  # (T,) root mean square of frame less rendered frame, in grey levels of [0, 1]
-    explained: Tensor  # (T,) whether the renderer explains the frame at all
     contrast: Tensor
     """(T,) misfit where cart and pole are drawn, over how much these differ from the mean picture there: small where
     the frame shows them, whatever light or shadow does to the rest of it"""
+    explained: Tensor  # (T,) whether the frame shows cart and pole where they are drawn
 
 
 class PoseFinder:
@@ -65,11 +64,8 @@ class PoseFinder:
         rendered = [self._render(part) for part in self._grid.split(CHUNK)]
         self.size = tuple(rendered[0].shape[1:])
         """height and width of a frame"""
-        self._mean = mean = torch.stack([part.sum(0) for part in rendered]).sum(0) / len(self._grid)
-        squares = torch.stack([(part - mean).square().sum() for part in rendered]).sum()
-        self.limit = UNEXPLAINED * float((squares / len(self._grid) / mean.numel()).sqrt())
-        """misfit beyond which a frame is unexplained, in grey levels of [0, 1]"""
-        self.grey = float(mean.mean())
+        self._mean = torch.stack([part.sum(0) for part in rendered]).sum(0) / len(self._grid)
+        self.grey = float(self._mean.mean())
         """mean grey level, of [0, 1], of the frames over the grid"""
         self._small = torch.cat([_shrink(part) for part in rendered])
 
@@ -80,7 +76,7 @@ class PoseFinder:
         place, covariance, misfit, contrast = (torch.cat(tensors).cpu() for tensors in zip(*parts, strict=True))
         # Where the picture does not depend on the pose (a cart out of sight) there is nothing to be found either.
         sound = covariance.flatten(1).isfinite().all(1)
-        return Poses(place, covariance, misfit, sound & (misfit <= self.limit), contrast)
+        return Poses(place, covariance, misfit, contrast, sound & (contrast <= HIDDEN))
 
     @torch.no_grad()
     def nearest(self, frames: Tensor, change: Callable[[Tensor], Tensor] | None = None) -> tuple[Tensor, Tensor]:

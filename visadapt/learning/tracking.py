@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from visadapt.estimation.kalman import Linear, backward
 from visadapt.estimation.linearise import linearise_step, load_effect
 from visadapt.estimation.noise import Noise, UnknownNoise, most_probable_noise
-from visadapt.estimation.poses import PoseFinder, Poses
+from visadapt.estimation.poses import HIDDEN, PoseFinder, Poses
 from visadapt.recordings import Episode
 from visadapt.world import World
 
@@ -121,11 +121,13 @@ class Tracker:
         missed = (~poses.explained).nonzero()[:, 0]
         if len(missed):
             first = int(missed[0])
+            differs = 100 * float(poses.contrast[first])
             line = (
-                f"episode {number}: the renderer does not explain {len(missed)} of {len(poses.misfit)} frames, row "
-                f"{first} the first (misfit {float(poses.misfit[first]):.3f}, at most {self.poses.limit:.3f} is right)"
+                f"episode {number}: the renderer does not explain {len(missed)} of {len(poses.contrast)} frames, row "
+                f"{first} the first (where it draws cart and pole, they differ by {differs:.0f} % of the contrast, "
+                f"at most {100 * HIDDEN:.0f} % is right)"
             )
-            if 2 * len(missed) > len(poses.misfit) or _longest(~poses.explained) > BRIDGED:
+            if 2 * len(missed) > len(poses.contrast) or _longest(~poses.explained) > BRIDGED:
                 raise TrackingError(line)
             warnings.warn(f"{line}; they were left out", TrackingWarning, stacklevel=3)
         return poses
