@@ -3,10 +3,11 @@
 import re
 
 import pytest
+import torch
 
 from tests.diagnosed import record
 from visadapt import diagnose
-from visadapt.effects import ConstantForce, ViscousFriction
+from visadapt.effects import ConstantForce, PeriodicForce, ViscousFriction
 from visadapt.systems import CartPole
 from visadapt.world import World
 
@@ -56,3 +57,14 @@ def test_what_there_is_to_do_is_said_before_it_begins(short, long):
     (line,) = long[1]
     assert re.fullmatch(r"4,800 rows of 2 channels, 2 effects: about \d+ s on 1 core, up to five times .*", line)
     assert short[1][0].startswith("600 rows of 2 channels")
+
+
+def test_the_phases_of_episodes_that_were_not_searched_are_found_too():
+    phases = torch.linspace(-3.0, 3.0, 30)[torch.randperm(30, generator=torch.Generator().manual_seed(0))]
+    running = PeriodicForce(amplitude=1.5, frequency=0.6, phase=phases, offset=0.0)
+    recording = record([running], episodes=30, measured=("x", "x_dot", "theta", "theta_dot"))
+    result = diagnose(recording, SOURCE, [PeriodicForce, ViscousFriction, ConstantForce])
+    assert result.verdict == "identified"
+    assert [cause.effect for cause in result.causes] == ["periodic_force"]
+    assert result.causes[0].parameters["amplitude"].value == pytest.approx(1.5, rel=0.03)
+    assert result.gap.closed == pytest.approx(1.0, abs=0.05)

@@ -11,7 +11,8 @@ from torch import nn
 
 from visadapt.diagnosis import policy_bound
 from visadapt.diagnosis.frames import UNSEEN, FramesError, watch, with_camera
-from visadapt.diagnosis.report.figures_data import Errors, disturbances, figure_data, film_frames
+from visadapt.diagnosis.measured_gap import measure
+from visadapt.diagnosis.report.figures_data import disturbances, figure_data, film_frames
 from visadapt.diagnosis.result import (
     AMBIGUOUS,
     IDENTIFIED,
@@ -22,22 +23,19 @@ from visadapt.diagnosis.result import (
     Where,
     without_slight,
 )
-from visadapt.diagnosis.search import duration, heldout
+from visadapt.diagnosis.search import duration
 from visadapt.diagnosis.search.all_rows import on_all_rows
 from visadapt.diagnosis.search.causes import alternatives, causes, phases_of_episodes, ranking, stage_shares
 from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
-from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.model_comparison import compare
 from visadapt.diagnosis.search.preparation import limited, prepare
 from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.verdict import MIN_GAP_CLOSED, at_bounds, left_unexplained, next_step, verdict_of
+from visadapt.diagnosis.verdict import at_bounds, left_unexplained, next_step, verdict_of
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized, twins
 from visadapt.estimation.effect_fit import remembers
-from visadapt.estimation.fit_states import Effects
-from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
 from visadapt.processes import one_thread
 from visadapt.progress import Report, staged
@@ -46,8 +44,6 @@ from visadapt.systems import System
 from visadapt.world import World
 
 TOO_SHORT = "too short to hold a part of it out: the gap is that of the rows to which the causes were fitted"
-
-RUNNERS_UP = 2  # Sets after the best for which the share of the gap that they close is computed
 
 
 @one_thread()
@@ -130,35 +126,11 @@ def diagnose(
     if film is not None and film.camera.best.camera:
         found_before.append((Stage.CAMERA, film.camera.lost))
 
-    # Predictions of the source, the best set, each cause alone and the runners-up, on held-out episodes.
-    alone = [search.single(effect) for effect in dict.fromkeys(one.canonical for group in groups for one in group)]
-    runners_up = [compared.model for compared in comparison.models[1 : 1 + RUNNERS_UP]]
-    without = [search.without(best, effect) for effect in best.effects]
-    noise = (best.fits.log_noise[0] / 2).exp()
-    shown = {frozenset(f.names): f for f in [search.source, best]}
-    sets = {names: f for f in [*alone, *without, *runners_up] if (names := frozenset(f.names)) not in shown}
-    rollouts = heldout.held_out(system, rows, _fitted(shown), lambda errors: errors, jobs)
-    source, corrected = rollouts[0], rollouts[-1]
-    rms = [errors.rms(noise) for errors in rollouts]
-    reached = rms[-1]
-    rms += heldout.held_out(system, rows, _fitted(sets), lambda errors: errors.rms(noise), jobs)
-    if repeats:
-        source = errors_with_repeats(prepared, search)
-    errors = Errors(source.rms(noise), reached, corrected.floor(noise), reached, noise)
-    gap, improvable = errors.gap(), False
-    is_held_out = rows.shape[0] > 1
-    if is_held_out and gap.closed < MIN_GAP_CLOSED:  # else a black box cannot close enough of what is left
-        black_box = heldout.beside_black_box(system, rows, best.effects, best.fits, jobs)
-        best_reached = min((reached, black_box.rms(noise)), key=lambda error: float(heldout.overall(error)[-1]))
-        errors = replace(errors, black_box=best_reached)
-        gap = errors.gap()
-        left = heldout.closed(gap.before, gap.black_box, gap.floor) - gap.closed
-        improvable = left > 1 - MIN_GAP_CLOSED and heldout.predicts_better(black_box, corrected, noise)
-    gap_closed = {names: errors.closed_by(each) for names, each in zip([*shown, *sets], rms, strict=True)}
-
-    explaining = (*repeat_causes, *causes(search, comparison, groups, gap_closed))
-    unexplained = comparison.unexplained(improvable)
-    verdict = verdict_of(comparison, gap, unexplained, improvable, explaining, bool(repeats))
+    measured = measure(search, comparison, groups, errors_with_repeats(prepared, search) if repeats else None, jobs)
+    gap = measured.gap
+    explaining = (*repeat_causes, *causes(search, comparison, groups, measured.closed))
+    unexplained = comparison.unexplained(measured.improvable)
+    verdict = verdict_of(comparison, gap, unexplained, measured.improvable, explaining, bool(repeats))
     found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
     carrying = {cause.effect for cause in without_slight(found)}
     before, after = disturbances(search, comparison)
@@ -169,26 +141,26 @@ def diagnose(
         verdict=verdict,
         where=Where(
             stage_shares(search, comparison, groups, found_before),
-            errors.by_state(system, rows.channels, bool(found)),
+            measured.errors.by_state(system, rows.channels, bool(found)),
             regions,
             () if prepared.whole is None else pushes(prepared.whole, world),
         ),
         causes=found,
-        ranking=ranking(comparison, effects, system, gap_closed, repeat_causes),
+        ranking=ranking(comparison, effects, system, measured.closed, repeat_causes),
         gap=gap,
         next_experiment=next_step(search, comparison, verdict, groups, gap),
         warnings=(
             *used.warnings,
             *prepared.warnings,
-            *(() if is_held_out else (f"{recording.sources[0]}: {TOO_SHORT}",)),
+            *(() if measured.held_out else (f"{recording.sources[0]}: {TOO_SHORT}",)),
             *left_unexplained(comparison, verdict, unexplained, system),
             *at_bounds(comparison),
             *(phases_of_episodes(best) if found else ()),
             *(f"{one.name}: {one.caveat}" for one in best.effects if one.caveat and one.name in carrying),
         ),
         figures=replace(
-            figure_data(search, source, corrected, errors, before, after, regions),
-            film=film_frames(film, rows, corrected) if film else None,
+            figure_data(search, measured.source, measured.corrected, measured.errors, before, after, regions),
+            film=film_frames(film, rows, measured.corrected) if film else None,
         ),
         policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, best),
     )
@@ -206,10 +178,6 @@ def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effec
         ):
             out.append(effect)
     return out
-
-
-def _fitted(sets: Mapping[frozenset[str], ScoredModel]) -> list[tuple[Effects, FitState]]:
-    return [(each.effects, each.fits) for each in sets.values()]
 
 
 def _regions(

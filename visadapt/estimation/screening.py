@@ -166,7 +166,8 @@ def _with_episode_phases(sensitivity: Sensitivity, effect: type[Effect]) -> Cand
     plain, rows, fits = in_step(effect), sensitivity.rows, sensitivity.fits
     sizes = torch.zeros(len(rows.command)).index_add(0, rows.episode, rows.inside.sum(1).float())
     found = []
-    for episode in sizes.argsort(descending=True, stable=True)[:EPISODES_SCREENED].tolist():
+    longest = sizes.argsort(descending=True, stable=True)[: min(EPISODES_SCREENED, int((sizes > 0).sum()))]
+    for episode in longest.tolist():
         own = (rows.episode == episode).nonzero()[:, 0]
         alone = screen(
             sensitivity.system,
@@ -175,15 +176,14 @@ def _with_episode_phases(sensitivity: Sensitivity, effect: type[Effect]) -> Cand
             rows.select(own),
             [plain],
         )
-        found += [_of_episodes(sensitivity, effect, plain, one.values) for one in alone]
+        found += [_best_phases(sensitivity, effect, one.values) for one in alone]
     return max(found, key=lambda one: one.gain, default=None)
 
 
-def _of_episodes(
-    sensitivity: Sensitivity, effect: type[Effect], plain: type[Effect], values: Sequence[float]
-) -> Candidate:
-    """An effect with a phase for each episode: of parameters (P,) with one phase, that which suits each best."""
-    rows, column = sensitivity.rows, next(k for k, p in enumerate(plain.table) if p.role is Role.PHASE)
+def _best_phases(sensitivity: Sensitivity, effect: type[Effect], values: Sequence[float]) -> Candidate:
+    """An effect with a phase for each episode: of parameters (P,) with one phase, the phase that suits each best."""
+    plain, rows = in_step(effect), sensitivity.rows
+    column = next(k for k, p in enumerate(plain.table) if p.role is Role.PHASE)
     phases = _values(plain.table[column])
     points = torch.tensor(list(values), dtype=torch.float64).repeat(len(phases), 1)
     points[:, column] = phases

@@ -37,10 +37,194 @@ class PreparedRecording:
     source: FitState | None = None  # the fit of the source to the windows searched, if a check needed it
 
 
-AS_SOURCE = Convention("nothing", ())
-
 MIN_JITTER = 1e-3
 """Deviation of stamps from even spacing, in periods, above which a fit decides whether the readings share it."""
+
+MOST_SEARCHES, STRETCH_WINDOWS = 24, 4
+"""Most rows of a recording that are used, as a multiple of those that the search uses, and windows in a stretch of
+them: the intervals from so many rows are narrow already, and the time grows with the rows."""
+
+
+def limited(recording: Recording, system: System) -> Recording:
+    """The recording; where it has more rows than a diagnosis uses, stretches that are spread evenly over it."""
+    profile = profile_of(system)
+    stretch = STRETCH_WINDOWS * max(profile.window_rows, round(PREDICTION_TIME / recording.period))
+    return spread(recording, MOST_SEARCHES * profile.search_rows, stretch)
+
+
+def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effect]] = ()) -> PreparedRecording:
+    """Prepare a recording of some or all states, and the commands; `catalogue` are the effects that may act."""
+    draft = _on_its_clock(_read(recording, system))
+    if not profile_of(system).check_sensors:
+        return draft.prepared()
+    unchecked = draft if draft.source is not None else replace(draft, source=draft.source_fit())
+    assert unchecked.source is not None
+    draft = _without_derived_velocities(_without_defective_angles(unchecked, unchecked.source))
+    # After the velocities, since those that lag make the wrong sign likelier.
+    return _in_signs_of_source(draft, unchecked.source, catalogue).prepared()
+
+
+@dataclass(frozen=True)
+class _Readings:
+    """A recording in tensors, one for each episode."""
+
+    recording: Recording
+    system: System
+    channels: tuple[int, ...]  # the m columns of the state that were measured
+    states: list[Tensor]  # (T, m)
+    commands: list[Tensor]  # (T, n_action)
+    stamps: list[Tensor]  # (T,) s
+    repeats: RepeatedReadings
+    usable: list[Tensor]  # (T, m) 1 where the recording may be used
+
+    def draft(self, stretches: Sequence[tuple[int, int, int]] | None = None) -> _Draft:
+        """Windows of the episodes, or of stretches of these."""
+        period = self.recording.period
+        # A window holds predictions from half of its rows, however fast these follow each other.
+        least = round(2 * PREDICTION_TIME / period)
+        longest = max(profile_of(self.system).window_rows, least)
+        if len(self.states) == 1:  # of which a part is held out
+            longest = min(longest, max(least, -(-len(self.states[0]) // 2)))
+        rows, raw = (
+            cut(self.states, valid, self.commands, self.stamps, self.channels, period, longest, stretches)
+            for valid in (self.repeats.used, self.usable)
+        )
+        if resolution := self.recording.resolution:
+            rows, raw = (replace(each, resolution=resolution) for each in (rows, raw))
+        return _Draft(self, rows, raw)
+
+    def whole(self, convention: Convention | None) -> Recording:
+        """Episodes from end to end, repeated readings filled in, in the signs of the source."""
+        convention = convention or Convention("nothing", ())
+        sign = sensor_checks.signs(convention, self.channels)
+        parts = zip(self.recording.episodes, self.stamps, self.commands, self.states, self.repeats.used, strict=True)
+        episodes = []
+        for episode, time, command, state, used in parts:
+            action, filled = (convention.command * command).numpy(), (sign * _filled(state, used, time)).numpy()
+            episodes.append(replace(episode, time=time.numpy(), action=action, state=filled))
+        return replace(self.recording, episodes=tuple(episodes))
+
+
+@dataclass(frozen=True)
+class _Draft:
+    """A recording on its way to being prepared."""
+
+    readings: _Readings
+    rows: Segments
+    raw: Segments
+    source: FitState | None = None  # of `rows`, where a check needed it
+    defect: tuple[float, float] | None = None
+    convention: Convention | None = None  # where it is not the source's
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def searched(self) -> Tensor:
+        """Indices of the windows that the search uses."""
+        return self.rows.spread(profile_of(self.readings.system).search_rows)
+
+    def source_fit(self) -> FitState:
+        """The source's fit to the windows searched."""
+        return Search(self.readings.system, self.rows.select(self.searched), ()).source.fits
+
+    def changed(self, rows: Segments, raw: Segments, *told: str) -> _Draft:
+        """With other rows, to which no fit is known."""
+        return replace(self, rows=rows, raw=raw, source=None, warnings=(*self.warnings, *told))
+
+    def prepared(self) -> PreparedRecording:
+        """The recording as it stands."""
+        whole = self.readings.whole(self.convention) if self.defect is None else None
+        about = self.searched, self.readings.repeats, self.defect, self.warnings, self.source
+        return PreparedRecording(self.rows, self.raw, whole, *about)
+
+
+def _read(recording: Recording, system: System) -> _Draft:
+    """All of the recording; readings that are repeated or may not be used are marked."""
+    profile = profile_of(system)
+    channels = tuple(system.index(name) for name in recording.measured)
+    quaternion = [k for k, channel in enumerate(channels) if channel in profile.quaternion]
+    states = [torch.tensor(np.asarray(e.state, dtype=np.float64)) for e in recording.episodes]
+    states = [sensor_checks.continuous_quaternion(values, quaternion) for values in states]
+    commands = [torch.tensor(np.asarray(e.action, dtype=np.float64)) for e in recording.episodes]
+    stamps = [torch.tensor(np.asarray(e.time, dtype=np.float64)) for e in recording.episodes]
+    repeats = find_repeats(states, channels, profile.angle_sensor)
+    usable = [torch.ones_like(values) for values in states]
+    if recording.usable:
+        usable = [every * torch.tensor(rows)[:, None] for every, rows in zip(usable, recording.usable, strict=True)]
+        used = [a * b for a, b in zip(repeats.used, usable, strict=True)]
+        lost = [rows & torch.tensor(kept) for rows, kept in zip(repeats.lost, recording.usable, strict=True)]
+        repeats = replace(repeats, used=used, lost=lost)
+    return _Readings(recording, system, channels, states, commands, stamps, repeats, usable).draft()
+
+
+def _on_its_clock(draft: _Draft) -> _Draft:
+    """With even stamps, where those recorded jitter and the readings do not."""
+    readings = draft.readings
+    even = [_evenly_spaced(each) for each in readings.stamps]
+    most = MIN_JITTER * readings.recording.period
+    if all(float((a - b).abs().max()) <= most for a, b in zip(readings.stamps, even, strict=True)):
+        return draft
+    steady = replace(readings, stamps=even).draft()
+    steady = replace(steady, warnings=("the stamps jitter, the readings do not: they were taken to be evenly spaced",))
+    # Without velocities whose positions are measured: they may be derived.
+    positions, channels = profile_of(readings.system).position_of, readings.channels
+    kept = [k for k, channel in enumerate(channels) if positions.get(channel) not in channels]
+    fitted, other = (replace(each, rows=each.rows.with_channels(kept)).source_fit() for each in (draft, steady))
+    chosen, fit = (steady, other) if other.likelihood[0] > fitted.likelihood[0] else (draft, fitted)
+    return replace(chosen, source=fit if len(kept) == len(channels) else None)
+
+
+def _without_defective_angles(draft: _Draft, source: FitState) -> _Draft:
+    """Without readings of the angle where its sensor is defective; `source` is the source's fit to the draft's rows."""
+    readings = draft.readings
+    sensor = profile_of(readings.system).angle_sensor
+    defect = sensor_checks.angle_defect(readings.system, draft.rows.select(draft.searched), source)
+    if defect is None:
+        return draft
+    band, full_turns = defect
+    angle = readings.channels.index(sensor[0])
+    bad = [sensor_checks.between(values[:, angle], *band) for values in readings.states]
+    told = (
+        f"{sum(int(b.sum()) for b in bad)} readings of theta between {band[0]:.2f} and {band[1]:.2f} rad "
+        "contradict those around them and the physics: the sensor is defective there; they were set aside"
+    )
+    stretches = sensor_checks.stretches_without(bad)
+    if full_turns and stretches:
+        # A potentiometer's dead zone has an unknown width, so windows end at it, and the angle runs from one of its
+        # edges to the other, so that an error of the sensor's scale is symmetric about upright.
+        states = [sensor_checks.on_one_turn(values, angle, 0.5 * (band[0] + band[1])) for values in readings.states]
+        readings = replace(readings, states=states)
+        turned = readings.draft(stretches)
+        return replace(draft, readings=readings, defect=band).changed(turned.rows, turned.raw, told)
+    rows = sensor_checks.without_angles(draft.rows, sensor, *band)
+    return replace(draft, defect=band).changed(rows, draft.raw, told)
+
+
+def _without_derived_velocities(draft: _Draft) -> _Draft:
+    """Without velocities that were derived from positions on the rig."""
+    system, channels = draft.readings.system, draft.readings.channels
+    derived = sensor_checks.derived_velocities(system, draft.rows)
+    if not derived:
+        return draft
+    kept = [k for k, channel in enumerate(channels) if system.states[channel].name not in derived]
+    told = [
+        f"{name} is {lag:.3g} s late against the slope of its position: derived on the rig, not measured; left out"
+        for name, lag in derived.items()
+    ]
+    return draft.changed(draft.rows.with_channels(kept), draft.raw.with_channels(kept), *told)
+
+
+def _in_signs_of_source(draft: _Draft, first: FitState, catalogue: Sequence[type[Effect]]) -> _Draft:
+    """In the signs in which the recording is likeliest; `first` is the source's fit before readings were left out."""
+    system, band = draft.readings.system, draft.defect
+    rows = draft.rows.select(draft.searched)
+    convention = sensor_checks.opposite_signs(system, rows, catalogue, first, draft.source)
+    if convention is None:
+        return draft
+    if band is not None and profile_of(system).angle_sensor[0] in convention.columns:
+        band = (-band[1], -band[0])
+    told = f"{convention.name} has the opposite sign of the source's; it was inverted"
+    rows, raw = (sensor_checks.to_source(each, convention) for each in (draft.rows, draft.raw))
+    return replace(draft, convention=convention, defect=band).changed(rows, raw, told)
 
 
 def _evenly_spaced(stamps: Tensor) -> Tensor:
@@ -57,121 +241,3 @@ def _filled(values: Tensor, used: Tensor, stamps: Tensor) -> Tensor:
         for column, kept in zip(values.numpy().T, used.numpy().T > 0, strict=True)
     ]
     return torch.tensor(np.stack(columns, 1))
-
-
-MOST_SEARCHES, STRETCH_WINDOWS = 24, 4
-"""Most rows of a recording that are used, as a multiple of those that the search uses, and windows in a stretch of
-them: the intervals from so many rows are narrow already, and the time grows with the rows."""
-
-
-def limited(recording: Recording, system: System) -> Recording:
-    """The recording; where it has more rows than a diagnosis uses, stretches that are spread evenly over it."""
-    profile = profile_of(system)
-    stretch = STRETCH_WINDOWS * max(profile.window_rows, round(PREDICTION_TIME / recording.period))
-    return spread(recording, MOST_SEARCHES * profile.search_rows, stretch)
-
-
-def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effect]] = ()) -> PreparedRecording:
-    """Prepare a recording of some or all states, and the commands; `catalogue` are the effects that may act."""
-    profile = profile_of(system)
-    channels = tuple(system.index(name) for name in recording.measured)
-    quaternion = [k for k, channel in enumerate(channels) if channel in profile.quaternion]
-    states = [torch.tensor(np.asarray(e.state, dtype=np.float64)) for e in recording.episodes]
-    states = [sensor_checks.continuous_quaternion(values, quaternion) for values in states]
-    commands = [torch.tensor(np.asarray(e.action, dtype=np.float64)) for e in recording.episodes]
-    stamps = [torch.tensor(np.asarray(e.time, dtype=np.float64)) for e in recording.episodes]
-    repeats = find_repeats(states, channels, profile.angle_sensor)
-    usable = [torch.ones_like(values) for values in states]
-    if recording.usable:
-        usable = [every * torch.tensor(rows)[:, None] for every, rows in zip(usable, recording.usable, strict=True)]
-        used = [a * b for a, b in zip(repeats.used, usable, strict=True)]
-        lost = [rows & torch.tensor(kept) for rows, kept in zip(repeats.lost, recording.usable, strict=True)]
-        repeats = replace(repeats, used=used, lost=lost)
-
-    # A window holds predictions from half of its rows, however fast these follow each other.
-    least = round(2 * PREDICTION_TIME / recording.period)
-    longest = max(profile.window_rows, least)
-    if len(states) == 1:  # of which a part is held out
-        longest = min(longest, max(least, -(-len(states[0]) // 2)))
-
-    def windows(
-        measured: Sequence[Tensor], clock: Sequence[Tensor], stretches: Sequence[tuple[int, int, int]] | None = None
-    ) -> tuple[Segments, Segments]:
-        """`rows` and `raw` of episodes or stretches of these."""
-        rows, raw = (
-            cut(measured, valid, commands, clock, channels, recording.period, longest, stretches)
-            for valid in (repeats.used, usable)
-        )
-        if recording.resolution:
-            rows, raw = (replace(each, resolution=recording.resolution) for each in (rows, raw))
-        return rows, raw
-
-    def searched(rows: Segments) -> Tensor:
-        return rows.spread(profile.search_rows)
-
-    def source_fit(rows: Segments) -> FitState:
-        return Search(system, rows.select(searched(rows)), ()).source.fits
-
-    rows, raw = windows(states, stamps)
-    source: FitState | None = None
-    warnings: list[str] = []
-    even = [_evenly_spaced(each) for each in stamps]
-    if any(float((a - b).abs().max()) > MIN_JITTER * recording.period for a, b in zip(stamps, even, strict=True)):
-        # Without velocities whose positions are measured: they may be derived.
-        kept = [k for k, channel in enumerate(channels) if profile.position_of.get(channel) not in channels]
-        steady, steady_raw = windows(states, even)
-        fitted, other = (source_fit(each.with_channels(kept)) for each in (rows, steady))
-        if other.likelihood[0] > fitted.likelihood[0]:
-            rows, raw, stamps, fitted = steady, steady_raw, even, other
-            warnings.append("the stamps jitter, the readings do not: they were taken to be evenly spaced")
-        source = fitted if len(kept) == len(channels) else None
-
-    def whole(convention: Convention) -> Recording:
-        sign = sensor_checks.signs(convention, channels)
-        parts = zip(recording.episodes, stamps, commands, states, repeats.used, strict=True)
-        episodes = []
-        for episode, time, command, state, used in parts:
-            action, filled = (convention.command * command).numpy(), (sign * _filled(state, used, time)).numpy()
-            episodes.append(replace(episode, time=time.numpy(), action=action, state=filled))
-        return replace(recording, episodes=tuple(episodes))
-
-    if not profile.check_sensors:
-        return PreparedRecording(rows, raw, whole(AS_SOURCE), searched(rows), repeats, None, tuple(warnings), source)
-    unchecked, first = rows, source or source_fit(rows)
-    defect = sensor_checks.angle_defect(system, rows.select(searched(rows)), first)
-    band = None
-    if defect is not None:
-        band, full_turns = defect
-        angle = channels.index(profile.angle_sensor[0])
-        bad = [sensor_checks.between(values[:, angle], *band) for values in states]
-        stretches = sensor_checks.stretches_without(bad)
-        if full_turns and stretches:
-            # A potentiometer's dead zone has an unknown width, so windows end at it, and the angle runs from one of its
-            # edges to the other, so that an error of the sensor's scale is symmetric about upright.
-            states = [sensor_checks.on_one_turn(values, angle, 0.5 * (band[0] + band[1])) for values in states]
-            rows, raw = windows(states, stamps, stretches)
-        else:
-            rows = sensor_checks.without_angles(rows, profile.angle_sensor, *band)
-        warnings.append(
-            f"{sum(int(b.sum()) for b in bad)} readings of theta between {band[0]:.2f} and {band[1]:.2f} rad "
-            "contradict those around them and the physics: the sensor is defective there; they were set aside"
-        )
-    derived = sensor_checks.derived_velocities(system, rows)
-    if derived:
-        kept = [k for k, channel in enumerate(channels) if system.states[channel].name not in derived]
-        warnings += [
-            f"{name} is {lag:.3g} s late against the slope of its position: derived on the rig, not measured; left out"
-            for name, lag in derived.items()
-        ]
-        rows, raw = rows.with_channels(kept), raw.with_channels(kept)
-    # After the velocities, since those that lag make the wrong sign likelier.
-    source = first if rows is unchecked else None
-    convention = sensor_checks.opposite_signs(system, rows.select(searched(rows)), catalogue, first, source)
-    if convention is not None:
-        rows, raw = (sensor_checks.to_source(each, convention) for each in (rows, raw))
-        source = None
-        if band is not None and profile.angle_sensor[0] in convention.columns:
-            band = (-band[1], -band[0])
-        warnings.append(f"{convention.name} has the opposite sign of the source's; it was inverted")
-    intact = None if defect is not None else whole(convention or AS_SOURCE)
-    return PreparedRecording(rows, raw, intact, searched(rows), repeats, band, tuple(warnings), source)
