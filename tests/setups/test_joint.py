@@ -186,7 +186,7 @@ class TestInterruption:
         for policy in policies[1:]:
             for key, value in policies[0].state_dict().items():
                 assert torch.equal(value, policy.state_dict()[key]), key
-        kept = load_tree(tmp_path / "None" / "round-01" / "residual.safetensors")["states"]
+        kept = load_tree(tmp_path / "None" / "round-01" / "residual.safetensors")["windows"]["states"]
         read = [torch.as_tensor(each.state) for each in read_recording(tmp_path / "None" / "round-01" / "recording.h5")]
         assert kept.shape == torch.cat(read).shape
         assert not torch.equal(kept, torch.cat(read))
