@@ -81,6 +81,8 @@ def from_states(source: World) -> SetupSettings:
     return replace(
         own,
         tuning=replace(fresh, longest=25, learning_rate=2e-3),
+        # Half of the way follows forces less closely; all of it follows the residual too far where a motor is late.
+        trust=0.75,
         # A residual is wrong where a closed loop takes it: under a late motor that policy ended at 0.7 m/s, one tuned
         # with plans at 0.03 m/s. Named effects hold everywhere.
         named=replace(fresh, closed_loop=True),
