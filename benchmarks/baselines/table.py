@@ -73,6 +73,8 @@ def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
     for name in settings.baselines:
         _module(name)
+    if unknown := sorted(set(settings.experiments) - set(PROBLEMS)):
+        raise SystemExit(f"no such experiment: {', '.join(unknown)}; there are {'; '.join(PROBLEMS)}")
     seeds = range(settings.seeds)
     jobs = [
         (name, experiment, seed) for seed in seeds for experiment in settings.experiments for name in settings.baselines
