@@ -134,7 +134,9 @@ def origins(table: Table) -> list[str]:
     done = stamps()
     lines = []
     for name in table.commands:
-        made = f"run on {done[name].date} at commit {done[name].commit}" if name in done else "not run yet"
+        made = "not run yet" + " as a whole at one commit" * (Path("results") / BY_NAME[name].table).exists()
+        if name in done:
+            made = f"run on {done[name].date} at commit {done[name].commit}"
         lines.append(f"- `results/{BY_NAME[name].table}`, {made}: `{BY_NAME[name].shown}`")
     return lines
 

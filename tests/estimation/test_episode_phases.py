@@ -35,9 +35,8 @@ def recording():
 
 def arrays(recording):
     """Readings and commands of each episode."""
-    return [torch.from_numpy(e.state) for e in recording.episodes], [
-        torch.from_numpy(e.action) for e in recording.episodes
-    ]
+    states, actions = zip(*((e.state, e.action) for e in recording.episodes), strict=True)
+    return list(map(torch.from_numpy, states)), list(map(torch.from_numpy, actions))
 
 
 def test_derivatives_by_the_phase_of_an_episode_are_those_of_finite_differences(recording):

@@ -115,6 +115,7 @@ def diagnose(
     search.run(staged(progress, "search"))
     if len(prepared.searched) < rows.shape[0]:
         search = on_all_rows(search, rows)
+    # Periodic effects may have got a phase for each episode.
     in_use = {effect.name: effect for effect in search.catalogue}
     effects = [in_use.get(effect.name, effect) for effect in effects]
     comparison = compare(search)

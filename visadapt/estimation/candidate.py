@@ -68,7 +68,7 @@ class CandidateModel:
         """columns of the parameters that change what acts of the commands"""
         self.delays = [k for k, effect in enumerate(named) if issubclass(effect, LateSensors)]
         """columns of the delays of late sensors"""
-        self._columns = phase_columns(effects, len(rows.command))
+        self._phase_columns = phase_columns(effects, len(rows.command))
         self.slopes: tuple[Tensor, Tensor] | None = None
         """transition (W, T - 1, n, n) and sensing (W, T, m, n) of an earlier linearisation, reused where given"""
 
@@ -83,16 +83,16 @@ class CandidateModel:
         They differ where an effect has a phase for each episode.
         """
         windows = len(self.rows.episode)
-        if self._columns is None:
+        if self._phase_columns is None:
             return theta if theta.dim() == 1 else theta.repeat_interleave(windows * length, 0)
-        every = theta.reshape(-1, theta.shape[-1])[:, self._columns[self.rows.episode]]
+        every = theta.reshape(-1, theta.shape[-1])[:, self._phase_columns[self.rows.episode]]
         return every.flatten(0, 1).repeat_interleave(length, 0)
 
     def by_theta(self, by_row: Tensor) -> Tensor:
         """Derivatives (W, T, n, P) by the parameters, from those by the parameters of each row."""
-        if self._columns is None:
+        if self._phase_columns is None:
             return by_row
-        columns = self._columns[self.rows.episode][:, None, None].expand_as(by_row)
+        columns = self._phase_columns[self.rows.episode][:, None, None].expand_as(by_row)
         return torch.zeros_like(by_row).scatter_add(-1, columns, by_row)
 
     def commands(self, theta: Tensor) -> Tensor:

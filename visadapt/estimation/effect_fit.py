@@ -165,7 +165,7 @@ def _best(
 
 def _within_a_turn(effect: type[Effect], values: Tensor) -> Tensor:
     """The parameters (P,) with phases between -pi and pi: during a fit they may go further."""
-    turns = torch.tensor([float(p.is_phase) for p in effect.table]) * (values / (2 * math.pi)).round()
+    turns = torch.tensor([float(p.role is Role.PHASE) for p in effect.table]) * (values / (2 * math.pi)).round()
     return values - 2 * math.pi * turns
 
 

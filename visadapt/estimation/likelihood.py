@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -48,6 +48,10 @@ class FitState(Batch):
     log_noise: Tensor  # (C, m) log variances of the measurements
     likelihood: Tensor  # (C,) log likelihood
     information: Tensor  # (C, K, K) Fisher information of the parameters
+
+    def on(self, windows: Tensor) -> FitState:
+        """The same, with the states of these windows, by index."""
+        return replace(self, state=self.state[:, windows])
 
 
 def initial_states(rows: Segments, system: System) -> Tensor:

@@ -169,13 +169,7 @@ def _with_episode_phases(sensitivity: Sensitivity, effect: type[Effect]) -> Cand
     longest = sizes.argsort(descending=True, stable=True)[: min(EPISODES_SCREENED, int((sizes > 0).sum()))]
     for episode in longest.tolist():
         own = (rows.episode == episode).nonzero()[:, 0]
-        alone = screen(
-            sensitivity.system,
-            sensitivity.effects,
-            replace(fits, state=fits.state[:, own]),
-            rows.select(own),
-            [plain],
-        )
+        alone = screen(sensitivity.system, sensitivity.effects, fits.on(own), rows.select(own), [plain])
         found += [_best_phases(sensitivity, effect, one.values) for one in alone]
     return max(found, key=lambda one: one.gain, default=None)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -67,7 +67,7 @@ class Sensitivity:
         """Use every `stride`-th window."""
         if stride > 1:
             windows = torch.arange(0, rows.shape[0], stride)
-            rows, fits = rows.select(windows), replace(fits, state=fits.state[:, windows])
+            rows, fits = rows.select(windows), fits.on(windows)
         return cls(system, effects, fits, rows, Innovations(CandidateModel(system, effects, rows), fits))
 
     def by_unit(self, effect: type[Effect], points: Tensor, linear: Sequence[int]) -> Tensor:

@@ -157,24 +157,23 @@ def _estimates(
 ) -> dict[str, Estimate]:
     """Parameters (P,) of an effect of a set, with intervals from `low` to `high` (P,), as the result states them."""
     covered = spans(search.system, search.rows, model.fits.state[0])
-    numbers = zip(effect.table, values.tolist(), low.tolist(), high.tolist(), strict=True)
+    stated = in_step(effect).table
+    numbers = zip(stated, values.tolist(), low.tolist(), high.tolist(), strict=False)  # later episodes' phases are last
     out = {p.name: _estimate(p, value, first, last, covered) for p, value, first, last in numbers}
-    if not has_episode_phases(effect):
-        return out
-    # Of another episode the phase is unknown.
-    whole = {p.name: replace(out[p.name], ci90=(p.low, p.high)) for p in effect.table if p.role is Role.PHASE}
-    return {p.name: whole.get(p.name, out[p.name]) for p in in_step(effect).table}
+    if has_episode_phases(effect):
+        # Of another episode the phase is unknown.
+        out |= {p.name: replace(out[p.name], ci90=(p.low, p.high)) for p in stated if p.role is Role.PHASE}
+    return out
 
 
 def phases_of_episodes(best: ScoredModel) -> list[str]:
     """For each effect of a set with a phase for each episode, a line that gives them."""
-    table = [(effect, parameter) for effect in best.effects for parameter in effect.table]
-    values = best.fits.theta[0].tolist()
+    counts = [len(effect.table) for effect in best.effects]
     out = []
-    for effect in best.effects:
+    for effect, values in zip(best.effects, best.fits.theta[0].split(counts), strict=True):
         if has_episode_phases(effect):
-            pairs = zip(table, values, strict=True)
-            phases = [math.remainder(value, 2 * math.pi) for (own, p), value in pairs if own is effect and p.is_phase]
+            pairs = zip(effect.table, values.tolist(), strict=True)
+            phases = [math.remainder(value, 2 * math.pi) for p, value in pairs if p.is_phase]
             shown = ", ".join(f"{phase:.2f}" for phase in phases[:SHOWN]) + ", ..." * (len(phases) > SHOWN)
             out.append(
                 f"{effect.name}: its phase differs from episode to episode ({shown} rad); the one given is the first's"
@@ -185,7 +184,7 @@ def phases_of_episodes(best: ScoredModel) -> list[str]:
 def _estimate(
     parameter: Parameter, value: float, low: float, high: float, covered: Mapping[str, tuple[float, float]]
 ) -> Estimate:
-    if parameter.is_phase:
+    if parameter.role is Role.PHASE:
         turn = 2 * math.pi * round(value / (2 * math.pi))
         return Estimate(value - turn, parameter.unit, (low - turn, high - turn))
     if parameter.is_edge:

@@ -164,7 +164,7 @@ def _of_folds(
     def on(fold: int, windows: Tensor) -> tuple[CandidateModel, FitState]:
         one = without[torch.tensor([fold])]
         model = CandidateModel(system, effects, rows.select(windows), COARSE)
-        return model, replace(one, state=one.state[:, windows])
+        return model, one.on(windows)
 
     parts = []
     for k in indices:

@@ -57,11 +57,10 @@ def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effec
     draft = _on_its_clock(_read(recording, system))
     if not profile_of(system).check_sensors:
         return draft.prepared()
-    unchecked = draft if draft.source is not None else replace(draft, source=draft.source_fit())
-    assert unchecked.source is not None
-    draft = _without_derived_velocities(_without_defective_angles(unchecked, unchecked.source))
+    first = draft.source or draft.source_fit()
+    draft = _without_derived_velocities(_without_defective_angles(replace(draft, source=first), first))
     # After the velocities, since those that lag make the wrong sign likelier.
-    return _in_signs_of_source(draft, unchecked.source, catalogue).prepared()
+    return _in_signs_of_source(draft, first, catalogue).prepared()
 
 
 @dataclass(frozen=True)
