@@ -22,6 +22,7 @@ REFERENCE_LEVELS = (("target", "before adaptation", ORANGE), ("source", "in the 
 """Domains of results without adaptation, drawn as levels: label and colour."""
 METHOD_COLOURS = (TEAL, BLUE, INK, "#8a5fb5", "#b8487a", "#7d8c2c", "#4fa3a0", "#9a6a3c")
 """Of the methods in charts, in the order in which they first come."""
+MOST_TICKS = 8  # Numbers of samples at most that are each labelled, or their labels overlap; of more, powers of ten are
 
 
 @matplotlib.rc_context(STYLE)
@@ -174,7 +175,11 @@ def _of(rows: Sequence[Mapping[str, Any]], method: str) -> list[Mapping[str, Any
 
 def _count_samples(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     ticks = sorted({float(row["samples"]) for row in rows})
-    axes.set_xticks(ticks, [f"{tick:,.0f}" for tick in ticks])
+    if len(ticks) > MOST_TICKS and axes.get_xscale() == "log":
+        axes.xaxis.set_major_locator(LogLocator())
+    else:
+        axes.set_xticks(ticks)
+    axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.set_xticks([], minor=True)
     axes.set_xlabel("counted target samples")
 
