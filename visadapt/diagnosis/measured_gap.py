@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from visadapt.diagnosis.report.figures_data import Errors
+from visadapt.diagnosis.prediction_errors import PredictionErrors
 from visadapt.diagnosis.result import Gap
 from visadapt.diagnosis.search import heldout
 from visadapt.diagnosis.search.causes import Alternative, GapClosed
@@ -26,7 +26,7 @@ class MeasuredGap:
 
     source: RolloutErrors
     corrected: RolloutErrors  # with the best set
-    errors: Errors
+    errors: PredictionErrors
     closed: GapClosed
     improvable: bool  # whether a black box beside the best set clearly predicts better
     held_out: bool  # whether there was a part to hold out
@@ -64,7 +64,7 @@ def measure(
     reached = rms[-1]
     rms += heldout.held_out(search.system, rows, _fitted(sets), lambda errors: errors.rms(noise), jobs)
     source = with_repeats or source
-    errors = Errors(source.rms(noise), reached, corrected.floor(noise), reached, noise)
+    errors = PredictionErrors(source.rms(noise), reached, corrected.floor(noise), reached, noise)
     improvable, is_held_out = False, rows.shape[0] > 1
     if is_held_out and errors.gap().closed < MIN_GAP_CLOSED:  # else a black box cannot close enough of what is left
         black_box = heldout.beside_black_box(search.system, rows, best.effects, best.fits, jobs)

@@ -138,13 +138,9 @@ def _steps(model: CandidateModel, theta: Tensor, state: Tensor, acted: Tensor, c
     tried = torch.cat((acted[..., None], _grid().expand(*acted.shape, -1)), -1)[chosen]
     count = 1 + COMMAND_POINTS
     row = chosen.flatten().nonzero()[:, 0].repeat_interleave(count)
-    values = model.by_row(theta, state.shape[1])
+    values = model.by_row(theta, state.shape[1]).expand(state[..., 0].numel(), -1)[row]
     start = model.started(theta, state)[row]
-    stepped = (
-        model.at(values if values.dim() == 1 else values[row])
-        .step(start, tried.flatten()[:, None])
-        .state.reshape(len(tried), count, -1)
-    )
+    stepped = model.at(values).step(start, tried.flatten()[:, None]).state.reshape(len(tried), count, -1)
     return stepped[:, 0], stepped[:, 1:]
 
 

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from visadapt.recordings.clock import Note, RawEpisode
@@ -18,7 +19,7 @@ from visadapt.recordings.csv import check_given, needed
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.topics import Read, Topic
 from visadapt.systems import RigidBody, System
-from visadapt.systems.rigid_body import ATTITUDE
+from visadapt.systems.rigid_body import ATTITUDE, continuous_quaternion
 
 GAP = 5.0
 """Longest interval between a topic's readings, in median intervals, that is interpolated; longer ones have no rows."""
@@ -90,7 +91,8 @@ def _rows(
             return values[rows]
         if name in quaternion:
             same = [places[other] for other in quaternion if other in places and places[other][0] == topic]
-            values = values * _signs(np.column_stack([topics[topic].values[field] for _, field in same]))
+            whole = np.column_stack([topics[topic].values[each] for _, each in same])
+            values = continuous_quaternion(torch.from_numpy(whole)).numpy()[:, same.index((topic, field))]
         angle = system.states[system.index(name)].unit == "rad"
         return np.interp(time, topics[topic].time, np.unwrap(values) if angle else values)
 
@@ -109,12 +111,6 @@ def _rows(
         lambda row: f"message {rows[row] + 1} of {slowest}",
         {name: ".".join(place) for name, place in places.items()},
     )
-
-
-def _signs(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(T,) factors, 1 or -1, that make quaternions (T, 4), which mean the same with either sign, continuous."""
-    flips = (quaternions[1:] * quaternions[:-1]).sum(1) < 0
-    return np.cumprod(np.append(1.0, np.where(flips, -1.0, 1.0)))
 
 
 def _between_readings(time: NDArray[np.float64], stamps: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -155,3 +155,9 @@ def from_angles(angles: Tensor) -> Tensor:
         ),
         -1,
     )
+
+
+def continuous_quaternion(values: Tensor) -> Tensor:
+    """Quaternions in time (T, 4), or components of them (T, k), without jumps of sign: q and -q are one attitude."""
+    jumps = (values[1:] * values[:-1]).sum(1) < 0
+    return torch.cat([values[:1], values[1:] * torch.where(jumps, -1.0, 1.0).to(values).cumprod(0)[:, None]])

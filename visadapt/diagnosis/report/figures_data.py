@@ -1,17 +1,16 @@
-"""Numbers behind a result: prediction errors by horizon and state, and the data of the report's figures."""
+"""The data of the report's figures."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from visadapt.diagnosis.frames import Film
-from visadapt.diagnosis.result import Chart, Curve, FigureData, FilmFrames, Gap, Prediction, Region
+from visadapt.diagnosis.prediction_errors import PredictionErrors
+from visadapt.diagnosis.result import Chart, Curve, FigureData, FilmFrames, Prediction, Region
 from visadapt.diagnosis.search import heldout
 from visadapt.diagnosis.search.disturbance import Disturbance, binned, disturbance
 from visadapt.diagnosis.search.heldout import RolloutErrors
@@ -19,7 +18,6 @@ from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.segments import Segments
-from visadapt.systems import System
 
 MAX_FRAMES = 100  # Of a film; 120 by 100 px with noise take 25 kB each in the page
 
@@ -28,54 +26,6 @@ MAX_PREDICTIONS, MAX_PROFILES = 3, 3
 
 SOURCE, CORRECTED = "simulator", "with the causes"
 """Labels of curves."""
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Root mean square errors of held-out predictions by horizon and channel (H, m), in units of `deviation`."""
-
-    before: Tensor  # of the source
-    after: Tensor  # of the source with the causes
-    floor: Tensor  # of the states that the smoother estimates: noise
-    black_box: Tensor  # the best that a black box reaches beside the causes
-    deviation: Tensor  # (m,) standard deviations of the measurement noise, in the states' units
-
-    def closed_by(self, rms: Tensor) -> float:
-        """Share of the gap that the set with these errors (H, m) closes."""
-        reached = heldout.overall(rms)[-1]
-        return heldout.closed(_last(self.before), float(reached), _last(self.floor))
-
-    def gap(self) -> Gap:
-        """The errors at the longest horizon, over all channels."""
-        before, after, floor, box = (_last(e) for e in (self.before, self.after, self.floor, self.black_box))
-        measure = (
-            f"root mean square error of predictions {heldout.PREDICTION_TIME:g} s ahead on held-out episodes, "
-            "in standard deviations of the measurement noise"
-        )
-        return Gap(measure, before, after, floor, box, heldout.closed(before, after, floor))
-
-    def growth(self, period: float) -> Chart:
-        """The errors over the horizon, over all channels; `period` in s."""
-        errors = {SOURCE: self.before, CORRECTED: self.after, "black box": self.black_box, "noise": self.floor}
-        curves = tuple(Curve(label, heldout.overall(error).numpy()) for label, error in errors.items())
-        return Chart("predicted ahead", "s", "error", "", period * np.arange(1, len(self.before) + 1), curves)
-
-    def by_state(self, system: System, channels: Sequence[int], explained: bool) -> dict[str, float]:
-        """Share by state of the squared error above `after` if the causes explain the gap, else above the noise floor.
-
-        NaN where the state was not measured.
-        """
-        least = self.after if explained else self.floor
-        excess = (self.before[-1].square() - least[-1].square()).clamp(min=0)
-        whole = float(excess.sum())
-        shares = {variable.name: math.nan for variable in system.states}
-        for k, channel in enumerate(channels):
-            shares[system.states[channel].name] = float(excess[k]) / whole if whole > 0 else 0.0
-        return shares
-
-
-def _last(errors: Tensor) -> float:
-    return float(heldout.overall(errors)[-1])
 
 
 def disturbances(search: Search, comparison: ModelComparison) -> tuple[Disturbance, Disturbance]:
@@ -93,7 +43,7 @@ def figure_data(
     search: Search,
     source: RolloutErrors,
     corrected: RolloutErrors,
-    errors: Errors,
+    errors: PredictionErrors,
     before: Disturbance,
     after: Disturbance,
     regions: Sequence[Region],
@@ -106,9 +56,16 @@ def figure_data(
     return FigureData(
         _predictions(search, source, corrected),
         tuple(_profile(name, units[name], residual, before, after) for name in names),
-        errors.growth(search.rows.period),
+        _growth(errors, search.rows.period),
         _spectrum(residual, before, after, search.rows.period),
     )
+
+
+def _growth(errors: PredictionErrors, period: float) -> Chart:
+    """The errors over the horizon, over all channels; `period` in s."""
+    labelled = {SOURCE: errors.before, CORRECTED: errors.after, "black box": errors.black_box, "noise": errors.floor}
+    curves = tuple(Curve(label, heldout.overall(error).numpy()) for label, error in labelled.items())
+    return Chart("predicted ahead", "s", "error", "", period * np.arange(1, len(errors.before) + 1), curves)
 
 
 def _predictions(search: Search, source: RolloutErrors, corrected: RolloutErrors) -> tuple[Prediction, ...]:

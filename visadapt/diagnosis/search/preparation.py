@@ -20,6 +20,7 @@ from visadapt.estimation.segments import Segments, cut
 from visadapt.recordings import Recording
 from visadapt.recordings.thinning import spread
 from visadapt.systems import System
+from visadapt.systems.rigid_body import continuous_quaternion
 
 
 @dataclass(frozen=True)
@@ -142,7 +143,8 @@ def _read(recording: Recording, system: System) -> _Draft:
     channels = tuple(system.index(name) for name in recording.measured)
     quaternion = [k for k, channel in enumerate(channels) if channel in profile.quaternion]
     states = [torch.tensor(np.asarray(e.state, dtype=np.float64)) for e in recording.episodes]
-    states = [sensor_checks.continuous_quaternion(values, quaternion) for values in states]
+    for values in states:
+        values[:, quaternion] = continuous_quaternion(values[:, quaternion])
     commands = [torch.tensor(np.asarray(e.action, dtype=np.float64)) for e in recording.episodes]
     stamps = [torch.tensor(np.asarray(e.time, dtype=np.float64)) for e in recording.episodes]
     repeats = find_repeats(states, channels, profile.angle_sensor)

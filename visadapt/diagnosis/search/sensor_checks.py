@@ -31,17 +31,6 @@ EFFECTS_WITH_SIGNS, LEADS_WITH_SIGNS = 2, 3
 look like a wrong sign; and how many are tried for each."""
 
 
-def continuous_quaternion(measured: Tensor, quaternion: Sequence[int]) -> Tensor:
-    """An episode (T, m) with the sign of its quaternion, in these columns, made continuous."""
-    if not quaternion:
-        return measured
-    values = measured[:, quaternion]
-    jumps = (values[1:] * values[:-1]).sum(1) < 0
-    out = measured.clone()
-    out[1:, quaternion] *= torch.where(jumps, -1.0, 1.0).to(measured).cumprod(0)[:, None]
-    return out
-
-
 def opposite_signs(
     system: System, rows: Segments, catalogue: Sequence[type[Effect]], source: FitState, fitted: FitState | None
 ) -> Convention | None:

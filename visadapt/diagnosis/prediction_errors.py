@@ -1,0 +1,55 @@
+"""Prediction errors of the source and of the causes, by horizon and channel, and the gap between them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from visadapt.diagnosis.result import Gap
+from visadapt.diagnosis.search import heldout
+from visadapt.systems import System
+
+
+@dataclass(frozen=True)
+class PredictionErrors:
+    """Root mean square errors of held-out predictions by horizon and channel (H, m), in units of `deviation`."""
+
+    before: Tensor  # of the source
+    after: Tensor  # of the source with the causes
+    floor: Tensor  # of the states that the smoother estimates: noise
+    black_box: Tensor  # the best that a black box reaches beside the causes
+    deviation: Tensor  # (m,) standard deviations of the measurement noise, in the states' units
+
+    def closed_by(self, rms: Tensor) -> float:
+        """Share of the gap that the set with these errors (H, m) closes."""
+        reached = heldout.overall(rms)[-1]
+        return heldout.closed(_last(self.before), float(reached), _last(self.floor))
+
+    def gap(self) -> Gap:
+        """The errors at the longest horizon, over all channels."""
+        before, after, floor, box = (_last(e) for e in (self.before, self.after, self.floor, self.black_box))
+        measure = (
+            f"root mean square error of predictions {heldout.PREDICTION_TIME:g} s ahead on held-out episodes, "
+            "in standard deviations of the measurement noise"
+        )
+        return Gap(measure, before, after, floor, box, heldout.closed(before, after, floor))
+
+    def by_state(self, system: System, channels: Sequence[int], explained: bool) -> dict[str, float]:
+        """Share by state of the squared error above `after` if the causes explain the gap, else above the noise floor.
+
+        NaN where the state was not measured.
+        """
+        least = self.after if explained else self.floor
+        excess = (self.before[-1].square() - least[-1].square()).clamp(min=0)
+        whole = float(excess.sum())
+        shares = {variable.name: math.nan for variable in system.states}
+        for k, channel in enumerate(channels):
+            shares[system.states[channel].name] = float(excess[k]) / whole if whole > 0 else 0.0
+        return shares
+
+
+def _last(errors: Tensor) -> float:
+    return float(heldout.overall(errors)[-1])
