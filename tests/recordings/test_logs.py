@@ -8,7 +8,6 @@ from rosbags.typesys import Stores, get_typestore
 from tests.cli.commands import refused
 from tests.logs import LATE, PERIOD, PX4, ROS, ROWS, START, motion, ros_bag, ulog
 from visadapt.recordings import RecordingError, load_recording
-from visadapt.recordings.logs import _signs
 from visadapt.systems import CartPole
 
 LOGS = {
@@ -54,13 +53,6 @@ def test_a_slower_topic_gives_the_rows_and_the_others_are_interpolated(tmp_path)
     np.testing.assert_allclose(turned, turned[0], atol=1e-5)
     np.testing.assert_allclose(episode.action, 0.5)
     assert "/theta is interpolated" in " ".join(found.warnings)
-
-
-def test_quaternions_are_made_continuous_before_they_are_interpolated():
-    angle = np.linspace(0, 1, 6)
-    turning = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle, 0 * angle])
-    told = turning * np.array([1, 1, -1, -1, 1, 1])[:, None]
-    np.testing.assert_allclose(_signs(told)[:, None] * told, turning)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.rigid_bodies import HEAVY, fly, random_states
 from visadapt.systems import Quadrotor, RigidBody
-from visadapt.systems.rigid_body import ATTITUDE, RATES, VELOCITY, from_angles, rotation, turning
+from visadapt.systems.rigid_body import ATTITUDE, RATES, VELOCITY, continuous_quaternion, from_angles, rotation, turning
 
 
 @dataclass(frozen=True)
@@ -82,3 +82,10 @@ def test_a_steady_turn_ends_where_scipy_says():
     expected = Rotation.from_quat(start.numpy(), scalar_first=True) * Rotation.from_rotvec(rates.numpy())
     np.testing.assert_allclose(rotation(attitude), expected.as_matrix(), atol=1e-5)
     torch.testing.assert_close(attitude.norm(dim=1), start.norm(dim=1), rtol=1e-6, atol=0)
+
+
+def test_quaternions_whose_sign_jumps_are_made_continuous():
+    angle = np.linspace(0, 1, 6)
+    turning_by = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle, 0 * angle])
+    jumping = turning_by * np.array([1, 1, -1, -1, 1, 1])[:, None]
+    np.testing.assert_allclose(continuous_quaternion(torch.from_numpy(jumping)), turning_by)
