@@ -115,6 +115,62 @@ def made(camera: Camera, values: Tensor) -> list[CameraEffect]:
     ]
 
 
+class _Comparison:
+    """Frames (N, H, W) less what renderer and camera draw at places (N, 2) with parameters (P,), and its derivatives.
+
+    Args:
+        fixed: names of the parameters that stay as they are, whose derivatives are 0.
+    """
+
+    def __init__(self, renderer: nn.Module, frames: Tensor, camera: Camera, fixed: frozenset[str]) -> None:
+        self.renderer = renderer
+        self.frames = frames
+        self.camera = camera
+        table = [parameter for kind in camera for parameter in kind.table]
+        self.low, self.high = (
+            torch.tensor([getattr(p, end) for p in table], dtype=torch.float64) for end in ("low", "high")
+        )
+        self.free = torch.tensor([p.name not in fixed for p in table], dtype=torch.float64)
+        self.step = (DIFFERENCE_SHARE * (self.high - self.low)).clamp_max(LONGEST_DIFFERENCE)
+
+    def left(self, place: Tensor, values: Tensor) -> Tensor:
+        """What is left of the frames, also where the renderer draws nothing of what they show."""
+        return self.frames - self._shown(self._scene(place), values)
+
+    def compared(self, place: Tensor, values: Tensor, smooth: bool) -> tuple[Tensor, float]:
+        """What is left of the frames, and its mean square where the renderer draws what they show."""
+        left = self._counted(self.left(place, values), values, smooth)
+        return left, float(left.square().mean() / within_frame(made(self.camera, values), self.frames).mean())
+
+    def slopes(self, place: Tensor, values: Tensor, smooth: bool) -> tuple[Tensor, Tensor]:
+        """Derivatives (N, 2, H W) by place and (N, P, H W) by the parameters, as central differences."""
+        by_place = [
+            self._shown(self._scene(place + h), values) - self._shown(self._scene(place - h), values)
+            for h in DIFFERENCE * torch.eye(2).to(place)
+        ]
+        scene = self._scene(place)
+        by_value = [
+            self.free[k] * (self._shown(scene, values + h) - self._shown(scene, values - h)) / (2 * self.step[k])
+            for k, h in enumerate(torch.diag(self.step))
+        ]
+        counted = [self._counted(each.to(self.frames), values, smooth) for each in (*by_place, *by_value)]
+        derivatives = torch.stack(counted, 1).flatten(2)
+        return derivatives[:, :2] / (2 * DIFFERENCE), derivatives[:, 2:]
+
+    def _scene(self, place: Tensor) -> Tensor:
+        out: Tensor = self.renderer(place[:, 0].to(self.frames), place[:, 1].to(self.frames))
+        return out
+
+    def _shown(self, scene: Tensor, values: Tensor) -> Tensor:
+        return through(scene, made(self.camera, values))
+
+    def _counted(self, pictures: Tensor, values: Tensor, smooth: bool) -> Tensor:
+        """Pictures (N, H, W), 0 where the renderer draws nothing of what is seen."""
+        effects = made(self.camera, values)
+        pictures = pictures * within_frame(effects, self.frames)
+        return smoothed(pictures, effects) if smooth else pictures
+
+
 def fit_camera(
     renderer: nn.Module,
     frames: Tensor,
@@ -126,53 +182,17 @@ def fit_camera(
 ) -> CameraFit:
     """Fit camera effects to frames (N, H, W) in [0, 1], from values (P,) and places (N, 2); `fixed` are the names of
     parameters that stay as they are; with `smooth`, to `smoothed` frames."""
-    table = [parameter for kind in camera for parameter in kind.table]
-    low, high = (torch.tensor([getattr(p, end) for p in table], dtype=torch.float64) for end in ("low", "high"))
-    free = torch.tensor([p.name not in fixed for p in table], dtype=torch.float64)
-    step = (DIFFERENCE_SHARE * (high - low)).clamp_max(LONGEST_DIFFERENCE)
-
-    def shown(scene: Tensor, at: Tensor) -> Tensor:
-        return through(scene, made(camera, at))
-
-    def counted(pictures: Tensor, phi: Tensor, smooth: bool = smooth) -> Tensor:
-        """Pictures (N, H, W), 0 where the renderer draws nothing of what is seen."""
-        effects = made(camera, phi)
-        pictures = pictures * within_frame(effects, frames)
-        return smoothed(pictures, effects) if smooth else pictures
-
-    def compared(at: Tensor, phi: Tensor, smooth: bool = smooth) -> tuple[Tensor, float]:
-        """What is left of the frames, and its mean square where the renderer draws what they show."""
-        left = counted(frames - shown(scene_at(at), phi), phi, smooth)
-        return left, float(left.square().mean() / within_frame(made(camera, phi), frames).mean())
-
-    def scene_at(at: Tensor) -> Tensor:
-        out: Tensor = renderer(at[:, 0].to(frames), at[:, 1].to(frames))
-        return out
-
-    def slopes(at: Tensor, phi: Tensor) -> tuple[Tensor, Tensor]:
-        """Derivatives (N, 2, H W) by place and (N, P, H W) by the camera's parameters."""
-        move = DIFFERENCE * torch.eye(2).to(at)
-        by_place = [shown(scene_at(at + h), phi) - shown(scene_at(at - h), phi) for h in move]
-        scene = scene_at(at)
-        nudge = torch.diag(step)
-        by_value = [
-            free[k] * (shown(scene, phi + h) - shown(scene, phi - h)) / (2 * step[k]) for k, h in enumerate(nudge)
-        ]
-        empty = frames.new_zeros(len(frames), 0, frames[0].numel())
-        return (
-            torch.stack([counted(each, phi) for each in by_place], 1).flatten(2) / (2 * DIFFERENCE),
-            torch.stack([counted(each.to(frames), phi) for each in by_value], 1).flatten(2) if by_value else empty,
-        )
-
+    pictures = _Comparison(renderer, frames, camera, fixed)
+    low, high = pictures.low, pictures.high
     values, place = values.double().clone(), place.double().clone()
-    (error, loss), damping, parts = compared(place, values), 1e-3, None
+    (error, loss), damping, parts = pictures.compared(place, values, smooth), 1e-3, None
     for _ in range(STEPS):
         if parts is None:
-            parts = _normal(*slopes(place, values), error)
+            parts = _normal(*pictures.slopes(place, values, smooth), error)
         change, moves = _solved(*parts, damping)
         tried = torch.minimum(torch.maximum(values + change, low), high)
         there = place + moves.clamp(-SPACING, SPACING)
-        error_there, loss_there = compared(there, tried)
+        error_there, loss_there = pictures.compared(there, tried, smooth)
         if loss_there < loss:
             gained = 1 - loss_there / loss
             values, place, error, loss, damping, parts = tried, there, error_there, loss_there, damping / 10, None
@@ -182,10 +202,10 @@ def fit_camera(
             damping *= 10
             if damping > 1e3:
                 break
-    noise = white_noise(frames - shown(scene_at(place), values))
-    covariance = _covariance(*slopes(place, values), error, noise, (high - low).square() / 12)
+    noise = white_noise(pictures.left(place, values))
+    covariance = _covariance(*pictures.slopes(place, values, smooth), error, noise, (high - low).square() / 12)
     if smooth:  # what is left of sharp frames is compared with that of other cameras
-        error, loss = compared(place, values, smooth=False)
+        error, loss = pictures.compared(place, values, smooth=False)
     return CameraFit(camera, values, place, loss, covariance, error)
 
 

@@ -126,6 +126,7 @@ def adapt(
         raise ValueError(
             f"the budget N = {budget} is smaller than a round of B = {round_samples} samples: raise N or lower B"
         )
+    start = {key: value.clone() for key, value in policy.state_dict().items() if not key.startswith("residual.")}
     policy.residual = residual
     untrained = copy.deepcopy(residual.network.state_dict())
     collector = explorer or policy
@@ -166,9 +167,6 @@ def adapt(
         grounded = known.with_effects([*known.effects, residual])
         progress = staged(report, f"{name}: ground")
         grounding, windows = _ground(fitted, grounded, known, residual, windows, first, settings, drawn[1], progress)
-        if number == 0:
-            own = policy.state_dict().items()
-            start = {key: value.clone() for key, value in own if not key.startswith("residual.")}
         if first and settings.feedforward:
             initialise_feedforward(policy, source, residual.scale)
             start["feedforward.weight"] = policy.feedforward.weight.detach().clone()
