@@ -30,7 +30,7 @@ from visadapt.evaluation import CartPoleScore
 from visadapt.policies import Policy
 from visadapt.policies.networks import ResidualNetwork, mlp
 from visadapt.setups.base import Setup
-from visadapt.setups.cartpole import cartpole_frames, cartpole_states, from_frames
+from visadapt.setups.cartpole import cartpole_frames, cartpole_states
 from visadapt.storage.run_folder import open_run
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, no_effects, sine_force
@@ -62,8 +62,10 @@ def untuned(setup: Setup) -> Setup:
 
 
 def held_over_a_plan(setup: Setup) -> Setup:
-    """From states: the residual's correction is constant over a plan, as from frames, so that no gradient flows."""
-    held = replace(from_frames(setup.source).tuning, observation_noise=0.0)
+    """The residual's correction is constant over a plan, so that the gradient flows through the physics alone."""
+    plans = setup.settings.refinement
+    assert plans is not None
+    held = replace(plans, iterations=300, streams=32, recorded=0.8)
     return replace(setup, settings=replace(setup.settings, tuning=held))
 
 

@@ -27,7 +27,9 @@ from visadapt.world import World
 class GroundSettings:
     """How a residual is fitted. A linear head uses `ridge`, `negligible` and, for the losses it reports, `held_out`."""
 
-    ridge: float = 10.0  # weight of the squared coefficients of a linear head; a sample's squared error has weight 1
+    ridge: float = 1.0
+    """weight of the squared coefficients of a linear head, where a sample's squared error has weight 1. With 10, a late
+    motor's residual misses 14 % of the gap after 200 samples, with 1 it misses 4 %; with 0.1 policies get worse"""
     negligible: float = 0.0
     """least scale of the residual, as a share of the root mean square change of a state in a period"""
     steps: int = 2000  # optimisation steps at most
