@@ -93,8 +93,11 @@ COMMANDS = (
     Command(
         "ablations",
         "ablations.csv",
-        ("benchmarks.ablations", "--variants", "as shipped", "no tuning"),
-        25,
+        (
+            "benchmarks.ablations",
+            *("--seeds", "2", "--variants", "as shipped", "no tuning", "correction held over a plan"),
+        ),
+        40,
         work="--work",
     ),
     Command(
