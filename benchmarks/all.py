@@ -95,9 +95,11 @@ COMMANDS = (
         "ablations.csv",
         (
             "benchmarks.ablations",
-            *("--seeds", "2", "--variants", "as shipped", "no tuning", "correction held over a plan"),
+            *("--seeds", "2"),
+            *("--targets", "2(sin t + 1) N", "dry friction 4 N", "constant 2 N", "delay 0.05 s and 1 N"),
+            *("--variants", "as shipped", "no tuning", "correction held over a plan"),
         ),
-        40,
+        25,
         work="--work",
     ),
     Command(
