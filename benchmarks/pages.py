@@ -134,9 +134,12 @@ def origins(table: Table) -> list[str]:
     done = stamps()
     lines = []
     for name in table.commands:
-        made = "not run yet" + " as a whole at one commit" * (Path("results") / BY_NAME[name].table).exists()
         if name in done:
             made = f"run on {done[name].date} at commit {done[name].commit}"
+        elif (Path("results") / BY_NAME[name].table).exists():
+            made = "not run yet as a whole at one commit"
+        else:
+            made = "not run yet"
         lines.append(f"- `results/{BY_NAME[name].table}`, {made}: `{BY_NAME[name].shown}`")
     return lines
 

@@ -158,7 +158,7 @@ def figure_3(baselines: Rows) -> Lines:
             continue
         gain = 100 * (1 - float(ours["mean"]) / float(other["mean"]))
         outcome = "" if not paper else "reached" if gain >= float(paper.split()[0]) else "not"
-        lines.append([f"than {method}", paper, f"{gain:.0f} %", ours["seeds"], outcome])
+        lines.append([f"than {method}", paper, f"{gain:z.0f} %", ours["seeds"], outcome])
     return lines
 
 
@@ -247,7 +247,7 @@ def collection(rows: Rows) -> Lines:
             if method == "data of a random policy"
         )
         name, outcome = f"{system.replace('_', ' ')}, {kind}", "reached" if gain >= random else "not"
-        lines.append([f"{name}: a random policy's", f"{random} %", f"{gain:.0f} %", own[-1]["seeds"], outcome])
+        lines.append([f"{name}: a random policy's", f"{random} %", f"{gain:z.0f} %", own[-1]["seeds"], outcome])
         lines.append([f"{name}: the MBMF's", f"{mpc} %", "not run", "", "not run"])
     return lines
 

@@ -25,8 +25,7 @@ class PredictionErrors:
 
     def closed_by(self, rms: Tensor) -> float:
         """Share of the gap that the set with these errors (H, m) closes."""
-        reached = heldout.overall(rms)[-1]
-        return heldout.closed(_last(self.before), float(reached), _last(self.floor))
+        return heldout.closed(_last(self.before), _last(rms), _last(self.floor))
 
     def gap(self) -> Gap:
         """The errors at the longest horizon, over all channels."""

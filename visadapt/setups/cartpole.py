@@ -87,7 +87,8 @@ def from_frames(source: World) -> SetupSettings:
     return SetupSettings(
         source=TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500),
         refinement=refinement,
-        # An iteration takes 0.7 s of CPU; 250 are no better than 60, and a batch of 8 is too small.
+        # An iteration takes 0.7 s of CPU. 250 are no better than 60 under forces, better under dry friction; a batch of
+        # 8 is too small.
         tuning=replace(rendered, iterations=60),
         named=replace(refinement, iterations=1200, streams=32),
         unforeseen=rendered,
