@@ -41,12 +41,8 @@ class Plans:
 
     def seen(self, history: History) -> History:
         """The history with noise, as the policy sees it."""
-        return History(self.noisy(history.observations), history.actions)
-
-    def noisy(self, observations: Tensor) -> Tensor:
-        """The observations, of any shape, with white noise."""
-        noise = self.noise * torch.randn(observations.shape, generator=self.generator)
-        return observations + noise.to(observations)
+        noise = self.noise * torch.randn(history.observations.shape, generator=self.generator)
+        return History(history.observations + noise.to(history.observations), history.actions)
 
     def tree(self) -> dict[str, Any]:
         """All that plans depend on, as a tree of tensors, for a checkpoint."""
@@ -63,23 +59,18 @@ class ClosedLoop(Plans):
     Of a plan that is carried out whole, most of the cost is of its later actions where a force acts that cannot be
     foreseen over half a second, and the first action, the only one executed, is learnt from little of the gradient
     (Xu et al. 2022, Accelerated policy learning with parallel differentiable simulation, ICLR).
-
-    The noise of an observation is drawn once, when it is made, as a camera's or a sensor's is.
     """
 
     def loss(self, iteration: int, progress: float) -> Tensor:
         streams, now = self.streams, self.streams.now
         at, history, first = now.at, now.history, now.at
-        seen = self.seen(history)
         states: list[Tensor] = []
         actions: list[Tensor] = []
         for k in range(HORIZON):
             if k > 0:
-                shown, at = look(streams.world, streams.observe, at, self.generator)
-                shown = streams.task.show(shown, now.task_state)
-                history = history.acting(actions[-1]).observing(shown)
-                seen = seen.acting(actions[-1]).observing(self.noisy(shown))
-            actions.append(self.policy.act(seen))
+                seen, at = look(streams.world, streams.observe, at, self.generator)
+                history = history.acting(actions[-1]).observing(streams.task.show(seen, now.task_state))
+            actions.append(self.policy.act(self.seen(history)))
             at = streams.world.step(at, actions[-1], history)
             states.append(at.state)
             if k == 0:
