@@ -54,6 +54,18 @@ def test_a_recording_of_the_source_has_no_gap():
     assert result.gap.before == pytest.approx(result.gap.floor, rel=0.05)
 
 
+@pytest.mark.parametrize(("step", "verdict"), [(0.002, "no_gap"), (0.1, "unexplained")])
+def test_a_gap_may_hide_in_coarse_steps_of_an_encoder(step, verdict):
+    whole = record()
+    read = [np.stack((e.state[:, 0], step * np.round(e.state[:, 1] / step)), 1) for e in whole.episodes]
+    episodes = tuple(Episode(e.time, e.action, state) for e, state in zip(whole.episodes, read, strict=True))
+    result = diagnose(dataclasses.replace(whole, episodes=episodes), SOURCE)
+    assert result.verdict == verdict
+    assert result.causes == ()
+    assert any(f"theta is read in steps of {step:g} rad" in warning for warning in result.warnings) == (step == 0.1)
+    assert ("finer steps" in result.next_experiment) == (step == 0.1)
+
+
 def test_on_a_heavy_machine_effects_are_found_beyond_the_ranges_of_a_light_one():
     """Ten times the default's masses: within its ranges a patch of friction and dry friction in the hinge are named."""
     heavy = CartPole(cart_mass=10.0, pole_mass=1.0, max_force=300.0)

@@ -131,7 +131,8 @@ def diagnose(
     gap = measured.gap
     explaining = (*repeat_causes, *causes(search, comparison, groups, measured.closed))
     unexplained = comparison.unexplained(measured.improvable)
-    verdict = verdict_of(comparison, gap, unexplained, measured.improvable, explaining, bool(repeats))
+    coarse = prepared.coarse
+    verdict = verdict_of(comparison, gap, unexplained, measured.improvable, explaining, bool(repeats), bool(coarse))
     found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
     carrying = {cause.effect for cause in without_slight(found)}
     before, after = disturbances(search, comparison)
@@ -149,7 +150,7 @@ def diagnose(
         causes=found,
         ranking=ranking(comparison, effects, system, measured.closed, repeat_causes),
         gap=gap,
-        next_experiment=next_step(search, comparison, verdict, groups, gap),
+        next_experiment=next_step(search, comparison, verdict, groups, gap, coarse),
         warnings=(
             *used.warnings,
             *prepared.warnings,

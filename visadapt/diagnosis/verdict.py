@@ -10,6 +10,7 @@ from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED
 from visadapt.diagnosis.search.causes import Alternative
 from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
+from visadapt.diagnosis.search.sensor_checks import CoarseSteps
 from visadapt.diagnosis.search.unexplained import smooth_functions
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.systems import System
@@ -35,6 +36,7 @@ def verdict_of(
     improvable: bool,
     explaining: Sequence[Cause],
     repeats: bool,
+    coarse: bool,
 ) -> str:
     """The verdict where these causes are what explains the gap best.
 
@@ -42,9 +44,12 @@ def verdict_of(
         unexplained: they leave something unexplained.
         improvable: a black box beside them clearly closes more of the gap.
         repeats: readings are repeated.
+        coarse: a position is read in steps that are coarse for the motion.
     """
+    # Coarse steps are fitted as noise; that the source predicts within them does not say that nothing departs from it.
+    nothing = UNEXPLAINED if coarse else NO_GAP
     if math.isnan(gap.closed) and not repeats:
-        return NO_GAP  # the source predicts as well as the noise allows
+        return nothing  # the source predicts as well as the noise allows
     if unexplained:
         # Where the noise is low, any model of a real machine leaves something significant: then the share of the gap
         # that is closed decides, otherwise whether what is unexplained is negligible.
@@ -54,16 +59,23 @@ def verdict_of(
             return UNEXPLAINED
     carrying = without_slight(explaining)
     if not carrying:
-        return UNEXPLAINED if unexplained or gap.before > CLEAR_OF_NOISE * gap.floor else NO_GAP
+        return UNEXPLAINED if unexplained or gap.before > CLEAR_OF_NOISE * gap.floor else nothing
     return AMBIGUOUS if any(cause.indistinguishable_from for cause in carrying) else IDENTIFIED
 
 
 def next_step(
-    search: Search, comparison: ModelComparison, verdict: str, groups: Sequence[Sequence[Alternative]], gap: Gap
+    search: Search,
+    comparison: ModelComparison,
+    verdict: str,
+    groups: Sequence[Sequence[Alternative]],
+    gap: Gap,
+    coarse: Sequence[CoarseSteps],
 ) -> str:
     """The experiment to make next, in words."""
     if verdict == NO_GAP:
         return next_experiment.more(search.profile)
+    if verdict == UNEXPLAINED and coarse:
+        return next_experiment.finer([position.state for position in coarse])
     if verdict == UNEXPLAINED:
         first = comparison.functions[0]
         if not gap.closed >= MIN_CLOSED_TO_EXPLAIN:

@@ -79,6 +79,11 @@ def more(profile: SystemProfile) -> str:
     )
 
 
+def finer(positions: Sequence[str]) -> str:
+    """The experiment where the steps of these positions' readings are coarse for the motion."""
+    return f"Read {listed(positions)} in finer steps, or record motions that are large against these steps."
+
+
 def _general(members: Collection[type[Effect]], profile: SystemProfile) -> str:
     motions = MOTIONS | (MOTIONS_IN_FLIGHT if profile.is_aircraft else {})
     stages = sorted({effect.stage for effect in members})

@@ -145,6 +145,10 @@ def _unexplained(diagnosis: Diagnosis) -> str:
             "The frames show what neither the renderer nor a known effect of the camera explains: "
             f"{number(pixels.error, 2)} grey levels{most}; its own errors are {number(pixels.usual, 2)}."
         )
+    if math.isnan(gap.closed):
+        return (
+            "Within the noise and the steps of the readings nothing departs from the simulator; a gap may hide in them."
+        )
     closed = [ranked.gap_closed for ranked in diagnosis.ranking if ranked.effects and math.isfinite(ranked.gap_closed)]
     best = max(closed, default=0.0)
     black_box = (gap.before - gap.black_box) / (gap.before - gap.floor) if gap.before != gap.floor else math.nan

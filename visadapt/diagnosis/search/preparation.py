@@ -34,6 +34,7 @@ class PreparedRecording:
     searched: Tensor  # indices of the windows that the search uses, spread evenly where there are many
     repeats: RepeatedReadings
     defect: tuple[float, float] | None  # rad, between which the angle sensor is defective
+    coarse: tuple[sensor_checks.CoarseSteps, ...]  # positions whose steps are coarse for the motion
     warnings: tuple[str, ...]
     source: FitState | None = None  # the fit of the source to the windows searched, if a check needed it
 
@@ -133,7 +134,9 @@ class _Draft:
     def prepared(self) -> PreparedRecording:
         """The recording as it stands."""
         whole = self.readings.whole(self.convention) if self.defect is None else None
-        about = self.searched, self.readings.repeats, self.defect, self.warnings, self.source
+        coarse = sensor_checks.coarse_steps(self.readings.system, self.rows)
+        warnings = (*self.warnings, *map(str, coarse))
+        about = self.searched, self.readings.repeats, self.defect, coarse, warnings, self.source
         return PreparedRecording(self.rows, self.raw, whole, *about)
 
 
