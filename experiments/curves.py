@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from visadapt.films.widgets import BLUE, HAIRLINE, INK, MUTED, ORANGE, STYLE, TEAL, Floats
-from visadapt.learning.joint import Round
+from visadapt.learning.rounds import Round
 from visadapt.storage.atomic_files import replacing
 
 REFERENCE_LEVELS = (("target", "before adaptation", ORANGE), ("source", "in the source", MUTED))

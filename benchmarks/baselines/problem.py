@@ -18,8 +18,8 @@ from benchmarks.cartpole_states import CONSTANT, FORCE, SINE
 from visadapt.effects import ActuatorDelay, ConstantForce, CoulombFriction, Effect, PeriodicForce, Residual
 from visadapt.effects.base import Role
 from visadapt.learning.grounding import ground, rescale
-from visadapt.learning.joint import collect
 from visadapt.learning.ledger import Ledger
+from visadapt.learning.rounds import collect
 from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
 from visadapt.recordings import Episode

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from experiments.curves import Chart, plot_charts, plot_curve, plot_losses
-from visadapt.learning.joint import Round
+from visadapt.learning.rounds import Round
 
 
 def make_round(samples: int) -> Round:

@@ -1,52 +1,28 @@
 """Joint learning of residual and policy: Algorithm 1 of the paper, round after round.
 
 Each round executes the policy in the target for B counted samples, grounds the residual on all samples so far, and
-tunes the policy by backpropagation through the world so grounded (`learning.plans`). Every stage of a round writes one
-file, which gets its final name once it is complete; an interrupted run goes on after the last complete stage.
+tunes the policy by backpropagation through the world so grounded (`learning.plans`). What a round does is in
+`learning.rounds`.
 """
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
 from visadapt.effects import Residual
-from visadapt.learning.explanation import NOT_DIAGNOSED, Explain, Explanation
-from visadapt.learning.grounding import GroundLoss, fit_named, ground, rescale
+from visadapt.learning.explanation import Explain
 from visadapt.learning.ledger import Ledger
-from visadapt.learning.policy import TuneSettings, initialise_feedforward, tune
+from visadapt.learning.rounds import JointLearning, Label, Round, RoundFolder
 from visadapt.learning.setup_settings import SetupSettings
-from visadapt.learning.windows import Observe, Windows
+from visadapt.learning.windows import Observe
 from visadapt.policies import Policy
-from visadapt.progress import Progress, Report, staged
-from visadapt.recordings import Episode, read_recording, write_recording
-from visadapt.storage.checkpoints import fitting, load_tree, load_weights, save_tree
-from visadapt.targets import Target, TargetError
-from visadapt.targets.rollout import run
+from visadapt.progress import Report
+from visadapt.recordings import Episode
+from visadapt.storage.checkpoints import load_tree, load_weights
+from visadapt.targets import Target
 from visadapt.world import World
-
-EXPLORATION = 0.05  # Standard deviation of white noise on the commands while data are collected
-
-FILES = ("recording.h5", "residual.safetensors", "policy.safetensors")  # What the stages of a round leave in its folder
-
-
-Label = Callable[[list[Episode]], list[Episode]]  # Gives the episodes of a round the states that grounding learns from
-
-
-@dataclass(frozen=True)
-class Round:
-    """What a round did: its losses over optimisation steps, and the samples counted when it began to learn."""
-
-    samples: int
-    grounding: Sequence[tuple[int, float, float]]  # (step, training loss, held-out loss)
-    policy: list[float]  # loss by iteration; empty where the policy was left as it is, since there is no gap
-    explanation: Explanation = NOT_DIAGNOSED
 
 
 @dataclass(frozen=True)
@@ -81,7 +57,7 @@ class Adapted:
         ends = [each.samples for each in self.rounds]
         if samples not in ends:
             raise ValueError(f"no round ended at {samples} samples; rounds ended at {', '.join(map(str, ends))}")
-        path = _weights(self.folder, ends.index(samples))
+        path = RoundFolder.of(self.folder, ends.index(samples), len(ends), 0).policy
         load_weights(policy, load_tree(path)["weights"], path)
 
 
@@ -126,142 +102,10 @@ def adapt(
         raise ValueError(
             f"the budget N = {budget} is smaller than a round of B = {round_samples} samples: raise N or lower B"
         )
-    start = {key: value.clone() for key, value in policy.state_dict().items() if not key.startswith("residual.")}
-    policy.residual = residual
-    untrained = copy.deepcopy(residual.network.state_dict())
-    collector = explorer or policy
-    known = source
-    found = NOT_DIAGNOSED
-    learnt = False  # whether the residual has been fitted
     ledger = Ledger(budget)
-    recorded: list[Episode] = []
-    episodes: list[Episode] = []
-    labelled = 0
-    rounds: list[Round] = []
+    learning = JointLearning(
+        policy, residual, source, target, settings, ledger, observe, label, report, explorer, explain
+    )
     count = math.ceil(budget / round_samples)
-    for number in range(count):
-        name = f"round {number + 1}/{count}"
-        recording, fitted, tuned = (_weights(folder, number).with_name(file) for file in FILES)
-        # Each stage draws from its own stream, so that a resumed run draws the same.
-        drawn = [torch.Generator().manual_seed(1_000_000 * seed + 10 * number + stage) for stage in range(3)]
-        if not recording.exists():
-            wanted, longest = min(round_samples, ledger.left), settings.longest_episode
-            added = found.experiment(collector, min(wanted, longest)) if found.experiment else None
-            write_recording(recording, collect(collector, target, wanted, longest, drawn[0], added))
-        new = read_recording(recording)
-        for episode in new:
-            ledger.count(f"{name}: data", episode.samples)
-        recorded += new
-        found = explain(recorded, recording.with_name("diagnosis.json")) if explain else NOT_DIAGNOSED
-        windows: Windows | None = None
-        if not found.complete:
-            # Only the residual needs states, and from the frames of a faulty camera none could be estimated.
-            episodes += label(recorded[labelled:]) if label else recorded[labelled:]
-            labelled = len(recorded)
-            windows = Windows.cut(episodes, settings.observations, observe)
-        known = source.with_effects([*source.effects, *found.effects])
-        first = not found.complete and not learnt
-        learnt = learnt or first
-        if found.complete:
-            residual.network.load_state_dict(untrained)
-        grounded = known.with_effects([*known.effects, residual])
-        progress = staged(report, f"{name}: ground")
-        grounding, windows = _ground(fitted, grounded, known, residual, windows, first, settings, drawn[1], progress)
-        if first and settings.feedforward:
-            initialise_feedforward(policy, source, residual.scale)
-            start["feedforward.weight"] = policy.feedforward.weight.detach().clone()
-        no_gap = found.complete and not len(known.effects)
-        if settings.trust < 1 or no_gap:
-            policy.load_state_dict(start, strict=False)
-        world, how, trust = grounded, settings.tuning, settings.trust
-        if found.complete:
-            world, how, trust = known, settings.with_names(known), 1.0
-        if no_gap:
-            how = replace(how, iterations=0)  # there is nothing to tune for
-        progress = staged(report, f"{name}: tune")
-        tuning = _tune(tuned, policy, start, trust, world, observe, how, drawn[2], windows, progress)
-        rounds.append(Round(ledger.used, grounding, tuning, found))
-    return Adapted(policy, ledger, rounds, [*episodes, *recorded[labelled:]], folder, known)
-
-
-def _ground(
-    path: Path,
-    grounded: World,
-    known: World,
-    residual: Residual,
-    windows: Windows | None,
-    first: bool,
-    settings: SetupSettings,
-    generator: torch.Generator,
-    progress: Progress | None,
-) -> tuple[list[GroundLoss], Windows | None]:
-    """Fit the named effects and the residual of `grounded` to the windows, or read what is in `path`.
-
-    Returns the residual's losses, and the windows as `fit_named` leaves them. Without windows nothing is fitted.
-    """
-    if not path.exists():
-        losses: list[GroundLoss] = []
-        changed = {}
-        if windows is not None:
-            true = fit_named(known, windows)
-            if first:
-                rescale(residual, known, true, settings.ground.negligible)
-            losses = ground(residual, known, true, settings.ground, generator, progress)
-            changed = {} if true is windows else {"states": true.states, "times": true.times}
-        save_tree(path, {"weights": grounded.state_dict(), "losses": losses, "windows": changed})
-    tree = load_tree(path)
-    with fitting(path):
-        load_weights(grounded, tree["weights"], path)
-        if windows is not None:
-            windows = replace(windows, **tree["windows"])
-        return [GroundLoss(*each) for each in tree["losses"]], windows
-
-
-def _tune(
-    path: Path,
-    policy: Policy,
-    start: Mapping[str, Tensor],
-    trust: float,
-    world: World,
-    observe: Observe | None,
-    settings: TuneSettings,
-    generator: torch.Generator,
-    windows: Windows | None,
-    progress: Progress | None,
-) -> list[float]:
-    """Tune the policy in `world`, then set its weights to start + trust * (tuned - start); or read them from `path`.
-
-    Returns the loss of every iteration.
-    """
-    if not path.exists():
-        partial = path.with_suffix(".partial.safetensors")
-        losses = tune(policy, world, observe, settings, generator, windows, progress, partial)
-        if trust < 1:
-            reached = policy.state_dict()
-            way = {key: torch.lerp(start[key], reached[key], trust) for key in start}
-            policy.load_state_dict(way, strict=False)
-        save_tree(path, {"weights": policy.state_dict(), "losses": losses})
-        partial.unlink(missing_ok=True)
-    tree = load_tree(path)
-    with fitting(path):
-        load_weights(policy, tree["weights"], path)
-        return list(tree["losses"])
-
-
-def _weights(folder: Path, number: int) -> Path:
-    """Where round `number`, counted from 0, leaves the policy."""
-    return folder / f"round-{number + 1:02d}" / "policy.safetensors"
-
-
-def collect(
-    policy: Policy, target: Target, wanted: int, longest: int, generator: torch.Generator, added: Tensor | None = None
-) -> list[Episode]:
-    """Episodes of `wanted` samples under `policy`, one after the other as on a machine; `added` (steps, n_action) is
-    added to the commands of each."""
-    episodes: list[Episode] = []
-    while wanted > 0:
-        episodes.append(run(target, policy, 1, min(wanted, longest), generator, EXPLORATION, added)[0].episode)
-        if episodes[-1].samples == 0:
-            raise TargetError(f"{target.name}: the episode is over before its first step")
-        wanted -= episodes[-1].samples
-    return episodes
+    rounds = [learning.round(RoundFolder.of(folder, number, count, seed), round_samples) for number in range(count)]
+    return Adapted(policy, ledger, rounds, learning.episodes, folder, learning.known)

@@ -11,8 +11,9 @@ import torch
 from torch import nn
 
 from visadapt.effects import Residual
-from visadapt.learning.joint import Adapted, Label, adapt
+from visadapt.learning.joint import Adapted, adapt
 from visadapt.learning.policy import tune
+from visadapt.learning.rounds import Label
 from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.training_state import train_or_load
 from visadapt.learning.windows import Observe

@@ -1,0 +1,249 @@
+"""One round of the paper's Algorithm 1: collect, explain, ground, tune.
+
+Each stage writes one file into the folder of its round, under its final name once it is complete, so that an
+interrupted run goes on after the last complete stage.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from visadapt.effects import Residual
+from visadapt.learning.explanation import NOT_DIAGNOSED, Explain, Explanation
+from visadapt.learning.grounding import GroundLoss, fit_named, ground, rescale
+from visadapt.learning.ledger import Ledger
+from visadapt.learning.policy import initialise_feedforward, tune
+from visadapt.learning.setup_settings import SetupSettings
+from visadapt.learning.windows import Observe, Windows
+from visadapt.policies import Policy
+from visadapt.progress import Progress, Report, staged
+from visadapt.recordings import Episode, read_recording, write_recording
+from visadapt.storage.checkpoints import fitting, load_tree, load_weights, save_tree
+from visadapt.targets import Target, TargetError
+from visadapt.targets.rollout import run
+from visadapt.world import World
+
+EXPLORATION = 0.05  # Standard deviation of white noise on the commands while data are collected
+
+Label = Callable[[list[Episode]], list[Episode]]  # Gives the episodes of a round the states that grounding learns from
+
+
+@dataclass(frozen=True)
+class Round:
+    """What a round did: its losses over optimisation steps, and the samples counted when it began to learn."""
+
+    samples: int
+    grounding: Sequence[tuple[int, float, float]]  # (step, training loss, held-out loss)
+    policy: list[float]  # loss by iteration; empty where the policy was left as it is, since there is no gap
+    explanation: Explanation = NOT_DIAGNOSED
+
+
+@dataclass(frozen=True)
+class RoundFolder:
+    """Where a round is kept, and the seeds of its stages."""
+
+    path: Path
+    name: str  # in progress and ledger
+    seed: int  # of the first stage
+
+    @classmethod
+    def of(cls, run: Path, number: int, count: int, seed: int) -> RoundFolder:
+        """Round `number`, from 0, of `count` rounds in the folder `run`, with the run's seed."""
+        path, name = run / f"round-{number + 1:02d}", f"round {number + 1}/{count}"
+        return cls(path, name, 1_000_000 * seed + 10 * number)
+
+    @property
+    def recording(self) -> Path:
+        """Episodes that were collected."""
+        return self.path / "recording.h5"
+
+    @property
+    def diagnosis(self) -> Path:
+        """What a diagnosis of all episodes so far found."""
+        return self.path / "diagnosis.json"
+
+    @property
+    def residual(self) -> Path:
+        """Weights of the residual and of the named effects, once they are fitted."""
+        return self.path / "residual.safetensors"
+
+    @property
+    def policy(self) -> Path:
+        """Weights of the policy, once it is tuned."""
+        return self.path / "policy.safetensors"
+
+    def generator(self, stage: int) -> torch.Generator:
+        """Random numbers of a stage: each has its own, so that a resumed run draws the same."""
+        return torch.Generator().manual_seed(self.seed + stage)
+
+
+@dataclass
+class JointLearning:
+    """A run of Algorithm 1 between two rounds; policy and residual are changed in place."""
+
+    policy: Policy
+    residual: Residual
+    source: World
+    target: Target
+    settings: SetupSettings
+    ledger: Ledger
+    observe: Observe | None
+    label: Label | None
+    report: Report | None
+    explorer: Policy | None
+    explain: Explain | None
+    recorded: list[Episode] = field(default_factory=list)  # all episodes of the target
+    labelled: list[Episode] = field(default_factory=list)  # those with the states that grounding learns from
+    waiting: list[Episode] = field(default_factory=list)  # the others, from rounds that needed no residual
+    found: Explanation = NOT_DIAGNOSED  # by the last round's diagnosis
+    grounded: bool = False  # whether the residual has been fitted
+
+    def __post_init__(self) -> None:
+        weights = self.policy.state_dict()
+        self.first = {key: value.clone() for key, value in weights.items() if not key.startswith("residual.")}
+        """weights of the policy before the first round, with its feed-forward once that is known"""
+        self.untrained = copy.deepcopy(self.residual.network.state_dict())
+        """weights of the residual before the first round"""
+        self.policy.residual = self.residual
+
+    @property
+    def known(self) -> World:
+        """The source with the effects that the last diagnosis named."""
+        return self.source.with_effects([*self.source.effects, *self.found.effects])
+
+    @property
+    def episodes(self) -> list[Episode]:
+        """The episodes of the target, with states as far as grounding needed them."""
+        return [*self.labelled, *self.waiting]
+
+    def round(self, folder: RoundFolder, samples: int) -> Round:
+        """Collect at most `samples`, explain all that was collected, ground, and tune."""
+        self._collect(folder, samples)
+        if self.explain is not None:
+            self.found = self.explain(self.recorded, folder.diagnosis)
+        if self.found.complete:
+            losses: list[GroundLoss] = []
+            self.residual.network.load_state_dict(self.untrained)
+            tuning = self._tune_with_names(folder)
+        else:
+            losses, windows = self._ground(folder)
+            tuning = self._tune_with_residual(folder, windows)
+        return Round(self.ledger.used, losses, tuning, self.found)
+
+    def _collect(self, folder: RoundFolder, samples: int) -> None:
+        """Run the policy on the target for so many samples, or read those that it has run."""
+        if not folder.recording.exists():
+            collector, longest = self.explorer or self.policy, self.settings.longest_episode
+            wanted = min(samples, self.ledger.left)
+            added = self.found.experiment(collector, min(wanted, longest)) if self.found.experiment else None
+            episodes = collect(collector, self.target, wanted, longest, folder.generator(0), added)
+            write_recording(folder.recording, episodes)
+        for episode in read_recording(folder.recording):
+            self.ledger.count(f"{folder.name}: data", episode.samples)
+            self.recorded.append(episode)
+            self.waiting.append(episode)
+
+    def _windows(self) -> Windows:
+        """Windows of all episodes. Only the residual needs their states, and from the frames of a faulty camera none
+        could be estimated."""
+        self.labelled += self.label(self.waiting) if self.label else self.waiting
+        self.waiting = []
+        return Windows.cut(self.labelled, self.settings.observations, self.observe)
+
+    def _ground(self, folder: RoundFolder) -> tuple[list[GroundLoss], Windows]:
+        """Fit the named effects and the residual to all samples; the residual's losses, and the windows with the states
+        and times that `fit_named` gives them."""
+        windows, known = self._windows(), self.known
+        world = known.with_effects([*known.effects, self.residual])
+        if not folder.residual.exists():
+            true = fit_named(known, windows)
+            if not self.grounded:
+                rescale(self.residual, known, true, self.settings.ground.negligible)
+            progress = self._progress(folder, "ground")
+            losses = ground(self.residual, known, true, self.settings.ground, folder.generator(1), progress)
+            changed = {} if true is windows else {"states": true.states, "times": true.times}
+            save_tree(folder.residual, {"weights": world.state_dict(), "losses": losses, "windows": changed})
+        tree = load_tree(folder.residual)
+        with fitting(folder.residual):
+            load_weights(world, tree["weights"], folder.residual)
+            windows = replace(windows, **tree["windows"])
+            return [GroundLoss(*each) for each in tree["losses"]], windows
+
+    def _tune_with_residual(self, folder: RoundFolder, windows: Windows) -> list[float]:
+        """Tune the policy in the source with the named effects and the residual; the loss of every iteration."""
+        if not self.grounded and self.settings.feedforward:
+            initialise_feedforward(self.policy, self.source, self.residual.scale)
+            self.first["feedforward.weight"] = self.policy.feedforward.weight.detach().clone()
+        self.grounded = True
+        trust = self.settings.trust
+        if trust < 1:
+            self._start_anew()
+        known = self.known
+        world = known.with_effects([*known.effects, self.residual])
+
+        def tuned(partial: Path) -> list[float]:
+            about = self.settings.tuning, folder.generator(2), windows, self._progress(folder, "tune"), partial
+            losses = tune(self.policy, world, self.observe, *about)
+            if trust < 1:
+                reached = self.policy.state_dict()
+                way = {key: torch.lerp(self.first[key], reached[key], trust) for key in self.first}
+                self.policy.load_state_dict(way, strict=False)
+            return losses
+
+        return self._kept(folder.policy, tuned)
+
+    def _tune_with_names(self, folder: RoundFolder) -> list[float]:
+        """Tune the policy in the source with the named effects alone; where there is no gap, it gets its weights from
+        before the first round."""
+        world = self.known
+        no_gap = not len(world.effects)
+        if no_gap or self.settings.trust < 1:
+            self._start_anew()
+
+        def tuned(partial: Path) -> list[float]:
+            if no_gap:
+                return []
+            how, progress = self.settings.with_names(world), self._progress(folder, "tune")
+            return tune(self.policy, world, self.observe, how, folder.generator(2), None, progress, partial)
+
+        return self._kept(folder.policy, tuned)
+
+    def _start_anew(self) -> None:
+        """Give the policy its weights from before the first round."""
+        self.policy.load_state_dict(self.first, strict=False)
+
+    def _kept(self, path: Path, tuned: Callable[[Path], list[float]]) -> list[float]:
+        """The losses of `tuned`, which tunes the policy and keeps its unfinished state in the file that it is given; or
+        those in `path`, whose weights the policy then gets."""
+        if not path.exists():
+            partial = path.with_suffix(".partial.safetensors")
+            losses = tuned(partial)
+            save_tree(path, {"weights": self.policy.state_dict(), "losses": losses})
+            partial.unlink(missing_ok=True)
+        tree = load_tree(path)
+        with fitting(path):
+            load_weights(self.policy, tree["weights"], path)
+            return list(tree["losses"])
+
+    def _progress(self, folder: RoundFolder, stage: str) -> Progress | None:
+        return staged(self.report, f"{folder.name}: {stage}")
+
+
+def collect(
+    policy: Policy, target: Target, wanted: int, longest: int, generator: torch.Generator, added: Tensor | None = None
+) -> list[Episode]:
+    """Episodes of `wanted` samples under `policy`, one after the other as on a machine; `added` (steps, n_action) is
+    added to the commands of each."""
+    episodes: list[Episode] = []
+    while wanted > 0:
+        episodes.append(run(target, policy, 1, min(wanted, longest), generator, EXPLORATION, added)[0].episode)
+        if episodes[-1].samples == 0:
+            raise TargetError(f"{target.name}: the episode is over before its first step")
+        wanted -= episodes[-1].samples
+    return episodes
