@@ -180,6 +180,7 @@ class TestInterruption:
             if after is not None:
                 with pytest.raises(KeyboardInterrupt):
                     adapt(policy, residual, *args, report=stopping("round 2/2: tune", after))
+                torch.manual_seed(0)
                 policy, residual = StatePolicy(4), Residual(StateResidualNetwork(4), torch.ones(4))
             adapt(policy, residual, *args)
             policies.append(policy)
@@ -236,6 +237,17 @@ class TestLearning:
             moved = (half[key] - first[key]).norm()
             assert moved > 0
             assert (second[key] - first[key]).norm() < 1.5 * moved
+
+    @pytest.mark.parametrize("tunes_on", [True, False])
+    def test_a_round_tunes_from_the_first_weights_or_on_from_the_last(self, tmp_path, tunes_on):
+        settings = dataclasses.replace(QUICK, tunes_on=tunes_on, feedforward=False)
+        run(tmp_path, settings, budget=60, round_samples=15)
+        torch.manual_seed(0)
+        first = StatePolicy(4).state_dict()["rest.0.weight"]
+        files = [tmp_path / f"round-0{number}" / "policy.safetensors" for number in (1, 4)]
+        once, last = [(load_tree(file)["weights"]["rest.0.weight"] - first).norm() for file in files]
+        assert once > 0
+        assert (last > 1.3 * once) == tunes_on
 
     def test_each_round_and_each_seed_meets_the_target_in_other_states(self, whole, tmp_path):
         _, adapted, _ = whole

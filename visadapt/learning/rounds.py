@@ -181,10 +181,9 @@ class JointLearning:
             initialise_feedforward(self.policy, self.source, self.residual.scale)
             self.first["feedforward.weight"] = self.policy.feedforward.weight.detach().clone()
         self.grounded = True
-        trust = self.settings.trust
-        if trust < 1:
+        if not self.settings.tunes_on:
             self._start_anew()
-        known = self.known
+        trust, known = self.settings.trust, self.known
         world = known.with_effects([*known.effects, self.residual])
 
         def tuned(partial: Path) -> list[float]:
@@ -203,7 +202,7 @@ class JointLearning:
         before the first round."""
         world = self.known
         no_gap = not len(world.effects)
-        if no_gap or self.settings.trust < 1:
+        if no_gap or not self.settings.tunes_on:
             self._start_anew()
 
         def tuned(partial: Path) -> list[float]:

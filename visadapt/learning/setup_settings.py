@@ -32,9 +32,10 @@ class SetupSettings:
     feedforward: bool = True
     """begin with a feed-forward that opposes the residual's correction; False where no one command can cancel it"""
     trust: float = 1.0
-    """after each round the policy gets w0 + trust (w - w0), of the weights w0 before the first round and those tuned in
-    this round, w, since the grounded source is not the target. Below 1 each round tunes from w0, at 1 from the weights
-    of the round before"""
+    """share of the way from the policy's weights before the first round to those tuned in a round that it goes, since
+    the grounded source is not the target"""
+    tunes_on: bool = False
+    """a round tunes on from the weights of the round before; False: it begins with those before the first round"""
     refinement: TuneSettings | None = None
     """second training of the policy in the source, after `source`: near rest, say, where it is scored"""
     named: TuneSettings | None = None

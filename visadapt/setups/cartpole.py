@@ -73,8 +73,6 @@ def from_states(source: World) -> SetupSettings:
         # tuned with plans ended at 0.03 m/s: that loop trusts the residual more than it deserves. Named effects hold
         # everywhere.
         named=replace(plans, closed_loop=True),
-        # At 1 each round would tune on from the last one, and under a changing force the policy would get worse with
-        # more data: 0.015 m/s after 300 samples, 0.022 after 1,000.
         trust=0.9,
     )
 

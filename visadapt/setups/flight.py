@@ -80,4 +80,6 @@ def fixed_wing(source: World | None = None, with_history: bool = False) -> Setup
 
 def _settings(source: TuneSettings, tuning: TuneSettings) -> SetupSettings:
     assert isinstance(tuning.task, FlightTask)
-    return SetupSettings(source, tuning, ground=GROUND, longest_episode=tuning.task.steps, feedforward=False)
+    return SetupSettings(
+        source, tuning, ground=GROUND, longest_episode=tuning.task.steps, feedforward=False, tunes_on=True
+    )
