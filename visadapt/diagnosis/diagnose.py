@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import nn
 
 from visadapt.diagnosis import policy_bound
 from visadapt.diagnosis.frames import UNSEEN, FramesError, watch, with_camera
-from visadapt.diagnosis.measured_gap import measure
+from visadapt.diagnosis.measured_gap import MeasuredGap, measure
 from visadapt.diagnosis.report.figures_data import disturbances, figure_data, film_frames
 from visadapt.diagnosis.result import (
     AMBIGUOUS,
@@ -25,10 +25,17 @@ from visadapt.diagnosis.result import (
 )
 from visadapt.diagnosis.search import duration
 from visadapt.diagnosis.search.all_rows import on_all_rows
-from visadapt.diagnosis.search.causes import alternatives, causes, phases_of_episodes, ranking, stage_shares
+from visadapt.diagnosis.search.causes import (
+    Alternative,
+    alternatives,
+    causes,
+    phases_of_episodes,
+    ranking,
+    stage_shares,
+)
 from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
-from visadapt.diagnosis.search.model_comparison import compare
-from visadapt.diagnosis.search.preparation import limited, prepare
+from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
+from visadapt.diagnosis.search.preparation import PreparedRecording, limited, prepare
 from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
@@ -36,7 +43,6 @@ from visadapt.diagnosis.verdict import at_bounds, left_unexplained, next_step, v
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized, twins
 from visadapt.estimation.effect_fit import remembers
-from visadapt.estimation.profiles import profile_of
 from visadapt.processes import one_thread
 from visadapt.progress import Report, staged
 from visadapt.recordings import Recording
@@ -93,50 +99,30 @@ def diagnose(
     if len(world.effects):
         raise ValueError("diagnose: the world is the source and has no effects; give the bare system")
     system = world.system
-    profile = profile_of(system)
-    effects = all_effects(system) if catalogue is None else [sized(effect, system) for effect in catalogue]
-    films = not recording.measured
-    effects = [effect for effect in effects if (effect not in UNSEEN if films else effect.stage is not Stage.CAMERA)]
-    film = None
-    if films:
-        if renderer is None:
-            raise FramesError(f"{recording.sources[0]}: frames are diagnosed with the renderer that draws the scene")
-        film = watch(recording, system, renderer, progress)
-        recording = film.positions
     if policy is not None:
         policy_bound.check(policy, system)
-    candidates = searched(effects, system)
+    effects = all_effects(system) if catalogue is None else [sized(effect, system) for effect in catalogue]
+    film = None
+    if recording.measured:
+        effects = [effect for effect in effects if effect.stage is not Stage.CAMERA]
+    else:
+        if renderer is None:
+            raise FramesError(f"{recording.sources[0]}: frames are diagnosed with the renderer that draws the scene")
+        effects = [effect for effect in effects if effect not in UNSEEN]
+        film = watch(recording, system, renderer, progress)
+        recording = film.positions
     used = limited(recording, system)
-    prepared = prepare(used, system, candidates)
-    rows = prepared.rows
-    search = Search(system, rows.select(prepared.searched), candidates, prepared.source, jobs)
-    if announce is not None:
-        announce(duration.announcement(rows, len(candidates), duration.expected(search, rows), jobs))
-    search.run(staged(progress, "search"))
-    if len(prepared.searched) < rows.shape[0]:
-        search = on_all_rows(search, rows)
-    # Periodic effects may have got a phase for each episode.
-    in_use = {effect.name: effect for effect in search.catalogue}
-    effects = [in_use.get(effect.name, effect) for effect in effects]
-    comparison = compare(search)
-    best = comparison.best
-    groups = alternatives(comparison, effects, system)
-    repeats = repeated_reading_causes(prepared, search, comparison, FrameDrop if film else Dropout)
-    repeat_causes = [cause for cause, _ in repeats]
-    found_before = [(EFFECTS[cause.effect].stage, cost) for cause, cost in repeats]
+    explored = _explore(used, system, effects, FrameDrop if film else Dropout, jobs, progress, announce)
+    prepared, search, comparison = explored.prepared, explored.search, explored.comparison
+    groups, rows = explored.groups, prepared.rows
+    repeats = [cause for cause, _ in explored.repeats]
+    measured = measure(search, comparison, groups, errors_with_repeats(prepared, search) if repeats else None, jobs)
+    verdict, found = _judge(explored, measured)
+    before, after = disturbances(search, comparison)
+    regions = _regions(found, before if found else after, explored.effects, search.profile.region_variables, seed)
+    found_before = [(EFFECTS[cause.effect].stage, cost) for cause, cost in explored.repeats]
     if film is not None and film.camera.best.camera:
         found_before.append((Stage.CAMERA, film.camera.lost))
-
-    measured = measure(search, comparison, groups, errors_with_repeats(prepared, search) if repeats else None, jobs)
-    gap = measured.gap
-    explaining = (*repeat_causes, *causes(search, comparison, groups, measured.closed))
-    unexplained = comparison.unexplained(measured.improvable)
-    coarse = prepared.coarse
-    verdict = verdict_of(comparison, gap, unexplained, measured.improvable, explaining, bool(repeats), bool(coarse))
-    found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
-    carrying = {cause.effect for cause in without_slight(found)}
-    before, after = disturbances(search, comparison)
-    regions = _regions(found, before if found else after, effects, profile.region_variables, seed)
     found_in_motion = Diagnosis(
         system=system.name,
         recording=RecordingSummary(len(recording.episodes), recording.samples, float(f"{recording.period:.9g}")),
@@ -148,25 +134,85 @@ def diagnose(
             () if prepared.whole is None else pushes(prepared.whole, world),
         ),
         causes=found,
-        ranking=ranking(comparison, effects, system, measured.closed, repeat_causes),
-        gap=gap,
-        next_experiment=next_step(search, comparison, verdict, groups, gap, coarse),
-        warnings=(
-            *used.warnings,
-            *prepared.warnings,
-            *(() if measured.held_out else (f"{recording.sources[0]}: {TOO_SHORT}",)),
-            *left_unexplained(comparison, verdict, unexplained, system),
-            *at_bounds(comparison),
-            *(phases_of_episodes(best) if found else ()),
-            *(f"{one.name}: {one.caveat}" for one in best.effects if one.caveat and one.name in carrying),
-        ),
+        ranking=ranking(comparison, explored.effects, system, measured.closed, repeats),
+        gap=measured.gap,
+        next_experiment=next_step(search, comparison, verdict, groups, measured.gap, prepared.coarse),
+        warnings=(*used.warnings, *_warnings(explored, measured, verdict, found, recording.sources[0])),
         figures=replace(
             figure_data(search, measured.source, measured.corrected, measured.errors, before, after, regions),
             film=film_frames(film, rows, measured.corrected) if film else None,
         ),
-        policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, best),
+        policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, comparison.best),
     )
     return found_in_motion if film is None else with_camera(found_in_motion, film, system)
+
+
+@dataclass(frozen=True)
+class _Explored:
+    """A recording of states, and which sets of effects explain it."""
+
+    effects: list[type[Effect]]  # that may be named
+    prepared: PreparedRecording
+    search: Search
+    comparison: ModelComparison
+    groups: list[list[Alternative]]  # the effects of the best set, each with those that fit as well in its place
+    repeats: list[tuple[Cause, float]]  # causes of repeated readings, and the log likelihood lost without them
+
+
+def _explore(
+    recording: Recording,
+    system: System,
+    effects: Sequence[type[Effect]],
+    repeating: type[Effect],
+    jobs: int,
+    progress: Report | None,
+    announce: Callable[[str], object] | None,
+) -> _Explored:
+    """Search for the sets of `effects` that explain a recording of states, and compare the best of them.
+
+    `repeating` is the effect that repeats whole rows.
+    """
+    candidates = searched(effects, system)
+    prepared = prepare(recording, system, candidates)
+    rows = prepared.rows
+    search = Search(system, rows.select(prepared.searched), candidates, prepared.source, jobs)
+    if announce is not None:
+        announce(duration.announcement(rows, len(candidates), duration.expected(search, rows), jobs))
+    search.run(staged(progress, "search"))
+    if len(prepared.searched) < rows.shape[0]:
+        search = on_all_rows(search, rows)
+    # Periodic effects may have got a phase for each episode.
+    in_use = {effect.name: effect for effect in search.catalogue}
+    named = [in_use.get(effect.name, effect) for effect in effects]
+    comparison = compare(search)
+    repeats = repeated_reading_causes(prepared, search, comparison, repeating)
+    return _Explored(named, prepared, search, comparison, alternatives(comparison, named, system), repeats)
+
+
+def _judge(explored: _Explored, measured: MeasuredGap) -> tuple[str, tuple[Cause, ...]]:
+    """The verdict, and the causes that go with it."""
+    comparison, groups = explored.comparison, explored.groups
+    repeats = [cause for cause, _ in explored.repeats]
+    explaining = (*repeats, *causes(explored.search, comparison, groups, measured.closed))
+    unexplained, coarse = comparison.unexplained(measured.improvable), bool(explored.prepared.coarse)
+    verdict = verdict_of(comparison, measured.gap, unexplained, measured.improvable, explaining, bool(repeats), coarse)
+    return verdict, explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
+
+
+def _warnings(
+    explored: _Explored, measured: MeasuredGap, verdict: str, found: Sequence[Cause], source: str
+) -> Iterator[str]:
+    """What a reader of the diagnosis must know of the recording `source`, the comparison and the causes found."""
+    comparison, system = explored.comparison, explored.search.system
+    yield from explored.prepared.warnings
+    if not measured.held_out:
+        yield f"{source}: {TOO_SHORT}"
+    yield from left_unexplained(comparison, verdict, comparison.unexplained(measured.improvable), system)
+    yield from at_bounds(comparison)
+    if found:
+        yield from phases_of_episodes(comparison.best)
+    carrying = {cause.effect for cause in without_slight(found)}
+    yield from (f"{one.name}: {one.caveat}" for one in comparison.best.effects if one.caveat and one.name in carrying)
 
 
 def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:

@@ -73,7 +73,6 @@ def from_states(source: World) -> SetupSettings:
         # tuned with plans ended at 0.03 m/s: that loop trusts the residual more than it deserves. Named effects hold
         # everywhere.
         named=replace(plans, closed_loop=True),
-        trust=0.9,
     )
 
 
