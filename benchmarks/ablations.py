@@ -93,7 +93,7 @@ VARIANTS: dict[str, Variant] = {
     "as shipped": lambda setup: setup,
     "no tuning": untuned,
     "no feed-forward": _with(feedforward=False),
-    "no averaging of weights": _with(trust=1.0),
+    "each round tunes on": _with(tunes_on=True),
     "correction held over a plan": held_over_a_plan,
     "MLP residual": with_an_mlp,
 }

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from visadapt.diagnosis.report import next_experiment
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Gap, without_slight
 from visadapt.diagnosis.search.causes import Alternative
+from visadapt.diagnosis.search.heldout import MIN_GAP
 from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import CoarseSteps
@@ -16,7 +17,8 @@ from visadapt.estimation.candidate import CandidateModel
 from visadapt.systems import System
 
 MIN_GAP_CLOSED = 0.95
-"""Share of the gap that the causes must close to count as identified although something remains unexplained."""
+"""Share of the gap that the causes must close to be named although something remains unexplained, or although
+predictions with them are not within the noise."""
 
 CLEAR_OF_NOISE = 3.0
 """Error of predictions over the noise above which there is a gap. Where the error with the causes is above it, the
@@ -60,6 +62,8 @@ def verdict_of(
     carrying = without_slight(explaining)
     if not carrying:
         return UNEXPLAINED if unexplained or gap.before > CLEAR_OF_NOISE * gap.floor else nothing
+    if gap.after > MIN_GAP * gap.floor and gap.closed < MIN_GAP_CLOSED:
+        return UNEXPLAINED  # the causes fit the rows that they were fitted to, but do not predict others
     return AMBIGUOUS if any(cause.indistinguishable_from for cause in carrying) else IDENTIFIED
 
 

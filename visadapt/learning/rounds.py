@@ -183,17 +183,12 @@ class JointLearning:
         self.grounded = True
         if not self.settings.tunes_on:
             self._start_anew()
-        trust, known = self.settings.trust, self.known
+        known = self.known
         world = known.with_effects([*known.effects, self.residual])
 
         def tuned(partial: Path) -> list[float]:
             about = self.settings.tuning, folder.generator(2), windows, self._progress(folder, "tune"), partial
-            losses = tune(self.policy, world, self.observe, *about)
-            if trust < 1:
-                reached = self.policy.state_dict()
-                way = {key: torch.lerp(self.first[key], reached[key], trust) for key in self.first}
-                self.policy.load_state_dict(way, strict=False)
-            return losses
+            return tune(self.policy, world, self.observe, *about)
 
         return self._kept(folder.policy, tuned)
 

@@ -31,9 +31,6 @@ class SetupSettings:
     """most steps of an episode of the target while data are collected"""
     feedforward: bool = True
     """begin with a feed-forward that opposes the residual's correction; False where no one command can cancel it"""
-    trust: float = 1.0
-    """share of the way from the policy's weights before the first round to those tuned in a round that it goes, since
-    the grounded source is not the target"""
     tunes_on: bool = False
     """a round tunes on from the weights of the round before; False: it begins with those before the first round"""
     refinement: TuneSettings | None = None

@@ -92,8 +92,6 @@ def from_frames(source: World) -> SetupSettings:
         tuning=replace(rendered, iterations=60),
         named=replace(refinement, iterations=1200, streams=32),
         unforeseen=rendered,
-        # All of the way follows the residual too far where a motor is late.
-        trust=0.75,
         observations="camera",
         perception=PerceptionSettings(),
     )

@@ -86,7 +86,7 @@ def overall(errors: Tensor) -> Tensor:
     return errors.square().mean(-1).sqrt()
 
 
-MIN_GAP = 1.02  # Error of the source over the noise floor, below which there is no gap to close
+MIN_GAP = 1.02  # Error of predictions over the noise floor, up to which they are as good as the noise allows
 
 
 def closed(before: float, after: float, floor: float) -> float:
