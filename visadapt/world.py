@@ -15,7 +15,7 @@ from visadapt.effects.base import expect
 from visadapt.effects.camera import seen_by
 from visadapt.history import History
 from visadapt.systems import SYSTEMS, System
-from visadapt.systems.dry_friction import sliding, stopped
+from visadapt.systems.dry_friction import Limits, sliding, stopped
 from visadapt.systems.integrators import INTEGRATORS, Duration
 
 
@@ -227,7 +227,8 @@ class World(nn.Module):
         system = self.system_at(at)
         idle = at.state.new_zeros(len(at.state), len(system.actions))
         load, limits = self._load(at.time, at.state, system), self._dry_friction(at.time, at.state, idle, system)
-        return load if limits is None else load + sliding(limits, at.state[:, self._velocities])
+        velocity = at.state[:, self._velocities]
+        return load if limits is None else load + sliding(limits, velocity, velocity.sign())
 
     def system_at(self, at: WorldState) -> System:
         """The system with the parameters that effects give it at an instant."""
@@ -255,6 +256,7 @@ class World(nn.Module):
         self._varying = [e for e in self._dynamics if type(e).vary is not DynamicsEffect.vary]
         self._loading = [e for e in self._dynamics if type(e).load is not DynamicsEffect.load]
         self._rubbing = [e for e in self._dynamics if type(e).dry_friction is not DynamicsEffect.dry_friction]
+        self._friction_varies = any(e.dry_friction_by_velocity for e in self._rubbing)
 
     def _at_rest(self, state: Tensor) -> tuple[Tensor, ...]:
         """What effects remember at the start of an episode in the state (B, n_state)."""
@@ -286,20 +288,26 @@ class World(nn.Module):
         self, system: System, time: Tensor, state: Tensor, commands: Tensor, duration: Tensor | None = None
     ) -> Tensor:
         h: Duration = (self.period if duration is None else duration) / self.substeps
-        integrate = INTEGRATORS[self.integrator]
         for k in range(self.substeps):
-            command, here = commands[:, k], self._varied(system, time, state)
-            limits = self._dry_friction(time, state, command, here)
-            friction = 0.0 if limits is None else sliding(limits, state[:, self._velocities])
-
-            def derivative(t: Tensor, s: Tensor, u: Tensor = command, rub: float | Tensor = friction) -> Tensor:
-                now = self._varied(system, t, s)
-                return now.derivative(s, u, self._load(t, s, now) + rub)
-
-            after = integrate(derivative, time, state, h)
-            state = after if limits is None else stopped(here, state, after, command, limits, h)
+            state = self._substep(system, time, state, commands[:, k], h)
             time = time + h
         return state
+
+    def _substep(self, system: System, time: Tensor, state: Tensor, command: Tensor, h: Duration) -> Tensor:
+        """The state after `h` s in which `command` (B, n_action) acts."""
+        integrate, columns = INTEGRATORS[self.integrator], self._velocities
+        here, direction = self._varied(system, time, state), state[:, columns].sign()
+        limits = self._dry_friction(time, state, command, here)
+        constant: float | Tensor = 0.0 if limits is None else sliding(limits, state[:, columns], direction)
+        varying = limits if self._friction_varies else None
+
+        def derivative(t: Tensor, s: Tensor) -> Tensor:
+            now = self._varied(system, t, s)
+            friction = constant if varying is None else sliding(varying, s[:, columns], direction)
+            return now.derivative(s, command, self._load(t, s, now) + friction)
+
+        after = integrate(derivative, time, state, h)
+        return after if limits is None else stopped(here, state, after, command, limits, h)
 
     def _read(
         self, state: Tensor, memory: tuple[Tensor, ...], generator: torch.Generator | None
@@ -328,11 +336,21 @@ class World(nn.Module):
     def _velocities(self) -> list[int]:
         return [velocity for _, velocity in self.system.coordinates]
 
-    def _dry_friction(self, time: Tensor, state: Tensor, command: Tensor, system: System) -> Tensor | None:
-        """Sum over all effects of the largest dry friction; None without any."""
-        found = [effect.dry_friction(time, state, command, system) for effect in self._rubbing]
-        limits = [each for each in found if each is not None]
-        return sum(limits[1:], limits[0]) if limits else None
+    def _dry_friction(self, time: Tensor, state: Tensor, command: Tensor, system: System) -> Limits | None:
+        """Sum over all effects of the largest dry friction near a state; None without any."""
+
+        def limits(velocities: Tensor) -> Tensor:
+            near = state.clone()
+            near[:, self._velocities] = velocities
+            each = [effect.dry_friction(time, near, command, system) for effect in self._rubbing]
+            return sum(each[1:], each[0])
+
+        if self._friction_varies:
+            return limits
+        if not self._rubbing:
+            return None
+        same = limits(state[:, self._velocities])
+        return lambda velocities: same
 
     def _load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         load = torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)

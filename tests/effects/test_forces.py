@@ -12,6 +12,7 @@ from visadapt.effects import (
     CartMass,
     ConstantForce,
     CoulombFriction,
+    Effect,
     FrictionPatch,
     Gust,
     PeriodicForce,
@@ -20,6 +21,7 @@ from visadapt.effects import (
     PoleMass,
     QuadraticDrag,
     Spring,
+    StribeckFriction,
     TrackTilt,
     ViscousFriction,
 )
@@ -199,7 +201,7 @@ class TestParameters:
 def stick_slip(y, push, friction):
     """The state a period on of a cart-pole with exact dry friction, and whether it stuck at some time.
 
-    Phases of slip and stick are joined at their events.
+    `friction` is the largest one by the cart's speed. Phases of slip and stick are joined at their events.
     """
     cart, pole, l, g = 1.0, 0.1, 0.5, 9.8  # noqa: E741
     tolerance = {"rtol": 1e-8, "atol": 1e-10, "max_step": 0.02}
@@ -216,12 +218,12 @@ def stick_slip(y, push, friction):
         return [0.0, 0.0, y[3], fall(y[2])]
 
     def breaks(_, y):
-        return abs(needed(y)) - friction
+        return abs(needed(y)) - friction(0.0)
 
     def slip(_, y):
         s, c = math.sin(y[2]), math.cos(y[2])
         inertia = [[cart + pole, pole * l * c], [pole * l * c, 4 / 3 * pole * l**2]]
-        forces = [push - way * friction + pole * l * y[3] ** 2 * s, pole * g * l * s]
+        forces = [push - way * friction(y[1]) + pole * l * y[3] ** 2 * s, pole * g * l * s]
         a, alpha = np.linalg.solve(inertia, forces)
         return [y[1], a, y[3], alpha]
 
@@ -233,7 +235,7 @@ def stick_slip(y, push, friction):
     vars(stops).update(terminal=True, direction=-1)
     t, y, stuck = 0.0, np.array(y, float), False
     while t < PERIOD:
-        if y[1] == 0 and abs(needed(y)) < friction:
+        if y[1] == 0 and abs(needed(y)) < friction(0.0):
             stuck = True
             out = solve_ivp(stick, (t, PERIOD), y, events=breaks, **tolerance)
             t, y = out.t[-1], out.y[:, -1]
@@ -248,9 +250,23 @@ def stick_slip(y, push, friction):
     return y, stuck
 
 
-class TestCoulombFriction:
-    @pytest.mark.parametrize("friction", [0.5, 2.0, 6.0])
-    def test_half_a_second_ahead_it_is_exact_stick_and_slip(self, friction):
+STRIBECK = [(0.5, 1.5, 0.05), (1.0, 1.3, 0.2), (0.263, 2.63, 0.1)]
+
+
+def stribeck(force, breakaway, velocity):
+    return lambda speed: force + (breakaway - force) * math.exp(-((speed / velocity) ** 2))
+
+
+class TestDryFriction:
+    @pytest.mark.parametrize(
+        ("effect", "friction"),
+        [
+            *((CoulombFriction(force=force), stribeck(force, force, 1.0)) for force in (0.5, 2.0, 6.0)),
+            *((StribeckFriction(force=f, breakaway=b, velocity=v), stribeck(f, b, v)) for f, b, v in STRIBECK),
+        ],
+        ids=lambda value: value.name if isinstance(value, Effect) else "",
+    )
+    def test_half_a_second_ahead_it_is_exact_stick_and_slip(self, effect, friction):
         generator, ahead = np.random.default_rng(0), 10
         states, actions, stuck, excitation = [np.array([0.1, 0.0, 0.03, 0.0])], [], 0, 0.0
         for k in range(120):
@@ -264,14 +280,13 @@ class TestCoulombFriction:
         true, count = torch.tensor(np.array(states)), 120 - ahead
         plan = torch.tensor(actions, dtype=torch.float64).unfold(0, ahead, 1)[:count].T[..., None]
 
-        def error(effect, substeps):
-            """Root mean square of x in mm."""
-            world = World(CartPole(), [effect], PERIOD, "rk4", substeps).requires_grad_(False)
-            reached = run(world, true[:count], plan)[-1]
-            return 1e3 * float((reached - true[ahead : ahead + count])[:, 0].square().mean().sqrt())
+        world = World(CartPole(), [effect.double()], PERIOD, "rk4", 4).requires_grad_(False)
+        reached = run(world, true[:count], plan)[-1]
+        error = (reached - true[ahead : ahead + count])[:, 0].square().mean().sqrt()
+        assert error < 2e-4  # m: a fifth of the noise of good sensors
 
-        # A fifth of the noise of good sensors, 1 mm and 1 mrad.
-        assert error(CoulombFriction(force=friction).double(), 4) < 0.2
+
+class TestCoulombFriction:
 
     def test_it_is_the_textbook_force_on_a_cart_that_moves(self):
         state = torch.zeros(4, 4, dtype=torch.float64)

@@ -76,6 +76,20 @@ class TestUnits:
             del table["x_dot"], table["theta_dot"]
         refuses("column 'x' answers the command as theta should, and column 'theta' as x", write(file, table))
 
+    @pytest.mark.parametrize("rows", [15, 30])
+    @pytest.mark.parametrize(("one", "other"), [("x", "theta"), ("x", "x_dot"), ("theta", "theta_dot")])
+    def test_short_episodes_are_judged_together(self, file, rows, one, other):
+        table = a_run(start=0.1, noise=1e-3)
+        count = len(table["time"])
+        table["episode"] = np.arange(count) // rows
+        assert load(write(file, table)).samples > 0
+        swapped = {**table, one: table[other], other: table[one]}
+        if (one, other) == ("x", "theta"):
+            swapped["x_dot"], swapped["theta_dot"] = table["theta_dot"], table["x_dot"]
+        refuses("are evidently exchanged|they are exchanged", write(file, swapped))
+        degrees = {**table, "theta": np.degrees(table["theta"]), "theta_dot": np.degrees(table["theta_dot"])}
+        refuses("radians are right", write(file, degrees))
+
     def test_a_column_is_called_what_the_file_calls_it(self, file):
         table = a_run(start=0.1, noise=1e-3)
         table["pole_angle"] = np.degrees(table.pop("theta"))

@@ -211,6 +211,9 @@ class DynamicsEffect(Effect):
 
     stage = Stage.DYNAMICS
 
+    dry_friction_by_velocity: ClassVar[bool] = True
+    """whether `dry_friction` depends on velocities; where not, it is computed once for each integration step"""
+
     def alter(self, system: System) -> System:
         """The system with the parameters that this effect changes; its fields may then be tensors, () or (B,)."""
         return system
@@ -235,12 +238,13 @@ class DynamicsEffect(Effect):
         base = DynamicsEffect
         return cls.alter is base.alter and cls.vary is base.vary and cls.dry_friction is base.dry_friction
 
-    def dry_friction(self, time: Tensor, state: Tensor, command: Tensor, system: System) -> Tensor | None:
-        """The largest dry friction (B, n_load, 2) against positive and against negative motion; None without any.
+    def dry_friction(self, time: Tensor, state: Tensor, command: Tensor, system: System) -> Tensor:
+        """The largest dry friction (B, n_load, 2) against positive and against negative motion.
 
-        Constant over an integration step, in which `command` (B, n_action) acts; the others as in `load`.
+        Within an integration step, in which `command` (B, n_action) acts, only the velocities in `state` change; the
+        others as in `load`.
         """
-        return None
+        raise NotImplementedError
 
 
 Reading: TypeAlias = tuple[Tensor, Tensor]  # what is read of a row, states (B, n_state) or a frame, and the new memory

@@ -129,6 +129,7 @@ class DryFrictionLaw(JointEffect):
 class CoulombLaw(DryFrictionLaw):
     """Dry friction of the joint, the same at every speed; a joint at rest sticks."""
 
+    dry_friction_by_velocity = False
     source = "Olsson et al. (1998), Friction models and friction compensation, section 2"
 
     def limits(self, state: Tensor, command: Tensor, system: System) -> tuple[Tensor, Tensor]:
@@ -160,6 +161,7 @@ class DirectionalLaw(DryFrictionLaw):
 
     forward = _OwnForward()
 
+    dry_friction_by_velocity = False
     source = "Armstrong-Helouvry, Dupont and Canudas de Wit (1994), Automatica 30(7), section 2"
 
     def limits(self, state: Tensor, command: Tensor, system: System) -> tuple[Tensor, Tensor]:
@@ -169,6 +171,7 @@ class DirectionalLaw(DryFrictionLaw):
 class LoadDependentLaw(DryFrictionLaw):
     """Dry friction of a gear, a share of what the motor passes through it; the joint's other loads add none."""
 
+    dry_friction_by_velocity = False
     source = "Duclusaud et al. (2025), Extended friction models for the physics simulation of servo actuators, model M3"
 
     def limits(self, state: Tensor, command: Tensor, system: System) -> tuple[Tensor, Tensor]:

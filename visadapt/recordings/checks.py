@@ -66,37 +66,49 @@ def check_commands(episodes: Sequence[RawEpisode], actions: Sequence[Variable], 
         note(f"{share:.1%} of {variable.name} lie outside, up to {largest:g}; {right}", "the recording")
 
 
-def check_units(raw: RawEpisode, system: System) -> None:
-    """Raises RecordingError where angles are evidently in degrees, lengths in cm or mm, or columns exchanged."""
+LEAST_ROWS = 8
+"""Rows of an episode below which its units are not judged."""
+
+
+def check_units(episodes: Sequence[RawEpisode], system: System) -> None:
+    """Check the columns of a file's episodes, all of which have the same.
+
+    Raises:
+        RecordingError: angles are evidently in degrees, lengths in cm or mm, or columns exchanged.
+    """
     variables = {variable.name: variable for variable in system.states}
-    if len(raw.time) < 8:
+    judged = [raw for raw in episodes if len(raw.time) >= LEAST_ROWS]
+    if not judged:
         return
-    columns = raw.states
+    columns = judged[0].states
     angles = [name for name in columns if variables[name].unit == "rad"]
-    for name in angles:
-        steps = np.abs(np.diff(columns[name]))
-        row = int(steps.argmax()) + 1
-        if steps.max() > 1.25 * TURN:
-            raise RecordingError(
-                f"{raw.cell(row, name)} jumps from {columns[name][row - 1]:g} to {columns[name][row]:g}; radians are "
-                "right (these look like degrees)"
-            )
-    _check_clock(raw, system)
-    _check_exchanged(raw, variables, {name: rate for name in columns if (rate := system.rate_of(name))})
-    for name in columns:
-        if (rate := system.rate_of(name)) is not None:
-            _check_rate(raw, variables[name], variables[rate])
-    if are_degrees(raw, system):
-        name, values = angles[0], columns[angles[0]]
+    for raw in judged:
+        for name in angles:
+            steps = np.abs(np.diff(raw.states[name]))
+            row = int(steps.argmax()) + 1
+            if steps.max() > 1.25 * TURN:
+                raise RecordingError(
+                    f"{raw.cell(row, name)} jumps from {raw.states[name][row - 1]:g} to {raw.states[name][row]:g}; "
+                    "radians are right (these look like degrees)"
+                )
+        _check_clock(raw, system)
+    _check_exchanged(judged, variables, {name: rate for name in columns if (rate := system.rate_of(name))})
+    for raw in judged:
+        for name in columns:
+            if (rate := system.rate_of(name)) is not None:
+                _check_rate(raw, variables[name], variables[rate])
+    whole = judged[0]
+    if are_degrees(judged, system):
+        name, values = angles[0], np.concatenate([raw.states[angles[0]] for raw in judged])
         raise RecordingError(
-            f"{raw.source}: {raw.column(name)} goes from {values.min():.3g} to {values.max():.3g} and answers the "
+            f"{whole.source}: {whole.column(name)} goes from {values.min():.3g} to {values.max():.3g} and answers the "
             f"command as if in degrees; radians are right"
         )
     for name, other in product((name for name in columns if variables[name].unit == "m"), angles):
-        if exchanged(raw, system, name, other):
+        if exchanged(judged, system, name, other):
             raise RecordingError(
-                f"{raw.source}: {raw.column(name)} answers the command as {other} should, and "
-                f"{raw.column(other)} as {name}: they are exchanged "
+                f"{whole.source}: {whole.column(name)} answers the command as {other} should, and "
+                f"{whole.column(other)} as {name}: they are exchanged "
                 f"(or the command's sign is wrong: positive pushes towards +x)"
             )
 
@@ -159,30 +171,40 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable) -> None:
                 )
 
 
-def _check_exchanged(raw: RawEpisode, variables: Mapping[str, Variable], rates: Mapping[str, str]) -> None:
+def _check_exchanged(
+    episodes: Sequence[RawEpisode], variables: Mapping[str, Variable], rates: Mapping[str, str]
+) -> None:
     """Raises RecordingError where two columns are evidently exchanged; `rates` are the rates of those that have one."""
-    columns = raw.states
-    changes = {name: _rates(raw.time, columns[name], variables[name].unit == "rad") for name in rates}
-    measured = {name: columns[rate] for name, rate in rates.items() if rate in columns}
+    raw = episodes[0]
+
+    def changes(name: str, angle: bool) -> NDArray[np.float64]:
+        return np.concatenate([_rates(each.time, each.states[name], angle) for each in episodes])
+
+    def later(name: str) -> NDArray[np.float64]:
+        return np.concatenate([each.states[name][1:] for each in episodes])
+
+    change = {name: changes(name, variables[name].unit == "rad") for name in rates}
+    measured = {name: later(rate) for name, rate in rates.items() if rate in raw.states}
     for name, rate in measured.items():
-        crossed = correlation(_rates(raw.time, rate, False), columns[name][1:])
-        if crossed > IS_RATE_CORRELATION and correlation(changes[name], rate[1:]) < NOT_RATE_CORRELATION:
+        crossed = correlation(changes(rates[name], False), later(name))
+        if crossed > IS_RATE_CORRELATION and correlation(change[name], rate) < NOT_RATE_CORRELATION:
             raise RecordingError(
                 f"{raw.source}: {raw.column(name)} and {raw.column(rates[name])} are evidently exchanged: "
                 "the first is the second's rate of change"
             )
     for name, other in combinations(measured, 2):
-        crossed = min(correlation(changes[name], measured[other][1:]), correlation(changes[other], measured[name][1:]))
-        own = max(correlation(changes[one], measured[one][1:]) for one in (name, other))
+        crossed = min(correlation(change[name], measured[other]), correlation(change[other], measured[name]))
+        own = max(correlation(change[one], measured[one]) for one in (name, other))
         if crossed > IS_RATE_CORRELATION and own < NOT_RATE_CORRELATION:
             raise RecordingError(
                 f"{raw.source}: {raw.column(name)} and {raw.column(other)} are evidently exchanged: "
                 f"{name} changes as {rates[other]} says, and {other} as {rates[name]} says"
             )
-    for name in rates:
-        steps = np.abs(np.diff(columns[name]))
+    for raw, name in product(episodes, rates):
+        values = raw.states[name]
+        steps = np.abs(np.diff(values))
         row = int(steps.argmax())
-        wraps = abs(steps[row] - TURN) < 0.5 and np.abs(columns[name]).max() < 0.55 * TURN
+        wraps = abs(steps[row] - TURN) < 0.5 and np.abs(values).max() < 0.55 * TURN
         if variables[name].unit == "m" and wraps:
             raise RecordingError(
                 f"{raw.cell(row + 1, name)} jumps by {steps[row]:.3g} m, like an angle that wraps; metres are right "

@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -88,8 +89,8 @@ def load_recording(
     whole = _commands(_shared(whole, system, note), system, note)
     check_commands(whole, system.actions, note)
     if not frames:
-        for raw in whole:
-            check_units(raw, system)
+        for _, of_file in groupby(whole, lambda raw: raw.path):
+            check_units(list(of_file), system)
         whole = check_sensors(whole, system, note)
     parts = [part for raw in whole for part in uninterrupted(_unwrapped(raw, system), note)]
     parts, period = alike(_long_enough(parts, note), note)

@@ -8,7 +8,7 @@ are compared with the source's.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -22,6 +22,8 @@ DIFFERENCE_S = 0.05
 """s between rows whose difference is taken: over less, noise would outweigh motion."""
 LONGEST_DELAY_S = 0.25
 """Longest delay of the command, s, that is tried before columns are called exchanged."""
+LEAST_DURATION_S = 2.0
+"""s that the episodes must last together for their units and order to be judged."""
 MOST_ROWS = 20_000
 """Rows of an episode that are used, for speed."""
 EXPLAINED_CORRELATION = 0.5
@@ -30,71 +32,106 @@ EXPLAINED_CORRELATION = 0.5
 Columns = Mapping[str, NDArray[np.float64]]
 
 
-def are_degrees(raw: RawEpisode, system: System) -> bool:
+def are_degrees(episodes: Sequence[RawEpisode], system: System) -> bool:
     """Whether the source explains the angle's acceleration if the angle is in degrees, and does not if in radians.
 
-    False where that cannot be decided: the command never changes, the recording is too short or too noisy, or the
-    system does not have exactly one angle.
+    False where that cannot be decided: the command never changes, the episodes of a file are together too short or too
+    noisy, or the system does not have exactly one angle.
     """
     angles = [variable.name for variable in system.states if variable.unit == "rad"]
-    if len(angles) != 1 or not _can_decide(raw, system, angles):
+    if len(angles) != 1 or not _can_decide(episodes, system, angles):
         return False
-    columns = _columns(raw)
-    radians, radian_slope = _fits(raw, columns, system)[angles[0]]
     angular = (angles[0], system.rate_of(angles[0]))
-    scaled = {name: values * (DEGREE if name in angular else 1) for name, values in columns.items()}
-    degrees, slope = _fits(raw, scaled, system)[angles[0]]
+
+    def scaled(columns: Columns) -> Columns:
+        return {name: values * (DEGREE if name in angular else 1) for name, values in columns.items()}
+
+    radians, radian_slope = _fits(episodes, system)[angles[0]]
+    degrees, slope = _fits(episodes, system, scaled)[angles[0]]
     return degrees > EXPLAINED_CORRELATION and 1 / 3 < slope < 3 and (degrees > radians + 0.2 or radian_slope > 10)
 
 
-def exchanged(raw: RawEpisode, system: System, one: str, other: str) -> bool:
+def exchanged(episodes: Sequence[RawEpisode], system: System, one: str, other: str) -> bool:
     """Whether the source explains both accelerations with two columns (and their rates) exchanged, and not as they are.
 
     A delayed command could look like that, so every delay up to `LONGEST_DELAY_S` is tried for the columns as
     they are. False where that cannot be decided.
     """
-    if not _can_decide(raw, system, (one, other)):
+    if not _can_decide(episodes, system, (one, other)):
         return False
-    columns = _columns(raw)
     rate, other_rate = system.rate_of(one) or "", system.rate_of(other) or ""
     to = {one: other, other: one, rate: other_rate, other_rate: rate}
-    swapped = {to.get(name, name): values for name, values in columns.items()}
-    fits = _fits(raw, swapped, system)
+
+    def swapped(columns: Columns) -> Columns:
+        return {to.get(name, name): values for name, values in columns.items()}
+
+    fits = _fits(episodes, system, swapped)
     if not all(1 / 4 < fits[name][1] < 4 for name in (one, other)):
         return False
-    period = float(np.median(np.diff(raw.time[:MOST_ROWS])))
-    unchanged = [_fits(raw, columns, system, delay) for delay in range(round(LONGEST_DELAY_S / period) + 1)]
+    period = min(_period(raw) for raw in episodes)
+    unchanged = [_fits(episodes, system, delay=delay) for delay in range(round(LONGEST_DELAY_S / period) + 1)]
     best = max(min(fits[one][0], fits[other][0]) for fits in unchanged)
     explained = min(fits[one][0], fits[other][0])
     opposite = max(unchanged[0][one][0], unchanged[0][other][0]) < 0
     return explained > EXPLAINED_CORRELATION and best < 0.7 * explained and opposite
 
 
-def _columns(raw: RawEpisode) -> Columns:
-    return {name: values[:MOST_ROWS] for name, values in raw.states.items()}
-
-
-def _can_decide(raw: RawEpisode, system: System, names: Sequence[str]) -> bool:
+def _can_decide(episodes: Sequence[RawEpisode], system: System, names: Sequence[str]) -> bool:
+    judged = _judged(episodes)
+    duration = sum(float(raw.time[:MOST_ROWS][-1] - raw.time[0]) for raw in judged)
     return (
         all(system.rate_of(name) for name in names)
-        and raw.time[min(len(raw.time), MOST_ROWS) - 1] - raw.time[0] > 40 * DIFFERENCE_S
-        and float(np.ptp(raw.action[:MOST_ROWS], axis=0).max()) > 0
+        and duration > LEAST_DURATION_S
+        and float(np.ptp(np.vstack([raw.action[:MOST_ROWS] for raw in judged]), axis=0).max()) > 0
     )
 
 
-def _fits(raw: RawEpisode, columns: Columns, system: System, delay: int = 0) -> dict[str, tuple[float, float]]:
+def _judged(episodes: Sequence[RawEpisode]) -> list[RawEpisode]:
+    """The episodes that are long enough for second differences."""
+    return [raw for raw in episodes if len(raw.time) > 2 * _stride(raw) + 1]
+
+
+def _period(raw: RawEpisode) -> float:
+    return float(np.median(np.diff(raw.time[:MOST_ROWS])))
+
+
+def _stride(raw: RawEpisode) -> int:
+    """Rows between those whose difference is taken."""
+    return max(1, round(DIFFERENCE_S / _period(raw)))
+
+
+def _unchanged(columns: Columns) -> Columns:
+    return columns
+
+
+def _fits(
+    episodes: Sequence[RawEpisode],
+    system: System,
+    changed: Callable[[Columns], Columns] = _unchanged,
+    delay: int = 0,
+) -> dict[str, tuple[float, float]]:
     """For each variable with a rate: correlation of its acceleration with the source's, and slope over the source's.
 
-    `columns` are the measured states, in the units and under the names to be tried; `delay` is the number of rows by
-    which the commands act late.
+    `changed` gives the measured states the units and names to be tried; `delay` is the number of rows by which the
+    commands act late.
     """
+    each = []
+    for raw in _judged(episodes):
+        columns = changed({name: values[:MOST_ROWS] for name, values in raw.states.items()})
+        each.append(_accelerations(raw, columns, system, delay))
+    return {name: _fit(*(np.concatenate([one[name][k] for one in each]) for k in (0, 1))) for name in each[0]}
+
+
+def _accelerations(
+    raw: RawEpisode, columns: Columns, system: System, delay: int
+) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Of an episode, by the name of each variable with a rate: measured and predicted accelerations."""
     names = [variable.name for variable in system.states]
     angles = [variable.name for variable in system.states if variable.unit == "rad"]
     columns = {name: np.unwrap(values) if name in angles else values for name, values in columns.items()}
     time, action = raw.time[:MOST_ROWS], raw.action[:MOST_ROWS]
-    period = float(np.median(np.diff(time)))
-    stride = max(1, round(DIFFERENCE_S / period))
-    span = 2 * stride * period
+    stride = _stride(raw)
+    span = 2 * stride * _period(raw)
     # The mean of three points has noise that is uncorrelated with that of their second difference.
     middle = {
         name: (values[: -2 * stride] + values[stride:-stride] + values[2 * stride :]) / 3
@@ -110,12 +147,12 @@ def _fits(raw: RawEpisode, columns: Columns, system: System, delay: int = 0) -> 
     state = np.column_stack([middle[name] for name in names])
     load = torch.zeros(len(state), len(system.loads), dtype=torch.float64)
     predicted = system.derivative(torch.from_numpy(state), torch.from_numpy(action), load).numpy()
-    fits = {}
+    found = {}
     for name, rate in rates.items():
         values = columns[name]
         measured = (values[2 * stride :] - 2 * values[stride:-stride] + values[: -2 * stride]) / (span / 2) ** 2
-        fits[name] = _fit(measured, predicted[:, names.index(rate)])
-    return fits
+        found[name] = measured, predicted[:, names.index(rate)]
+    return found
 
 
 def _fit(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> tuple[float, float]:

@@ -1,13 +1,16 @@
 """Dry friction over one integration step: sliding, stopping and sticking.
 
-While a coordinate slides, dry friction is a constant force against its motion, which the integrator sees as a load.
-Where the velocity would change its sign within the step, the coordinate has stopped: for what is left of the step,
-friction resists the start in the other direction, up to its largest force (Karnopp 1985, Computer simulation of
-stick-slip friction in mechanical dynamic systems, J. Dyn. Sys. Meas. Control 107(1)). Exact where the acceleration is
-constant over a step; a coordinate that sticks does not creep.
+While a coordinate slides, dry friction is a force against its motion, which the integrator sees as a load. Where the
+velocity would change its sign within the step, the coordinate has stopped: for what is left of the step, friction
+resists the start in the other direction, up to its largest force (Karnopp 1985, Computer simulation of stick-slip
+friction in mechanical dynamic systems, J. Dyn. Sys. Meas. Control 107(1)). A coordinate that sticks does not creep. One
+that starts meets the friction at half the velocity that it reaches (midpoint rule). Exact where accelerations are
+constant over a step.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -15,45 +18,56 @@ from torch import Tensor
 from visadapt.systems.base import System
 from visadapt.systems.integrators import Duration
 
+Limits = Callable[[Tensor], Tensor]
+"""The largest frictions (B, n_load, 2), N or N m, against positive and against negative motion, as a function of the
+velocities (B, n_load) of the coordinates."""
 
-def sliding(limits: Tensor, velocity: Tensor) -> Tensor:
-    """Friction (B, n_load) on coordinates that move with `velocity` (B, n_load); none on those at rest.
 
-    `limits` (B, n_load, 2) are the largest frictions, N or N m, against positive and against negative motion.
+def sliding(limits: Limits, velocity: Tensor, direction: Tensor) -> Tensor:
+    """Friction (B, n_load) on coordinates with `velocity` (B, n_load) that slide in the `direction` (B, n_load), +1 or
+    -1; none where it is 0.
+
+    A coordinate that has turned round has the friction of one at rest: `stopped` corrects what that does.
     """
-    forward, backward = limits.unbind(-1)
-    zero = torch.zeros_like(forward)
-    return torch.where(velocity > 0, -forward, torch.where(velocity < 0, backward, zero))
+    zero = torch.zeros_like(velocity)
+    forward, backward = limits(torch.where(velocity * direction > 0, velocity, zero)).unbind(-1)
+    return torch.where(direction > 0, -forward, torch.where(direction < 0, backward, zero))
 
 
-def stopped(system: System, before: Tensor, after: Tensor, command: Tensor, limits: Tensor, h: Duration) -> Tensor:
+def stopped(system: System, before: Tensor, after: Tensor, command: Tensor, limits: Limits, h: Duration) -> Tensor:
     """States (B, n_state) after a step of `h` s under sliding friction, with coordinates stopped that reversed in it.
 
-    `before` and `after` are the states at either end of the step, `command` (B, n_action) acted in it; `limits` as in
-    `sliding`.
+    `before` and `after` are the states at either end of the step; `command` (B, n_action) acted in it.
     """
     velocities = [velocity for _, velocity in system.coordinates]
     first, last = before[:, velocities], after[:, velocities]
+    at_rest = limits(torch.zeros_like(first))
     # A row in which nothing reverses is left as it is: computing the response to loads for these too takes longer than
     # the step itself.
-    rubs = torch.ones_like(first, dtype=torch.bool) if limits.requires_grad else (limits != 0).any(-1)
+    rubs = torch.ones_like(first, dtype=torch.bool) if at_rest.requires_grad else (at_rest != 0).any(-1)
     rows = (((first == 0) | (first * last < 0)) & rubs).any(-1)
     if not bool(rows.any()):
         return after
     duration = h[rows] if isinstance(h, Tensor) and h.dim() else h
-    acting = command.expand(len(rows), -1)[rows]
+    of_rows = system.of_rows(rows), before[rows], after[rows], command.expand(len(rows), -1)[rows], at_rest[rows]
     out = after.clone()
-    out[rows] = _stopped(system.of_rows(rows), before[rows], after[rows], acting, limits[rows], duration)
+    out[rows] = _stopped(*of_rows, at_rest[rows], duration)
+    started = limits(out[:, velocities] / 2)
+    if not torch.equal(started, at_rest):  # friction depends on velocity
+        out[rows] = _stopped(*of_rows, started[rows], duration)
     return out
 
 
-def _stopped(system: System, before: Tensor, after: Tensor, command: Tensor, limits: Tensor, h: Duration) -> Tensor:
-    """`stopped` for rows in each of which something reverses."""
-    none = torch.zeros_like(limits[..., 0])
+def _stopped(
+    system: System, before: Tensor, after: Tensor, command: Tensor, at_rest: Tensor, started: Tensor, h: Duration
+) -> Tensor:
+    """`stopped` for rows in each of which something reverses, with the limits (B, n_load, 2) on coordinates at rest and
+    on those that have started."""
+    none = torch.zeros_like(at_rest[..., 0])
     free = system.derivative(before, command, none)
     for k, (_, own) in enumerate(system.coordinates):
-        forward, backward = limits[:, k].unbind(-1)
-        if not limits.requires_grad and not bool((forward + backward).any()):
+        forward, backward = at_rest[:, k].unbind(-1)
+        if not at_rest.requires_grad and not bool((forward + backward).any()):
             continue  # no friction on this coordinate
         unit = none.clone()
         unit[:, k] = 1
@@ -65,8 +79,10 @@ def _stopped(system: System, before: Tensor, after: Tensor, command: Tensor, lim
         left = torch.where(rest, torch.ones_like(last), last / torch.where(reverses & ~rest, last - first, 1.0))
         # Until now friction acted against the first direction for the whole step: that share of it is taken back.
         taken = torch.where(rest, none[:, k], torch.where(first > 0, forward, backward))
-        most = torch.where(last > 0, forward, backward) + taken
-        kept = last.sign() * (last.abs() - most * left * h * gain[:, own]).clamp_min(0)
+        holds = torch.where(last > 0, forward, backward) + taken
+        slows = torch.where(last > 0, *started[:, k].unbind(-1)) + taken
+        change = left * h * gain[:, own]  # of the velocity, per unit of a load since the stop
+        kept = torch.where(last.abs() > holds * change, last - last.sign() * slows * change, 0.0)
         impulse = torch.where(reverses, (kept - last) / gain[:, own], torch.zeros_like(last))
         moved = after + gain * impulse[:, None]
         for position, velocity in system.coordinates:
