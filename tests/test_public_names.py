@@ -116,7 +116,7 @@ class TestPolicyFiles:
         assert va.score(again, target, 3, steps=30) == va.score(result.policy, target, 3, steps=30)
 
     def test_what_is_no_policy_is_refused_in_one_line(self, tmp_path):
-        with pytest.raises(CheckpointError, match=r"renderer\.safetensors: a safetensors file, but not one that"):
+        with pytest.raises(CheckpointError, match=r"renderer\.safetensors: holds a renderer; a policy"):
             va.load_policy(va.shipped("renderer"))
         with pytest.raises(ValueError, match="no weights 'none' are shipped; there are cartpole_frames, "):
             va.shipped("none")
@@ -133,5 +133,5 @@ class TestRefusals:
             va.adapt(va.load_policy(va.shipped("fixed_wing")), va.World(va.CartPole()))
 
     def test_a_quadrotor_without_references(self):
-        with pytest.raises(ValueError, match="give references="):
+        with pytest.raises(ValueError, match="give some, by references= or --references"):
             va.train(va.World(va.Quadrotor(), period=0.1))

@@ -44,6 +44,10 @@ def broken():
     raise RuntimeError("the motor is off")
 
 
+def needy(speed, *rest, again=2):
+    return "a robot"
+
+
 def nonsense():
     return "a robot"
 

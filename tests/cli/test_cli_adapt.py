@@ -130,6 +130,13 @@ def test_what_it_refuses(here, trained, capsys, arguments, says):
     assert not (here / "run").exists()
 
 
+def test_a_file_in_the_place_of_the_folder(here, trained, capsys):
+    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL)
+    (here / "kept.txt").write_text("notes")
+    assert "--out: kept.txt is a file; name a folder" in refused(capsys, *command, "--out", "kept.txt")
+    assert (here / "kept.txt").read_text() == "notes"
+
+
 def test_a_diagnosis_that_named_nothing(here, trained, diagnosis, capsys):
     command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL)
     line = refused(capsys, *command, "--diagnosis", diagnosis((), "no_gap"))

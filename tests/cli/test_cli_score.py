@@ -49,7 +49,7 @@ def test_frames(here, trained, capsys):
         (("module:Thing-v0",), "module:Thing-v0: a gymnasium id needs --map MAP.toml"),
         (("rig:pushed",), "rig:pushed: returned a gymnasium environment, which needs --map MAP.toml"),
         (("rig:states", "--map", "map.toml"), "rig:states: returns a visadapt.Target, for which --map has no use"),
-        (("rig:pushed", "--map", "none.toml"), "none.toml: cannot be read as TOML"),
+        (("rig:pushed", "--map", "none.toml"), "none.toml: cannot be read: No such file"),
         (("rig:pushed", "--map", "torn.toml"), "torn.toml: cannot be read as TOML"),
         (("rig:pushed", "--map", "typo.toml"), "typo.toml: unknown key 'hight'"),
         (("rig:pushed", "--map", "part.toml"), "rig:pushed: its tau says 0.02 s a step"),
@@ -62,6 +62,8 @@ def test_frames(here, trained, capsys):
         (("rig:not_callable",), "has a int, not a function, called 'not_callable'"),
         (("torn:make",), "torn.py, line 2: ZeroDivisionError"),
         (("needs:make",), "needs.py, line 1: ModuleNotFoundError: No module named 'absent'"),
+        (("rig.py:nonsense",), "rig.py:nonsense: returned a str"),
+        (("rig:needy",), "rig:needy: takes arguments (speed); a function without arguments is right"),
         (("rig:broken",), "RuntimeError: the motor is off"),
         (("rig:nonsense",), "rig:nonsense: returned a str; a visadapt.Target or a gymnasium environment is needed"),
         (("rig:slow",), "synthetic cart-pole has 0.1 s between actions"),
@@ -85,7 +87,7 @@ def test_policies_that_it_refuses(here, trained, capsys):
 
     assert "none.safetensors: there is no such checkpoint" in line("none.safetensors", "rig:states")
     assert "rig.py: not a complete safetensors file" in line("rig.py", "rig:states")
-    assert "renderer.safetensors: a safetensors file, but not one" in line(va.shipped("renderer"), "rig:states")
+    assert "renderer.safetensors: holds a renderer; a policy" in line(va.shipped("renderer"), "rig:states")
     assert "the target has none: give it a camera" in line(trained / "frames.safetensors", "rig:states")
     assert "shows frames of 60 x 50 px" in line(trained / "frames.safetensors", "rig:larger")
     assert "a policy of a quadrotor; synthetic vehicle is a fixed_wing" in line(va.shipped("quadrotor"), "rig:flying")

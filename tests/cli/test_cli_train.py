@@ -61,6 +61,16 @@ def test_a_quadrotor_follows_references(here, capsys):
     assert va.load_source("q.safetensors").period == pytest.approx(0.1)
 
 
+def test_an_effect_beyond_what_a_diagnosis_looks_for_is_said_so(here, capsys):
+    assert run(*TINY, "--effect", "viscous_friction:coefficient=-5") == 0
+    assert "coefficient is -5 N s/m; a diagnosis looks for it from 0 to 30 N s/m" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("iterations", [1, 10])
+def test_a_few_iterations(here, iterations):
+    assert run("train", "--system", "cartpole", "--out", "p.safetensors", "--iterations", iterations) == 0
+
+
 def test_effects_of_one_s_own(here, diagnosis):
     (here / "mine.py").write_text(OWN_EFFECT.format(name="Own", effect="test_cli_own"))
     try:
@@ -103,6 +113,7 @@ def test_interrupted_it_goes_on_to_the_same_policy(here, monkeypatch):
         (("--effect", "viscous_friction"), "viscous_friction takes the parameters coefficient; got none"),
         (("--effect", "viscous_friction:coefficient=much"), "'coefficient=much' is not of the form PARAMETER=NUMBER"),
         (("--effect", "viscous_friction:coefficient=nan"), "coefficient must be finite"),
+        (("--effect", "actuator_delay:delay=-0.1"), "delay must not be negative, got -0.1 s"),
         (("--effect", "rotor_drag:coefficient=0.1"), "rotor_drag acts on a quadrotor, not on a cartpole"),
         (("--diagnosis", "none.json"), "none.json: cannot be read: No such file"),
         (("--diagnosis", "rig.py"), "rig.py: not JSON"),

@@ -287,7 +287,6 @@ class TestDryFriction:
 
 
 class TestCoulombFriction:
-
     def test_it_is_the_textbook_force_on_a_cart_that_moves(self):
         state = torch.zeros(4, 4, dtype=torch.float64)
         state[:, 1] = torch.tensor([0.05, -0.06, 0.0, 5.0])

@@ -66,6 +66,14 @@ def write(path, text="new"):
         temporary.write_text(text)
 
 
+def test_a_file_may_be_read_by_whom_the_umask_lets_whatever_wrote_it(tmp_path):
+    path = tmp_path / "weights.safetensors"
+    with replacing(path) as temporary:
+        temporary.touch(0o600)
+    (tmp_path / "usual").touch()
+    assert path.stat().st_mode == (tmp_path / "usual").stat().st_mode
+
+
 def test_a_link_is_followed_and_a_mode_is_kept(tmp_path):
     path, link = tmp_path / "a" / "private.json", tmp_path / "link.json"
     path.parent.mkdir()

@@ -127,7 +127,7 @@ class TestBadFiles:
         paths["text"].write_text("not a checkpoint, but long enough to hold a header's length")
         save_file({"a": torch.zeros(1)}, paths["foreign"])
         says = dict.fromkeys(names, "not a complete safetensors file")
-        says |= {"missing": "there is no such checkpoint", "foreign": "not one that visadapt wrote"}
+        says |= {"missing": "there is no such checkpoint", "foreign": "that visadapt did not write"}
         for name, path in paths.items():
             with pytest.raises(CheckpointError, match=says[name]) as caught:
                 load_tree(path)

@@ -64,7 +64,8 @@ def _in_words(explanation: Explanation) -> str:
     """The last diagnosis, and what followed from it."""
     causes = ", ".join(
         f"{effect.name} ({', '.join(f'{p.name} {_value(effect, p)}' for p in effect.table)})"
-        for effect in explanation.effects
+        f"{', slight' if effect.name in explanation.slight else ''}"
+        for effect in sorted(explanation.effects, key=lambda effect: effect.name in explanation.slight)
     )
     if not explanation.complete:
         return f"{explanation.verdict}: a residual learnt the gap"

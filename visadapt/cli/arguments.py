@@ -102,7 +102,7 @@ def train(parser: argparse.ArgumentParser) -> None:
         "where it was."
     )
     add = parser.add_argument
-    _add_system(parser)
+    _add_system(parser, own=False)
     add("--out", required=True, metavar="P.safetensors", help="write the policy here")
     add("--period", metavar="S", type=_positive_number, help="s between commands (default: 0.05; quadrotor: 0.1)")
     add("--frames", action="store_true", help="the policy is shown a camera's frames, not states")
@@ -167,10 +167,12 @@ def export(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("policy", metavar="P.safetensors", help="as `visadapt train` or `visadapt adapt` wrote it")
     parser.add_argument("--out", metavar="P.onnx", required=True, help="the file to write")
+    effects_help = "a file that defines effects the policy was trained with"
+    parser.add_argument("--effects", metavar="FILE.py", help=effects_help)
 
 
-def _add_system(parser: argparse.ArgumentParser) -> None:
-    system_help = f"the source physics: {SYSTEMS_HELP}, {OWN_HELP}"
+def _add_system(parser: argparse.ArgumentParser, own: bool = True) -> None:
+    system_help = f"the source physics: {SYSTEMS_HELP}" + (f", {OWN_HELP}" if own else "")
     parser.add_argument("--system", required=True, type=_system, metavar="NAME", help=system_help)
     parser.add_argument("--params", metavar="RIG.toml", help="the rig's own parameters, in a table [parameters]")
 

@@ -11,7 +11,7 @@ from torch import nn
 
 from renderers import load_renderer
 from visadapt import diagnosis
-from visadapt.cli.inputs import InputError, checked, import_effects, progress, the_system
+from visadapt.cli.inputs import InputError, import_effects, progress, the_system
 from visadapt.diagnosis import Diagnosis
 from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.report.html import write_report
@@ -67,11 +67,15 @@ def _plan(
     if result.verdict != AMBIGUOUS:
         print(f"--plan: nothing to settle, the verdict is {result.verdict}; {options.plan} was not written")
         return
-    with progress() as report, checked():
-        planned = plan(result, recording, source, policy, seed=options.seed, progress=staged(report, "plan"))
+    try:
+        with progress() as report:
+            planned = plan(result, recording, source, policy, seed=options.seed, progress=staged(report, "plan"))
+    except ValueError as error:
+        print(f"--plan: {error}; {options.plan} was not written")
+        return
     if planned.settles:
         planned.write(options.plan)
-    print(planned)
+    print(planned if planned.settles else f"--plan: {planned}; {options.plan} was not written")
 
 
 def _settings(options: argparse.Namespace, system: System, seconds: float) -> dict[str, str]:
@@ -104,7 +108,7 @@ def _state_policy(path: Path, system: System) -> StatePolicy:
         )
     policy = load_policy(path)
     if not isinstance(policy, StatePolicy):
-        raise InputError(f"{path}: holds a {type(policy).__name__}, a StatePolicy is needed")
+        raise InputError(f"{path}: is shown the {policy.shown} of a target; a policy on states alone is needed")
     if (policy.n_state, policy.n_action) != (len(system.states), len(system.actions)):
         raise InputError(
             f"{path}: a policy of {policy.n_state} states and {policy.n_action} commands; "

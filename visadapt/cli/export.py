@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 
+from visadapt.cli.inputs import import_effects
 from visadapt.setups.onnx_file import about, export_policy
 from visadapt.setups.policy_file import load_policy, load_source
 
 
 def run(options: argparse.Namespace) -> None:
     """Write the file, print its metadata."""
+    import_effects(options)
     policy, source = load_policy(options.policy), load_source(options.policy)
     export_policy(options.out, policy, source)
     for name, value in about(policy, source).items():

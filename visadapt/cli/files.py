@@ -37,6 +37,8 @@ def check_files(options: argparse.Namespace) -> None:
                 if _overwrites(path, other, is_folder):
                     where = "the folder" if is_folder else "the file"
                     raise InputError(f"--{name}: {path} is {where} of {flag}, which would be lost; name another")
+            if is_folder and Path(path).is_file():
+                raise InputError(f"--{name}: {path} is a file; name a folder")
             if not is_folder:
                 check_writable(path)
             taken.append((f"--{name}", path))
@@ -51,9 +53,10 @@ def _inputs(options: argparse.Namespace) -> Iterator[tuple[str, str]]:
     for name in INPUTS:
         value = vars(options).get(name) or []
         for path in value if isinstance(value, list) else [value]:
-            yield _flag(name), path
+            flag = "POLICY" if name == "policy" and options.command == "export" else _flag(name)
+            yield flag, path
             if Path(path).is_dir():
-                yield from ((_flag(name), str(file)) for file in Path(path).iterdir())
+                yield from ((flag, str(file)) for file in Path(path).iterdir())
     module, colon, _ = (vars(options).get("target") or "").rpartition(":")
     if colon:
         yield "--target", module.replace(".", os.sep) + ".py"

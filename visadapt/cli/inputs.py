@@ -17,16 +17,20 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import torch
+
 from visadapt.cli.own_effects import complaints as complaints_of_effect
+from visadapt.diagnosis.report.text import with_unit
 from visadapt.diagnosis.saved import load_effects
 from visadapt.effects import EFFECTS, Effect
 from visadapt.effects.base import expect
-from visadapt.effects.catalogue import catalogue
+from visadapt.effects.catalogue import catalogue, sized
 from visadapt.progress import Report, reporting
 from visadapt.storage.run_folder import open_run
 from visadapt.systems import SYSTEMS, CartPole, System
 from visadapt.systems.contract import complaints
 from visadapt.systems.parameter_file import load_parameters
+from visadapt.world import World
 
 OWN_FILES: set[str] = set()
 """Files of the user's whose code is run."""
@@ -113,17 +117,26 @@ def _effect(text: str, system: System) -> Effect:
         raise InputError(f"--effect {text}: {error}") from error
     values: dict[str, float] = {}
     for part in rest.split(",") if rest else ():
-        parameter, _, number = part.partition("=")
+        asked, _, number = part.partition("=")
         try:
-            values[parameter] = float(number)
+            values[asked] = float(number)
         except ValueError:
             raise InputError(f"--effect {text}: {part!r} is not of the form PARAMETER=NUMBER") from None
-        if not abs(values[parameter]) < float("inf"):
-            raise InputError(f"--effect {text}: {parameter} must be finite")
+        if not abs(values[asked]) < float("inf"):
+            raise InputError(f"--effect {text}: {asked} must be finite")
     try:
-        return EFFECTS[name](**values)
+        effect = EFFECTS[name](**values)
+        world = World(system, [effect])
+        world.step(world.start(torch.zeros(1, len(system.states))), torch.zeros(1, len(system.actions)))
     except ValueError as error:
         raise InputError(f"--effect {text}: {error}") from error
+    for parameter in sized(EFFECTS[name], system).table:
+        low, high, value = (f"{one:g}" for one in (parameter.low, parameter.high, values[parameter.name]))
+        if not parameter.low <= values[parameter.name] <= parameter.high:
+            range_searched = f"{low} to {with_unit(high, parameter.unit)}"
+            given = f"visadapt: --effect {text}: {parameter.name} is {with_unit(value, parameter.unit)}"
+            print(f"{given}; a diagnosis looks for it from {range_searched}", file=sys.stderr)
+    return effect
 
 
 def import_effects(options: argparse.Namespace) -> None:
@@ -184,6 +197,7 @@ def own_code(message: Callable[[BaseException], str]) -> Iterator[None]:
 def find_factory(name: str) -> Callable[[], Any]:
     """What `package.module:factory` names; modules in the current directory are found too."""
     module_name, _, attribute = name.partition(":")
+    module_name = module_name.removesuffix(".py")
     if (here := str(Path.cwd())) not in sys.path:
         sys.path.insert(0, here)
     try:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 import warnings
+from collections.abc import Callable
+from inspect import Parameter, signature
+from typing import Any
 
 import torch
 
@@ -38,6 +41,8 @@ def load_target(options: argparse.Namespace, source: World, frames: bool) -> Tar
     # gymnasium too has ids of the form module:Name-v0, whose last part is no name of Python's.
     if ":" in name and name.rpartition(":")[2].isidentifier():
         factory = find_factory(name)
+        if needed := _arguments(factory):
+            raise InputError(f"{name}: takes arguments ({', '.join(needed)}); a function without arguments is right")
         with own_code(lambda error: f"{name}: {describe(error)}"):
             made = factory()
         if isinstance(made, Target):
@@ -59,6 +64,16 @@ def load_target(options: argparse.Namespace, source: World, frames: bool) -> Tar
     if target.period_origin != "as given":
         print(f"visadapt: {name}: {target.period:g} s between actions, from {target.period_origin}", file=sys.stderr)
     return target
+
+
+def _arguments(factory: Callable[..., Any]) -> list[str]:
+    """The arguments that a function cannot do without."""
+    try:
+        takes = signature(factory).parameters.values()
+    except ValueError:  # some functions of compiled modules do not say
+        return []
+    optional = (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)
+    return [each.name for each in takes if each.default is Parameter.empty and each.kind not in optional]
 
 
 def _check(path: str, policy: Policy, source: World, target: Target) -> None:

@@ -79,10 +79,10 @@ class Plan:
     def __str__(self) -> str:
         sets = [" and ".join(names) for names in self.explanations]
         if not self.settles:
-            return f"no excitation within the ranges of the states tells {sets[0]} from {', '.join(sets[1:])}"
+            return f"no excitation within the ranges of the states tells {sets[0]} from {' or '.join(sets[1:])}"
         white = "" if math.isnan(self.white) else f"; {self.white:.0f} for white noise"
         return (
-            f"to tell {sets[0]} from {', '.join(sets[1:])}: add {self.excitation} to the commands, for "
+            f"to tell {sets[0]} from {' or '.join(sets[1:])}: add {self.excitation} to the commands, for "
             f"{self.time[-1]:.3g} s (expected log odds {self.log_odds:.0f}{white})"
         )
 
@@ -145,9 +145,8 @@ def plan(
     admissible = torch.stack([each[1] for each in shown]).all(0).unflatten(0, (len(SIZES), len(names)))
     largest = admissible.long().cumprod(0).sum(0) - 1  # of each excitation; -1 without any
     if bool((largest < 0).all()):
-        raise ValueError(
-            "the machine leaves the ranges of its states under every excitation: give the policy of the rig"
-        )
+        hint = "" if policy else ": give the policy of the rig"
+        raise ValueError(f"the machine leaves the ranges of its states under every excitation{hint}")
     worth = torch.full((len(names),), math.nan)
     for done, k in enumerate(torch.nonzero(largest >= 0)[:, 0].tolist()):
         row = int(largest[k]) * len(names) + k

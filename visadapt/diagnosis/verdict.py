@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 from visadapt.diagnosis.report import next_experiment
+from visadapt.diagnosis.report.text import with_unit
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Gap, without_slight
 from visadapt.diagnosis.search.causes import Alternative
 from visadapt.diagnosis.search.heldout import MIN_GAP
@@ -93,8 +94,8 @@ def at_bounds(comparison: ModelComparison) -> list[str]:
     """A warning for each strength that the best set has at an end of the range searched."""
     table = [(effect, parameter) for effect in comparison.best.effects for parameter in effect.table]
     return [
-        f"{effect.name}: {parameter.name} is at {end:g} {parameter.unit}, the end of the range searched; the truth may "
-        "lie beyond it, and the other causes are then wrong as well"
+        f"{effect.name}: {parameter.name} is at {with_unit(f'{end:g}', parameter.unit)}, the end of the range searched"
+        "; the truth may lie beyond it, and the other causes are then wrong as well"
         for (effect, parameter), value in zip(table, comparison.best.fits.theta[0].tolist(), strict=True)
         for end in (parameter.low, parameter.high)
         if parameter.is_strength and end != parameter.neutral

@@ -25,6 +25,8 @@ class Explanation:
     """the causes that it names, at their found values"""
     complete: bool
     """whether they leave nothing for a residual to learn"""
+    slight: frozenset[str] = frozenset()
+    """names of those without which less than 1 % of the gap opens again"""
     experiment: Experiment | None = field(default=None, compare=False)
     """where other causes explain the data as well: designs the excitation that tells them apart in the next round"""
 

@@ -41,8 +41,10 @@ class TrainingState:
     losses: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        # OneCycleLR divides by zero where the warm-up is of exactly one step.
+        warm_up = 0.1 if self.iterations != 10 else 0.2
         self.schedule = torch.optim.lr_scheduler.OneCycleLR(
-            self.optimiser, self.learning_rate, total_steps=self.iterations, pct_start=0.1
+            self.optimiser, self.learning_rate, total_steps=self.iterations, pct_start=warm_up
         )
 
     def resume(self) -> dict[str, Any] | None:

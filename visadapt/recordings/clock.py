@@ -101,7 +101,7 @@ def check_forward(raw: RawEpisode) -> None:
     if len(backwards):
         row = int(backwards[0])
         before, after = raw.time[row], raw.time[row + 1]
-        problem = "repeats itself" if before == after else "runs backward"
+        problem = "repeats itself" if f"{before:.9g}" == f"{after:.9g}" else "runs backward"
         raise RecordingError(
             f"{raw.cell(row + 1, 'time')}: the clock {problem} (from {before:.9g} s to {after:.9g} s); each row must "
             "be later than the one before; mark several episodes by a column 'episode'"

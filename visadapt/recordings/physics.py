@@ -129,7 +129,7 @@ def _accelerations(
     names = [variable.name for variable in system.states]
     angles = [variable.name for variable in system.states if variable.unit == "rad"]
     columns = {name: np.unwrap(values) if name in angles else values for name, values in columns.items()}
-    time, action = raw.time[:MOST_ROWS], raw.action[:MOST_ROWS]
+    action = raw.action[:MOST_ROWS]
     stride = _stride(raw)
     span = 2 * stride * _period(raw)
     # The mean of three points has noise that is uncorrelated with that of their second difference.

@@ -47,7 +47,9 @@ def explained(source: World, renderer: nn.Module | None = None, report: Report |
         if not path.exists():
             found = diagnosed()
             write_json(path, found.to_json())
-        verdict = read_json(path)["verdict"]
+        content = read_json(path)
+        verdict = content["verdict"]
+        slight = frozenset(cause["effect"] for cause in content["causes"] if cause["slight"])
         effects = load_effects(path)[1] if verdict in (IDENTIFIED, AMBIGUOUS) else []
 
         def experiment(policy: Policy, steps: int) -> Tensor | None:
@@ -62,6 +64,6 @@ def explained(source: World, renderer: nn.Module | None = None, report: Report |
             return torch.as_tensor(planned.added)
 
         settles = experiment if verdict == AMBIGUOUS and renderer is None else None
-        return Explanation(verdict, effects, verdict != UNEXPLAINED, settles)
+        return Explanation(verdict, effects, verdict != UNEXPLAINED, slight, settles)
 
     return explain

@@ -121,7 +121,10 @@ def _world(description: Mapping[str, Any], path: Path) -> World:
     names = [description["system"], *(one["effect"] for one in description["effects"])]
     for name in names:
         if name not in SYSTEMS and name not in EFFECTS:
-            raise CheckpointError(f"{path}: needs {name!r}, which is not known here: import the file that defines it")
+            raise CheckpointError(
+                f"{path}: needs {name!r}, which is not known here: import the file that defines it, or name it by "
+                "--effects"
+            )
     system = SYSTEMS[description["system"]](**description["parameters"])
     given = [dict(one) for one in description["effects"]]
     effects = [EFFECTS[values.pop("effect")](**values) for values in given]

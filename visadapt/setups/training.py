@@ -17,7 +17,7 @@ from visadapt.setups.base import Setup
 from visadapt.setups.cartpole import cartpole_frames, cartpole_states
 from visadapt.setups.flight import fixed_wing, quadrotor
 from visadapt.setups.policy_file import save_policy
-from visadapt.systems import CartPole, FixedWing, Quadrotor
+from visadapt.systems import SYSTEMS, CartPole, FixedWing, Quadrotor
 from visadapt.targets import FlightTarget, Target
 from visadapt.tasks.follow import Follow
 from visadapt.tasks.references import Reference
@@ -57,13 +57,14 @@ def setup_for(
             setup = cartpole_states(world, policy.with_history if isinstance(policy, StatePolicy) else with_history)
     elif isinstance(system, Quadrotor):
         if references is None:
-            raise ValueError("a quadrotor follows references: give references=, such as visadapt.read_reference(path)")
+            raise ValueError("a quadrotor follows references: give some, by references= or --references")
         setup = quadrotor(references, source=world, with_history=with_history)
     elif isinstance(system, FixedWing):
         setup = fixed_wing(world, with_history)
     else:
         raise ValueError(
-            f"no setup is known for a {system.name}: make a visadapt.Setup with a task, a policy and a residual"
+            f"policies are trained for {', '.join(SYSTEMS)}; for a {system.name}, make a visadapt.Setup with a task, a "
+            "policy and a residual"
         )
     if policy is not None:
         setup.check_policy(policy)

@@ -63,8 +63,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         # Onto the disk first, so that a full disk or a power cut cannot cost the old file.
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
-        if final.exists():
-            temporary.chmod(stat.S_IMODE(final.stat().st_mode))
+        # Some writers make files that nobody else may read.
+        temporary.chmod(stat.S_IMODE(final.stat().st_mode) if final.exists() else 0o666 & ~_umask())
         temporary.replace(final)
     except BaseException as error:
         # Before the temporary file, which may be what fills the disk, is removed.
@@ -94,6 +94,13 @@ def check_writable(path: str | os.PathLike[str]) -> None:
             pass
     except OSError as error:
         raise NotWrittenError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _umask() -> int:
+    """The bits of a file's mode that the process does not give to new files."""
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask
 
 
 def _is_running(process: int) -> bool:

@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from renderers.weights import sealed, unsealed
+from renderers.weights import HEADER_KEY, sealed, unsealed
 from visadapt.storage.atomic_files import replacing
 
 TREE_KEY = "visadapt.tree"
@@ -41,6 +41,7 @@ def load_tree(path: Path) -> Any:
         path.open("rb").close()  # since safetensors reports any failure to open as a missing file
         with safe_open(path, framework="pt") as file:
             entry = (file.metadata() or {}).get(TREE_KEY)
+            holds_renderer = HEADER_KEY in (file.metadata() or {})
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     except FileNotFoundError as error:
         raise CheckpointError(f"{path}: there is no such checkpoint") from error
@@ -49,7 +50,8 @@ def load_tree(path: Path) -> Any:
     except SafetensorError as error:
         raise CheckpointError(f"{path}: not a complete safetensors file ({error})") from error
     if entry is None:
-        raise CheckpointError(f"{path}: a safetensors file, but not one that visadapt wrote")
+        what = "holds a renderer" if holds_renderer else "a safetensors file that visadapt did not write"
+        raise CheckpointError(f"{path}: {what}; a policy, or what a run kept, is needed")
     if (skeleton := unsealed(entry, tensors)) is None:
         raise CheckpointError(f"{path}: is damaged: its checksum is not that of what it holds")
     with fitting(path):

@@ -34,7 +34,8 @@ def open_run(folder: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
     if found != wanted:
         differing = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
         raise RunError(
-            f"{folder} holds a run with other settings ({', '.join(differing)}): remove it or name another folder"
+            f"{folder} holds a run with other settings ({', '.join(differing)}): remove that folder, or name another "
+            "by --out"
         )
     return run
 

@@ -44,7 +44,7 @@ def stopped(system: System, before: Tensor, after: Tensor, command: Tensor, limi
     at_rest = limits(torch.zeros_like(first))
     # A row in which nothing reverses is left as it is: computing the response to loads for these too takes longer than
     # the step itself.
-    rubs = torch.ones_like(first, dtype=torch.bool) if at_rest.requires_grad else (at_rest != 0).any(-1)
+    rubs = torch.ones_like(first, dtype=torch.bool) if at_rest.requires_grad else (at_rest + limits(last) != 0).any(-1)
     rows = (((first == 0) | (first * last < 0)) & rubs).any(-1)
     if not bool(rows.any()):
         return after
@@ -53,7 +53,7 @@ def stopped(system: System, before: Tensor, after: Tensor, command: Tensor, limi
     out = after.clone()
     out[rows] = _stopped(*of_rows, at_rest[rows], duration)
     started = limits(out[:, velocities] / 2)
-    if not torch.equal(started, at_rest):  # friction depends on velocity
+    if started.requires_grad or not torch.equal(started, at_rest):  # friction may depend on velocity
         out[rows] = _stopped(*of_rows, started[rows], duration)
     return out
 
@@ -67,7 +67,7 @@ def _stopped(
     free = system.derivative(before, command, none)
     for k, (_, own) in enumerate(system.coordinates):
         forward, backward = at_rest[:, k].unbind(-1)
-        if not at_rest.requires_grad and not bool((forward + backward).any()):
+        if not at_rest.requires_grad and not bool((at_rest + started)[:, k].any()):
             continue  # no friction on this coordinate
         unit = none.clone()
         unit[:, k] = 1
@@ -82,7 +82,8 @@ def _stopped(
         holds = torch.where(last > 0, forward, backward) + taken
         slows = torch.where(last > 0, *started[:, k].unbind(-1)) + taken
         change = left * h * gain[:, own]  # of the velocity, per unit of a load since the stop
-        kept = torch.where(last.abs() > holds * change, last - last.sign() * slows * change, 0.0)
+        moving = last.sign() * (last.abs() - slows * change).clamp_min(0)
+        kept = torch.where(last.abs() > holds * change, moving, torch.zeros_like(last))
         impulse = torch.where(reverses, (kept - last) / gain[:, own], torch.zeros_like(last))
         moved = after + gain * impulse[:, None]
         for position, velocity in system.coordinates:

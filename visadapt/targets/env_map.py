@@ -121,7 +121,9 @@ class EnvMap:
         """
         try:
             table = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-        except (OSError, ValueError, RecursionError) as error:  # of TOML, of its encoding, or of Python
+        except OSError as error:
+            raise TargetError(f"{path}: cannot be read: {error.strerror}") from error
+        except (ValueError, RecursionError) as error:  # of TOML, of its encoding, or of Python
             raise TargetError(f"{path}: cannot be read as TOML: {error}") from error
         known = [item.name for item in fields(cls)]
         for key in table:
