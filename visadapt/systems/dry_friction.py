@@ -80,7 +80,7 @@ def _stopped(
         # Until now friction acted against the first direction for the whole step: that share of it is taken back.
         taken = torch.where(rest, none[:, k], torch.where(first > 0, forward, backward))
         holds = torch.where(last > 0, forward, backward) + taken
-        slows = torch.where(last > 0, *started[:, k].unbind(-1)) + taken
+        slows = torch.where(last > 0, started[:, k, 0], started[:, k, 1]) + taken
         change = left * h * gain[:, own]  # of the velocity, per unit of a load since the stop
         moving = last.sign() * (last.abs() - slows * change).clamp_min(0)
         kept = torch.where(last.abs() > holds * change, moving, torch.zeros_like(last))
