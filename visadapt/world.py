@@ -10,12 +10,12 @@ import torch
 from torch import Tensor, nn
 
 from visadapt.batch import Batch
+from visadapt.dynamics import Dynamics
 from visadapt.effects import ActuationEffect, CameraEffect, DynamicsEffect, Effect, Parameter, Residual, SensingEffect
 from visadapt.effects.base import expect
 from visadapt.effects.camera import seen_by
 from visadapt.history import History
 from visadapt.systems import SYSTEMS, System
-from visadapt.systems.dry_friction import Limits, sliding, stopped
 from visadapt.systems.integrators import INTEGRATORS, Duration
 
 
@@ -224,22 +224,16 @@ class World(nn.Module):
     def load(self, at: WorldState) -> Tensor:
         """Sum of the loads (B, n_load) of all effects at an instant without a command, with dry friction of the
         coordinates that move."""
-        system = self.system_at(at)
-        idle = at.state.new_zeros(len(at.state), len(system.actions))
-        load, limits = self._load(at.time, at.state, system), self._dry_friction(at.time, at.state, idle, system)
-        velocity = at.state[:, self._velocities]
-        return load if limits is None else load + sliding(limits, velocity, velocity.sign())
+        idle = at.state.new_zeros(len(at.state), len(self.system.actions))
+        return self._dynamics.load(self.altered(at.state), at.time, at.state, idle)
 
     def system_at(self, at: WorldState) -> System:
         """The system with the parameters that effects give it at an instant."""
-        return self._varied(self.altered(at.state), at.time, at.state)
+        return self._dynamics.varied(self.altered(at.state), at.time, at.state)
 
     def altered(self, like: Tensor) -> System:
         """The system with the parameters that effects change permanently, with the device and dtype of `like`."""
-        system = self.system
-        for effect in self._dynamics:
-            system = effect.alter(system)
-        return system if system is self.system else system.to(like)
+        return self._dynamics.altered(like)
 
     def _arrange(self) -> None:
         """Sort the effects by what they act on, in the order in which they act."""
@@ -250,13 +244,9 @@ class World(nn.Module):
         )
         self._sensing = sorted((e for e in effects if isinstance(e, SensingEffect)), key=lambda effect: effect.order)
         self._camera = sorted((e for e in effects if isinstance(e, CameraEffect)), key=lambda effect: effect.order)
-        self._dynamics = [effect for effect in effects if isinstance(effect, DynamicsEffect)]
         self._residuals = [effect for effect in effects if isinstance(effect, Residual)]
-        # Most effects do one of these three alone, and a step asks for them at every derivative.
-        self._varying = [e for e in self._dynamics if type(e).vary is not DynamicsEffect.vary]
-        self._loading = [e for e in self._dynamics if type(e).load is not DynamicsEffect.load]
-        self._rubbing = [e for e in self._dynamics if type(e).dry_friction is not DynamicsEffect.dry_friction]
-        self._friction_varies = any(e.dry_friction_by_velocity for e in self._rubbing)
+        dynamics = [effect for effect in effects if isinstance(effect, DynamicsEffect)]
+        self._dynamics = Dynamics(self.system, dynamics, self.integrator)
 
     def _at_rest(self, state: Tensor) -> tuple[Tensor, ...]:
         """What effects remember at the start of an episode in the state (B, n_state)."""
@@ -289,25 +279,9 @@ class World(nn.Module):
     ) -> Tensor:
         h: Duration = (self.period if duration is None else duration) / self.substeps
         for k in range(self.substeps):
-            state = self._substep(system, time, state, commands[:, k], h)
+            state = self._dynamics.step(system, time, state, commands[:, k], h)
             time = time + h
         return state
-
-    def _substep(self, system: System, time: Tensor, state: Tensor, command: Tensor, h: Duration) -> Tensor:
-        """The state after `h` s in which `command` (B, n_action) acts."""
-        integrate, columns = INTEGRATORS[self.integrator], self._velocities
-        here, direction = self._varied(system, time, state), state[:, columns].sign()
-        limits = self._dry_friction(time, state, command, here)
-        constant: float | Tensor = 0.0 if limits is None else sliding(limits, state[:, columns], direction)
-        varying = limits if self._friction_varies else None
-
-        def derivative(t: Tensor, s: Tensor) -> Tensor:
-            now = self._varied(system, t, s)
-            friction = constant if varying is None else sliding(varying, s[:, columns], direction)
-            return now.derivative(s, command, self._load(t, s, now) + friction)
-
-        after = integrate(derivative, time, state, h)
-        return after if limits is None else stopped(here, state, after, command, limits, h)
 
     def _read(
         self, state: Tensor, memory: tuple[Tensor, ...], generator: torch.Generator | None
@@ -326,34 +300,3 @@ class World(nn.Module):
             state, own = effect.scene(state, own, self.period)
             remembered.append(own)
         return state, tuple(remembered)
-
-    def _varied(self, system: System, time: Tensor, state: Tensor) -> System:
-        for effect in self._varying:
-            system = effect.vary(system, time, state)
-        return system
-
-    @property
-    def _velocities(self) -> list[int]:
-        return [velocity for _, velocity in self.system.coordinates]
-
-    def _dry_friction(self, time: Tensor, state: Tensor, command: Tensor, system: System) -> Limits | None:
-        """Sum over all effects of the largest dry friction near a state; None without any."""
-
-        def limits(velocities: Tensor) -> Tensor:
-            near = state.clone()
-            near[:, self._velocities] = velocities
-            each = [effect.dry_friction(time, near, command, system) for effect in self._rubbing]
-            return sum(each[1:], each[0])
-
-        if self._friction_varies:
-            return limits
-        if not self._rubbing:
-            return None
-        same = limits(state[:, self._velocities])
-        return lambda velocities: same
-
-    def _load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        load = torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)
-        for effect in self._loading:
-            load = load + effect.load(time, state, system)
-        return load

@@ -1,0 +1,89 @@
+"""The physics of a world: a system under the effects on its dynamics, integrated over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from visadapt.effects import DynamicsEffect
+from visadapt.systems import System
+from visadapt.systems.dry_friction import Limits, sliding, stopped
+from visadapt.systems.integrators import INTEGRATORS, Duration
+
+
+class Dynamics:
+    """A system and the effects on its dynamics; `integrator` is one of `INTEGRATORS`.
+
+    Methods that take a system expect the one that `altered` gives, which is the same for many steps.
+    """
+
+    def __init__(self, system: System, effects: Sequence[DynamicsEffect], integrator: str) -> None:
+        self.system = system
+        self.integrator = integrator
+        self._effects = effects
+        # Most effects do one of these three alone, and a step asks for them at every derivative.
+        self._varying = [e for e in effects if type(e).vary is not DynamicsEffect.vary]
+        self._loading = [e for e in effects if type(e).load is not DynamicsEffect.load]
+        self._rubbing = [e for e in effects if type(e).dry_friction is not DynamicsEffect.dry_friction]
+        self._friction_varies = any(e.dry_friction_by_velocity for e in self._rubbing)
+        self._velocities = [velocity for _, velocity in system.coordinates]
+
+    def altered(self, like: Tensor) -> System:
+        """The system with the parameters that effects change permanently, with the device and dtype of `like`."""
+        system = self.system
+        for effect in self._effects:
+            system = effect.alter(system)
+        return system if system is self.system else system.to(like)
+
+    def varied(self, system: System, time: Tensor, state: Tensor) -> System:
+        """The system with the parameters that effects give it at the time (B,) in the state (B, n_state)."""
+        for effect in self._varying:
+            system = effect.vary(system, time, state)
+        return system
+
+    def load(self, system: System, time: Tensor, state: Tensor, command: Tensor) -> Tensor:
+        """Sum of the loads (B, n_load) of all effects at an instant in which `command` (B, n_action) acts, with dry
+        friction of the coordinates that move."""
+        here, velocity = self.varied(system, time, state), state[:, self._velocities]
+        load, limits = self._load(time, state, here), self._dry_friction(time, state, command, here)
+        return load if limits is None else load + sliding(limits, velocity, velocity.sign())
+
+    def step(self, system: System, time: Tensor, state: Tensor, command: Tensor, h: Duration) -> Tensor:
+        """The state (B, n_state) after `h` s, a number or (B,), in which `command` (B, n_action) acts."""
+        columns, here = self._velocities, self.varied(system, time, state)
+        direction, limits = state[:, columns].sign(), self._dry_friction(time, state, command, here)
+        constant: float | Tensor = 0.0 if limits is None else sliding(limits, state[:, columns], direction)
+        varying = limits if self._friction_varies else None
+
+        def derivative(t: Tensor, s: Tensor) -> Tensor:
+            now = self.varied(system, t, s)
+            friction = constant if varying is None else sliding(varying, s[:, columns], direction)
+            return now.derivative(s, command, self._load(t, s, now) + friction)
+
+        after = INTEGRATORS[self.integrator](derivative, time, state, h)
+        return after if limits is None else stopped(here, state, after, command, limits, h)
+
+    def _load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+        """Sum of the loads (B, n_load) without dry friction."""
+        load = torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)
+        for effect in self._loading:
+            load = load + effect.load(time, state, system)
+        return load
+
+    def _dry_friction(self, time: Tensor, state: Tensor, command: Tensor, system: System) -> Limits | None:
+        """Sum of the largest dry friction of all effects near a state; None without any."""
+
+        def limits(velocities: Tensor) -> Tensor:
+            near = state.clone()
+            near[:, self._velocities] = velocities
+            each = [effect.dry_friction(time, near, command, system) for effect in self._rubbing]
+            return sum(each[1:], each[0])
+
+        if self._friction_varies:
+            return limits
+        if not self._rubbing:
+            return None
+        same = limits(state[:, self._velocities])
+        return lambda velocities: same
