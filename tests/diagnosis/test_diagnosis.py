@@ -66,6 +66,15 @@ def test_a_gap_may_hide_in_coarse_steps_of_an_encoder(step, verdict):
     assert ("finer steps" in result.next_experiment) == (step == 0.1)
 
 
+def test_a_gap_may_hide_in_the_noise_of_a_velocity_that_is_read_wrong():
+    whole = record(measured=("x", "x_dot", "theta", "theta_dot"))
+    wrong = [np.stack((e.state[:, 0], 1.2 * e.state[:, 1], *e.state[:, 2:].T), 1) for e in whole.episodes]
+    episodes = tuple(Episode(e.time, e.action, state) for e, state in zip(whole.episodes, wrong, strict=True))
+    result = diagnose(dataclasses.replace(whole, episodes=episodes), SOURCE)
+    assert result.verdict == "unexplained"
+    assert "error of the reading of x dot" in result.next_experiment
+
+
 def test_on_a_heavy_machine_effects_are_found_beyond_the_ranges_of_a_light_one():
     """Ten times the default's masses: within its ranges a patch of friction and dry friction in the hinge are named."""
     heavy = CartPole(cart_mass=10.0, pole_mass=1.0, max_force=300.0)

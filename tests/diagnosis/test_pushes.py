@@ -121,3 +121,46 @@ def test_a_kick_of_the_cart_is_found():
     assert push.load == "cart_force"
     assert push.start == pytest.approx(2.5 - 0.245, abs=0.1)
     assert push.impulse == pytest.approx(4.0 * 0.1 * math.sqrt(2 * math.pi), rel=0.3)
+
+
+def balanced(force, jitter, seed=0):
+    """12 s of a cart-pole that is balanced by feedback, read by encoders, with a push of `force` N for about 0.5 s at
+    8 s; steps of the clock are up to `jitter` longer than 20 ms."""
+    random = np.random.default_rng(seed)
+    world = World(CartPole(), period=0.02)
+    at, time, rows, wander = torch.tensor([[0.1, 0.0, 0.03, 0.0]]).double(), 0.0, [], 0.0
+    while time < 12:
+        read = np.round(at[0].numpy()[[0, 2]] / STEPS) * STEPS
+        wander = 0.97 * wander + 0.03 * random.normal()
+        command = float(np.clip(at[0].numpy() @ [0.05, 0.12, 1.6, 0.35] + wander, -1, 1))
+        rows.append((time, *read, command))
+        step = 0.02 * (1 + jitter * random.uniform())
+        for _ in range(4):
+            push = force * math.exp(-0.5 * ((time - 8) / 0.11) ** 2) / CartPole().max_force
+            acting = torch.tensor([[[command + push]]]).double()
+            at = world.integrate(torch.zeros(1), at, acting, torch.tensor([step / 4]).double())
+            time += step / 4
+    table = np.array(rows)
+    episode = Episode(table[:, 0], table[:, 3:], table[:, 1:3])
+    return Recording((episode,), ("x", "theta"), float(np.median(np.diff(table[:, 0]))), ("run",))
+
+
+STEPS = np.array([1e-4, 2 * math.pi / 4096])
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.2])
+@pytest.mark.parametrize("seed", range(3))
+def test_of_a_balanced_cart_pole_none_is_named_where_there_is_none(jitter, seed):
+    with torch.inference_mode():
+        assert pushes(balanced(0.0, jitter, seed), World(CartPole())) == ()
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.2])
+@pytest.mark.parametrize("force", [2.0, -4.0])
+def test_feedback_does_not_hide_a_push(force, jitter):
+    with torch.inference_mode():
+        (push,) = pushes(balanced(force, jitter), World(CartPole()))
+    assert push.load == "cart_force"
+    assert push.size == pytest.approx(force, rel=0.25)
+    assert push.start == pytest.approx(8 - 2.45 * 0.11, abs=0.1)
+    assert push.ci90[0] < force * 0.11 * math.sqrt(2 * math.pi) < push.ci90[1]

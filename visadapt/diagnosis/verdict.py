@@ -49,8 +49,9 @@ def verdict_of(
         repeats: readings are repeated.
         coarse: a position is read in steps that are coarse for the motion.
     """
-    # Coarse steps are fitted as noise; that the source predicts within them does not say that nothing departs from it.
-    nothing = UNEXPLAINED if coarse else NO_GAP
+    # Coarse steps, and errors of a velocity's reading, are fitted as noise: a source that predicts within that noise may
+    # still have a gap.
+    nothing = UNEXPLAINED if coarse or comparison.misread else NO_GAP
     if math.isnan(gap.closed) and not repeats:
         return nothing  # the source predicts as well as the noise allows
     if unexplained:

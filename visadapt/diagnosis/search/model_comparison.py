@@ -65,6 +65,12 @@ class ModelComparison:
         return any(each.log_odds > required.get(each.port, self.threshold) for each in self.functions)
 
     @property
+    def misread(self) -> bool:
+        """Whether a reading clearly has an error beyond the best model. Predictions may not show it: that of a velocity
+        is fitted as noise where the positions are read too."""
+        return any(each.log_odds > CLEAR_LOG_ODDS and each.port not in self.loads for each in self.functions)
+
+    @property
     def negligible(self) -> bool:
         """Whether what is unexplained is small against what the best model explains."""
         return max(self.leftover, self.functions[0].log_odds) < SLIGHT_SHARE * self.gained

@@ -34,6 +34,8 @@ FIRST, CANDIDATE, CLEAR = 3.5, 3.0, 5.0
 """Height of a bump, over its standard deviation, from which the first one on a part is fitted with all else, from which
 further ones are, and from which a bump is called a push: high, since errors of a model are not normally distributed."""
 
+CORRECTION = 0.1  # Height over that of an overlapping bump, below which a bump is a correction of its shape
+
 SHAPE_ERROR = 0.15  # Deviation of an impulse, as a share of it, because a push need not have the shape of a bump
 
 MOST = 6  # Bumps on an episode at most
@@ -88,10 +90,12 @@ class _Bump:
     def score(self) -> float:
         return abs(self.height) / self.deviation
 
-    def within(self, other: _Bump) -> bool:
-        """Whether its middle lies in a higher bump on the same joint."""
-        near = abs(self.middle - other.middle) < EDGE * other.width
-        return near and self.part == other.part and self.joint == other.joint and abs(self.height) < abs(other.height)
+    def corrects(self, other: _Bump) -> bool:
+        """Whether it only corrects the shape of a higher bump on the same joint: its middle lies in that one, or it is
+        far lower and overlaps it."""
+        apart, share = abs(self.middle - other.middle), abs(self.height) / abs(other.height)
+        reach = other.width + (self.width if share < CORRECTION else 0.0)
+        return share < 1 and apart < EDGE * reach and (self.part, self.joint) == (other.part, other.joint)
 
     def on(self, track: LoadTrack) -> Tensor:
         """(N, J) the bump with unit height, smoothed as the track is."""
@@ -125,7 +129,9 @@ class _Fit:
         self.bumps: list[_Bump] = []
         joints = tracks[0].load.shape[1]
         self.size = torch.cat([track.load for track in tracks]).square().mean().sqrt() + 1e-300
-        self.left = [torch.zeros_like(track.load) for track in tracks]
+        # All of the load, so that columns follow the world's motion: along the measured one, a factor common to all of
+        # them would explain a push away.
+        self.left = [track.load.clone() for track in tracks]
         self.weights = [torch.zeros(0, dtype=torch.float64) for _ in tracks]
         self.roots = [torch.zeros(0, 0, dtype=torch.float64) for _ in tracks]
         self.spread = [self.size.expand_as(track.load) for track in tracks]
@@ -151,8 +157,7 @@ class _Fit:
                 break
             self.bumps = [one for one in self.bumps if one not in weakest.values()]
             self._fit(ROUNDS_AGAIN)
-        # A smaller bump within another is no push of its own: it corrects the shape of that one.
-        return [one for one in self.bumps if not any(one.within(other) for other in self.bumps)]
+        return [one for one in self.bumps if not any(one.corrects(other) for other in self.bumps if other is not one)]
 
     def _design(self, part: int) -> Tensor:
         """(K, N, J) loads of unit prior deviation: of the columns, and of the bumps on this part."""

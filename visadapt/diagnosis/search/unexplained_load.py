@@ -17,14 +17,20 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv1d
+from torch.nn.functional import conv1d, pad
 
 from visadapt.effects.own.dynamics import scalable
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import System
 from visadapt.world import World, WorldState
 
+GAUSSIAN_REACH = 4  # Deviations at which a smoothing Gaussian is cut off
+
 SMOOTHING = 0.065  # s, deviation of the Gaussian that smooths the load, or one period if that is longer
+
+EDGE = GAUSSIAN_REACH + 0.2
+"""Deviations of the smoothing that are left out at either end, where it reaches beyond the recording; positions are
+smoothed too."""
 
 STEP = 0.04  # s between the instants at which the load is given, or one period if that is longer
 
@@ -103,6 +109,7 @@ def _track(number: int, episode: Episode, world: World, measured: Sequence[int],
         torch.as_tensor(values, dtype=torch.float64) for values in (episode.time, episode.state, episode.action)
     )
     smoothing = max(SMOOTHING, period)
+    stamps = stamps.contiguous()
     time = torch.arange(float(stamps[0]), float(stamps[-1]), period, dtype=torch.float64)
     if len(time) * period < SHORTEST * smoothing:
         return []
@@ -112,7 +119,7 @@ def _track(number: int, episode: Episode, world: World, measured: Sequence[int],
     for k, column in enumerate(measured):
         state[:, column] = torch.lerp(readings[after - 1, k], readings[after, k], share)
     held = torch.cat((stamps.diff(), stamps.new_tensor([period])))
-    acting = world.actuate(given[None], held[None])[0].mean(1)[after - 1]
+    acting = _mean_commands(world.actuate(given[None], held[None])[0].mean(1), stamps, held, time, period)
 
     def smooth(values: Tensor, deviation: float = smoothing) -> Tensor:
         return _smoothed(values, deviation / period)
@@ -138,7 +145,7 @@ def _track(number: int, episode: Episode, world: World, measured: Sequence[int],
         1,
     )
     at_rest = smooth((-(state[:, velocities] / (SLOW * fastest)).square()).exp())
-    edge, stride = round(2 * smoothing / period), max(1, round(STEP / period))
+    edge, stride = round(EDGE * smoothing / period), max(1, round(STEP / period))
     inner = slice(edge, len(time) - edge, stride)
     both = torch.cat((found.load[:, None], found.columns), 1)
     smoothed = _smoothed(both.flatten(1), smoothing / period, edge, stride).unflatten(1, both.shape[1:])
@@ -240,6 +247,20 @@ class _Motion:
         return _Loads(load(self.measured - free), torch.stack(columns, 1), reaction, tuple(dry))
 
 
+def _mean_commands(acting: Tensor, stamps: Tensor, held: Tensor, time: Tensor, period: float) -> Tensor:
+    """Means (N, n_action) over a period about each of N instants `time`, of what acts (T, n_action) for `held` (T,) s
+    from `stamps` (T,) on.
+
+    On an unsteady clock the command at the instant itself would jump by up to a period against the motion.
+    """
+    edges = torch.cat((stamps, stamps[-1:] + held[-1:]))
+    total = pad((acting * held[:, None]).cumsum(0), (0, 0, 1, 0))
+    ends = torch.stack((time - period / 2, time + period / 2)).clamp(edges[0], edges[-1])
+    row = (torch.searchsorted(edges, ends, right=True) - 1).clamp(0, len(stamps) - 1)
+    until = total[row] + acting[row] * (ends - edges[row])[..., None]
+    return (until[1] - until[0]) / (ends[1] - ends[0])[:, None]
+
+
 def _moved(state: Tensor, column: int) -> Tensor:
     """States (T, n) with one column a little larger."""
     out = state.clone()
@@ -252,7 +273,7 @@ def _smoothed(values: Tensor, deviation: float, edge: int = 0, stride: int = 1) 
 
     Of the rows, every `stride`-th from `edge` on, up to as far from the end.
     """
-    reach = math.ceil(4 * deviation)
+    reach = math.ceil(GAUSSIAN_REACH * deviation)
     lags = torch.arange(-reach, reach + 1, dtype=values.dtype)
     kernel = torch.exp(-0.5 * (lags / max(deviation, 1e-6)).square())
     first, last = values[:1], values[-1:]
