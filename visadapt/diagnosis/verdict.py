@@ -49,8 +49,8 @@ def verdict_of(
         repeats: readings are repeated.
         coarse: a position is read in steps that are coarse for the motion.
     """
-    # Coarse steps, and errors of a velocity's reading, are fitted as noise: a source that predicts within that noise may
-    # still have a gap.
+    # Coarse steps, and errors of a velocity's reading, are fitted as noise: a source that predicts within it may still
+    # have a gap.
     nothing = UNEXPLAINED if coarse or comparison.misread else NO_GAP
     if math.isnan(gap.closed) and not repeats:
         return nothing  # the source predicts as well as the noise allows

@@ -147,8 +147,8 @@ def _unexplained(diagnosis: Diagnosis) -> str:
         )
     if math.isnan(gap.closed):
         return (
-            "The simulator predicts as well as the fitted noise allows, but a gap hides, or may hide, in that noise: see "
-            "what to record next."
+            "The simulator predicts as well as the fitted noise allows, but a gap hides, or may hide, in that noise: "
+            "see what to record next."
         )
     closed = [ranked.gap_closed for ranked in diagnosis.ranking if ranked.effects and math.isfinite(ranked.gap_closed)]
     best = max(closed, default=0.0)
