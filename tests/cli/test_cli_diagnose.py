@@ -243,7 +243,6 @@ class TestBadInput:
         assert f"argument {arguments[0]}" in capsys.readouterr().err
 
 
-@pytest.mark.skipif(not hasattr(diagnosis, "diagnose"), reason="the diagnosis has not landed")
 class TestDiagnosis:
     @pytest.mark.skipif(not RIG.is_dir(), reason="the recordings of the real rig are not here")
     def test_the_real_rig(self, tmp_path, capsys):

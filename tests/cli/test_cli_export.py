@@ -22,6 +22,11 @@ def test_a_policy_as_onnx(here, capsys):
     assert about["states"] == "x m, x_dot m/s, theta rad, theta_dot rad/s"
 
 
+def test_the_goal_of_a_flight_is_explained(here, capsys):
+    assert run("export", va.shipped("quadrotor"), "--out", "policy.onnx") == 0
+    assert "goal          the next 10 points of the reference, a period apart: x, y, z in m" in capsys.readouterr().out
+
+
 def test_a_policy_that_was_trained_with_an_effect_of_one_s_own(here, capsys):
     (here / "mine.py").write_text(OWN_EFFECT.format(name="Own", effect="test_cli_export"))
     given = ("train", "--system", "cartpole", "--out", "p.safetensors", "--iterations", 1, "--effects", "mine.py")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -25,6 +25,8 @@ class FlightPolicy(Policy):
     """
 
     shown = "state and goal"
+    goal: ClassVar[str]
+    """what the goal's numbers are, in words"""
 
     def __init__(self, n_goal: int, n_aim: int, arguments: Mapping[str, Any] | None = None) -> None:
         n_action, width, n_state = 4, 128, len(RigidBody.states)
@@ -71,6 +73,8 @@ class FlightPolicy(Policy):
 class FollowPolicy(FlightPolicy):
     """Follows a reference, whose next HORIZON positions and velocities (6 each), `period` s apart, are its goal."""
 
+    goal = f"the next {HORIZON} points of the reference, a period apart: x, y, z in m and their rates in m/s"
+
     def __init__(self, period: float) -> None:
         super().__init__(6 * HORIZON, 6 * HORIZON, {"period": period})
         self.period = period
@@ -98,6 +102,8 @@ def _at_most(limit: float, vectors: Tensor) -> Tensor:
 
 class ReachPolicy(FlightPolicy):
     """Flies a fixed wing through a point (3), its goal."""
+
+    goal = "the point to fly through: x, y, z in m"
 
     def __init__(self) -> None:
         super().__init__(3, 10)

@@ -78,10 +78,12 @@ class Setup:
         rough, fine = path.with_suffix(".rough.safetensors"), self.settings.refinement
         stages = [(path, self.settings.source)] if fine is None else [(rough, self.settings.source), (path, fine)]
         # `prepare` draws from a generator of `seed` itself, so training uses the seeds after it.
-        for draws, (made, settings) in enumerate(stages, seed if self.prepare is None else seed + 1):
+        first = seed if self.prepare is None else seed + 1
+        for draws, (made, settings) in enumerate(stages, first):
             if made == path or not path.exists():
                 generator = torch.Generator().manual_seed(draws)
-                progress = staged(report, f"{self.source.system.name}: source policy")
+                stage = "source policy" if draws == first else "source policy, refined"
+                progress = staged(report, f"{self.source.system.name}: {stage}")
                 args = (policy, self.source, self.observe, settings, generator, None, progress)
                 train_or_load(made, policy, about, partial(tune, *args))
         for finished in (prepared, rough):

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from visadapt.history import HORIZON, LENGTH, History
-from visadapt.policies import Policy
+from visadapt.policies import FlightPolicy, Policy
 from visadapt.storage.atomic_files import replacing
 
 if TYPE_CHECKING:
@@ -113,6 +113,8 @@ def about(policy: Policy, source: World | None = None) -> dict[str, str]:
         "actions": f"the last {LENGTH}, oldest first, in [-1, 1]: {LENGTH} x {policy.n_action} float32",
         "plan": f"the next {HORIZON}, of which the first is executed: {HORIZON} x {policy.n_action} float32",
     }
+    if isinstance(policy, FlightPolicy):
+        known["goal"] = policy.goal
     if source is not None:
         states, actions = source.system.states, source.system.actions
         known["system"] = source.system.name
