@@ -73,10 +73,14 @@ def causes(
     models = {c.model.names: c.model for c in comparison.models if c.probability > NEGLIGIBLE}
     models |= {one.compared.model.names: one.compared.model for group in groups for one in group}
     fitted = {names: _fitted(search, model) for names, model in models.items()}
+    lean = comparison.best
+    for effect in comparison.best.effects:
+        lean = lean if effect in carrying else search.without(lean, effect)
+    without_slight = _fitted(search, lean)
     for effect, group in zip(comparison.best.effects, groups, strict=True):
         names = [one.effect.name for one in group]
         for one in group:
-            found = _averaged(search, comparison, one, fitted)
+            found = _averaged(search, comparison, one, fitted, without_slight)
             out.append(
                 Cause(
                     one.effect.name,
@@ -119,12 +123,17 @@ def _fitted(search: Search, model: ScoredModel) -> Fitted:
 
 
 def _averaged(
-    search: Search, comparison: ModelComparison, one: Alternative, fitted: Mapping[tuple[str, ...], Fitted]
+    search: Search,
+    comparison: ModelComparison,
+    one: Alternative,
+    fitted: Mapping[tuple[str, ...], Fitted],
+    without_slight: Fitted,
 ) -> dict[str, Estimate]:
     """Estimates of the most probable set with the effect, with 90 % intervals over all compared sets with it.
 
     Which other effects act is uncertain too, and changes what is left for this one (Hoeting, Madigan, Raftery and
-    Volinsky 1999, Bayesian model averaging, Statistical Science 14(4)).
+    Volinsky 1999, Bayesian model averaging, Statistical Science 14(4)). No verdict rests on slight causes, so the
+    intervals also hold the estimates `without_slight` ones, which often only mend what no effect describes exactly.
     """
     own = fitted[one.compared.model.names][one.canonical][0]
     having = [c for c in comparison.models if one.canonical in c.model.effects and c.model.names in fitted]
@@ -134,6 +143,10 @@ def _averaged(
     values = values - phases * ((values - own) / (2 * math.pi)).round()
     weights = torch.tensor([compared.probability for compared in having], dtype=values.dtype)
     low, high = (_quantile(values, spreads, weights, level) for level in (0.05, 0.95))
+    if one.canonical in without_slight:
+        alone = without_slight[one.canonical][0]
+        alone = alone - phases * ((alone - own) / (2 * math.pi)).round()
+        low, high = torch.minimum(low, alone), torch.maximum(high, alone)
     return _estimates(search, one.compared.model, one.canonical, own, low, high)
 
 
