@@ -1,7 +1,15 @@
 import pytest
 
 from visadapt.diagnosis.report.next_experiment import explain, separate
-from visadapt.effects import ActuatorBias, ConstantForce, CoulombFriction, QuadraticDrag, Spring, ViscousFriction
+from visadapt.effects import (
+    ActuatorBias,
+    ConstantForce,
+    CoulombFriction,
+    PeriodicForce,
+    QuadraticDrag,
+    Spring,
+    ViscousFriction,
+)
 from visadapt.systems import CartPole, Quadrotor
 
 
@@ -12,6 +20,12 @@ def test_the_experiments_of_all_pairs_of_a_class_are_advised():
         "the square of the speed; record slow reversals and fast runs: dry friction is as large at any speed and stops "
         "the cart near standstill."
     )
+
+
+def test_every_member_of_a_class_is_told_apart():
+    advice = separate([[ActuatorBias, ConstantForce, PeriodicForce]], CartPole())
+    assert "an actuator bias is gone" in advice
+    assert "a periodic force comes and goes" in advice
 
 
 def test_an_experiment_for_a_cart_is_not_advised_on_a_vehicle_which_needs_none():
@@ -30,3 +44,7 @@ def test_an_experiment_for_a_cart_is_not_advised_on_a_vehicle_which_needs_none()
 )
 def test_a_disturbance_is_a_load_or_an_error_of_a_reading(port, said):
     assert explain(port, "x_dot", CartPole()).startswith(said)
+
+
+def test_what_depends_on_time_is_looked_for_in_repeated_runs():
+    assert "several long runs under the same commands" in explain("cart_force", "time", CartPole())

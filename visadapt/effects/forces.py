@@ -50,6 +50,9 @@ class PeriodicForce(PeriodicLaw):
         Parameter("phase", "rad", -math.pi, math.pi, None, role=Role.PHASE),
         Parameter("offset", "N", -10.0, 10.0, 0.0, linear=True),
     )
+    settled_by: ClassVar[Mapping[str, str]] = {
+        "constant_force": "record episodes of several seconds: a periodic force comes and goes, a constant one stays"
+    }
 
 
 class Gust(PulseLaw):

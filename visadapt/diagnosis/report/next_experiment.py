@@ -64,7 +64,8 @@ def disturbance_on(port: str, variable: str, system: System) -> str:
 def explain(port: str, variable: str, system: System) -> str:
     """The experiment that shows an unexplained disturbance on `port`, a function of `variable`, more clearly."""
     said = disturbance_on(port, variable, system)
-    runs = f"runs over the whole range of {plain(variable)}, slow and fast, with all else as constant as possible"
+    whole = f"the whole range of {plain(variable)} slowly and fast"
+    runs = f"runs that cover {whole}, with all else as constant as possible"
     if variable == "time":
         runs = "several long runs under the same commands, to see what returns in each"
     return f"{said[0].upper()}{said[1:]}: record {runs}, and add an effect of your own for it (--effects)."
