@@ -90,6 +90,13 @@ class TestUnits:
         degrees = {**table, "theta": np.degrees(table["theta"]), "theta_dot": np.degrees(table["theta_dot"])}
         refuses("radians are right", write(file, degrees))
 
+    def test_an_episode_shorter_than_the_delays_that_are_tried_is_not_judged(self, file):
+        table = a_run(start=0.1, noise=1e-4, rows=400, period=0.01)
+        table["episode"] = (np.arange(400) >= 387).astype(int)  # the second one has 13 rows
+        table["x"], table["theta"] = table["theta"], table["x"]
+        del table["x_dot"], table["theta_dot"]
+        refuses("column 'x' answers the command as theta should", write(file, table))
+
     def test_a_column_is_called_what_the_file_calls_it(self, file):
         table = a_run(start=0.1, noise=1e-3)
         table["pole_angle"] = np.degrees(table.pop("theta"))

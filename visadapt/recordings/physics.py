@@ -69,7 +69,7 @@ def exchanged(episodes: Sequence[RawEpisode], system: System, one: str, other: s
     if not all(1 / 4 < fits[name][1] < 4 for name in (one, other)):
         return False
     period = min(_period(raw) for raw in episodes)
-    unchanged = [_fits(episodes, system, delay=delay) for delay in range(round(LONGEST_DELAY_S / period) + 1)]
+    unchanged = [_fits(episodes, system, delay=k * period) for k in range(round(LONGEST_DELAY_S / period) + 1)]
     best = max(min(fits[one][0], fits[other][0]) for fits in unchanged)
     explained = min(fits[one][0], fits[other][0])
     opposite = max(unchanged[0][one][0], unchanged[0][other][0]) < 0
@@ -87,8 +87,8 @@ def _can_decide(episodes: Sequence[RawEpisode], system: System, names: Sequence[
 
 
 def _judged(episodes: Sequence[RawEpisode]) -> list[RawEpisode]:
-    """The episodes that are long enough for second differences."""
-    return [raw for raw in episodes if len(raw.time) > 2 * _stride(raw) + 1]
+    """The episodes that are long enough for second differences after the longest delay."""
+    return [raw for raw in episodes if len(raw.time) > 2 * _stride(raw) + 1 + round(LONGEST_DELAY_S / _period(raw))]
 
 
 def _period(raw: RawEpisode) -> float:
@@ -108,12 +108,12 @@ def _fits(
     episodes: Sequence[RawEpisode],
     system: System,
     changed: Callable[[Columns], Columns] = _unchanged,
-    delay: int = 0,
+    delay: float = 0.0,
 ) -> dict[str, tuple[float, float]]:
     """For each variable with a rate: correlation of its acceleration with the source's, and slope over the source's.
 
-    `changed` gives the measured states the units and names to be tried; `delay` is the number of rows by which the
-    commands act late.
+    `changed` gives the measured states the units and names to be tried; `delay` is by how many s the commands
+    act late.
     """
     each = []
     for raw in _judged(episodes):
@@ -123,7 +123,7 @@ def _fits(
 
 
 def _accelerations(
-    raw: RawEpisode, columns: Columns, system: System, delay: int
+    raw: RawEpisode, columns: Columns, system: System, delay: float
 ) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Of an episode, by the name of each variable with a rate: measured and predicted accelerations."""
     names = [variable.name for variable in system.states]
@@ -141,7 +141,8 @@ def _accelerations(
     for name, rate in rates.items():
         middle.setdefault(rate, (columns[name][2 * stride :] - columns[name][: -2 * stride]) / span)
     # The mean command over the span.
-    action = np.vstack([np.repeat(action[:1], delay, axis=0), action[: len(action) - delay]])
+    late = round(delay / _period(raw))
+    action = np.vstack([np.repeat(action[:1], late, axis=0), action[: len(action) - late]])
     kernel = np.ones(2 * stride) / (2 * stride)
     action = np.column_stack([np.convolve(column[:-1], kernel, "valid") for column in action.T])
     state = np.column_stack([middle[name] for name in names])
