@@ -54,7 +54,7 @@ def test_the_response_is_that_of_integrated_steps(source, effect):
         if parameter.linear:
             point[k] = neutral[k] + 0.05 * (parameter.high - neutral[k])
     without = torch.where(torch.tensor([p.neutral is None for p in effect.table]), point, neutral)
-    found = sensitivity.by_unit(effect, point[None], ())[:, 0, 0]
+    found = sensitivity.around(effect, point[None], ())[0][:, 0]
     model = CandidateModel(SYSTEM, [effect], rows, FINE)
     after, before = (linearise(model, theta, fits.state[0]).next_state for theta in (point, without))
     drive = (after - before)[..., None] * rows.inside[:, 1:, None, None]

@@ -1,8 +1,9 @@
 """Which effects are worth adding to a fitted set, by the linear response of its innovations to each of them.
 
 When a small effect is added, the filter's innovations change by the effect's one-step disturbances passed through the
-same gains. So a whole grid of parameter values is scored by one pass of the filter's means, without refitting; where a
-grid would be too large, a few Gauss-Newton steps with the same response find the parameters.
+same gains. So a whole grid of parameter values is scored by one pass of the filter's means, without refitting. If the
+effect is proportional to its strengths, their best sizes at each point of the grid follow in closed form; otherwise
+Gauss-Newton steps with the same response find them.
 """
 
 from __future__ import annotations
@@ -23,50 +24,46 @@ from visadapt.estimation.sensitivity import Sensitivity
 from visadapt.processes import shared_out
 from visadapt.systems import System
 
-STRENGTH_POINTS = 9
-"""Values on either side of neutral, for a strength that the effect is not proportional to: this many spaced
-logarithmically up to a tenth of the range, and as many evenly beyond."""
+SMALL_POINTS, LARGE_POINTS = 5, 9
+"""Values on either side of neutral, for a strength that the effect is not proportional to: the first number spaced
+logarithmically up to a tenth of the range, the second evenly beyond."""
 
 EDGE_POINTS, FREQUENCY_POINTS, PHASE_POINTS, SHAPE_POINTS = 13, 24, 8, 5
 """Values of a region's start or end, of a frequency, of a phase, and of any other shape parameter."""
 
 START_STRENGTH = 0.05
-"""Share of its range, from neutral, at which a strength starts that is found by Gauss-Newton steps."""
+"""Share of its range, from neutral, at which each of several strengths starts that Gauss-Newton steps find."""
 
 Spans = Mapping[str, tuple[float, float]]
 """By unit, the interval that the recording covers of the variable along which regions of that unit lie."""
 
 
+def is_proportional(effect: type[Effect]) -> bool:
+    """Whether the effect has strengths, and is proportional to all of them."""
+    strengths = [p for p in effect.table if p.neutral is not None]
+    return bool(strengths) and all(p.linear for p in strengths)
+
+
 def grid(effect: type[Effect], spans: Spans) -> tuple[Tensor, list[int]]:
-    """Parameter values (G, P) to try, and the columns of parameters that the effect is proportional to."""
-    linear = [k for k, p in enumerate(effect.table) if p.linear and p.neutral is not None]
-    axes = []
-    for parameter in effect.table:
-        if parameter.is_edge:
-            axes.append(_edges(parameter, spans, EDGE_POINTS))
-        else:
-            axes.append(_values(parameter))
+    """Parameter values (G, P) of an effect that is proportional to its strengths, and the columns of these."""
+    axes = [_edges(p, spans, EDGE_POINTS) if p.is_edge else _values(p) for p in effect.table]
     points = torch.cartesian_prod(*axes).reshape(-1, len(effect.table))
     if (region := effect.region()) is not None:
         start, end = (effect.table.index(edge) for edge in region)
         points = points[points[:, start] < points[:, end]]
-    return points, linear
-
-
-def needs_descent(effect: type[Effect]) -> bool:
-    """Whether a grid would be too large: the effect is not proportional to several of its strengths."""
-    return sum(p.neutral is not None and not p.linear for p in effect.table) > 1
+    return points, [k for k, p in enumerate(effect.table) if p.neutral is not None]
 
 
 def starts(effect: type[Effect], spans: Spans) -> tuple[Tensor, list[int]]:
     """Points (G, P) from which Gauss-Newton steps start, and the columns of the effect's strengths.
 
-    Strengths start slightly off neutral: at neutral the derivative vanishes where it takes several of them to act.
+    One strength has a grid, since its derivative may vanish far from the best value, as where no command reaches a limit.
+    Several start slightly off neutral: at neutral the derivatives vanish where it takes several of them to act.
     """
     strengths = [k for k, p in enumerate(effect.table) if p.neutral is not None]
     axes = []
     for parameter in effect.table:
-        if parameter.neutral is not None:
+        if parameter.neutral is not None and len(strengths) > 1:
             end = parameter.high if parameter.high > parameter.neutral else parameter.low
             axes.append(
                 torch.tensor([parameter.neutral + START_STRENGTH * (end - parameter.neutral)], dtype=torch.float64)
@@ -75,7 +72,8 @@ def starts(effect: type[Effect], spans: Spans) -> tuple[Tensor, list[int]]:
             axes.append(_edges(parameter, spans, SHAPE_POINTS))
         else:
             values = _values(parameter)
-            axes.append(values if parameter.role is Role.FREQUENCY else values[:: max(1, len(values) // 2)])
+            coarse = parameter.neutral is None and parameter.role is not Role.FREQUENCY
+            axes.append(values[:: max(1, len(values) // 2)] if coarse else values)
     return torch.cartesian_prod(*axes).reshape(-1, len(effect.table)), strengths
 
 
@@ -94,7 +92,7 @@ def _values(parameter: Parameter) -> Tensor:
         return torch.linspace(low, high, PHASE_POINTS + 1, dtype=torch.float64)[:-1]
     if neutral is None:
         return torch.linspace(low, high, SHAPE_POINTS + 2, dtype=torch.float64)[1:-1]
-    shares = torch.cat((torch.logspace(-2.7, -1, STRENGTH_POINTS), torch.linspace(0.15, 1, STRENGTH_POINTS))).double()
+    shares = torch.cat((torch.logspace(-2.7, -1, SMALL_POINTS), torch.linspace(0.15, 1, LARGE_POINTS))).double()
     return torch.cat([neutral + shares * (end - neutral) for end in (low, high) if end != neutral])
 
 
@@ -111,6 +109,9 @@ def spans(system: System, rows: Segments, state: Tensor) -> dict[str, tuple[floa
 
 EPISODES_SCREENED = 3
 """Episodes, the longest first, from each of which alone an effect is screened that has a phase for each episode."""
+
+STEPPED_POINTS = 3
+"""Points of a grid that are tried where a Gauss-Newton step leads from them. A step from afar may promise too much."""
 
 MAX_STEPS = 6
 MIN_STEP_GAIN = 0.1
@@ -149,11 +150,14 @@ def screen(
     def best(effect: type[Effect]) -> Candidate | None:
         if has_episode_phases(effect):
             return _with_episode_phases(sensitivity(1), effect)
-        points, columns = starts(effect, covered) if needs_descent(effect) else grid(effect, covered)
+        points, columns = grid(effect, covered) if is_proportional(effect) else starts(effect, covered)
         stride = _window_stride(profile_of(system).screening_rows, rows, len(points) * (1 + len(columns)))
-        if needs_descent(effect):
-            return _descend(sensitivity(1), effect, _best_start(sensitivity(stride), effect, points, columns))
         some = sensitivity(stride)
+        if not is_proportional(effect):
+            promising = _promising(some, effect, points, columns)
+            if len(columns) == 1:
+                return _best_of(sensitivity(1), effect, promising)
+            return _descend(sensitivity(1), effect, promising[0])
         found = _best(effect, points, columns, some.innovations.error, some.by_unit(effect, points, columns))
         return None if found is None else replace(found, gain=stride * found.gain)
 
@@ -198,8 +202,9 @@ def _window_stride(most: float, rows: Segments, points: int) -> int:
     return 2 ** max(0, min(math.ceil(math.log2(max(1.0, wanted))), int(math.log2(max(1, rows.shape[0] // 8)))))
 
 
-def _best_start(sensitivity: Sensitivity, effect: type[Effect], points: Tensor, strengths: list[int]) -> Tensor:
-    """(P,) the best result of one Gauss-Newton step of the strengths from each of points (G, P)."""
+def _promising(sensitivity: Sensitivity, effect: type[Effect], points: Tensor, strengths: list[int]) -> Tensor:
+    """Of points (G, P), after one Gauss-Newton step of their strengths each, those that promise most, the best first;
+    then what the step makes of the point that is best without it, and that point."""
     change, slopes = sensitivity.around(effect, points, strengths)
     left, slopes = sensitivity.innovations.error[:, None] + change, slopes.movedim(1, 0)
     normal = slopes.mT @ slopes
@@ -207,10 +212,20 @@ def _best_start(sensitivity: Sensitivity, effect: type[Effect], points: Tensor, 
     pull = -(slopes.mT @ left.T[..., None])[..., 0]
     steps = torch.linalg.solve(normal + torch.diag_embed(ridge), pull[..., None])[..., 0]
     after = (left + torch.einsum("gnk,gk->ng", slopes, steps)).square().sum(0)
-    best = int(after.argmin())
-    out = points[best].clone()
-    out[strengths] += steps[best]
-    return _inside(effect, out)
+    stepped = points.clone()
+    stepped[:, strengths] += steps
+    best = left.square().sum(0).argmin()
+    chosen = torch.cat((after.argsort(stable=True)[:STEPPED_POINTS], best[None]))
+    return _inside(effect, torch.cat((stepped[chosen], points[best][None])))
+
+
+def _best_of(sensitivity: Sensitivity, effect: type[Effect], points: Tensor) -> Candidate | None:
+    """The candidate with the largest gain of points (G, P); None without a gain."""
+    change, _ = sensitivity.around(effect, points, [])
+    error = sensitivity.innovations.error[:, None]
+    gains = 0.5 * (error.square() - (error + change).square()).sum(0)
+    best = int(gains.argmax())
+    return Candidate(effect, tuple(points[best].tolist()), float(gains[best])) if gains[best] > 0 else None
 
 
 def _descend(sensitivity: Sensitivity, effect: type[Effect], point: Tensor) -> Candidate | None:
@@ -245,10 +260,6 @@ def _best(effect: type[Effect], shapes: Tensor, linear: list[int], error: Tensor
     """The point of a grid (G, P) that reduces the squares of `error` (N,) most, with the best sizes of the parameters
     `linear`; `response` (N, G, L) is the change per unit of these. None where no point reduces them.
     """
-    if not linear:
-        gains = 0.5 * (error.square().sum() - (error[:, None] + response[..., 0]).square().sum(0))
-        best = int(gains.argmax())
-        return Candidate(effect, tuple(shapes[best].tolist()), float(gains[best])) if gains[best] > 0 else None
     response = response.movedim(1, 0)
     normal = response.mT @ response
     ridge = 1e-9 * torch.diagonal(normal, dim1=1, dim2=2).mean(1) + 1e-30

@@ -73,9 +73,9 @@ class Sensitivity:
     def by_unit(self, effect: type[Effect], points: Tensor, linear: Sequence[int]) -> Tensor:
         """Change (N, G, L) of the N innovations per unit of each of the L `linear` parameters, at points (G, P).
 
-        The effect must be proportional to these parameters. Without any, the change (N, G, 1) at the points themselves.
+        The effect must be proportional to these parameters.
         """
-        columns = max(1, len(linear))
+        columns = len(linear)
         tried = points[:, None].repeat(1, columns, 1)
         unit = torch.ones(columns, dtype=torch.float64)
         for j, column in enumerate(linear):
