@@ -177,7 +177,7 @@ def _explore(
     rows = prepared.rows
     search = Search(system, rows.select(prepared.searched), candidates, prepared.source, jobs)
     if announce is not None:
-        announce(duration.announcement(rows, len(candidates), duration.expected(search, rows), jobs))
+        announce(duration.announcement(rows, len(effects), duration.expected(search, rows), jobs))
     search.run(staged(progress, "search"))
     if len(prepared.searched) < rows.shape[0]:
         search = on_all_rows(search, rows)

@@ -57,8 +57,8 @@ def grid(effect: type[Effect], spans: Spans) -> tuple[Tensor, list[int]]:
 def starts(effect: type[Effect], spans: Spans) -> tuple[Tensor, list[int]]:
     """Points (G, P) from which Gauss-Newton steps start, and the columns of the effect's strengths.
 
-    One strength has a grid, since its derivative may vanish far from the best value, as where no command reaches a limit.
-    Several start slightly off neutral: at neutral the derivatives vanish where it takes several of them to act.
+    One strength has a grid, since its derivative may vanish far from the best value, as where no command reaches a
+    limit. Several start slightly off neutral: at neutral the derivatives vanish where it takes several of them to act.
     """
     strengths = [k for k, p in enumerate(effect.table) if p.neutral is not None]
     axes = []
