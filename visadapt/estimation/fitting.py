@@ -110,7 +110,9 @@ def refitted(model: CandidateModel, fits: FitState, window_used: Tensor) -> FitS
     """One fit (C = 1) to all windows, refitted to those where each row of `window_used` (C, W) is 1, by one step.
 
     The windows that are left out pull the optimum a little, to which one Gauss-Newton step is close, at the cost of one
-    step for all (Beirami, Razaviyayn, Shahrampour and Tarokh 2017, On optimal generalizability, NeurIPS).
+    step for all (Beirami, Razaviyayn, Shahrampour and Tarokh 2017, On optimal generalizability, NeurIPS). The states,
+    about which the model is linearised next, stay those of the whole fit: moved linearly, they may cross a stop of a
+    joint with dry friction, where its motion is not linear.
     """
     every = torch.zeros(len(window_used), dtype=torch.long)
     whole = differentiate([model], fits)
@@ -121,7 +123,7 @@ def refitted(model: CandidateModel, fits: FitState, window_used: Tensor) -> FitS
     most = MAX_REFIT_CHANGE * torch.linalg.inv(information).diagonal(dim1=1, dim2=2).sqrt()
     bounds = torch.maximum(low, copies.theta - most), torch.minimum(high, copies.theta + most)
     damping = torch.full((len(every),), MIN_DAMPING, dtype=torch.float64)
-    return replace(_step(copies, at, damping, bounds, model), likelihood=at.likelihood)
+    return replace(_step(copies, at, damping, bounds, model), state=copies.state, likelihood=at.likelihood)
 
 
 def _step(
