@@ -92,7 +92,9 @@ def _values(parameter: Parameter) -> Tensor:
         return torch.linspace(low, high, PHASE_POINTS + 1, dtype=torch.float64)[:-1]
     if neutral is None:
         return torch.linspace(low, high, SHAPE_POINTS + 2, dtype=torch.float64)[1:-1]
-    shares = torch.cat((torch.logspace(-2.7, -1, SMALL_POINTS), torch.linspace(0.15, 1, LARGE_POINTS))).double()
+    shares = torch.cat(
+        (torch.logspace(-2.7, math.log10(SMALL_SHARE), SMALL_POINTS), torch.linspace(0.15, 1, LARGE_POINTS))
+    ).double()
     return torch.cat([neutral + shares * (end - neutral) for end in (low, high) if end != neutral])
 
 
@@ -110,8 +112,15 @@ def spans(system: System, rows: Segments, state: Tensor) -> dict[str, tuple[floa
 EPISODES_SCREENED = 3
 """Episodes, the longest first, from each of which alone an effect is screened that has a phase for each episode."""
 
-STEPPED_POINTS = 3
-"""Points of a grid that are tried where a Gauss-Newton step leads from them. A step from afar may promise too much."""
+STEPPED_POINTS = 2
+"""Points of a grid, and small ones among them, that are tried where a Gauss-Newton step leads from them: a step from
+afar may promise too much."""
+
+SMALL_SHARE = 0.1  # Share of its range, from neutral, up to which a strength is small
+
+NEARLY = 0.9
+"""Share of the largest gain from which on a smaller effect is proposed: the response is linear, so that a motor that
+does nothing may seem as good as a little backlash."""
 
 MAX_STEPS = 6
 MIN_STEP_GAIN = 0.1
@@ -203,8 +212,8 @@ def _window_stride(most: float, rows: Segments, points: int) -> int:
 
 
 def _promising(sensitivity: Sensitivity, effect: type[Effect], points: Tensor, strengths: list[int]) -> Tensor:
-    """Of points (G, P), after one Gauss-Newton step of their strengths each, those that promise most, the best first;
-    then what the step makes of the point that is best without it, and that point."""
+    """Points to which one Gauss-Newton step of the strengths leads from those of points (G, P) that promise most, the
+    best first, also from the best of the small ones; then that of `points` which is best without a step."""
     change, slopes = sensitivity.around(effect, points, strengths)
     left, slopes = sensitivity.innovations.error[:, None] + change, slopes.movedim(1, 0)
     normal = slopes.mT @ slopes
@@ -215,17 +224,34 @@ def _promising(sensitivity: Sensitivity, effect: type[Effect], points: Tensor, s
     stepped = points.clone()
     stepped[:, strengths] += steps
     best = left.square().sum(0).argmin()
-    chosen = torch.cat((after.argsort(stable=True)[:STEPPED_POINTS], best[None]))
+    order = after.argsort(stable=True)
+    small = order[_size(effect, points[order]) <= SMALL_SHARE]
+    chosen = torch.cat((order[:STEPPED_POINTS], small[:STEPPED_POINTS], best[None]))
     return _inside(effect, torch.cat((stepped[chosen], points[best][None])))
 
 
 def _best_of(sensitivity: Sensitivity, effect: type[Effect], points: Tensor) -> Candidate | None:
-    """The candidate with the largest gain of points (G, P); None without a gain."""
+    """The candidate with the largest gain of points (G, P), or of much smaller ones that gain nearly as much: large
+    ones the linear response may misjudge. None without a gain."""
     change, _ = sensitivity.around(effect, points, [])
     error = sensitivity.innovations.error[:, None]
     gains = 0.5 * (error.square() - (error + change).square()).sum(0)
-    best = int(gains.argmax())
-    return Candidate(effect, tuple(points[best].tolist()), float(gains[best])) if gains[best] > 0 else None
+    if not gains.max() > 0:
+        return None
+    size = _size(effect, points)
+    smallest = size[gains >= NEARLY * gains.max()].min()
+    best = int(torch.where(size <= 2 * smallest, gains, -math.inf).argmax())
+    return Candidate(effect, tuple(points[best].tolist()), float(gains[best]))
+
+
+def _size(effect: type[Effect], points: Tensor) -> Tensor:
+    """(G,) how far the strengths of points (G, P) are from neutral, as a share of their range; the largest of them."""
+    away = [
+        (points[:, k] - parameter.neutral).abs() / (parameter.high - parameter.low)
+        for k, parameter in enumerate(effect.table)
+        if parameter.neutral is not None
+    ]
+    return torch.stack([*away, torch.zeros(len(points), dtype=points.dtype)]).amax(0)
 
 
 def _descend(sensitivity: Sensitivity, effect: type[Effect], point: Tensor) -> Candidate | None:
