@@ -114,7 +114,6 @@ COMMANDS = (
         25,
         work="--work",
     ),
-    Command("ablations_flight", "ablations_flight.csv", ("benchmarks.ablations_flight",), 20, work="--work"),
     Command(
         "inverted_pendulum",
         "inverted_pendulum.csv",

@@ -9,7 +9,7 @@ from visadapt.diagnosis.search.search import Search
 from visadapt.effects import ActuationEffect, DynamicsEffect
 from visadapt.effects.catalogue import catalogue
 from visadapt.estimation.candidate import FINE, SHORT_PERIOD, CandidateModel, linearise
-from visadapt.estimation.screening import grid, spans
+from visadapt.estimation.grids import grid, spans
 from visadapt.estimation.sensitivity import Sensitivity
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole

@@ -9,14 +9,15 @@ Gauss-Newton steps with the same response find them.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from visadapt.effects import Effect, Parameter, Role
+from visadapt.effects import Effect, Role
 from visadapt.estimation.episode_phases import has_episode_phases, in_step
+from visadapt.estimation.grids import SMALL_SHARE, grid, inside, is_proportional, size, spans, starts, values_of
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
@@ -24,99 +25,12 @@ from visadapt.estimation.sensitivity import Sensitivity
 from visadapt.processes import shared_out
 from visadapt.systems import System
 
-SMALL_POINTS, LARGE_POINTS = 5, 9
-"""Values on either side of neutral, for a strength that the effect is not proportional to: the first number spaced
-logarithmically up to a tenth of the range, the second evenly beyond."""
-
-EDGE_POINTS, FREQUENCY_POINTS, PHASE_POINTS, SHAPE_POINTS = 13, 24, 8, 5
-"""Values of a region's start or end, of a frequency, of a phase, and of any other shape parameter."""
-
-START_STRENGTH = 0.05
-"""Share of its range, from neutral, at which each of several strengths starts that Gauss-Newton steps find."""
-
-Spans = Mapping[str, tuple[float, float]]
-"""By unit, the interval that the recording covers of the variable along which regions of that unit lie."""
-
-
-def is_proportional(effect: type[Effect]) -> bool:
-    """Whether the effect has strengths, and is proportional to all of them."""
-    strengths = [p for p in effect.table if p.neutral is not None]
-    return bool(strengths) and all(p.linear for p in strengths)
-
-
-def grid(effect: type[Effect], spans: Spans) -> tuple[Tensor, list[int]]:
-    """Parameter values (G, P) of an effect that is proportional to its strengths, and the columns of these."""
-    axes = [_edges(p, spans, EDGE_POINTS) if p.is_edge else _values(p) for p in effect.table]
-    points = torch.cartesian_prod(*axes).reshape(-1, len(effect.table))
-    if (region := effect.region()) is not None:
-        start, end = (effect.table.index(edge) for edge in region)
-        points = points[points[:, start] < points[:, end]]
-    return points, [k for k, p in enumerate(effect.table) if p.neutral is not None]
-
-
-def starts(effect: type[Effect], spans: Spans) -> tuple[Tensor, list[int]]:
-    """Points (G, P) from which Gauss-Newton steps start, and the columns of the effect's strengths.
-
-    One strength has a grid, since its derivative may vanish far from the best value, as where no command reaches a
-    limit. Several start slightly off neutral: at neutral the derivatives vanish where it takes several of them to act.
-    """
-    strengths = [k for k, p in enumerate(effect.table) if p.neutral is not None]
-    axes = []
-    for parameter in effect.table:
-        if parameter.neutral is not None and len(strengths) > 1:
-            end = parameter.high if parameter.high > parameter.neutral else parameter.low
-            axes.append(
-                torch.tensor([parameter.neutral + START_STRENGTH * (end - parameter.neutral)], dtype=torch.float64)
-            )
-        elif parameter.is_edge:
-            axes.append(_edges(parameter, spans, SHAPE_POINTS))
-        else:
-            values = _values(parameter)
-            coarse = parameter.neutral is None and parameter.role is not Role.FREQUENCY
-            axes.append(values[:: max(1, len(values) // 2)] if coarse else values)
-    return torch.cartesian_prod(*axes).reshape(-1, len(effect.table)), strengths
-
-
-def _edges(parameter: Parameter, spans: Spans, count: int) -> Tensor:
-    return torch.linspace(*spans.get(parameter.unit, (parameter.low, parameter.high)), count, dtype=torch.float64)
-
-
-def _values(parameter: Parameter) -> Tensor:
-    low, high, neutral = parameter.low, parameter.high, parameter.neutral
-    if parameter.linear and neutral is not None:
-        return torch.tensor([neutral], dtype=torch.float64)
-    if parameter.role is Role.FREQUENCY:
-        ends = torch.tensor([low, high]).log10().tolist()
-        return torch.logspace(ends[0], ends[1], FREQUENCY_POINTS, dtype=torch.float64)
-    if parameter.role is Role.PHASE:
-        return torch.linspace(low, high, PHASE_POINTS + 1, dtype=torch.float64)[:-1]
-    if neutral is None:
-        return torch.linspace(low, high, SHAPE_POINTS + 2, dtype=torch.float64)[1:-1]
-    shares = torch.cat(
-        (torch.logspace(-2.7, math.log10(SMALL_SHARE), SMALL_POINTS), torch.linspace(0.15, 1, LARGE_POINTS))
-    ).double()
-    return torch.cat([neutral + shares * (end - neutral) for end in (low, high) if end != neutral])
-
-
-def spans(system: System, rows: Segments, state: Tensor) -> dict[str, tuple[float, float]]:
-    """By unit, the smallest and largest value, along states (W, T, n), of the variable along which regions lie."""
-    inside = rows.inside > 0
-
-    def span(values: Tensor) -> tuple[float, float]:
-        return float(values[inside].min()), float(values[inside].max())
-
-    variables = {"time": rows.time} | {v.name: state[..., k] for k, v in enumerate(system.states)}
-    return {unit: span(variables[name]) for unit, name in profile_of(system).region_variables.items()}
-
-
 EPISODES_SCREENED = 3
 """Episodes, the longest first, from each of which alone an effect is screened that has a phase for each episode."""
 
 STEPPED_POINTS = 2
 """Points of a grid, and small ones among them, that are tried where a Gauss-Newton step leads from them: a step from
 afar may promise too much."""
-
-SMALL_SHARE = 0.1  # Share of its range, from neutral, up to which a strength is small
 
 NEARLY = 0.9
 """Share of the largest gain from which on a smaller effect is proposed: the response is linear, so that a motor that
@@ -191,7 +105,7 @@ def _best_phases(sensitivity: Sensitivity, effect: type[Effect], values: Sequenc
     """An effect with a phase for each episode: of parameters (P,) with one phase, the phase that suits each best."""
     plain, rows = in_step(effect), sensitivity.rows
     column = next(k for k, p in enumerate(plain.table) if p.role is Role.PHASE)
-    phases = _values(plain.table[column])
+    phases = values_of(plain.table[column])
     points = torch.tensor(list(values), dtype=torch.float64).repeat(len(phases), 1)
     points[:, column] = phases
     change, _ = sensitivity.around(plain, points, [])
@@ -225,9 +139,9 @@ def _promising(sensitivity: Sensitivity, effect: type[Effect], points: Tensor, s
     stepped[:, strengths] += steps
     best = left.square().sum(0).argmin()
     order = after.argsort(stable=True)
-    small = order[_size(effect, points[order]) <= SMALL_SHARE]
+    small = order[size(effect, points[order]) <= SMALL_SHARE]
     chosen = torch.cat((order[:STEPPED_POINTS], small[:STEPPED_POINTS], best[None]))
-    return _inside(effect, torch.cat((stepped[chosen], points[best][None])))
+    return inside(effect, torch.cat((stepped[chosen], points[best][None])))
 
 
 def _best_of(sensitivity: Sensitivity, effect: type[Effect], points: Tensor) -> Candidate | None:
@@ -238,20 +152,10 @@ def _best_of(sensitivity: Sensitivity, effect: type[Effect], points: Tensor) -> 
     gains = 0.5 * (error.square() - (error + change).square()).sum(0)
     if not gains.max() > 0:
         return None
-    size = _size(effect, points)
-    smallest = size[gains >= NEARLY * gains.max()].min()
-    best = int(torch.where(size <= 2 * smallest, gains, -math.inf).argmax())
+    sizes = size(effect, points)
+    smallest = sizes[gains >= NEARLY * gains.max()].min()
+    best = int(torch.where(sizes <= 2 * smallest, gains, -math.inf).argmax())
     return Candidate(effect, tuple(points[best].tolist()), float(gains[best]))
-
-
-def _size(effect: type[Effect], points: Tensor) -> Tensor:
-    """(G,) how far the strengths of points (G, P) are from neutral, as a share of their range; the largest of them."""
-    away = [
-        (points[:, k] - parameter.neutral).abs() / (parameter.high - parameter.low)
-        for k, parameter in enumerate(effect.table)
-        if parameter.neutral is not None
-    ]
-    return torch.stack([*away, torch.zeros(len(points), dtype=points.dtype)]).amax(0)
 
 
 def _descend(sensitivity: Sensitivity, effect: type[Effect], point: Tensor) -> Candidate | None:
@@ -273,13 +177,8 @@ def _descend(sensitivity: Sensitivity, effect: type[Effect], point: Tensor) -> C
             damping *= 10
         normal = slopes.T @ slopes
         normal = normal + torch.diag(damping * normal.diagonal() + 1e-12 * normal.diagonal().max() + 1e-30)
-        point = _inside(effect, found - torch.linalg.solve(normal, slopes.T @ left))
+        point = inside(effect, found - torch.linalg.solve(normal, slopes.T @ left))
     return Candidate(effect, tuple(found.tolist()), best) if best > 0 else None
-
-
-def _inside(effect: type[Effect], point: Tensor) -> Tensor:
-    low, high = (torch.tensor([getattr(p, end) for p in effect.table], dtype=point.dtype) for end in ("low", "high"))
-    return point.clamp(low, high)
 
 
 def _best(effect: type[Effect], shapes: Tensor, linear: list[int], error: Tensor, response: Tensor) -> Candidate | None:

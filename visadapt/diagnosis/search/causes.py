@@ -18,7 +18,7 @@ from visadapt.effects.catalogue import twins
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.covariance import deviations
 from visadapt.estimation.episode_phases import has_episode_phases, in_step
-from visadapt.estimation.screening import spans
+from visadapt.estimation.grids import spans
 from visadapt.systems import System
 
 Z_90 = 1.6449  # Half-width of a normal distribution's 90 % interval, in standard deviations
