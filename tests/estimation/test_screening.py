@@ -30,3 +30,11 @@ def test_a_strength_between_the_points_of_its_grid_is_found(name, value):
     search = Search(SYSTEM, prepare(recording, SYSTEM).rows, ())
     found = screen(SYSTEM, (), search.source.fits, search.rows, [effect])
     assert found[0].values[0] == pytest.approx(value, rel=0.06)
+
+
+def test_a_limit_that_only_the_largest_commands_reach_is_found():
+    largest = max(float(abs(episode.action).max()) for episode in record().episodes)
+    effect, limit = EFFECTS["actuator_saturation"], 0.85 * largest
+    search = Search(SYSTEM, prepare(record([effect(limit=limit)]), SYSTEM).rows, ())
+    found = screen(SYSTEM, (), search.source.fits, search.rows, [effect])
+    assert found[0].values[0] == pytest.approx(limit, rel=0.06)

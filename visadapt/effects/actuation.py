@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from visadapt.effects.base import ActuationEffect, Parameter
+from visadapt.effects.base import ActuationEffect, Parameter, Role
 from visadapt.systems.integrators import Duration
 
 
@@ -116,7 +116,7 @@ class ActuatorBacklash(ActuationEffect):
     order = 20
     equation = "u_k = min(max(u_(k-1), command_k - width/2), command_k + width/2)"
     source = "Tao and Kokotovic (1996), Adaptive Control of Systems with Actuator and Sensor Nonlinearities, chapter 2"
-    table = (Parameter("width", "1", 0.0, 1.0, 0.0),)
+    table = (Parameter("width", "1", 0.0, 1.0, 0.0, role=Role.COMMAND),)
 
     def memory(self, commands: Tensor, substep: float) -> Tensor:
         return torch.zeros_like(commands[:, :1])
@@ -138,7 +138,7 @@ class ActuatorDeadzone(ActuationEffect):
     order = 30
     equation = "u = sign(command) max(|command| - width, 0)"
     source = "Tao and Kokotovic (1996), Adaptive Control of Systems with Actuator and Sensor Nonlinearities, chapter 2"
-    table = (Parameter("width", "1", 0.0, 0.6, 0.0),)
+    table = (Parameter("width", "1", 0.0, 0.6, 0.0, role=Role.COMMAND),)
 
     def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
         # The sign stays outside: a clamp between equal limits would have no gradient in a width of 0.
@@ -152,7 +152,7 @@ class ActuatorSaturation(ActuationEffect):
     order = 40
     equation = "u = min(max(command, -limit), limit)"
     source = "Khalil (2002), Nonlinear Systems, section 1.2.7"
-    table = (Parameter("limit", "1", 0.02, 1.0, 1.0),)
+    table = (Parameter("limit", "1", 0.02, 1.0, 1.0, role=Role.COMMAND),)
 
     def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
         limit = self.column("limit", commands)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -26,7 +27,8 @@ START_STRENGTH = 0.05
 """Share of its range, from neutral, at which each of several strengths starts that Gauss-Newton steps find."""
 
 Spans = Mapping[str, tuple[float, float]]
-"""By unit, the interval that the recording covers of the variable along which regions of that unit lie."""
+"""By unit, the interval that the recording covers of the variable along which regions of that unit lie; and, by
+Role.COMMAND, that of the sizes of commands."""
 
 
 def is_proportional(effect: type[Effect]) -> bool:
@@ -62,7 +64,7 @@ def starts(effect: type[Effect], spans: Spans) -> tuple[Tensor, list[int]]:
         elif parameter.is_edge:
             axes.append(_edges(parameter, spans, SHAPE_POINTS))
         else:
-            values = values_of(parameter)
+            values = values_of(_reached(parameter, spans))
             coarse = parameter.neutral is None and parameter.role is not Role.FREQUENCY
             axes.append(values[:: max(1, len(values) // 2)] if coarse else values)
     return torch.cartesian_prod(*axes).reshape(-1, len(effect.table)), strengths
@@ -70,6 +72,15 @@ def starts(effect: type[Effect], spans: Spans) -> tuple[Tensor, list[int]]:
 
 def _edges(parameter: Parameter, spans: Spans, count: int) -> Tensor:
     return torch.linspace(*spans.get(parameter.unit, (parameter.low, parameter.high)), count, dtype=torch.float64)
+
+
+def _reached(parameter: Parameter, spans: Spans) -> Parameter:
+    """The parameter; one that is a size of the command with a range that ends at the largest recorded."""
+    largest = spans.get(Role.COMMAND, (0.0, math.inf))[1]
+    if parameter.role is not Role.COMMAND or not parameter.low < largest < parameter.high:
+        return parameter
+    neutral = largest if parameter.neutral == parameter.high else parameter.neutral
+    return replace(parameter, high=largest, neutral=neutral)
 
 
 def values_of(parameter: Parameter) -> Tensor:
@@ -90,14 +101,16 @@ def values_of(parameter: Parameter) -> Tensor:
 
 
 def spans(system: System, rows: Segments, state: Tensor) -> dict[str, tuple[float, float]]:
-    """By unit, the smallest and largest value, along states (W, T, n), of the variable along which regions lie."""
+    """By unit, the smallest and largest value, along states (W, T, n), of the variable along which regions lie; and the
+    largest size of a command."""
     inside = rows.inside > 0
 
     def span(values: Tensor) -> tuple[float, float]:
         return float(values[inside].min()), float(values[inside].max())
 
     variables = {"time": rows.time} | {v.name: state[..., k] for k, v in enumerate(system.states)}
-    return {unit: span(variables[name]) for unit, name in profile_of(system).region_variables.items()}
+    found = {unit: span(variables[name]) for unit, name in profile_of(system).region_variables.items()}
+    return found | {Role.COMMAND: (0.0, float(rows.command.abs().max()))}
 
 
 def size(effect: type[Effect], points: Tensor) -> Tensor:
