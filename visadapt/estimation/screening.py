@@ -133,11 +133,12 @@ def _promising(sensitivity: Sensitivity, effect: type[Effect], points: Tensor, s
     normal = slopes.mT @ slopes
     ridge = 1e-3 * torch.diagonal(normal, dim1=1, dim2=2) + 1e-30
     pull = -(slopes.mT @ left.T[..., None])[..., 0]
-    steps = torch.linalg.solve(normal + torch.diag_embed(ridge), pull[..., None])[..., 0]
-    after = (left + torch.einsum("gnk,gk->ng", slopes, steps)).square().sum(0)
+    # Where an effect is so strong that numbers are not finite, there is no step.
+    steps = torch.linalg.solve_ex(normal + torch.diag_embed(ridge), pull[..., None]).result[..., 0].nan_to_num(0, 0, 0)
+    after = _finite((left + torch.einsum("gnk,gk->ng", slopes, steps)).square().sum(0))
     stepped = points.clone()
     stepped[:, strengths] += steps
-    best = left.square().sum(0).argmin()
+    best = _finite(left.square().sum(0)).argmin()
     order = after.argsort(stable=True)
     small = order[size(effect, points[order]) <= SMALL_SHARE]
     chosen = torch.cat((order[:STEPPED_POINTS], small[:STEPPED_POINTS], best[None]))
@@ -149,13 +150,18 @@ def _best_of(sensitivity: Sensitivity, effect: type[Effect], points: Tensor) -> 
     ones the linear response may misjudge. None without a gain."""
     change, _ = sensitivity.around(effect, points, [])
     error = sensitivity.innovations.error[:, None]
-    gains = 0.5 * (error.square() - (error + change).square()).sum(0)
+    gains = 0.5 * (error.square().sum(0) - _finite((error + change).square().sum(0)))
     if not gains.max() > 0:
         return None
     sizes = size(effect, points)
     smallest = sizes[gains >= NEARLY * gains.max()].min()
     best = int(torch.where(sizes <= 2 * smallest, gains, -math.inf).argmax())
     return Candidate(effect, tuple(points[best].tolist()), float(gains[best]))
+
+
+def _finite(squares: Tensor) -> Tensor:
+    """Sums of squares, infinite where they are not numbers."""
+    return squares.nan_to_num(math.inf, math.inf)
 
 
 def _descend(sensitivity: Sensitivity, effect: type[Effect], point: Tensor) -> Candidate | None:
