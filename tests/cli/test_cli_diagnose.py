@@ -248,11 +248,10 @@ class TestDiagnosis:
     def test_the_real_rig(self, tmp_path, capsys):
         rig, out, page = tmp_path / "rig.toml", tmp_path / "a.json", tmp_path / "a.html"
         rig.write_text(RIG_PARAMETERS)
-        files = []
-        for k, whole in enumerate(sorted((RIG / "train").glob("*.csv"))[:2]):
-            files.append(tmp_path / f"{k}.csv")  # 3 s of each: all of them take minutes
-            files[-1].write_text("".join(whole.read_text().splitlines(keepends=True)[:152]))
-        assert run(*files, "--params", rig, "--json", out, "--report", page) == 0
+        whole = min((RIG / "train").glob("*.csv"))
+        part = tmp_path / "part.csv"  # 2 s: the search takes minutes on all
+        part.write_text("".join(whole.read_text().splitlines(keepends=True)[:102]))
+        assert run(part, "--params", rig, "--json", out, "--report", page) == 0
         content = json.loads(out.read_text())
         jsonschema.Draft202012Validator(SCHEMA).validate(content)
         assert content["verdict"] != "no_gap"
