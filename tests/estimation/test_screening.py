@@ -12,6 +12,13 @@ from visadapt.systems import CartPole
 SYSTEM = CartPole()
 
 
+def screened(effect, value):
+    """The value that is proposed for the one strength of an effect that is hidden with `value`."""
+    recording = record([effect(**{effect.table[0].name: value})])
+    search = Search(SYSTEM, prepare(recording, SYSTEM).rows, ())
+    return screen(SYSTEM, (), search.source.fits, search.rows, [effect])[0].values[0]
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -25,16 +32,10 @@ SYSTEM = CartPole()
     ],
 )
 def test_a_strength_between_the_points_of_its_grid_is_found(name, value):
-    effect = EFFECTS[name]
-    recording = record([effect(**{effect.table[0].name: value})])
-    search = Search(SYSTEM, prepare(recording, SYSTEM).rows, ())
-    found = screen(SYSTEM, (), search.source.fits, search.rows, [effect])
-    assert found[0].values[0] == pytest.approx(value, rel=0.06)
+    assert screened(EFFECTS[name], value) == pytest.approx(value, rel=0.06)
 
 
 def test_a_limit_that_only_the_largest_commands_reach_is_found():
     largest = max(float(abs(episode.action).max()) for episode in record().episodes)
-    effect, limit = EFFECTS["actuator_saturation"], 0.85 * largest
-    search = Search(SYSTEM, prepare(record([effect(limit=limit)]), SYSTEM).rows, ())
-    found = screen(SYSTEM, (), search.source.fits, search.rows, [effect])
-    assert found[0].values[0] == pytest.approx(limit, rel=0.06)
+    limit = 0.85 * largest
+    assert screened(EFFECTS["actuator_saturation"], limit) == pytest.approx(limit, rel=0.06)

@@ -47,7 +47,7 @@ def source():
 @pytest.mark.parametrize("effect", ANSWERED_BY_SLOPES, ids=lambda effect: effect.name)
 def test_the_response_is_that_of_integrated_steps(source, effect):
     rows, fits, sensitivity = source
-    points, _ = grid(effect, spans(SYSTEM, rows, fits.state[0]))
+    points = grid(effect, spans(SYSTEM, rows, fits.state[0]))
     point = points[len(points) // 2].clone()
     neutral = torch.tensor([0.0 if p.neutral is None else p.neutral for p in effect.table], dtype=torch.float64)
     for k, parameter in enumerate(effect.table):

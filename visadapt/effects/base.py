@@ -40,7 +40,7 @@ class Role(StrEnum):
     FREQUENCY = "frequency"  # In Hz; searched on a logarithmic grid
     PHASE = "phase"  # In rad; equal modulo a turn
     EPISODE_PHASE = "episode phase"  # That of one later episode alone, in a fit where each has its own
-    COMMAND = "command"  # A size of the command; searched up to the largest that was recorded
+    COMMAND = "command"  # A size of the command; tried at values up to the largest that was recorded
 
 
 @dataclass(frozen=True)

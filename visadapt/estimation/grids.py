@@ -31,32 +31,37 @@ Spans = Mapping[str, tuple[float, float]]
 Role.COMMAND, that of the sizes of commands."""
 
 
+def strengths(effect: type[Effect]) -> list[int]:
+    """Columns of the effect's strengths."""
+    return [k for k, parameter in enumerate(effect.table) if parameter.is_strength]
+
+
 def is_proportional(effect: type[Effect]) -> bool:
     """Whether the effect has strengths, and is proportional to all of them."""
-    strengths = [p for p in effect.table if p.neutral is not None]
-    return bool(strengths) and all(p.linear for p in strengths)
+    columns = strengths(effect)
+    return bool(columns) and all(effect.table[k].linear for k in columns)
 
 
-def grid(effect: type[Effect], spans: Spans) -> tuple[Tensor, list[int]]:
-    """Parameter values (G, P) of an effect that is proportional to its strengths, and the columns of these."""
+def grid(effect: type[Effect], spans: Spans) -> Tensor:
+    """Parameter values (G, P) of an effect that is proportional to its strengths, which are neutral."""
     axes = [_edges(p, spans, EDGE_POINTS) if p.is_edge else values_of(p) for p in effect.table]
     points = torch.cartesian_prod(*axes).reshape(-1, len(effect.table))
     if (region := effect.region()) is not None:
         start, end = (effect.table.index(edge) for edge in region)
         points = points[points[:, start] < points[:, end]]
-    return points, [k for k, p in enumerate(effect.table) if p.neutral is not None]
+    return points
 
 
-def starts(effect: type[Effect], spans: Spans) -> tuple[Tensor, list[int]]:
-    """Points (G, P) from which Gauss-Newton steps start, and the columns of the effect's strengths.
+def starts(effect: type[Effect], spans: Spans) -> Tensor:
+    """Points (G, P) from which Gauss-Newton steps of the effect's strengths start.
 
     One strength has a grid, since its derivative may vanish far from the best value, as where no command reaches a
     limit. Several start slightly off neutral: at neutral the derivatives vanish where it takes several of them to act.
     """
-    strengths = [k for k, p in enumerate(effect.table) if p.neutral is not None]
+    several = len(strengths(effect)) > 1
     axes = []
     for parameter in effect.table:
-        if parameter.neutral is not None and len(strengths) > 1:
+        if parameter.neutral is not None and several:
             end = parameter.high if parameter.high > parameter.neutral else parameter.low
             axes.append(
                 torch.tensor([parameter.neutral + START_STRENGTH * (end - parameter.neutral)], dtype=torch.float64)
@@ -67,7 +72,7 @@ def starts(effect: type[Effect], spans: Spans) -> tuple[Tensor, list[int]]:
             values = values_of(_reached(parameter, spans))
             coarse = parameter.neutral is None and parameter.role is not Role.FREQUENCY
             axes.append(values[:: max(1, len(values) // 2)] if coarse else values)
-    return torch.cartesian_prod(*axes).reshape(-1, len(effect.table)), strengths
+    return torch.cartesian_prod(*axes).reshape(-1, len(effect.table))
 
 
 def _edges(parameter: Parameter, spans: Spans, count: int) -> Tensor:

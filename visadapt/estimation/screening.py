@@ -17,7 +17,17 @@ from torch import Tensor
 
 from visadapt.effects import Effect, Role
 from visadapt.estimation.episode_phases import has_episode_phases, in_step
-from visadapt.estimation.grids import SMALL_SHARE, grid, inside, is_proportional, size, spans, starts, values_of
+from visadapt.estimation.grids import (
+    SMALL_SHARE,
+    grid,
+    inside,
+    is_proportional,
+    size,
+    spans,
+    starts,
+    strengths,
+    values_of,
+)
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
@@ -73,10 +83,11 @@ def screen(
     def best(effect: type[Effect]) -> Candidate | None:
         if has_episode_phases(effect):
             return _with_episode_phases(sensitivity(1), effect)
-        points, columns = grid(effect, covered) if is_proportional(effect) else starts(effect, covered)
+        proportional, columns = is_proportional(effect), strengths(effect)
+        points = grid(effect, covered) if proportional else starts(effect, covered)
         stride = _window_stride(profile_of(system).screening_rows, rows, len(points) * (1 + len(columns)))
         some = sensitivity(stride)
-        if not is_proportional(effect):
+        if not proportional:
             promising = _promising(some, effect, points, columns)
             if len(columns) == 1:
                 return _best_of(sensitivity(1), effect, promising)
@@ -125,10 +136,10 @@ def _window_stride(most: float, rows: Segments, points: int) -> int:
     return 2 ** max(0, min(math.ceil(math.log2(max(1.0, wanted))), int(math.log2(max(1, rows.shape[0] // 8)))))
 
 
-def _promising(sensitivity: Sensitivity, effect: type[Effect], points: Tensor, strengths: list[int]) -> Tensor:
-    """Points to which one Gauss-Newton step of the strengths leads from those of points (G, P) that promise most, the
+def _promising(sensitivity: Sensitivity, effect: type[Effect], points: Tensor, columns: list[int]) -> Tensor:
+    """Points to which one Gauss-Newton step of `columns` leads from those of points (G, P) that promise most, the
     best first, also from the best of the small ones; then that of `points` which is best without a step."""
-    change, slopes = sensitivity.around(effect, points, strengths)
+    change, slopes = sensitivity.around(effect, points, columns)
     left, slopes = sensitivity.innovations.error[:, None] + change, slopes.movedim(1, 0)
     normal = slopes.mT @ slopes
     ridge = 1e-3 * torch.diagonal(normal, dim1=1, dim2=2) + 1e-30
@@ -137,7 +148,7 @@ def _promising(sensitivity: Sensitivity, effect: type[Effect], points: Tensor, s
     steps = torch.linalg.solve_ex(normal + torch.diag_embed(ridge), pull[..., None]).result[..., 0].nan_to_num(0, 0, 0)
     after = _finite((left + torch.einsum("gnk,gk->ng", slopes, steps)).square().sum(0))
     stepped = points.clone()
-    stepped[:, strengths] += steps
+    stepped[:, columns] += steps
     best = _finite(left.square().sum(0)).argmin()
     order = after.argsort(stable=True)
     small = order[size(effect, points[order]) <= SMALL_SHARE]
