@@ -28,7 +28,7 @@ class Dynamics:
         self._loading = [e for e in effects if type(e).load is not DynamicsEffect.load]
         self._rubbing = [e for e in effects if type(e).dry_friction is not DynamicsEffect.dry_friction]
         self._friction_varies = any(e.dry_friction_by_velocity for e in self._rubbing)
-        self._velocities = [velocity for _, velocity in system.coordinates]
+        self._columns = torch.tensor([velocity for _, velocity in system.coordinates], dtype=torch.long)
 
     def altered(self, like: Tensor) -> System:
         """The system with the parameters that effects change permanently, with the device and dtype of `like`."""
@@ -46,24 +46,35 @@ class Dynamics:
     def load(self, system: System, time: Tensor, state: Tensor, command: Tensor) -> Tensor:
         """Sum of the loads (B, n_load) of all effects at an instant in which `command` (B, n_action) acts, with dry
         friction of the coordinates that move."""
-        here, velocity = self.varied(system, time, state), state[:, self._velocities]
+        here, velocity = self.varied(system, time, state), self._velocity(state)
         load, limits = self._load(time, state, here), self._dry_friction(time, state, command, here)
         return load if limits is None else load + sliding(limits, velocity, velocity.sign())
 
     def step(self, system: System, time: Tensor, state: Tensor, command: Tensor, h: Duration) -> Tensor:
         """The state (B, n_state) after `h` s, a number or (B,), in which `command` (B, n_action) acts."""
-        columns, here = self._velocities, self.varied(system, time, state)
-        direction, limits = state[:, columns].sign(), self._dry_friction(time, state, command, here)
-        constant: float | Tensor = 0.0 if limits is None else sliding(limits, state[:, columns], direction)
-        varying = limits if self._friction_varies else None
+        integrate = INTEGRATORS[self.integrator]
 
-        def derivative(t: Tensor, s: Tensor) -> Tensor:
+        def smooth(t: Tensor, s: Tensor) -> Tensor:
             now = self.varied(system, t, s)
-            friction = constant if varying is None else sliding(varying, s[:, columns], direction)
+            return now.derivative(s, command, self._load(t, s, now))
+
+        here = self.varied(system, time, state)
+        limits = self._dry_friction(time, state, command, here)
+        if limits is None:
+            return integrate(smooth, time, state, h)
+        direction = self._velocity(state).sign()
+        constant = None if self._friction_varies else sliding(limits, self._velocity(state), direction)
+
+        def rubbing(t: Tensor, s: Tensor) -> Tensor:
+            now = self.varied(system, t, s)
+            friction = sliding(limits, self._velocity(s), direction) if constant is None else constant
             return now.derivative(s, command, self._load(t, s, now) + friction)
 
-        after = INTEGRATORS[self.integrator](derivative, time, state, h)
-        return after if limits is None else stopped(here, state, after, command, limits, h)
+        return stopped(here, state, integrate(rubbing, time, state, h), command, limits, h)
+
+    def _velocity(self, state: Tensor) -> Tensor:
+        """The velocities (B, n_load) of the coordinates."""
+        return state.index_select(1, self._columns.to(state.device))
 
     def _load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         """Sum of the loads (B, n_load) without dry friction."""
@@ -76,8 +87,7 @@ class Dynamics:
         """Sum of the largest dry friction of all effects near a state; None without any."""
 
         def limits(velocities: Tensor) -> Tensor:
-            near = state.clone()
-            near[:, self._velocities] = velocities
+            near = state.index_copy(1, self._columns.to(state.device), velocities)
             each = [effect.dry_friction(time, near, command, system) for effect in self._rubbing]
             return sum(each[1:], each[0])
 
@@ -85,5 +95,5 @@ class Dynamics:
             return limits
         if not self._rubbing:
             return None
-        same = limits(state[:, self._velocities])
+        same = limits(self._velocity(state))
         return lambda velocities: same

@@ -10,7 +10,7 @@ constant over a step.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -49,42 +49,56 @@ def stopped(system: System, before: Tensor, after: Tensor, command: Tensor, limi
     if not bool(rows.any()):
         return after
     duration = h[rows] if isinstance(h, Tensor) and h.dim() else h
-    of_rows = system.of_rows(rows), before[rows], after[rows], command.expand(len(rows), -1)[rows], at_rest[rows]
+    first, last, at_rest = before[rows], after[rows], at_rest[rows]
+    loads = rubs.any(0).nonzero()[:, 0].tolist()
+    responses = _responses(system.of_rows(rows), first, command.expand(len(rows), -1)[rows], loads)
     out = after.clone()
-    out[rows] = _stopped(*of_rows, at_rest[rows], duration)
-    started = limits(out[:, velocities] / 2)
+    out[rows] = _stopped(system, first, last, responses, at_rest, at_rest, duration)
+    started = limits(out[:, velocities] / 2)[rows]
     if started.requires_grad or not torch.equal(started, at_rest):  # friction may depend on velocity
-        out[rows] = _stopped(*of_rows, started[rows], duration)
+        out[rows] = _stopped(system, first, last, responses, at_rest, started, duration)
     return out
 
 
+def _responses(system: System, state: Tensor, command: Tensor, loads: Sequence[int]) -> dict[int, Tensor]:
+    """Change (B, n_state) of all rates per unit of each of these loads."""
+    none = torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)
+    free = system.derivative(state, command, none)
+    responses = {}
+    for k in loads:
+        unit = none.clone()
+        unit[:, k] = 1
+        responses[k] = system.derivative(state, command, unit) - free
+    return responses
+
+
 def _stopped(
-    system: System, before: Tensor, after: Tensor, command: Tensor, at_rest: Tensor, started: Tensor, h: Duration
+    system: System,
+    before: Tensor,
+    after: Tensor,
+    responses: dict[int, Tensor],
+    at_rest: Tensor,
+    started: Tensor,
+    h: Duration,
 ) -> Tensor:
     """`stopped` for rows in each of which something reverses, with the limits (B, n_load, 2) on coordinates at rest and
     on those that have started."""
-    none = torch.zeros_like(at_rest[..., 0])
-    free = system.derivative(before, command, none)
-    for k, (_, own) in enumerate(system.coordinates):
+    for k, gain in responses.items():
+        own = system.coordinates[k][1]
         forward, backward = at_rest[:, k].unbind(-1)
-        if not at_rest.requires_grad and not bool((at_rest + started)[:, k].any()):
-            continue  # no friction on this coordinate
-        unit = none.clone()
-        unit[:, k] = 1
-        gain = system.derivative(before, command, unit) - free  # of all rates, per unit of this load
         first, last = before[:, own], after[:, own]
         rest = first == 0
         reverses = rest | (first * last < 0)
         # Share of the step that is left after the stop.
-        left = torch.where(rest, torch.ones_like(last), last / torch.where(reverses & ~rest, last - first, 1.0))
+        left = torch.where(rest, 1.0, last / torch.where(reverses & ~rest, last - first, 1.0))
         # Until now friction acted against the first direction for the whole step: that share of it is taken back.
-        taken = torch.where(rest, none[:, k], torch.where(first > 0, forward, backward))
+        taken = torch.where(rest, 0.0, torch.where(first > 0, forward, backward))
         holds = torch.where(last > 0, forward, backward) + taken
         slows = torch.where(last > 0, started[:, k, 0], started[:, k, 1]) + taken
         change = left * h * gain[:, own]  # of the velocity, per unit of a load since the stop
         moving = last.sign() * (last.abs() - slows * change).clamp_min(0)
-        kept = torch.where(last.abs() > holds * change, moving, torch.zeros_like(last))
-        impulse = torch.where(reverses, (kept - last) / gain[:, own], torch.zeros_like(last))
+        kept = torch.where(last.abs() > holds * change, moving, 0.0)
+        impulse = torch.where(reverses, (kept - last) / gain[:, own], 0.0)
         moved = after + gain * impulse[:, None]
         for position, velocity in system.coordinates:
             moved[:, position] = moved[:, position] + 0.5 * left * h * gain[:, velocity] * impulse
