@@ -26,9 +26,10 @@ and sensors are checked."""
 MIN_GAIN_PER_READING = 0.1
 """Log likelihood per reading that another convention must gain to be taken for that of the recording."""
 
-EFFECTS_WITH_SIGNS, LEADS_WITH_SIGNS = 2, 3
+EFFECTS_WITH_SIGNS, MOST_EFFECTS_WITH_SIGNS, LEADS_WITH_SIGNS = 2, 6, 3
 """Effects that are added one by one to the source in either convention before that is decided, since a large effect can
-look like a wrong sign; and how many are tried for each."""
+look like a wrong sign; how many are added at most while another convention is ahead, but not clearly; and how many are
+tried for each."""
 
 
 def opposite_signs(
@@ -49,8 +50,11 @@ def opposite_signs(
     best = max(range(len(others)), key=lambda k: _likelihood(others[k]))
     if _likelihood(others[best]) - _likelihood(own) <= required:
         return None
-    for search in (own, others[best]):
-        for _ in range(EFFECTS_WITH_SIGNS):
+    for added in range(MOST_EFFECTS_WITH_SIGNS):
+        ahead = _likelihood(others[best]) - _likelihood(own)
+        if added >= EFFECTS_WITH_SIGNS and not 0 < ahead <= required:
+            break
+        for search in (own, others[best]):
             search.extend([search.best], LEADS_WITH_SIGNS)
     return profile.sign_conventions[best] if _likelihood(others[best]) - _likelihood(own) > required else None
 
