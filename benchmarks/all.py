@@ -114,6 +114,7 @@ COMMANDS = (
         25,
         work="--work",
     ),
+    Command("ablations_flight", "ablations_flight.csv", ("benchmarks.ablations_flight",), 20, work="--work"),
     Command(
         "inverted_pendulum",
         "inverted_pendulum.csv",

@@ -83,6 +83,18 @@ def ablations(rows: Rows) -> Lines:
     return lines
 
 
+def flight_ablations(rows: Rows) -> Lines:
+    """The same of the vehicles, in m."""
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    lines = [["m (failed)", *methods]]
+    for experiment in dict.fromkeys(row["experiment"] for row in rows):
+        found = {row["method"]: row for row in rows if row["experiment"] == experiment}
+        measure = found[methods[0]]["measure"]
+        cells = [f"{mean_and_spread(found[method])} ({_failed(found[method])})" for method in methods]
+        lines.append([f"{experiment} N: {measure}", *cells])
+    return lines
+
+
 def pendulum(rows: Rows) -> Lines:
     """InvertedPendulum-v5."""
     lines = [["InvertedPendulum-v5, mean cart speed in m/s", "counted samples", "here", "episodes up", "seeds"]]

@@ -1,0 +1,118 @@
+"""What each part of an adaptation is worth to the paper's vehicles, under a force that changes, after one round.
+
+    python -m benchmarks.ablations_flight
+
+Each seed adapts the shipped source policy anew, as shipped and with a part left out, to 2 cos(t + phase) N, and is
+scored on flights that were not trained on. No score chooses anything. Interrupt it anywhere; started again, it goes on.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import torch
+import tyro
+
+from benchmarks.ablations import with_an_mlp
+from datasets import quadrotor_references
+from experiments.flights import EXPERIMENTS, flight_target
+from experiments.kept_scores import kept_score
+from experiments.result_tables import miss_row, write_rows
+from visadapt.evaluation import FlightScore
+from visadapt.policies import Policy
+from visadapt.policies.flight import FlightPolicy
+from visadapt.setups.base import Setup
+from visadapt.setups.policy_file import residual_for
+from visadapt.weights import shipped
+
+VEHICLES = ("quadrotor, 2 cos t", "fixed wing, 2 cos t")
+
+
+def without_history(setup: Setup, policy: Policy) -> Setup:
+    """The residual reads one state, and the policy no disturbance estimate."""
+    return replace(setup, residual=residual_for)
+
+
+def with_output_layers_alone(setup: Setup, policy: Policy) -> Setup:
+    """Of the policy, the maps to its commands alone are tuned."""
+    assert isinstance(policy, FlightPolicy)
+    policy.requires_grad_(False)
+    for layer in (policy.out, policy.straight, policy.answer):
+        layer.requires_grad_(True)
+    return setup
+
+
+VARIANTS: dict[str, Callable[[Setup, Policy], Setup]] = {
+    "as shipped": lambda setup, policy: setup,
+    "no history": without_history,
+    "MLP residual": lambda setup, policy: with_an_mlp(setup),
+    "output layers alone": with_output_layers_alone,
+}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is run, and where."""
+
+    seeds: int = 2
+    flights: int = 100
+    """that each policy is scored on"""
+    experiments: tuple[str, ...] = VEHICLES
+    """which of experiments.flights.EXPERIMENTS"""
+    variants: tuple[str, ...] = tuple(VARIANTS)
+    """which of VARIANTS"""
+    jobs: int = 2
+    """adaptations at once, one core each"""
+    references: Path = Path("data/quadrotor_references.npz")
+    """made where it is not there"""
+    work: Path = Path("runs/ablations_flight")
+    out: Path = Path("results/ablations_flight.csv")
+
+
+def main(settings: Settings) -> None:
+    """Run what is missing, then write the table."""
+    quadrotor_references.ready(settings.references)  # before the jobs, which share it
+    jobs = [
+        (settings, name, variant, seed)
+        for name in settings.experiments
+        for variant in ("", *settings.variants)
+        for seed in range(settings.seeds if variant else 1)
+    ]
+    with ProcessPoolExecutor(settings.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        found = dict(zip(jobs, pool.map(_score, *zip(*jobs, strict=True)), strict=True))
+    rows = []
+    for name in settings.experiments:
+        experiment = EXPERIMENTS[name]
+        about, samples = (name, experiment.vehicle.name), experiment.round_samples
+        before = [found[settings, name, "", 0]]
+        rows.append(miss_row(*about, "unadapted", "target", 0, experiment.measure, before))
+        for variant in settings.variants:
+            scores = [found[settings, name, variant, seed] for seed in range(settings.seeds)]
+            rows.append(miss_row(*about, variant, "adapted", samples, experiment.measure, scores))
+    write_rows(settings.out, rows)
+    for row in rows:
+        failed = f"{row.failed} of {row.episodes} failed"
+        print(f"{row.experiment:20} {row.method:20} {row.mean:.4f} +- {row.std:.4f} m, {failed}")
+
+
+def _score(settings: Settings, name: str, variant: str, seed: int) -> FlightScore:
+    """The score of a policy after one round of an adaptation; of the source's, where no variant is named."""
+    torch.set_num_threads(1)
+    experiment = replace(EXPERIMENTS[name], budget=EXPERIMENTS[name].round_samples)
+    setup = experiment.setup(partial(quadrotor_references.ready, settings.references))
+    policy = setup.load(shipped(experiment.vehicle.name))
+    target = flight_target(setup, experiment.effects(setup))
+    work = settings.work / (variant or "unadapted")
+    folder = experiment.open(setup, work, seed, settings.flights)
+    if variant:
+        experiment.adapt(VARIANTS[variant](setup, policy), work, policy, seed)
+    return kept_score(folder / "score.json", policy, target, settings.flights)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings, description=__doc__))
