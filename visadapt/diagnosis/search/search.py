@@ -110,7 +110,8 @@ class Search(FittedModels):
         periodic = {effect.name for effect in catalogue if has_episode_phases(effect)}
         self._use({names: each for names, each in fitted.items() if not names & periodic}, catalogue)
         self.extend(list({each.names: each for each in (self.source, self.best)}.values()))
-        self._settle()
+        if any(has_episode_phases(effect) for effect in self.best.effects):
+            self._settle()
         if self.best.log_odds <= rival.log_odds:
             self._use(fitted, in_step)
 
