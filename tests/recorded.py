@@ -1,5 +1,7 @@
 """Tables of a cart-pole's motion, and CSV files of them, for the tests of recordings."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -31,8 +33,17 @@ def a_table(rows=41, period=0.05, seed=0, noise=1e-3):
 
 def a_run(start, noise, rows=200, period=0.05, seed=0):
     """The cart-pole itself under a controller and excitation, from an angle `start`; wrapped, noisy."""
+    values = a_motion(start, rows, period, seed).copy()
+    values[:, :4] += noise * np.random.default_rng((seed, 1)).normal(size=(rows, 4)) * [0.5, 3, 1, 3]
+    values[:, 2] = (values[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    return {"time": np.arange(rows) * period, **dict(zip(HEADER[1:], values.T, strict=True))}
+
+
+@cache
+def a_motion(start, rows, period, seed):
+    """States and commands (rows, 5) of such a run; many tests begin with the same one."""
     rng = np.random.default_rng(seed)
-    world = World(CartPole(), period=period, substeps=4).double()
+    world = World(CartPole(), period=period, substeps=2).double()
     now = world.start(torch.tensor([[0.1, 0.0, start, 0.0]], dtype=torch.float64))
     log, push = [], 0.0
     gains = torch.tensor([0.05, 0.1, 1.5, 0.3], dtype=torch.float64)
@@ -44,10 +55,7 @@ def a_run(start, noise, rows=200, period=0.05, seed=0):
         log.append([*now.state[0].tolist(), command])
         with torch.no_grad():
             now = world.step(now, torch.tensor([[command]], dtype=torch.float64))
-    values = np.array(log)
-    values[:, :4] += noise * rng.normal(size=(rows, 4)) * [0.5, 3, 1, 3]
-    values[:, 2] = (values[:, 2] + np.pi) % (2 * np.pi) - np.pi
-    return {"time": np.arange(rows) * period, **dict(zip(HEADER[1:], values.T, strict=True))}
+    return np.array(log)
 
 
 def write(path, table, separator=",", end="\n", before="", encoding="utf-8"):

@@ -46,7 +46,7 @@ def inputs(batch=3, steps=4, seed=0):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"integrator": "leapfrog"}, "unknown integrator 'leapfrog'; there are euler, midpoint, rk4"),
+        ({"integrator": "leapfrog"}, "unknown integrator 'leapfrog'; there are euler, midpoint, rk3, rk4"),
         ({"period": 0.0}, "positive, got 0.0 s"),
         ({"period": float("nan")}, "positive, got nan s"),
         ({"substeps": 0}, "positive, got 0.05 s and 0"),
@@ -75,7 +75,7 @@ def test_the_clock_runs_a_period_a_step_and_starts_at_zero_in_every_row(substeps
         assert at.time.tolist() == pytest.approx([0.04 * k] * 2)
 
 
-@pytest.mark.parametrize("integrator", ["euler", "midpoint", "rk4"])
+@pytest.mark.parametrize("integrator", ["euler", "midpoint", "rk3", "rk4"])
 def test_more_substeps_come_closer_to_the_same_motion(integrator):
     state, actions = inputs()
     exact = run(World(CartPole(), substeps=500), state, actions)[-1]

@@ -31,7 +31,7 @@ from visadapt.policies import Policy
 from visadapt.storage.run_folder import read_json
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget
-from visadapt.targets.synthetic import no_effects
+from visadapt.targets.synthetic import fine_world, no_effects
 from visadapt.world import World
 
 MACHINES = 64
@@ -55,7 +55,7 @@ class Machines(VecEnv):
     Args:
         draw_effects: of a batch of episodes.
         start: first states (B, 4) of a batch of episodes.
-        fine: whether the clock is the target's, of 1 ms, or the source's.
+        fine: whether they are integrated as finely as the target, or as the source.
     """
 
     def __init__(
@@ -66,17 +66,16 @@ class Machines(VecEnv):
         fine: bool,
         seed: int,
     ) -> None:
-        self.draw_effects, self.start, self.with_history = draw_effects, start, with_history
+        self.draw_effects, self.start, self.with_history, self.fine = draw_effects, start, with_history, fine
         self.generator = torch.Generator().manual_seed(seed)
-        self.clock: tuple[str, int] = ("midpoint", 50) if fine else ("rk4", 1)
         width = len(shown(History.start(torch.zeros(1, 4), 1), with_history)[0])
         boxes = [gymnasium.spaces.Box(-limit, limit, (size,)) for limit, size in ((np.inf, width), (1.0, 1))]
         super().__init__(MACHINES, *boxes)
 
     def reset(self) -> np.ndarray:
-        integrator, substeps = self.clock
         self.effects = self.draw_effects(MACHINES, self.generator)
-        self.world = World(CartPole(), self.effects, 0.05, integrator, substeps).requires_grad_(False)
+        args = CartPole(), self.effects, 0.05
+        self.world = fine_world(*args) if self.fine else World(*args).requires_grad_(False)
         self.at, self.history = self._begun()
         self.age = torch.zeros(MACHINES, dtype=torch.long)
         return shown(self.history, self.with_history).numpy()

@@ -14,7 +14,7 @@ from visadapt.effects.base import Stage
 from visadapt.estimation.effect_fit import fit_effects
 from visadapt.estimation.fit_states import neutral
 from visadapt.systems import SYSTEMS, CartPole, FixedWing, Quadrotor
-from visadapt.world import World
+from visadapt.targets.synthetic import fine_world
 
 COARSE = 0.005
 """Share of a parameter by which it may be off since the fit integrates more coarsely than the target."""
@@ -108,7 +108,7 @@ def record(kind, effects, seed=0):
     """What sensors read, the true states (E, T, n), and the commands (E, T, n_action), of episodes of the target."""
     setup, system = SETUPS[kind.name], kind()
     generator = torch.Generator().manual_seed(seed)
-    world = World(system, effects, setup.period, "midpoint", round(setup.period / 0.001)).requires_grad_(False)
+    world = fine_world(system, effects, setup.period)
     at = world.start(setup.start(generator))
     read: list[torch.Tensor] = []
     clean: list[torch.Tensor] = []

@@ -5,7 +5,7 @@ import torch
 
 from visadapt.systems.integrators import INTEGRATORS
 
-ORDERS = {"euler": 1, "midpoint": 2, "rk4": 4}
+ORDERS = {"euler": 1, "midpoint": 2, "rk3": 3, "rk4": 4}
 
 
 def test_every_integrator_has_a_known_order():

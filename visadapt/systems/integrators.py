@@ -24,6 +24,15 @@ def midpoint(f: Derivative, t: Tensor, y: Tensor, h: Duration) -> Tensor:
     return y + step * f(t + h / 2, y + step / 2 * f(t, y))
 
 
+def rk3(f: Derivative, t: Tensor, y: Tensor, h: Duration) -> Tensor:
+    """Kutta's third-order method (Kutta 1901)."""
+    step = _column(h)
+    k1 = f(t, y)
+    k2 = f(t + h / 2, y + step / 2 * k1)
+    k3 = f(t + h, y + step * (2 * k2 - k1))
+    return y + step / 6 * (k1 + 4 * k2 + k3)
+
+
 def rk4(f: Derivative, t: Tensor, y: Tensor, h: Duration) -> Tensor:
     """The classical Runge-Kutta method (Kutta 1901), fourth order."""
     step = _column(h)
@@ -41,5 +50,6 @@ def _column(h: Duration) -> Duration:
 INTEGRATORS: dict[str, Callable[[Derivative, Tensor, Tensor, Duration], Tensor]] = {
     "euler": euler,
     "midpoint": midpoint,
+    "rk3": rk3,
     "rk4": rk4,
 }

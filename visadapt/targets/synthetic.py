@@ -69,8 +69,23 @@ class Start:
         return width * (2 * torch.rand(batch, 4, generator=generator) - 1)
 
 
+SMOOTH_STEP, ABRUPT_STEP = 0.005, 0.002
+"""s, the longest integration steps of a target under smooth effects alone, and under abrupt ones."""
+
+
+def fine_world(system: System, effects: Sequence[Effect], period: float) -> World:
+    """A world that is integrated more finely than any source, and by another method.
+
+    >>> import visadapt as va
+    >>> fine_world(va.CartPole(), [va.effects.ViscousFriction(coefficient=1.0)], 0.05).substeps
+    10
+    """
+    longest = ABRUPT_STEP if any(effect.abrupt for effect in effects) else SMOOTH_STEP
+    return World(system, effects, period, "rk3", math.ceil(period / longest - 1e-9)).requires_grad_(False)
+
+
 class WorldTarget(Target):
-    """A batch of worlds with hidden effects, integrated by the midpoint rule with steps of 1 ms, unlike any source."""
+    """A batch of worlds with hidden effects, as `fine_world` integrates them."""
 
     def __init__(self, system: System, period: float, draw_effects: DrawEffects) -> None:
         self.system = system
@@ -84,8 +99,7 @@ class WorldTarget(Target):
     def _start(self, state: Tensor, effects: Sequence[Effect], generator: torch.Generator) -> Observation:
         """Start episodes in states (batch, n_state)."""
         self._generator = generator
-        substeps = round(self.period / 0.001)
-        self._world = World(self.system, effects, self.period, "midpoint", substeps).requires_grad_(False)
+        self._world = fine_world(self.system, effects, self.period)
         self._at = self._world.start(state)
         return self._observe()
 
@@ -104,7 +118,7 @@ class WorldTarget(Target):
 
 
 class SyntheticTarget(WorldTarget):
-    """A cart-pole with hidden effects, integrated more finely (1 ms) and by another method than any source.
+    """A cart-pole with hidden effects, integrated more finely and by another method than any source.
 
     Args:
         draw_effects: draws the hidden effects of a batch of episodes.
@@ -161,7 +175,7 @@ class SyntheticTarget(WorldTarget):
 
 
 class FlightTarget(WorldTarget):
-    """A vehicle with hidden effects, integrated by another method and more finely (1 ms) than any source.
+    """A vehicle with hidden effects, integrated more finely and by another method than any source.
 
     A flight ends after the task's steps, or where its state is no longer finite; how far off it is does not end it,
     unless `reach` says so.
