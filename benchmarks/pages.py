@@ -57,6 +57,7 @@ TABLES = {
     "grounding": Table(adaptation.grounding, ("cartpole_pixels",)),
     "ablations": Table(adaptation.ablations, ("ablations",)),
     "ablations, states": Table(adaptation.ablations, ("ablations_states",)),
+    "ablations, flights": Table(adaptation.flight_ablations, ("ablations_flight",)),
     "pendulum": Table(adaptation.pendulum, ("inverted_pendulum",)),
     "dm_control": Table(adaptation.dm_control, ("dm_control",)),
     "vehicles": Table(adaptation.vehicles, ("flight",)),
