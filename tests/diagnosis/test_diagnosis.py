@@ -134,7 +134,8 @@ def test_a_heavier_cart_is_not_a_weaker_motor_with_a_lighter_pole():
     assert result.causes[0].gap_reopened > 0.9
 
 
-def test_two_large_effects_are_both_named():
+def test_two_large_effects_are_both_named(only_effects):
+    only_effects("coulomb_friction", "stribeck_friction", "actuator_gain", "cart_mass", "pole_mass")
     effects = [CoulombFriction(force=3.0), ActuatorGain(scale=0.7)]
     result = diagnose(record(effects, measured=("x", "x_dot", "theta", "theta_dot"), episodes=6), SOURCE)
     carrying = {cause.effect: cause for cause in result.causes if not cause.slight}
@@ -142,7 +143,8 @@ def test_two_large_effects_are_both_named():
     assert carrying["coulomb_friction"].parameters["force"].value == pytest.approx(3.0, rel=0.02)
 
 
-def test_the_region_of_a_friction_patch_is_found():
+def test_the_region_of_a_friction_patch_is_found(only_effects):
+    only_effects("friction_patch", "viscous_friction", "coulomb_friction", "spring", "actuator_gain", "pole_mass")
     result = diagnose(record([FrictionPatch(start=-0.1, end=0.15, coefficient=6.0)], episodes=6), SOURCE)
     assert names(result) == {"friction_patch"}
     region = result.where.regions[0]

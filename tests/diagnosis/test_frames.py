@@ -17,6 +17,7 @@ from visadapt.estimation.camera_fit import through
 from visadapt.estimation.poses import PoseFinder
 
 RENDERER = va.shipped("renderer")
+MOTION = ("viscous_friction", "coulomb_friction", "pole_damping", "actuator_gain", "actuator_delay", "angle_offset")
 
 
 def film(path, effects=(), camera=lambda frames: frames, episodes=5, rows=60, seed=2):
@@ -127,7 +128,9 @@ class TestCamera:
         assert cause.parameters["dy"].value == pytest.approx(-3.0, abs=0.05)
         assert cause.parameters["dx"].ci90 == (-20.0, 20.0)
 
-    def test_it_is_a_cause_beside_that_of_the_motion(self, tmp_path):
+    def test_it_is_a_cause_beside_that_of_the_motion(self, tmp_path, only_effects):
+        only_effects(*MOTION)
+
         def blurred(frames):
             return through(frames.float(), [Blur(sigma=1.0)]).detach()
 
@@ -147,7 +150,9 @@ class TestCamera:
 
 
 class TestPixels:
-    def test_a_shadow_is_unexplained_and_the_motion_is_told_nevertheless(self, tmp_path):
+    def test_a_shadow_is_unexplained_and_the_motion_is_told_nevertheless(self, tmp_path, only_effects):
+        only_effects(*MOTION)
+
         def shaded(frames):
             column = torch.arange(frames.shape[2])
             middle = 20 + 1.5 * torch.arange(len(frames))[:, None]

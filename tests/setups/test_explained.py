@@ -29,7 +29,8 @@ def rivals(folder):
     return {cause["effect"]: cause["indistinguishable_from"] for cause in causes}
 
 
-def test_what_two_causes_explain_is_settled_by_an_experiment_in_the_next_round(tmp_path, monkeypatch):
+def test_what_two_causes_explain_is_settled_by_an_experiment_in_the_next_round(tmp_path, monkeypatch, only_effects):
+    only_effects("viscous_friction", "stribeck_friction", "coulomb_friction", "pole_damping", "actuator_gain")
     monkeypatch.setattr(planning, "FREQUENCIES", (0.8,))  # one of six, for the time it takes
     effects = [va.effects.ViscousFriction(coefficient=0.8), ReadingNoise()]
     target = va.SyntheticTarget(lambda batch, generator: effects)
