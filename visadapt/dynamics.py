@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -52,25 +52,25 @@ class Dynamics:
 
     def step(self, system: System, time: Tensor, state: Tensor, command: Tensor, h: Duration) -> Tensor:
         """The state (B, n_state) after `h` s, a number or (B,), in which `command` (B, n_action) acts."""
-        integrate = INTEGRATORS[self.integrator]
-
-        def smooth(t: Tensor, s: Tensor) -> Tensor:
-            now = self.varied(system, t, s)
-            return now.derivative(s, command, self._load(t, s, now))
-
         here = self.varied(system, time, state)
         limits = self._dry_friction(time, state, command, here)
-        if limits is None:
-            return integrate(smooth, time, state, h)
-        direction = self._velocity(state).sign()
-        constant = None if self._friction_varies else sliding(limits, self._velocity(state), direction)
+        friction = None if limits is None else self._sliding(limits, state)
 
-        def rubbing(t: Tensor, s: Tensor) -> Tensor:
+        def derivative(t: Tensor, s: Tensor) -> Tensor:
             now = self.varied(system, t, s)
-            friction = sliding(limits, self._velocity(s), direction) if constant is None else constant
-            return now.derivative(s, command, self._load(t, s, now) + friction)
+            load = self._load(t, s, now)
+            return now.derivative(s, command, load if friction is None else load + friction(s))
 
-        return stopped(here, state, integrate(rubbing, time, state, h), command, limits, h)
+        after = INTEGRATORS[self.integrator](derivative, time, state, h)
+        return after if limits is None else stopped(here, state, after, command, limits, h)
+
+    def _sliding(self, limits: Limits, start: Tensor) -> Callable[[Tensor], Tensor]:
+        """Dry friction (B, n_load) in each state (B, n_state) of a step that starts in `start`."""
+        direction = self._velocity(start).sign()
+        if self._friction_varies:
+            return lambda state: sliding(limits, self._velocity(state), direction)
+        constant = sliding(limits, self._velocity(start), direction)
+        return lambda state: constant
 
     def _velocity(self, state: Tensor) -> Tensor:
         """The velocities (B, n_load) of the coordinates."""

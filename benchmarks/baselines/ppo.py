@@ -74,8 +74,8 @@ class Machines(VecEnv):
 
     def reset(self) -> np.ndarray:
         self.effects = self.draw_effects(MACHINES, self.generator)
-        args = CartPole(), self.effects, 0.05
-        self.world = fine_world(*args) if self.fine else World(*args).requires_grad_(False)
+        make = fine_world if self.fine else World
+        self.world = make(CartPole(), self.effects, period=0.05).requires_grad_(False)
         self.at, self.history = self._begun()
         self.age = torch.zeros(MACHINES, dtype=torch.long)
         return shown(self.history, self.with_history).numpy()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
@@ -70,11 +70,18 @@ class System(ABC):
         """Accelerations (B, J) of the joints; arguments as in `derivative`."""
         return self.derivative(state, command, load)[:, [velocity for _, velocity in self.coordinates]]
 
+    def rates_per_load(
+        self, state: Tensor, command: Tensor, load: Tensor, chosen: Sequence[int]
+    ) -> tuple[Tensor, list[Tensor]]:
+        """Rates (B, n_state) of the states, and their change (B, n_state) per unit of each of the `chosen` loads."""
+        rates, units = self.derivative(state, command, load), torch.eye(load.shape[1]).to(load)
+        return rates, [self.derivative(state, command, load + units[k]) - rates for k in chosen]
+
     def response_to_loads(self, state: Tensor, command: Tensor, load: Tensor) -> tuple[Tensor, Tensor]:
         """Accelerations (B, J) of the joints, and their change (B, J, J) per unit of each load, the last axis."""
-        free = self.accelerations(state, command, load)
-        units = torch.eye(load.shape[1]).to(load)
-        return free, torch.stack([self.accelerations(state, command, load + unit) - free for unit in units], -1)
+        rates, by_load = self.rates_per_load(state, command, load, range(load.shape[1]))
+        velocities = [velocity for _, velocity in self.coordinates]
+        return rates[:, velocities], torch.stack([change[:, velocities] for change in by_load], -1)
 
     def motor_loads(self, state: Tensor, command: Tensor) -> Tensor:
         """The loads (B, J) that would move the system as the command does.

@@ -10,7 +10,7 @@ constant over a step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -51,25 +51,15 @@ def stopped(system: System, before: Tensor, after: Tensor, command: Tensor, limi
     duration = h[rows] if isinstance(h, Tensor) and h.dim() else h
     first, last, at_rest = before[rows], after[rows], at_rest[rows]
     loads = rubs.any(0).nonzero()[:, 0].tolist()
-    responses = _responses(system.of_rows(rows), first, command.expand(len(rows), -1)[rows], loads)
+    acting, none = command.expand(len(rows), -1)[rows], torch.zeros_like(at_rest[..., 0])
+    _, by_load = system.of_rows(rows).rates_per_load(first, acting, none, loads)
+    responses = dict(zip(loads, by_load, strict=True))
     out = after.clone()
     out[rows] = _stopped(system, first, last, responses, at_rest, at_rest, duration)
     started = limits(out[:, velocities] / 2)[rows]
     if started.requires_grad or not torch.equal(started, at_rest):  # friction may depend on velocity
         out[rows] = _stopped(system, first, last, responses, at_rest, started, duration)
     return out
-
-
-def _responses(system: System, state: Tensor, command: Tensor, loads: Sequence[int]) -> dict[int, Tensor]:
-    """Change (B, n_state) of all rates per unit of each of these loads."""
-    none = torch.zeros(len(state), len(system.loads), device=state.device, dtype=state.dtype)
-    free = system.derivative(state, command, none)
-    responses = {}
-    for k in loads:
-        unit = none.clone()
-        unit[:, k] = 1
-        responses[k] = system.derivative(state, command, unit) - free
-    return responses
 
 
 def _stopped(
@@ -82,7 +72,7 @@ def _stopped(
     h: Duration,
 ) -> Tensor:
     """`stopped` for rows in each of which something reverses, with the limits (B, n_load, 2) on coordinates at rest and
-    on those that have started."""
+    on those that have started, and the change (B, n_state) of all rates per unit of each load that rubs, by index."""
     for k, gain in responses.items():
         own = system.coordinates[k][1]
         forward, backward = at_rest[:, k].unbind(-1)

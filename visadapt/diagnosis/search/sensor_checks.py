@@ -48,15 +48,19 @@ def opposite_signs(
     conventions = [to_source(rows, convention) for convention in profile.sign_conventions]
     others = [Search(system, each, catalogue, rival=_likelihood(own)) for each in conventions]
     best = max(range(len(others)), key=lambda k: _likelihood(others[k]))
-    if _likelihood(others[best]) - _likelihood(own) <= required:
+    other = others[best]
+    if _ahead(other, own) <= required:
         return None
     for added in range(MOST_EFFECTS_WITH_SIGNS):
-        ahead = _likelihood(others[best]) - _likelihood(own)
-        if added >= EFFECTS_WITH_SIGNS and not 0 < ahead <= required:
+        if added >= EFFECTS_WITH_SIGNS and not 0 < _ahead(other, own) <= required:
             break
-        for search in (own, others[best]):
+        for search in (own, other):
             search.extend([search.best], LEADS_WITH_SIGNS)
-    return profile.sign_conventions[best] if _likelihood(others[best]) - _likelihood(own) > required else None
+    return profile.sign_conventions[best] if _ahead(other, own) > required else None
+
+
+def _ahead(one: Search, other: Search) -> float:
+    return _likelihood(one) - _likelihood(other)
 
 
 def _likelihood(search: Search) -> float:
