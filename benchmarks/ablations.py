@@ -10,9 +10,7 @@ networks see 5 states and actions, it is trained first. Interrupt it anywhere; s
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,6 +21,7 @@ import tyro
 from torch import nn
 
 from experiments.kept_scores import kept_score
+from experiments.parallel import in_processes
 from experiments.result_tables import print_speed, speed_row, write_rows
 from renderers import DrawnCartPole
 from visadapt.effects import ActuatorDelay, ActuatorGain, ConstantForce, CoulombFriction, Residual
@@ -123,19 +122,18 @@ def main(settings: Settings) -> None:
     if settings.shown == "states":
         _source(settings)
     jobs = [
-        (settings, name, variant, seed)
+        (name, variant, seed)
         for name in settings.targets
         for variant in settings.variants
         for seed in range(settings.seeds)
     ]
-    with ProcessPoolExecutor(settings.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        unadapted = [pool.submit(_before, settings, name) for name in settings.targets]
-        found = dict(zip(jobs, pool.map(_after, *zip(*jobs, strict=True)), strict=True))
-    for name, before in zip(settings.targets, unadapted, strict=True):
+    unadapted = in_processes(_before, settings, [(name,) for name in settings.targets])
+    found = in_processes(_after, settings, jobs)
+    for name in settings.targets:
         experiment = f"CartPole, {'pixels' if settings.shown == 'frames' else 'states'}, {name}"
-        rows.append(speed_row(experiment, "unadapted", "target", 0, [before.result()]))
+        rows.append(speed_row(experiment, "unadapted", "target", 0, [unadapted[(name,)]]))
         for variant in settings.variants:
-            scores = [found[settings, name, variant, seed] for seed in range(settings.seeds)]
+            scores = [found[name, variant, seed] for seed in range(settings.seeds)]
             rows.append(speed_row(experiment, variant, "adapted", SAMPLES, scores))
     write_rows(settings.out, rows)
     for row in rows:

@@ -8,9 +8,7 @@ scored on flights that were not trained on. No score chooses anything. Interrupt
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,6 +20,7 @@ from benchmarks.ablations import with_an_mlp
 from datasets import quadrotor_references
 from experiments.flights import EXPERIMENTS, flight_target
 from experiments.kept_scores import kept_score
+from experiments.parallel import in_processes
 from experiments.result_tables import miss_row, write_rows
 from visadapt.evaluation import FlightScore
 from visadapt.policies import Policy
@@ -31,6 +30,7 @@ from visadapt.setups.policy_file import residual_for
 from visadapt.weights import shipped
 
 VEHICLES = ("quadrotor, 2 cos t", "fixed wing, 2 cos t")
+UNADAPTED = "unadapted"
 
 
 def without_history(setup: Setup, policy: Policy) -> Setup:
@@ -77,22 +77,21 @@ class Settings:
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
     quadrotor_references.ready(settings.references)  # before the jobs, which share it
-    jobs = [
-        (settings, name, variant, seed)
+    jobs = [(name, UNADAPTED, 0) for name in settings.experiments]
+    jobs += [
+        (name, variant, seed)
         for name in settings.experiments
-        for variant in ("", *settings.variants)
-        for seed in range(settings.seeds if variant else 1)
+        for variant in settings.variants
+        for seed in range(settings.seeds)
     ]
-    with ProcessPoolExecutor(settings.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        found = dict(zip(jobs, pool.map(_score, *zip(*jobs, strict=True)), strict=True))
+    found = in_processes(_score, settings, jobs)
     rows = []
     for name in settings.experiments:
         experiment = EXPERIMENTS[name]
         about, samples = (name, experiment.vehicle.name), experiment.round_samples
-        before = [found[settings, name, "", 0]]
-        rows.append(miss_row(*about, "unadapted", "target", 0, experiment.measure, before))
+        rows.append(miss_row(*about, UNADAPTED, "target", 0, experiment.measure, [found[name, UNADAPTED, 0]]))
         for variant in settings.variants:
-            scores = [found[settings, name, variant, seed] for seed in range(settings.seeds)]
+            scores = [found[name, variant, seed] for seed in range(settings.seeds)]
             rows.append(miss_row(*about, variant, "adapted", samples, experiment.measure, scores))
     write_rows(settings.out, rows)
     for row in rows:
@@ -101,15 +100,14 @@ def main(settings: Settings) -> None:
 
 
 def _score(settings: Settings, name: str, variant: str, seed: int) -> FlightScore:
-    """The score of a policy after one round of an adaptation; of the source's, where no variant is named."""
+    """The score of a policy after one round of an adaptation, or UNADAPTED."""
     torch.set_num_threads(1)
     experiment = replace(EXPERIMENTS[name], budget=EXPERIMENTS[name].round_samples)
     setup = experiment.setup(partial(quadrotor_references.ready, settings.references))
     policy = setup.load(shipped(experiment.vehicle.name))
-    target = flight_target(setup, experiment.effects(setup))
-    work = settings.work / (variant or "unadapted")
+    target, work = flight_target(setup, experiment.effects(setup)), settings.work / variant
     folder = experiment.open(setup, work, seed, settings.flights)
-    if variant:
+    if variant != UNADAPTED:
         experiment.adapt(VARIANTS[variant](setup, policy), work, policy, seed)
     return kept_score(folder / "score.json", policy, target, settings.flights)
 

@@ -12,8 +12,6 @@ Writes results/cartpole_pixels.csv and assets/curve.png. Interrupt it anywhere; 
 
 from __future__ import annotations
 
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -22,6 +20,7 @@ import tyro
 
 from experiments.curves import plot_curve
 from experiments.kept_scores import kept_score
+from experiments.parallel import in_processes
 from experiments.result_tables import print_speed, read_rows, speed_row, write_rows
 from renderers import DrawnCartPole
 from visadapt.evaluation import CartPoleScore
@@ -72,17 +71,15 @@ class Settings:
 
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
-    jobs: list[tuple[Settings, int | None, int]] = [(settings, None, 0)]
-    jobs += [(settings, number, seed) for number in settings.variants for seed in range(settings.seeds)]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(settings.jobs, mp_context=context) as pool:
-        found = list(pool.map(_scores, *zip(*jobs, strict=True)))
-    reference, results = found[0], dict(zip(jobs[1:], found[1:], strict=True))
+    jobs: list[tuple[int | None, int]] = [(None, 0)]
+    jobs += [(number, seed) for number in settings.variants for seed in range(settings.seeds)]
+    results = in_processes(_scores, settings, jobs)
+    reference = results[None, 0]
     rows = [speed_row(EXPERIMENT, "unadapted", domain, 0, [reference[domain]]) for domain in ("source", "target")]
     for number in settings.variants:
         variant = VARIANTS[number]
         for samples in variant.scored:
-            scores = [results[settings, number, seed][str(samples)] for seed in range(settings.seeds)]
+            scores = [results[number, seed][str(samples)] for seed in range(settings.seeds)]
             rows.append(speed_row(EXPERIMENT, variant.method, "adapted", samples, scores))
     write_rows(settings.out, rows)
     drawn = [row for row in read_rows(settings.out) if row["method"] in (OURS, "unadapted")]

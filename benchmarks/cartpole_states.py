@@ -14,8 +14,6 @@ Writes results/cartpole_states.csv and assets/curve_states.png. Interrupt it any
 from __future__ import annotations
 
 import copy
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +22,7 @@ import tyro
 
 from experiments.curves import plot_curve
 from experiments.kept_scores import kept_score
+from experiments.parallel import in_processes
 from experiments.result_tables import print_speed, read_rows, speed_row, write_rows
 from visadapt.evaluation import CartPoleScore
 from visadapt.policies import Policy
@@ -58,9 +57,7 @@ class Settings:
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
     jobs = [(experiment, seed) for experiment in settings.experiments for seed in range(settings.seeds)]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(settings.jobs, mp_context=context) as pool:
-        found = dict(zip(jobs, pool.map(_scores, [settings] * len(jobs), *zip(*jobs, strict=True)), strict=True))
+    found = in_processes(_scores, settings, jobs)
     rows = []
     for experiment in settings.experiments:
         plans = PLANS[experiment]

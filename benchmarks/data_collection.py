@@ -14,9 +14,7 @@ Writes results/data_collection.csv and assets/data_collection.png. Interrupt it 
 from __future__ import annotations
 
 import math
-import multiprocessing
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +27,7 @@ from datasets import quadrotor_references
 from experiments.curves import Chart, plot_charts
 from experiments.flights import EXPERIMENTS, flight_target
 from experiments.kept_scores import kept_score
+from experiments.parallel import in_processes
 from experiments.result_tables import Row, miss_row, read_rows, write_rows
 from visadapt.effects import Residual
 from visadapt.evaluation import SCORE_SEED, FlightScore
@@ -99,9 +98,7 @@ def main(settings: Settings) -> None:
     methods = (CURRENT, *EXPLORERS)
     before = {name: _before(settings, name) for name in settings.experiments}  # and references are made, for the jobs
     jobs = [(name, by, seed) for seed in range(settings.seeds) for name in settings.experiments for by in methods]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(settings.jobs, mp_context=context) as pool:
-        found = dict(zip(jobs, pool.map(_stands, [settings] * len(jobs), *zip(*jobs, strict=True)), strict=True))
+    found = in_processes(_stands, settings, jobs)
     rows = []
     for name in settings.experiments:
         rows += _rows(name, "unadapted", "target", 0, [before[name]])

@@ -16,8 +16,6 @@ anywhere; started again, it goes on.
 from __future__ import annotations
 
 import copy
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +27,7 @@ from datasets import quadrotor_references
 from experiments.curves import Chart, plot_charts, plot_losses
 from experiments.flights import EXPERIMENTS, flight_target
 from experiments.kept_scores import kept_score
+from experiments.parallel import in_processes
 from experiments.result_tables import miss_row, read_rows, write_rows
 from visadapt.evaluation import FlightScore
 from visadapt.policies import Policy
@@ -64,9 +63,7 @@ def main(settings: Settings) -> None:
     for name in settings.experiments:
         prepared(settings, name)  # before the jobs, which share the references
     jobs = [(name, seed) for name in settings.experiments for seed in range(settings.seeds)]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(settings.jobs, mp_context=context) as pool:
-        found = dict(zip(jobs, pool.map(_scores, [settings] * len(jobs), *zip(*jobs, strict=True)), strict=True))
+    found = in_processes(_scores, settings, jobs)
     rows = []
     for name in settings.experiments:
         kind, measure = EXPERIMENTS[name].vehicle.name, EXPERIMENTS[name].measure

@@ -18,9 +18,7 @@ from __future__ import annotations
 
 import copy
 import math
-import multiprocessing
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -30,6 +28,7 @@ import tyro
 from torch import Tensor
 
 from experiments.kept_scores import kept_score
+from experiments.parallel import in_processes
 from experiments.result_tables import print_speed, speed_row, write_rows
 from renderers import DrawnCartPole
 from visadapt.effects import (
@@ -116,9 +115,7 @@ class Settings:
 
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(settings.jobs, mp_context=context) as pool:
-        found = list(pool.map(_scores, [settings] * settings.seeds, range(settings.seeds)))
+    found = list(in_processes(_scores, settings, [(seed,) for seed in range(settings.seeds)]).values())
     rows = []
     for kind in _hidden(settings):
         for method in METHODS:

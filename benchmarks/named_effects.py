@@ -11,9 +11,7 @@ Writes results/named_effects.csv. Interrupt it anywhere; started again, it goes 
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +21,7 @@ import tyro
 from datasets import quadrotor_references
 from experiments.flights import EXPERIMENTS, flight_target
 from experiments.kept_scores import kept_score
+from experiments.parallel import in_processes
 from experiments.result_tables import miss_row, write_rows
 from visadapt.effects import ConstantForce, Effect, LinearDrag, ThrustGain
 from visadapt.evaluation import FlightScore
@@ -58,9 +57,7 @@ class Settings:
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
     jobs = [(name, budget, seed) for name in NAMES for budget in BUDGETS for seed in range(settings.seeds)]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(settings.jobs, mp_context=context) as pool:
-        found = dict(zip(jobs, pool.map(_scored, [settings] * len(jobs), *zip(*jobs, strict=True)), strict=True))
+    found = in_processes(_scored, settings, jobs)
     rows = []
     for name in NAMES:
         for budget in BUDGETS:

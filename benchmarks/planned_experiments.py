@@ -13,9 +13,7 @@ Writes results/planned_experiments.csv. Interrupt it anywhere; started again, it
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +24,7 @@ import tyro
 from torch import Tensor
 
 import visadapt as va
+from experiments.parallel import in_processes
 from experiments.result_tables import Row, write_rows
 from visadapt import effects
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, Diagnosis, without_slight
@@ -89,9 +88,7 @@ class Settings:
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
     jobs = [(name, seed) for name in settings.hidden for seed in range(settings.seeds)]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(settings.jobs, mp_context=context) as pool:
-        found = list(pool.map(_settled, [settings] * len(jobs), *zip(*jobs, strict=True)))
+    found = list(in_processes(_settled, settings, jobs).values())
     planned = [each for each in found if each["after"]]
     about = ("CartPole, states, one hidden effect", "cartpole")
 

@@ -18,8 +18,6 @@ Interrupt it anywhere; started again, it goes on.
 from __future__ import annotations
 
 import math
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +27,7 @@ import torch
 import tyro
 from torch import Tensor
 
+from experiments.parallel import in_processes
 from experiments.result_tables import Row, write_rows
 from visadapt.evaluation import SCORE_SEED
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
@@ -120,9 +119,7 @@ class Score:
 
 def main(settings: Settings) -> None:
     """Train what is missing, then write the table."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(settings.jobs, mp_context=context) as pool:
-        scores = list(pool.map(_seed, [settings] * settings.seeds, range(settings.seeds)))
+    scores = list(in_processes(_seed, settings, [(seed,) for seed in range(settings.seeds)]).values())
     succeeded = sum(score.succeeded for score in scores)
     failed = settings.seeds * settings.episodes - succeeded
     rows = []

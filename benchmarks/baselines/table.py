@@ -11,11 +11,9 @@ Writes results/baselines.csv and assets/baselines.png. Interrupt it anywhere; st
 
 from __future__ import annotations
 
-import multiprocessing
 import statistics
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -26,6 +24,7 @@ import torch
 from benchmarks.baselines.problem import PROBLEMS, SMOKE, Sizes, score_path, source_policy
 from experiments.curves import Chart, plot_charts
 from experiments.kept_scores import kept_score
+from experiments.parallel import in_processes
 from experiments.result_tables import ACTION_TIME, Row, print_speed, read_rows, speed_row, write_rows
 from visadapt.evaluation import CartPoleScore
 from visadapt.policies import Policy
@@ -79,13 +78,9 @@ def main(settings: Settings) -> None:
     jobs = [
         (name, experiment, seed) for seed in seeds for experiment in settings.experiments for name in settings.baselines
     ]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(settings.jobs, mp_context=context) as pool:
-        sources = {(PROBLEMS[experiment].with_history, seed): experiment for _, experiment, seed in jobs}
-        starts = [(settings, experiment, seed) for (_, seed), experiment in sources.items()]
-        list(pool.map(_source, *zip(*starts, strict=True)))
-        arguments = zip(*((settings, *job) for job in jobs), strict=True)
-        list(pool.map(_scores, *arguments))
+    sources = {(PROBLEMS[experiment].with_history, seed): experiment for _, experiment, seed in jobs}
+    in_processes(_source, settings, [(experiment, seed) for (_, seed), experiment in sources.items()])
+    in_processes(_scores, settings, jobs)
     rows = [
         row
         for experiment in PROBLEMS
