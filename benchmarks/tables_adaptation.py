@@ -11,7 +11,8 @@ from benchmarks.cartpole_pixels import EXPERIMENT as PIXELS, OURS as FRAMES_ALON
 from benchmarks.cartpole_states import CONSTANT, OURS, SINE
 from benchmarks.named_control import METHODS
 
-Rows = list[dict[str, str]]
+Row = dict[str, str]
+Rows = list[Row]
 Lines = list[list[str]]
 
 CURVE_SAMPLES = (50, 100, 200, 500, 1000)
@@ -74,24 +75,32 @@ def grounding(pixels: Rows) -> Lines:
 
 def ablations(rows: Rows) -> Lines:
     """What each part of an adaptation is worth, one target a line, in m/s."""
-    methods = list(dict.fromkeys(row["method"] for row in rows))
-    lines = [["mean cart speed in m/s (episodes up)", *methods]]
-    for experiment in dict.fromkeys(row["experiment"] for row in rows):
-        found = {row["method"]: _speed_cells(row) for row in rows if row["experiment"] == experiment}
-        cells = [f"{found[method][0]} ({found[method][1]})" for method in methods]
-        lines.append([experiment.split(", ", 2)[2], *cells])
-    return lines
+
+    def cell(row: Row) -> str:
+        speed, up, _ = _speed_cells(row)
+        return f"{speed} ({up})"
+
+    return _by_method(
+        rows, "mean cart speed in m/s (episodes up)", lambda row: row["experiment"].split(", ", 2)[2], cell
+    )
 
 
 def flight_ablations(rows: Rows) -> Lines:
     """The same of the vehicles, in m."""
+
+    def cell(row: Row) -> str:
+        return f"{mean_and_spread(row)} ({_failed(row)})"
+
+    return _by_method(rows, "m (failed)", lambda row: VEHICLES[row["experiment"]][0], cell)
+
+
+def _by_method(rows: Rows, head: str, label: Callable[[Row], str], cell: Callable[[Row], str]) -> Lines:
+    """A line for each experiment with a cell for each method."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    lines = [["m (failed)", *methods]]
+    lines = [[head, *methods]]
     for experiment in dict.fromkeys(row["experiment"] for row in rows):
         found = {row["method"]: row for row in rows if row["experiment"] == experiment}
-        measure = found[methods[0]]["measure"]
-        cells = [f"{mean_and_spread(found[method])} ({_failed(found[method])})" for method in methods]
-        lines.append([f"{experiment} N: {measure}", *cells])
+        lines.append([label(found[methods[0]]), *(cell(found[method]) for method in methods)])
     return lines
 
 
@@ -308,7 +317,7 @@ def _speed(rows: Rows, experiment: str, method: str, domain: str, samples: int) 
     return ["not run", "", ""]
 
 
-def _speed_cells(row: dict[str, str]) -> list[str]:
+def _speed_cells(row: Row) -> list[str]:
     episodes, failed = int(row["episodes"]), int(row["failed"])
     speed = "unstable" if failed == episodes else mean_and_spread(row, 3)
     return [speed, f"{episodes - failed} of {episodes}", row["seeds"]]
