@@ -1,68 +1,85 @@
-"""What a late sensor reads, from the state at present: against the motion itself, simulated in steps of 1 ms."""
+"""What late sensors read: against the motion itself, simulated in steps of 1 ms."""
 
 import pytest
 import torch
 
 from visadapt.effects import AngleDelay, CoulombFriction, MeasurementDelay, PositionDelay
-from visadapt.estimation.late_readings import Past, reading
-from visadapt.estimation.linearise import linearise_reading
+from visadapt.estimation.candidate import CandidateModel, linearise
+from visadapt.estimation.segments import cut
 from visadapt.systems import CartPole
 from visadapt.world import World
 
 TICK = 0.001  # s, the step of the motion
-PERIOD = 50  # ticks for which a command is held
+STEADY = torch.full((40,), 50)  # ticks from each row to the next
+UNSTEADY = torch.tensor(
+    [50, 57, 50, 130, 52, 50, 20, 58, 50, 54, 50, 53, 50, 56, 50, 50, 140, 50, 55, 50, 51, 50, 59, 50]
+)
 LATE = {MeasurementDelay: [0, 1, 2, 3], PositionDelay: [0, 1], AngleDelay: [2, 3]}
+FRICTION = 2.0  # N; the cart stops and starts again several times
 
 
-def motion(effects=(), periods=8):
-    """States (T + 1, 4) at every tick, and the command (n, 1) of every period."""
+def motion(ticks, effects=()):
+    """States (T, 4) at every tick, and its rows: all read without delay, commands held from each to the next."""
     generator = torch.Generator().manual_seed(3)
-    commands = torch.rand(periods, 1, generator=generator, dtype=torch.float64) - 0.5
+    commands = torch.rand(len(ticks), 1, generator=generator, dtype=torch.float64) - 0.5
     at = torch.tensor([[0.1, 0.4, 0.1, -0.3]], dtype=torch.float64)
-    world, rows = World(CartPole(), effects, period=TICK).double().requires_grad_(False), [at]
-    for command in commands.repeat_interleave(PERIOD, 0):
-        rows.append(world.integrate(torch.zeros(1).double(), rows[-1], command[None, None]))
-    return torch.cat(rows), commands
+    world, track = World(CartPole(), effects, period=TICK).double().requires_grad_(False), [at]
+    for command in commands.repeat_interleave(ticks, 0):
+        track.append(world.integrate(torch.zeros(1).double(), track[-1], command[None, None]))
+    track, index = torch.cat(track), ticks.cumsum(0) - ticks
+    stamps = TICK * index.double()
+    period = float(stamps.diff().median())
+    return track, cut([track[index]], [torch.ones(len(index), 4)], [commands], [stamps], (0, 1, 2, 3), period, 15)
 
 
-def past_of(commands, index, count):
-    """The `count` periods before the row `index`, of 50 ms each."""
-    before = (index - 1 - torch.arange(count)).clamp_min(0)
-    time = torch.tensor([index * PERIOD * TICK]).double()
-    return Past(time, commands[before][None], torch.full((1, count), PERIOD * TICK).double())
+def at(track, time):
+    return track[(time / TICK).round().long().clamp(0, len(track) - 1)]
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.007, 0.05, 0.086])
 @pytest.mark.parametrize("sensor", LATE)
-@pytest.mark.parametrize("friction", [[], [CoulombFriction(force=2.0)]])
-def test_a_late_sensor_reads_the_motion_as_it_was_and_the_others_as_it_is(sensor, delay, friction):
-    track, commands = motion(friction)
-    world = World(CartPole(), [*friction, sensor(delay=delay)], 0.05, substeps=4).double().requires_grad_(False)
-    for index in range(2, 8):
-        seen = reading(world, track[None, PERIOD * index], past_of(commands, index, 3))[0]
-        true = track[PERIOD * index].clone()
-        true[LATE[sensor]] = track[PERIOD * index - round(delay / TICK), LATE[sensor]]
-        torch.testing.assert_close(seen, true, rtol=0, atol=2e-3 if friction else 1e-5)
+@pytest.mark.parametrize("friction", [[], [CoulombFriction]])
+@pytest.mark.parametrize("ticks", [STEADY, UNSTEADY], ids=["steady", "unsteady"])
+def test_a_late_sensor_reads_the_motion_as_it_was_also_through_stops(ticks, friction, sensor, delay):
+    track, rows = motion(ticks, [kind(force=FRICTION) for kind in friction])
+    if friction:
+        assert int((track[1:, 1] == 0).sum()) > 5
+    model = CandidateModel(CartPole(), [*friction, sensor], rows)
+    theta = torch.tensor([FRICTION] * len(friction) + [delay]).double()
+    seen, (times, there) = model.measure(theta, at(track, rows.time)), read_at(model, theta)
+    for channel in range(4):
+        shown = at(track, times[..., channel] - delay * (channel in LATE[sensor]))[..., channel]
+        torch.testing.assert_close(seen[..., channel][there], shown[there], rtol=0, atol=2e-3)
 
 
-def test_before_the_episode_the_motion_is_that_under_its_first_command():
-    track, commands = motion()
-    world = World(CartPole(), [AngleDelay(delay=0.09)], 0.05).double().requires_grad_(False)
-    seen = reading(world, track[None, PERIOD], past_of(commands, 1, 3))
-    torch.testing.assert_close(seen[0, :2], track[PERIOD, :2])
-    before, tick = track[:1], torch.full((1,), TICK).double()
-    for _ in range(40):
-        before = world.integrate(0 * tick, before, commands[None, 0], -tick)
-    torch.testing.assert_close(seen[0, 2:], before[0, 2:], rtol=0, atol=1e-3)
-    torch.testing.assert_close(reading(world, track[:1], None), track[:1], rtol=0, atol=0)
+def read_at(model, theta):
+    """(W, T, 4) when the readings are read that show each row's state; which rows (W, T) have one of each sensor."""
+    rows = model.rows
+    times = rows.later(rows.time[..., None].expand(-1, -1, 4), model.rows_later(theta))
+    return times, (model.shown(theta)[1] > 0).all(-1)
 
 
-def test_the_derivative_by_the_delay_is_minus_the_rate_at_that_time():
-    track, commands = motion()
-    world = World(CartPole(), [AngleDelay(delay=0.0)], 0.05).double().requires_grad_(False)
-    values = torch.tensor([0.02]).double()
-    tangent = linearise_reading(world, values, track[None, PERIOD * 4], past_of(commands, 4, 2))
-    then = track[PERIOD * 4 - 20]
-    assert float(tangent.by_parameter[0, 2, 0]) == pytest.approx(-float(then[3]), rel=1e-3)
-    torch.testing.assert_close(tangent.by_parameter[0, :2, 0], torch.zeros(2).double(), rtol=0, atol=1e-9)
-    assert float(tangent.by_state[0, 2, 3]) == pytest.approx(-0.02, rel=0.1), "the angle 20 ms ago: theta - 0.02 rate"
+def test_every_reading_is_shown_once_but_for_those_of_before_the_episode():
+    _, rows = motion(STEADY)
+    model = CandidateModel(CartPole(), [PositionDelay], rows)
+    measured, used = model.shown(torch.tensor([0.12]).double())
+    assert used.sum((0, 1)).tolist() == [37, 37, 40, 40], "0.12 s are in the third row"
+    torch.testing.assert_close(measured[..., 0][used[..., 0] > 0], rows.measured[..., 0][rows.inside > 0][3:])
+    torch.testing.assert_close(measured[..., 2], rows.measured[..., 2])
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.02, 0.05])
+def test_derivatives_are_those_of_the_motion(delay):
+    track, rows = motion(STEADY, [CoulombFriction(force=FRICTION)])
+    model = CandidateModel(CartPole(), [CoulombFriction, AngleDelay], rows)
+    theta, state = torch.tensor([FRICTION, delay]).double(), at(track, rows.time)
+    found = linearise(model, theta, state)
+    (times, there), step = read_at(model, theta), 1e-3
+    rate = at(track, times[..., 2] - delay)[..., 3]
+    torch.testing.assert_close(found.sensing_by_parameter[..., 2, 1][there], -rate[there], rtol=0, atol=0.05)
+    assert not found.sensing_by_parameter[..., :2, 1].any(), "the position is not late"
+    moved = theta + torch.tensor([step, 0.0]).double()
+    by_force = (model.measure(moved, state) - found.measured) / step
+    torch.testing.assert_close(found.sensing_by_parameter[..., 0], by_force, rtol=0, atol=1e-3)
+    pushed = model.measure(theta, state + torch.tensor([0.0, 0.0, 0.0, step]).double())
+    torch.testing.assert_close(found.sensing[..., 3], (pushed - found.measured) / step, rtol=0, atol=5e-3)

@@ -42,6 +42,7 @@ from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.verdict import at_bounds, left_unexplained, next_step, verdict_of
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized, twins
+from visadapt.effects.late_sensors import LateSensors
 from visadapt.estimation.effect_fit import remembers
 from visadapt.processes import one_thread
 from visadapt.progress import Report, staged
@@ -216,11 +217,13 @@ def _warnings(
 
 
 def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:
-    """The first effect of each group of twins; without effects that repeat readings, which are found by another method,
+    """One effect of each group of twins; without effects that repeat readings, which are found by another method,
     without sensors with memory, which candidate models cannot linearise by the present state, and without a camera's,
     which are fitted to pixels."""
     out: list[type[Effect]] = []
-    for effect in effects:
+    # Of a late command and late readings, the readings: then commands change between rows, not within a step, which is
+    # exact also where a joint stops.
+    for effect in sorted(effects, key=lambda effect: not issubclass(effect, LateSensors)):
         if not (
             twins(effect, out, system) or effect.repeats_readings or remembers(effect) or effect.stage is Stage.CAMERA
         ):

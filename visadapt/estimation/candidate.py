@@ -12,7 +12,7 @@ from torch import Tensor
 from visadapt.effects import ActuationEffect, Effect
 from visadapt.effects.late_sensors import LateSensors
 from visadapt.estimation.episode_phases import phase_columns
-from visadapt.estimation.late_readings import Past, reading
+from visadapt.estimation.late_readings import Delays, Following, following, reading, rows_later
 from visadapt.estimation.linearise import (
     linearise_reading,
     linearise_step,
@@ -31,9 +31,6 @@ quick fits, and for reported results."""
 
 SHORT_PERIOD = 0.005
 """s: up to it the midpoint rule is accurate enough for what is not reported, and takes half as long."""
-
-PAST_STEP = 0.0125
-"""s: shorter periods are integrated back several at once, under their mean command, to what late sensors read."""
 
 
 class CandidateModel:
@@ -66,8 +63,7 @@ class CandidateModel:
         named = [effect for effect in effects for _ in effect.table]
         self.acting_parameters = [k for k, effect in enumerate(named) if acting and (effect in acting or not alone)]
         """columns of the parameters that change what acts of the commands"""
-        self.delays = [k for k, effect in enumerate(named) if issubclass(effect, LateSensors)]
-        """columns of the delays of late sensors"""
+        self._late = [(k, effect.late) for k, effect in enumerate(named) if issubclass(effect, LateSensors)]
         self._phase_columns = phase_columns(effects, len(rows.command))
         self.slopes: tuple[Tensor, Tensor] | None = None
         """transition (W, T - 1, n, n) and sensing (W, T, m, n) of an earlier linearisation, reused where given"""
@@ -97,9 +93,9 @@ class CandidateModel:
 
     def commands(self, theta: Tensor) -> Tensor:
         """Commands after the actuation effects, (R, W, T, substeps, n_action), for R parameter vectors (R, P)."""
-        return self._acting(theta)[:, self.rows.episode[:, None], self.rows.index]
+        return self.acting(theta)[:, self.rows.episode[:, None], self.rows.index]
 
-    def _acting(self, theta: Tensor) -> Tensor:
+    def acting(self, theta: Tensor) -> Tensor:
         """The same of whole episodes, (R, E, L, substeps, n_action)."""
         rows = self.rows
         episodes = len(rows.command)
@@ -126,29 +122,35 @@ class CandidateModel:
         time = rows.time[:, :length].flatten()
         return WorldState(time, state.flatten(0, 1), tuple(m[episode, index] for m in memory))
 
-    def measure(self, theta: Tensor, state: Tensor, first: int = 0, stride: int = 1) -> Tensor:
-        """Measurements, without noise, for parameters (P,) of states (W, T', n) of the windows' rows from the `first`
-        on, every `stride`-th; or for parameters (R, P) of states (R, W, T', n)."""
-        values, past = theta, self.past(theta, slice(first, first + stride * state.shape[-2], stride))
-        if theta.dim() > 1:
-            values = theta.repeat_interleave(math.prod(state.shape[1:-1]), 0)
-            past = None if past is None else past.repeat(len(theta))
-        seen = reading(self.at(values), state.flatten(0, -2), past)
-        return seen[:, list(self.rows.channels)].unflatten(0, state.shape[:-1])
+    def measure(self, theta: Tensor, state: Tensor, chosen: slice = slice(None)) -> Tensor:
+        """Readings without noise (W, T', m), with parameters (P,), that show the states (W, T', n) of the `chosen` rows
+        of every window: those of `shown`."""
+        after = self.following(theta, self.acting(theta[None])[0], chosen) if self._late else None
+        values = theta if after is None else self.by_row(theta, state.shape[1])
+        seen = reading(self.at(values), state.flatten(0, 1), after)
+        return seen[:, list(self.rows.channels)].unflatten(0, state.shape[:2])
 
-    def past(self, theta: Tensor, chosen: slice = slice(None)) -> Past | None:
-        """What led to the states of the `chosen` rows of every window, as far back as late sensors with parameters
-        (..., P) read; None without such sensors. The first of the parameters decide what acted."""
-        if not self.delays:
+    def shown(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """The recorded readings (W, T, m), each in the row whose state it shows with parameters (P,), and 1 where there
+        is one that a fit may use."""
+        later = self.rows_later(theta)
+        return self.rows.later(self.rows.measured, later), self.rows.later(self.rows.used, later)
+
+    def rows_later(self, theta: Tensor) -> list[int]:
+        """By how many rows the readings (m,) come after the row whose state they show, with parameters (P,)."""
+        return rows_later(self.rows, self._delays(theta), self.rows.channels)
+
+    def following(self, theta: Tensor, acting: Tensor, chosen: slice = slice(None)) -> Following | None:
+        """What late sensors with parameters (P,) show of what follows the `chosen` rows of every window, where `acting`
+        (E, L, substeps, n_action) acts; None without such sensors."""
+        if not self._late:
             return None
-        rows, every = self.rows, theta.reshape(-1, theta.shape[-1])
-        together = max(1, int(PAST_STEP / rows.period))
-        count = together * math.ceil((1 + math.ceil(float(every[:, self.delays].max()) / rows.period)) / together)
-        index = rows.index[:, chosen, None] - 1 - torch.arange(count)
-        episode, before = rows.episode[:, None, None], index.clamp_min(0)
-        acting = self._acting(every[:1])[0].mean(2)[episode, before].unflatten(2, (-1, together)).mean(3)
-        held = rows.held[episode, before].unflatten(2, (-1, together)).sum(3)
-        return Past(rows.time[:, chosen].flatten(), acting.flatten(0, 1), held.flatten(0, 1))
+        return following(self.rows, self._delays(theta), acting, len(self.system.states), chosen)
+
+    def _delays(self, theta: Tensor) -> Delays:
+        """s by which states are read late."""
+        columns = {column for _, late in self._late for column in late}
+        return {c: sum(float(theta[k]) for k, late in self._late if c in late) for c in sorted(columns)}
 
 
 def with_loads(model: CandidateModel, accuracy: int) -> CandidateModel:
@@ -175,15 +177,17 @@ def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised
     shifted = torch.cat((theta[None], theta + torch.diag(parameter_steps(model.table, theta))))
     # What acts changes with the parameters of actuation effects alone: for the others it is computed once.
     variants = [0, *(1 + k for k in model.acting_parameters)]
-    world, acting = model.stepping(theta, model.commands(shifted[variants])[:, :, :-1].flatten(1, 2))
-    commands = acting[[variants.index(k) if k in variants else 0 for k in range(len(shifted))]]
+    used = [variants.index(k) if k in variants else 0 for k in range(len(shifted))]
+    whole = model.acting(shifted[variants])
+    world, acting = model.stepping(theta, whole[:, model.rows.episode[:, None], model.rows.index[:, :-1]].flatten(1, 2))
     time, duration = model.rows.time[:, :-1].flatten(), model.rows.duration[:, :-1].flatten()
     values = model.by_row(theta, length - 1)
     step = linearise_step(
-        world, values, time, state[:, :-1].flatten(0, 1), commands, by_state=known is None, duration=duration
+        world, values, time, state[:, :-1].flatten(0, 1), acting[used], by_state=known is None, duration=duration
     )
-    past = model.past(theta)
-    read = linearise_reading(world, theta, state.flatten(0, 1), past, by_state=known is None)
+    after = [shown for k in used if (shown := model.following(theta, whole[k])) is not None]
+    values = model.by_row(theta, length)
+    read = linearise_reading(model.at(theta), values, state.flatten(0, 1), after, by_state=known is None)
     channels = list(model.rows.channels)
     steps, rows = (windows, length - 1), (windows, length)
     out = Linearised(
@@ -192,6 +196,6 @@ def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised
         model.by_theta(step.by_parameter.unflatten(0, steps)),
         read.value[:, channels].unflatten(0, rows),
         read.by_state[:, channels].unflatten(0, rows),
-        read.by_parameter[:, channels].unflatten(0, rows),
+        model.by_theta(read.by_parameter[:, channels].unflatten(0, rows)),
     )
     return out if known is None else replace(out, transition=known[0], sensing=known[1])

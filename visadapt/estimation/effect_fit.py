@@ -105,14 +105,6 @@ def fit_effects(
         for value in with_own_phases(kind, [float(getattr(effect, p.name)) for p in in_step(kind).table])
     ]
     found = _fitted(system, fitted, rows, present)
-    late = [kind for kind in fitted if issubclass(kind, LateSensors)]
-    if late:
-        # Until its first reading arrives, a simulated sensor reads the first state, whatever the motion.
-        used = rows.used.clone()
-        for kind in late:
-            used[..., kind.late] *= (rows.time >= found.theta[0, columns[kind]])[..., None]
-        rows = replace(rows, used=used)
-        found = _best(system, fitted, [found], rows, QUICK)
     covariance = torch.linalg.inv(posterior(fitted, found)[1]) if fitted else torch.zeros(0, 0)
     states = _by_episode(rows, found.state[0], measured)
     values, spreads = {}, {}

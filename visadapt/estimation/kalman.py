@@ -168,6 +168,6 @@ def noise_scores(
 
 
 def log_likelihood(filtered: Filtered, used: Tensor) -> Tensor:
-    """(N,) of the first column; `used` (N, T, m) is 1 where something was measured."""
+    """(N,) of the first column; `used` (N, T, m) is 0 where nothing was measured, else the reading's weight."""
     terms = filtered.white[..., 0].square() + 2 * filtered.deviation.log() + math.log(2 * math.pi)
     return -0.5 * (terms * used).sum((1, 2))

@@ -1,10 +1,13 @@
-"""Readings of late sensors from the present state: the motion is integrated back to the instant at which they read it.
+"""Readings of late sensors, each taken as one of the last row before the instant that it shows.
 
-So a reading depends on one state alone, as the Kalman filter needs it, while a simulated sensor remembers rows.
+A reading of row t that is `delay` s late shows the state at that time less the delay: the state of an earlier row,
+moved on by a period or less. The filter takes it at that row, as it may take readings in any order. So no motion is
+integrated backwards: through dry friction it could not be, since a joint at rest may have stood or have just stopped.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,38 +15,98 @@ from torch import Tensor
 
 from visadapt.batch import Batch
 from visadapt.effects.late_sensors import LateSensors
+from visadapt.estimation.segments import ROUNDING_ERROR, Segments
 from visadapt.world import World
+
+Delays = Mapping[int, float]
+"""Late states, by index, to the s by which they are read late."""
 
 
 @dataclass(frozen=True)
-class Past(Batch):
-    """What led to N states: the K periods before each, the latest first."""
+class Following(Batch):
+    """What follows N states: the K periods after each, and when the sensors are read that show it."""
 
     time: Tensor  # (N,) s since the episode began
-    command: Tensor  # (N, K, n_action) that acted
-    duration: Tensor  # (N, K) s; what is earlier than all K of them is taken to belong to the last one
+    command: Tensor  # (N, K, substeps, n_action) that acts
+    duration: Tensor  # (N, K) s
+    read: Tensor  # (N, n_state) s from each state to the row in which each of its sensors is read
 
 
-def reading(world: World, state: Tensor, past: Past | None) -> Tensor:
-    """What sensors read (N, n_state) of N states; without a past, as at the start of an episode."""
-    seen = state
-    for effect in world.effects:
-        if isinstance(effect, LateSensors) and past is not None:
-            earlier = _earlier(world, state, past, effect.value("delay", state))
-            seen = seen.clone()
-            seen[:, effect.late] = earlier[:, effect.late]
+def reading(world: World, state: Tensor, following: Following | None) -> Tensor:
+    """What sensors read (N, n_state), each in the row that `following` says, of the motion that goes through N states;
+    without it, no sensor is late."""
+    if following is None:
+        return world.reading(state)
+    sensors = [effect for effect in world.effects if isinstance(effect, LateSensors)]
+    seen, shown = state.clone(), dict[tuple[int, ...], Tensor]()
+    for column in range(state.shape[1]):
+        of = tuple(k for k, sensor in enumerate(sensors) if column in sensor.late)
+        if of and of not in shown:
+            delay = sum(sensors[k].value("delay", state) for k in of)
+            shown[of] = _later(world, state, following, following.read[:, column] - delay)
+        if of:
+            seen[:, column] = shown[of][:, column]
     return world.reading(seen)
 
 
-def _earlier(world: World, state: Tensor, past: Past, delay: Tensor) -> Tensor:
-    """The states (N, n_state) `delay` s, () or (N,), earlier.
-
-    Before the episode its first command is taken to have acted: a log begins while the machine moves.
-    """
-    left, time = delay.expand_as(past.time), past.time
-    last = past.command.shape[1] - 1
-    for k, (command, duration) in enumerate(zip(past.command.unbind(1), past.duration.unbind(1), strict=True)):
-        back = left if k == last else torch.minimum(left, duration)
-        state = world.integrate(time, state, command[:, None].expand(-1, world.substeps, -1), -back)
-        left, time = left - back, time - back
+def _later(world: World, state: Tensor, following: Following, ahead: Tensor) -> Tensor:
+    """The states (N, n_state) `ahead` (N,) s later."""
+    time, last = following.time, following.command.shape[1] - 1
+    for k in range(last + 1):
+        h = ahead if k == last else torch.minimum(ahead, following.duration[:, k])
+        state = world.integrate(time, state, following.command[:, k], h)
+        ahead, time = ahead - h, time + h
     return state
+
+
+def rows_later(rows: Segments, delays: Delays, columns: Sequence[int]) -> list[int]:
+    """By how many rows the readings of these states come after the row whose state they show: the least after which,
+    everywhere in the episodes, more time than the delay has passed."""
+    clock = _clock(rows)
+    out = []
+    for column in columns:
+        count = 0
+        if column in delays:
+            count = 1 + int(delays[column] / rows.period)
+            while count < clock.shape[1] - 1 and float((clock[:, count:] - clock[:, :-count]).min()) <= delays[column]:
+                count += 1
+        out.append(count)
+    return out
+
+
+def following(rows: Segments, delays: Delays, acting: Tensor, states: int, chosen: slice) -> Following:
+    """What follows the `chosen` rows of every window, flattened, where `acting` (E, L, substeps, n_action) acts."""
+    clock, episode, index = _clock(rows), rows.episode[:, None], rows.index[:, chosen]
+
+    def passed(periods: int) -> Tensor:
+        """s from each row until so many periods later."""
+        return clock[episode, (index + periods).clamp(max=clock.shape[1] - 1)] - clock[episode, index]
+
+    read = torch.zeros(*index.shape, states, dtype=torch.float64)
+    farthest = read[..., 0]
+    for column, delay in delays.items():
+        read[..., column] = passed(*rows_later(rows, delays, [column]))
+        farthest = torch.maximum(farthest, read[..., column] - delay)
+    count = 1
+    while count < clock.shape[1] and bool((passed(count) < farthest - ROUNDING_ERROR).any()):
+        count += 1
+    after = (index[..., None] + torch.arange(count)).clamp(max=acting.shape[1] - 1)
+    return Following(
+        rows.time[:, chosen].flatten(),
+        acting[episode[..., None], after].flatten(0, 1),
+        rows.held[episode[..., None], after].flatten(0, 1),
+        read.flatten(0, 1),
+    )
+
+
+def _clock(rows: Segments) -> Tensor:
+    """(E, L + 1) s from the start of each episode to its rows."""
+    return torch.cat((torch.zeros_like(rows.held[:, :1]), rows.held.cumsum(1)), 1)
+
+
+def earlier(values: Tensor, by: Sequence[int]) -> Tensor:
+    """The values (W, T, m) `by` (m,) rows earlier in the windows; NaN where there are none."""
+    index = torch.arange(values.shape[1])[:, None] - torch.tensor(by)
+    inside = (index >= 0) & (index < values.shape[1])
+    out = values[:, index.clamp(0, values.shape[1] - 1), torch.arange(values.shape[2])]
+    return torch.where(inside, out, torch.nan)

@@ -78,7 +78,6 @@ def linear_problem(models: Sequence[CandidateModel], fits: FitState) -> Linear:
     rows = models[0].rows
     origin = initial_states(rows, models[0].system)[:, 0]
     variance = torch.tensor(models[0].profile.initial_variance, dtype=torch.float64)
-    used = rows.used[..., None]
     inside = rows.inside[:, 1:, None, None]
     windows, length, n = fits.state.shape[1:]
     columns = 1 + fits.theta.shape[1]
@@ -90,22 +89,23 @@ def linear_problem(models: Sequence[CandidateModel], fits: FitState) -> Linear:
     for c, model in enumerate(models):
         count = len(model.table)
         lin = linearise(model, fits.theta[c, :count], fits.state[c])
+        measured, used = model.shown(fits.theta[c, :count])
         if model.profile.relinearise_every > 1:
             model.slopes = lin.transition, lin.sensing
         transition.append(torch.where(inside > 0, lin.transition, identity))
-        sensing.append(lin.sensing * used)
+        sensing.append(lin.sensing * used[..., None])
         per_state = _reading_per_state(lin.sensing[:, 0], models[0])
         initial_variance.append(variance / per_state.square())
         drive[c, ..., 0] = lin.next_state - fits.state[c, :, 1:]
         drive[c, ..., 1 : 1 + count] = lin.by_parameter
-        reading[c, ..., 0] = rows.measured - lin.measured
-        reading[c, ..., 1 : 1 + count] = -lin.sensing_by_parameter
+        reading[c, ..., 0] = (measured - lin.measured) * used
+        reading[c, ..., 1 : 1 + count] = -lin.sensing_by_parameter * used[..., None]
         start[c, ..., 0] = origin / per_state - fits.state[c, :, 0]
     return Linear(
         torch.cat(transition),
         (drive * inside).flatten(0, 1),
         torch.cat(sensing),
-        (reading * used).flatten(0, 1),
+        reading.flatten(0, 1),
         start.flatten(0, 1),
         torch.cat(initial_variance),
     )
@@ -190,22 +190,41 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState) -> Derivativ
     count, windows = fits.state.shape[:2]
     problem = linear_problem(models, fits)
     process, noise = variances(models[0], fits, problem)
+    rows = models[0].rows
     # The same draws for every fit.
-    drawn = torch.randn(models[0].rows.used.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    used, drawn = models[0].rows.used.repeat(count, 1, 1), drawn.repeat(count, 1, 1)
+    drawn = torch.randn(rows.used.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    drawn = drawn.repeat(count, 1, 1)
+    each = zip(models, fits.theta, strict=True)
+    used = torch.cat([model.shown(theta[: len(model.table)])[1] for model, theta in each])
+    # Late readings that show no state of the windows count as much as an average one of their sensor: sets of effects
+    # are compared by the likelihood of the same readings.
+    shown = used.unflatten(0, (count, windows)).sum((1, 2))
+    share = torch.where(shown > 0, rows.used.sum((0, 1)) / shown, 1.0)
+    counted = used * share.repeat_interleave(windows, 0)[:, None]
     members = noise_members(models[0])
     at_once = max(1, ROWS_AT_ONCE // fits.state.shape[2])
     parts = []
     for first in range(0, count * windows, at_once):
         own = slice(first, first + at_once)
-        parts.append(_of_systems(problem[own], process[own], noise[own], used[own], drawn[own], members))
+        parts.append(_of_systems(problem[own], process[own], noise[own], used[own], counted[own], drawn[own], members))
     return Derivatives(*(torch.cat(each).unflatten(0, (count, windows)) for each in zip(*parts, strict=True)))
 
 
 def _of_systems(
-    problem: Linear, process: Tensor, noise: Tensor, used: Tensor, drawn: Tensor, members: tuple[Tensor, Tensor]
+    problem: Linear,
+    process: Tensor,
+    noise: Tensor,
+    used: Tensor,
+    counted: Tensor,
+    drawn: Tensor,
+    members: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, ...]:
-    """The fields of `Derivatives` for N linear systems; `drawn` (N, T, m) are standard normal."""
+    """The fields of `Derivatives` for N linear systems.
+
+    Args:
+        used: (N, T, m) 1 where there is a reading; `counted` is its weight in the likelihood.
+        drawn: (N, T, m) standard normal.
+    """
     here = forward(problem, process, noise)
 
     def of_each(white: Tensor) -> Tensor:
@@ -232,7 +251,7 @@ def _of_systems(
     working = of_each(respond(here, drive.flatten(-2), reading.flatten(-2)))
     working = working.unflatten(-1, (2, len(driven))).flatten(1, 2)
     return (
-        log_likelihood(here, used),
+        log_likelihood(here, counted),
         columns.mT @ columns,
         -(columns.mT @ error)[..., 0],
         0.25 * working.mT @ working,

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from visadapt.effects import DynamicsEffect, Effect, Parameter, Role, SensingEffect
-from visadapt.estimation.late_readings import Past, reading
+from visadapt.estimation.late_readings import Following, reading
 from visadapt.systems import System
 from visadapt.world import World
 
@@ -115,25 +115,30 @@ def linearise_step(
     return _tangent(step, world, values, state, by_state, columns, width if by_command else 0, width)
 
 
-def linearise_reading(world: World, values: Tensor, state: Tensor, past: Past | None, by_state: bool = True) -> Tangent:
-    """Sensor readings (N, n) of N states, whose `past` late sensors read, with derivatives.
+def linearise_reading(
+    world: World, values: Tensor, state: Tensor, following: Sequence[Following], by_state: bool = True
+) -> Tangent:
+    """Sensor readings (N, n) that show N states, with derivatives.
 
-    The other arguments are those of `linearise_step`.
+    `following` is what late sensors show: with `values`, then with each parameter moved by `parameter_steps`; empty
+    without such sensors. The other arguments are those of `linearise_step`.
     """
 
     def read(rows: Tensor, states: Tensor, moved: Sequence[int], pushed: Tensor) -> Tensor:
-        return reading(world.with_values(rows), states, None if past is None else past.repeat(len(moved)))
+        after = [following[k] for k in moved] if following else []
+        shown = after[0].map(lambda *each: torch.cat(each), *after[1:]) if after else None
+        return reading(world.with_values(rows), states, shown)
 
     if not any(isinstance(effect, SensingEffect) for effect in world.effects):
         count, n = state.shape
         identity = torch.eye(n, dtype=state.dtype, device=state.device).expand(count, n, n)[..., : n if by_state else 0]
         return Tangent(state, identity, state.new_zeros(count, n, values.shape[-1]), state.new_zeros(count, n, 0))
-    columns = _columns(world, sensing=True)
+    columns = _columns(world, sensing=True) + (_columns(world, sensing=False) if following else [])
     return _tangent(read, world, values, state, by_state, columns, 0, len(world.system.actions))
 
 
 def _columns(world: World, sensing: bool) -> list[int]:
-    """The parameters that change readings (`sensing`), or those that change steps: the ones of all other effects."""
+    """The parameters of the sensing effects, or those of the others."""
     effects = [effect for effect in world.effects if isinstance(effect, Effect)]
     acts = [isinstance(effect, SensingEffect) == sensing for effect in effects for _ in effect.table]
     # Rows have the phase of their own episode in the place of the first's.

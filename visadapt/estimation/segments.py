@@ -44,6 +44,16 @@ class Segments:
         """(W, T) s from each row to the next; it continues in the padding."""
         return self.held[self.episode[:, None], self.index]
 
+    def later(self, values: Tensor, by: Sequence[int]) -> Tensor:
+        """Of values (W, T, m) of every row those of `by` (m,) rows later in the episode; 0 where no window has them."""
+        if not any(by):
+            return values
+        inside, index = self.inside > 0, self.index
+        whole = values.new_zeros(*self.held.shape, len(by))
+        whole[self.episode[:, None].expand_as(index)[inside], index[inside]] = values[inside]
+        later = (index[..., None] + torch.tensor(by)).clamp(max=whole.shape[1] - 1)
+        return whole[self.episode[:, None, None], later, torch.arange(len(by))] * self.inside[..., None]
+
     def select(self, windows: Tensor) -> Segments:
         """These windows, by index."""
         every = ("measured", "used", "inside", "time", "first", "episode")

@@ -12,6 +12,7 @@ from torch import Tensor
 from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, SensingEffect
 from visadapt.estimation.candidate import COARSEST, SHORT_PERIOD, CandidateModel, with_loads
 from visadapt.estimation.kalman import forward, respond
+from visadapt.estimation.late_readings import earlier
 from visadapt.estimation.likelihood import FitState, linear_problem, variances
 from visadapt.estimation.linearise import integrate, linearise_step
 from visadapt.estimation.segments import Segments
@@ -24,21 +25,18 @@ class Innovations:
     parameters: what refitting those would explain is not attributed to anything new. The set has one fit (C = 1)."""
 
     def __init__(self, model: CandidateModel, fits: FitState) -> None:
-        rows = model.rows
-        self.rows = rows
+        self.model = model
         problem = linear_problem([model], fits)
         self._filtered = forward(problem, *variances(model, fits, problem))
-        white = self._readings(self._filtered.white)
+        white = self._filtered.white.flatten(0, 2)
         self._known, _ = torch.linalg.qr(white[:, 1:])
         self.error: Tensor = self._projected(white[:, :1])[:, 0]
         """(N,)"""
 
     def response(self, drive: Tensor, reading: Tensor) -> Tensor:
-        """Change (N, M) of the innovations with M inputs: `drive` (W, T - 1, n, M) and `reading` (W, T, m, M)."""
-        return self._projected(self._readings(respond(self._filtered, drive, reading)))
-
-    def _readings(self, white: Tensor) -> Tensor:
-        return (white * self.rows.used[..., None]).reshape(-1, white.shape[-1])
+        """Change (N, M) of the innovations with M inputs: `drive` (W, T - 1, n, M) and `reading` (W, T, m, M), which is
+        0 where nothing was measured."""
+        return self._projected(respond(self._filtered, drive, reading).flatten(0, 2))
 
     def _projected(self, white: Tensor) -> Tensor:
         return white - self._known @ (self._known.T @ white)
@@ -115,10 +113,9 @@ class Sensitivity:
             if parameter.neutral is None:
                 theta[0, j - count_own] = tried[1, j]
         if issubclass(effect, SensingEffect):
-            state = fits.state[0]
-            read = model.measure(theta, state.expand(len(theta), *state.shape))
-            reading = -(read[1:] - read[:1]).movedim(0, -1) * rows.used[..., None]
-            return self.innovations.response(torch.zeros_like(state[:, 1:, :, None]), reading)
+            base, *changed = (self._read(model, one) for one in theta)
+            reading = torch.stack([(base - each).nan_to_num() for each in changed], -1)
+            return self.innovations.response(torch.zeros_like(fits.state[0, :, 1:, :, None]), reading)
         linear = rows.period <= SHORT_PERIOD
         if linear and issubclass(effect, ActuationEffect):
             mean = self._acted(model, theta).mean(3)
@@ -131,6 +128,14 @@ class Sensitivity:
             drive = (after[1:] - after[:1]).movedim(0, -1)
         drive = drive * rows.inside[:, 1:, None, None]
         return self.innovations.response(drive, torch.zeros_like(rows.measured[..., None]))
+
+    def _read(self, model: CandidateModel, theta: Tensor) -> Tensor:
+        """(W, T, m) the readings with parameters (P,), each in the row in which the innovations have the reading; NaN
+        where they have none."""
+        own = self.innovations.model
+        by = [a - b for a, b in zip(model.rows_later(theta), own.rows_later(self.fits.theta[0]), strict=True)]
+        used = own.shown(self.fits.theta[0])[1]
+        return torch.where(used > 0, earlier(model.measure(theta, self.fits.state[0]), by), torch.nan)
 
     def _acted(self, model: CandidateModel, theta: Tensor) -> Tensor:
         """What acts of the commands after each row with parameters (M, P): (M, W, T - 1, substeps, n_action), or one

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from visadapt.diagnosis.search.search import MAX_EFFECTS, Search
-from visadapt.estimation.fit_states import FINAL
+from visadapt.estimation.fit_states import CAREFUL, FINAL
 from visadapt.estimation.segments import Segments
 
 FINALISTS = 4  # Sets at most that are fitted to all rows
@@ -23,9 +23,9 @@ def on_all_rows(search: Search, rows: Segments) -> Search:
     """
     whole = Search(search.system, rows, search.catalogue, search.source.fits, search.jobs)
     close = [each for each in search.close() if each.effects][:FINALISTS]
-    for group in (close[:1], close[1:]):
+    for group, effort in ((close[:1], CAREFUL), (close[1:], FINAL)):
         # From the states of the best set so far, which a start from the readings would first have to find.
-        whole.fit([(each.effects, replace(each.fits, state=whole.best.fits.state)) for each in group], FINAL)
+        whole.fit([(each.effects, replace(each.fits, state=whole.best.fits.state)) for each in group], effort)
     for _ in range(MAX_ADDED):
         before = whole.best
         promising = [one for one in whole.candidates(before) if one.gain > MIN_GAIN]

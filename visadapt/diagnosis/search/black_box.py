@@ -116,10 +116,9 @@ class _Regression:
         windows, steps, _, loads = gains.shape
         problem = linear_problem([model], fits).data()
         filtered = forward(problem, *variances(model, fits, problem))
-        used = model.rows.used[..., None]
         drive = torch.diag_embed(gains.permute(0, 2, 3, 1)).permute(0, 4, 1, 2, 3).flatten(3)
-        response = respond(filtered, drive, torch.zeros_like(used))
-        response, error = (response * used).flatten(1, 2), (filtered.white * used).flatten(1, 2)
+        response = respond(filtered, drive, torch.zeros_like(filtered.white)).flatten(1, 2)
+        error = filtered.white.flatten(1, 2)
         information = (response.mT @ response).reshape(windows, loads, steps, loads, steps).transpose(2, 3)
         gradient = -(response.mT @ error).reshape(windows, loads, steps)
         chosen = torch.randperm(int(here.sum()), generator=torch.Generator().manual_seed(0))[:POINTS]

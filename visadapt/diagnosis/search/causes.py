@@ -47,15 +47,20 @@ class Alternative:
 def alternatives(
     comparison: ModelComparison, effects: Sequence[type[Effect]], system: System
 ) -> list[list[Alternative]]:
-    """For each effect of the best set, those that fit as well in its place, the best first, each followed by its twins;
-    of `effects` alone."""
+    """For each effect of the best set, those that fit as well in its place, the best first, each with its twins; of
+    `effects` alone, and twins in their order."""
     out = []
     for effect, rivals in comparison.alternatives.items():
         fitted = [(effect, comparison.models[0])]
         fitted += [(e, rival) for rival in rivals for e in rival.model.effects if e not in comparison.best.effects]
-        group = [Alternative(twin, model, own) for own, model in fitted for twin in [own, *twins(own, effects, system)]]
-        out.append([one for one in group if one.effect in effects])
+        out.append([Alternative(one, model, own) for own, model in fitted for one in _same(own, effects, system)])
     return out
+
+
+def _same(effect: type[Effect], effects: Sequence[type[Effect]], system: System) -> list[type[Effect]]:
+    """Those of `effects` that passive data cannot separate from one: itself and its twins."""
+    others = twins(effect, effects, system)
+    return [one for one in effects if one is effect or one in others]
 
 
 def causes(
@@ -223,8 +228,8 @@ def ranking(
     for compared in comparison.models:
         versions: list[tuple[str, ...]] = [()]
         for effect in compared.model.effects:
-            same = [e.name for e in [effect, *twins(effect, effects, system)] if e in effects]
-            versions = [(*version, name) for version in versions for name in same]
+            same = _same(effect, effects, system)
+            versions = [(*version, one.name) for version in versions for one in same]
         closed = gap_closed.get(frozenset(compared.model.names), math.nan)
         out += [Ranked((*names, *version), compared.probability / len(versions), closed) for version in versions]
     return tuple(sorted(out, key=lambda ranked: -ranked.probability))

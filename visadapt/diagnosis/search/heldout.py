@@ -73,12 +73,12 @@ class RolloutErrors:
         return ((error[1:].square() * self.valid[1:]).sum((1, 2)) / count).sqrt()
 
     def by_stretch(self, deviation: Tensor) -> Tensor:
-        """Mean square errors H rows ahead in stretches of H rows, in units of `deviation` (m,)."""
+        """Mean square errors H rows ahead in stretches of H rows, in units of `deviation` (m,); NaN without any."""
         length = max(1, (len(self.error) - 1) // self.stride)
         parts = ((self.error[-1] / deviation).square().sum(-1), self.valid[-1].sum(-1))
         padding = -parts[0].shape[1] % length
         square, count = (pad(each, (0, padding)).unflatten(1, (-1, length)).sum(-1).flatten() for each in parts)
-        return square[count > 0] / count[count > 0]
+        return square / count
 
 
 def overall(errors: Tensor) -> Tensor:
@@ -105,6 +105,7 @@ def predicts_better(other: RolloutErrors, one: RolloutErrors, deviation: Tensor)
     A paired t-test of the log errors at the longest horizon, in stretches of one horizon: those are nearly independent.
     """
     gain = (one.by_stretch(deviation) / other.by_stretch(deviation)).log()
+    gain = gain[~gain.isnan()]
     if len(gain) < 2:
         return False
     return float(gain.mean() / gain.std() * math.sqrt(len(gain))) > CLEAR[min(len(gain) - 2, len(CLEAR) - 1)]
@@ -194,12 +195,13 @@ def rollout_errors(model: CandidateModel, fits: FitState, black_box: BlackBox | 
     estimated = fits.state[0] + smoothed[..., 0]
     predicted = _rollouts(model, fits.theta[0], estimated, horizon, stride, black_box)
 
-    left = model.measure(fits.theta[0], estimated) - rows.measured
+    measured, shown = model.shown(fits.theta[0])
+    left = model.measure(fits.theta[0], estimated) - measured
     parts = []
     for h in range(horizon + 1):
         ends = slice(h, None, stride)
-        used, found = rows.used[:, ends], predicted[:, : len(range(h, length, stride)), h]
-        error = (model.measure(fits.theta[0], found, h, stride) - rows.measured[:, ends]) * used
+        used, found = shown[:, ends], predicted[:, : len(range(h, length, stride)), h]
+        error = (model.measure(fits.theta[0], found, ends) - measured[:, ends]) * used
         # Predictions that would end beyond the window are not valid.
         parts.append([pad(x, (0, 0, 0, predicted.shape[1] - x.shape[1])) for x in (error, used, left[:, ends] * used)])
     error, valid, left = (torch.stack(each) for each in zip(*parts, strict=True))

@@ -75,11 +75,11 @@ def _cost(
     """Half the squared errors, in noise variances, of the best model against the repeated readings."""
     best = comparison.best
     model = CandidateModel(search.system, best.effects, recording.raw)
-    state = best.fits.state[0]
-    measured = recording.raw.measured
-    error = measured - model.measure(best.fits.theta[0], state)
-    square = (error.square() / best.fits.log_noise[0].exp()).sum(-1)
-    return float(0.5 * square[_in_windows(recording.rows, repeated)].sum())
+    theta, state = best.fits.theta[0], best.fits.state[0]
+    error = model.shown(theta)[0] - model.measure(theta, state)
+    square = error.square() / best.fits.log_noise[0].exp()
+    marked = _in_windows(recording.rows, repeated)[..., None].expand_as(square)
+    return float(0.5 * (square * model.rows.later(marked.double(), model.rows_later(theta))).sum())
 
 
 def _zone(recording: PreparedRecording, search: Search, comparison: ModelComparison) -> tuple[Tensor, Tensor]:

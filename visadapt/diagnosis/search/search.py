@@ -13,6 +13,7 @@ from dataclasses import replace
 from itertools import combinations
 
 from visadapt.diagnosis.search.fitted_models import FittedModels, ScoredModel, key_of, less
+from visadapt.effects.late_sensors import LateSensors
 from visadapt.estimation.episode_phases import has_episode_phases, with_episode_phases
 from visadapt.estimation.fit_states import CAREFUL, QUICK, Effects, neutral, with_effect
 from visadapt.estimation.fitting import OUT_OF_REACH
@@ -37,6 +38,8 @@ WIDEN_ABOVE = 5.0
 WIDEN_MODELS = 6
 """Log likelihood that process noise adds to the best set, above which the search is widened, and to how many of the
 best sets of one and of two effects."""
+
+LATE_SHARE = 0.3  # Share of the longest delay from which a late sensor is fitted without a lead
 
 POLISH_WITHIN, POLISH_SIMPLER_WITHIN = 8.0, 60.0
 POLISH_MODELS = 8
@@ -70,6 +73,8 @@ class Search(FittedModels):
             for size in (1, 2):
                 bases = [f for f in self.ranked if len(f.effects) == size and f.log_odds > -math.inf]
                 self.extend(bases[:WIDEN_MODELS])
+                self._with_late_sensors(bases[:WIDEN_MODELS])
+            self._with_late_sensors([self.best])
             self._settle()
             self._phases_of_episodes()
         if progress is not None:
@@ -91,6 +96,13 @@ class Search(FittedModels):
     def _in_turn(self, starts: Sequence[tuple[Effects, FitState]]) -> list[ScoredModel]:
         """Fit the first few sets, which promise most, then the others, which stop early where they fall far behind."""
         return self.fit(starts[:LEADERS], QUICK) + self.fit(starts[LEADERS:], QUICK)
+
+    def _with_late_sensors(self, bases: Sequence[ScoredModel]) -> None:
+        """Every base with each late sensor in addition, which the screening does not see where a joint stops:
+        in its linear response the joint goes on stopping when the late readings say."""
+        late = [e for e in self.catalogue if issubclass(e, LateSensors)]
+        starts = [(base, e, with_effect(base.fits, [LATE_SHARE * e.table[0].high])) for base in bases for e in late]
+        self.fit([((*base.effects, e), start) for base, e, start in starts if e not in base.effects], QUICK)
 
     def _settle(self) -> None:
         """Exchange, remove and fit carefully until the best set stays the best."""

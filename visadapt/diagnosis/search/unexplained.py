@@ -63,7 +63,8 @@ def _blocks(model: CandidateModel, fits: FitState) -> Iterator[Block]:
     loads = loads_of(model, fits)
     variables = variables_of(model, state)
     no_drive = torch.zeros(*state[:, 1:].shape, BUMPS, dtype=torch.float64)
-    no_reading = torch.zeros(*rows.used.shape, BUMPS, dtype=torch.float64)
+    used = model.shown(fits.theta[0])[1]
+    no_reading = torch.zeros(*used.shape, BUMPS, dtype=torch.float64)
     for name, values in variables.items():
         bumps = _bumps(values, rows.inside > 0)
         inner = bumps[:, :-1] * rows.inside[:, 1:, None]
@@ -76,7 +77,7 @@ def _blocks(model: CandidateModel, fits: FitState) -> Iterator[Block]:
             state_name = system.states[channel].name
             if name in (state_name, "time"):
                 reading = no_reading.clone()
-                reading[:, :, k] = -bumps * rows.used[:, :, k, None]
+                reading[:, :, k] = -bumps * used[:, :, k, None]
                 yield Block(state_name, name, no_drive, reading)
 
 
