@@ -125,10 +125,15 @@ class CandidateModel:
     def measure(self, theta: Tensor, state: Tensor, chosen: slice = slice(None)) -> Tensor:
         """Readings without noise (W, T', m), with parameters (P,), that show the states (W, T', n) of the `chosen` rows
         of every window: those of `shown`."""
-        after = self.following(theta, self.acting(theta[None])[0], chosen) if self._late else None
-        values = theta if after is None else self.by_row(theta, state.shape[1])
-        seen = reading(self.at(values), state.flatten(0, 1), after)
-        return seen[:, list(self.rows.channels)].unflatten(0, state.shape[:2])
+        return self.measure_each(theta[None], state, chosen)[0]
+
+    def measure_each(self, theta: Tensor, state: Tensor, chosen: slice = slice(None)) -> Tensor:
+        """The same for R parameter vectors (R, P), which have `rows_later` and what acts in common: (R, W, T', m)."""
+        # The shortest delays show what comes last.
+        after = self.following(theta.min(0).values, self.acting(theta[:1])[0], chosen)
+        world = self.at(self.by_row(theta, state.shape[1]))
+        seen = reading(world, state.flatten(0, 1).repeat(len(theta), 1), after and after.repeat(len(theta)))
+        return seen[:, list(self.rows.channels)].unflatten(0, (len(theta), *state.shape[:2]))
 
     def shown(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """The recorded readings (W, T, m), each in the row whose state it shows with parameters (P,), and 1 where there

@@ -113,8 +113,8 @@ class Sensitivity:
             if parameter.neutral is None:
                 theta[0, j - count_own] = tried[1, j]
         if issubclass(effect, SensingEffect):
-            base, *changed = (self._read(model, one) for one in theta)
-            reading = torch.stack([(base - each).nan_to_num() for each in changed], -1)
+            read = self._read(model, theta)
+            reading = (read[:1] - read[1:]).movedim(0, -1).nan_to_num()
             return self.innovations.response(torch.zeros_like(fits.state[0, :, 1:, :, None]), reading)
         linear = rows.period <= SHORT_PERIOD
         if linear and issubclass(effect, ActuationEffect):
@@ -130,12 +130,19 @@ class Sensitivity:
         return self.innovations.response(drive, torch.zeros_like(rows.measured[..., None]))
 
     def _read(self, model: CandidateModel, theta: Tensor) -> Tensor:
-        """(W, T, m) the readings with parameters (P,), each in the row in which the innovations have the reading; NaN
-        where they have none."""
-        own = self.innovations.model
-        by = [a - b for a, b in zip(model.rows_later(theta), own.rows_later(self.fits.theta[0]), strict=True)]
-        used = own.shown(self.fits.theta[0])[1]
-        return torch.where(used > 0, earlier(model.measure(theta, self.fits.state[0]), by), torch.nan)
+        """(M, W, T, m) the readings with parameters (M, P), each in the row in which the innovations have the reading;
+        NaN where they have none."""
+        own, state = self.innovations.model, self.fits.state[0]
+        rows_later, used = own.rows_later(self.fits.theta[0]), own.shown(self.fits.theta[0])[1]
+        out = torch.full((len(theta), *used.shape), torch.nan, dtype=torch.float64)
+        alike: dict[tuple[int, ...], list[int]] = {}
+        for k, one in enumerate(theta):
+            alike.setdefault(tuple(model.rows_later(one)), []).append(k)
+        for later, indices in alike.items():
+            by = [a - b for a, b in zip(later, rows_later, strict=True)]
+            for k, read in zip(indices, model.measure_each(theta[indices], state), strict=True):
+                out[k] = torch.where(used > 0, earlier(read, by), torch.nan)
+        return out
 
     def _acted(self, model: CandidateModel, theta: Tensor) -> Tensor:
         """What acts of the commands after each row with parameters (M, P): (M, W, T - 1, substeps, n_action), or one
