@@ -22,6 +22,7 @@ from visadapt.effects import (
     PoleDamping,
     PoleFriction,
     PoleMass,
+    PositionDelay,
     ViscousFriction,
 )
 from visadapt.effects.forces import CartForce
@@ -190,6 +191,17 @@ def test_a_late_sensor_is_named_with_its_delay():
     assert names(result) == {"angle_delay"}
     low, high = result.causes[0].parameters["delay"].ci90
     assert low < 0.02 < high < 0.03
+
+
+@pytest.mark.parametrize("others", [[], [CoulombFriction(force=1.5)]])
+def test_a_sensor_later_than_a_row_is_found_also_where_the_joint_stops(only_effects, others):
+    only_effects("coulomb_friction", "position_delay", "angle_delay", "pole_mass", "actuator_gain", "periodic_force")
+    noise = (2e-4, 0.005, 5e-4, 0.005)
+    recording = record([*others, PositionDelay(delay=0.08)], measured=("x", "x_dot", "theta", "theta_dot"), noise=noise)
+    result = diagnose(recording, SOURCE)
+    assert names(result) == {"position_delay", *(effect.name for effect in others)}
+    delay = next(cause for cause in result.causes if cause.effect == "position_delay")
+    assert delay.parameters["delay"].value == pytest.approx(0.08, abs=0.002)
 
 
 def test_a_sensor_that_stands_still_is_found_with_its_zone():

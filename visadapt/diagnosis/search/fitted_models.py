@@ -33,6 +33,8 @@ from visadapt.systems import System
 
 ROWS_AT_ONCE = 100_000  # Rows times sets that are fitted together, so that memory is bounded
 
+MIN_BETTER = 5.0  # Log likelihood by which a fit without process noise must be better to be kept
+
 
 class NoFitError(ValueError):
     """The source's fit to a recording ends in numbers that are not finite; the message is one line."""
@@ -138,23 +140,35 @@ class FittedModels:
         return with_effect(base.fits, found[0].values if found else neutral(effect))
 
     def leftover(self, sets: Sequence[ScoredModel]) -> list[float]:
-        """Log likelihood that process noise adds to each set: a measure of what it leaves unexplained."""
+        """Log likelihood that process noise adds to each set: a measure of what it leaves unexplained.
 
-        def of_share(indices: Sequence[int]) -> list[float]:
-            models = [CandidateModel(self.system, sets[k].effects, self.rows) for k in indices]
-            start = stacked([sets[k].fits for k in indices])
-            without = fit(models, start, QUICK[0], process_noise=False).likelihood
-            return without.tolist()
+        Where a set is likelier without, that fit is kept: the other one has ended where process noise explains what
+        other parameters would.
+        """
+        starts = [(each.effects, each.fits) for each in sets]
+        out = self._fits(starts, CAREFUL, -math.inf, process_noise=False)
+        for each, fits in zip(sets, out, strict=True):
+            if fits.likelihood > each.fits.likelihood + MIN_BETTER:
+                self._keep(each.effects, fits)
+        pairs = zip(sets, out, strict=True)
+        return [max(0.0, float(each.fits.likelihood - fits.likelihood)) for each, fits in pairs]
 
-        without = shared_out(of_share, len(sets), self.jobs)
-        return [max(0.0, float(f.fits.likelihood[0]) - other) for f, other in zip(sets, without, strict=True)]
+    def fit(
+        self, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int], process_noise: bool = True
+    ) -> list[ScoredModel]:
+        """Fit sets of effects, each from a start, with effort QUICK or CAREFUL; return the best fit so far of each.
 
-    def fit(self, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int]) -> list[ScoredModel]:
-        """Fit sets of effects, each from a start, with effort QUICK or CAREFUL; return the best fit so far of each."""
-        if not starts:
-            return []
-        iterations, accuracy = effort
+        Without process noise, a fit comes from far away to the parameters that explain all, if there are such.
+        """
         rival = max((float(each.fits.likelihood[0]) for each in self.fitted.values()), default=self._rival)
+        out = self._fits(starts, effort, rival if process_noise else -math.inf, process_noise)
+        return [self._keep(effects, fits) for (effects, _), fits in zip(starts, out, strict=True)]
+
+    def _fits(
+        self, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int], rival: float, process_noise: bool
+    ) -> list[FitState]:
+        """The fits of sets of effects, each from a start."""
+        iterations, accuracy = effort
 
         def fitted_share(indices: Sequence[int]) -> list[FitState]:
             at_once = max(1, ROWS_AT_ONCE // self.rows.used[..., 0].numel())
@@ -165,19 +179,20 @@ class FittedModels:
             models = [CandidateModel(self.system, starts[k][0], self.rows, accuracy) for k in indices]
             for model in models:
                 model.slopes = self._slopes
-            out = fit(models, stacked([starts[k][1] for k in indices]), iterations, rival=rival)
+            out = fit(models, stacked([starts[k][1] for k in indices]), iterations, process_noise, rival)
             if self._slopes is None:
                 self._slopes = models[0].slopes
             return [single_fit(out, k, len(model.table)) for k, model in enumerate(models)]
 
-        results = []
-        for (effects, _), fits in zip(starts, shared_out(fitted_share, len(starts), self.jobs), strict=True):
-            fitted = ScoredModel(effects, fits, log_posterior_odds(effects, fits, len(self.catalogue)))
-            key = key_of(effects)
-            if key not in self.fitted or self.fitted[key].log_odds < fitted.log_odds:
-                self.fitted[key] = fitted
-            results.append(self.fitted[key])
-        return results
+        return shared_out(fitted_share, len(starts), self.jobs) if starts else []
+
+    def _keep(self, effects: Effects, fits: FitState) -> ScoredModel:
+        """The best fit so far of a set, this one among them."""
+        fitted = ScoredModel(effects, fits, log_posterior_odds(effects, fits, len(self.catalogue)))
+        key = key_of(effects)
+        if key not in self.fitted or self.fitted[key].log_odds < fitted.log_odds:
+            self.fitted[key] = fitted
+        return self.fitted[key]
 
 
 def key_of(effects: Effects) -> frozenset[str]:

@@ -39,7 +39,9 @@ WIDEN_MODELS = 6
 """Log likelihood that process noise adds to the best set, above which the search is widened, and to how many of the
 best sets of one and of two effects."""
 
-LATE_SHARE = 0.3  # Share of the longest delay from which a late sensor is fitted without a lead
+LATE_SHARE, LATE_BASES = 0.3, 3
+"""Share of the longest delay from which a late sensor is fitted without a lead, and to how many of the best sets of one
+effect it is added, beside the source and the best set."""
 
 POLISH_WITHIN, POLISH_SIMPLER_WITHIN = 8.0, 60.0
 POLISH_MODELS = 8
@@ -68,13 +70,12 @@ class Search(FittedModels):
             if beam[0].log_odds < before.log_odds:
                 break
         self._settle()
-        if self.leftover([self.best])[0] > WIDEN_ABOVE:
-            # Something is unexplained: perhaps two effects that only together beat single effects which fit fairly.
+        if self._unexplained():
+            # Perhaps by two effects that only together beat single effects which fit fairly.
             for size in (1, 2):
                 bases = [f for f in self.ranked if len(f.effects) == size and f.log_odds > -math.inf]
                 self.extend(bases[:WIDEN_MODELS])
-                self._with_late_sensors(bases[:WIDEN_MODELS])
-            self._with_late_sensors([self.best])
+            self._with_late_sensors()
             self._settle()
             self._phases_of_episodes()
         if progress is not None:
@@ -97,12 +98,41 @@ class Search(FittedModels):
         """Fit the first few sets, which promise most, then the others, which stop early where they fall far behind."""
         return self.fit(starts[:LEADERS], QUICK) + self.fit(starts[LEADERS:], QUICK)
 
-    def _with_late_sensors(self, bases: Sequence[ScoredModel]) -> None:
-        """Every base with each late sensor in addition, which the screening does not see where a joint stops:
-        in its linear response the joint goes on stopping when the late readings say."""
+    def _unexplained(self) -> bool:
+        """Whether process noise explains much that the best set does not; the best set may become another one."""
+        before, left = None, 0.0
+        while self.best is not before:
+            before = self.best
+            left = self.leftover([before])[0]
+            if self.best is not before:
+                self._prune()
+                self._settle()
+        return left > WIDEN_ABOVE
+
+    def _prune(self) -> None:
+        """Remove effects of the best set one by one while that raises the odds, in fits without process noise: with it,
+        a fit may return to where noise explained what they did."""
+        before = None
+        while self.best is not before:
+            before = self.best
+            self.fit([less(before, [removed]) for removed in before.effects], QUICK, process_noise=False)
+
+    def _with_late_sensors(self) -> None:
+        """The source, the best set and the best single effects with each late sensor in addition.
+
+        The screening does not see a sensor that is far too late: with states that follow its readings, a little of the
+        delay helps little, and where a joint stops, it goes on stopping when the late readings say.
+        """
         late = [e for e in self.catalogue if issubclass(e, LateSensors)]
-        starts = [(base, e, with_effect(base.fits, [LATE_SHARE * e.table[0].high])) for base in bases for e in late]
-        self.fit([((*base.effects, e), start) for base, e, start in starts if e not in base.effects], QUICK)
+        alone = [each for each in self.ranked if len(each.effects) == 1]
+        bases = {each.names: each for each in (self.source, self.best, *alone[:LATE_BASES])}
+        starts = [
+            ((*base.effects, e), with_effect(base.fits, [LATE_SHARE * e.table[0].high]))
+            for base in bases.values()
+            for e in late
+            if e not in base.effects
+        ]
+        self.fit([(each.effects, each.fits) for each in self.fit(starts, QUICK, process_noise=False)], QUICK)
 
     def _settle(self) -> None:
         """Exchange, remove and fit carefully until the best set stays the best."""
