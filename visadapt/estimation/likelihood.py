@@ -196,11 +196,13 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState) -> Derivativ
     drawn = drawn.repeat(count, 1, 1)
     each = zip(models, fits.theta, strict=True)
     used = torch.cat([model.shown(theta[: len(model.table)])[1] for model, theta in each])
-    # Late readings that show no state of the windows count as much as an average one of their sensor: sets of effects
-    # are compared by the likelihood of the same readings.
-    shown = used.unflatten(0, (count, windows)).sum((1, 2))
-    share = torch.where(shown > 0, rows.used.sum((0, 1)) / shown, 1.0)
-    counted = used * share.repeat_interleave(windows, 0)[:, None]
+    # Late readings that show no state of the windows count as much as an average one of their sensor in the second half
+    # of the windows, where the prior of the first state does not matter any more: sets of effects are compared by the
+    # likelihood of the same readings.
+    later = used * (torch.arange(used.shape[1]) >= used.shape[1] // 2)[:, None]
+    lost = rows.used.sum((0, 1)) - used.unflatten(0, (count, windows)).sum((1, 2))
+    share = lost / later.unflatten(0, (count, windows)).sum((1, 2)).clamp_min(1)
+    counted = used + later * share.repeat_interleave(windows, 0)[:, None]
     members = noise_members(models[0])
     at_once = max(1, ROWS_AT_ONCE // fits.state.shape[2])
     parts = []
