@@ -130,7 +130,7 @@ class CandidateModel:
     def measure_each(self, theta: Tensor, state: Tensor, chosen: slice = slice(None)) -> Tensor:
         """The same for R parameter vectors (R, P), which have `rows_later` and what acts in common: (R, W, T', m)."""
         # The shortest delays show what comes last.
-        after = self.following(theta.min(0).values, self.acting(theta[:1])[0], chosen)
+        after = self.following(theta.min(0).values, self.acting(theta[:1])[0], chosen) if self._late else None
         world = self.at(self.by_row(theta, state.shape[1]))
         seen = reading(world, state.flatten(0, 1).repeat(len(theta), 1), after and after.repeat(len(theta)))
         return seen[:, list(self.rows.channels)].unflatten(0, (len(theta), *state.shape[:2]))
@@ -182,15 +182,15 @@ def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised
     shifted = torch.cat((theta[None], theta + torch.diag(parameter_steps(model.table, theta))))
     # What acts changes with the parameters of actuation effects alone: for the others it is computed once.
     variants = [0, *(1 + k for k in model.acting_parameters)]
-    used = [variants.index(k) if k in variants else 0 for k in range(len(shifted))]
+    variant = [variants.index(k) if k in variants else 0 for k in range(len(shifted))]
     whole = model.acting(shifted[variants])
     world, acting = model.stepping(theta, whole[:, model.rows.episode[:, None], model.rows.index[:, :-1]].flatten(1, 2))
     time, duration = model.rows.time[:, :-1].flatten(), model.rows.duration[:, :-1].flatten()
     values = model.by_row(theta, length - 1)
     step = linearise_step(
-        world, values, time, state[:, :-1].flatten(0, 1), acting[used], by_state=known is None, duration=duration
+        world, values, time, state[:, :-1].flatten(0, 1), acting[variant], by_state=known is None, duration=duration
     )
-    after = [shown for k in used if (shown := model.following(theta, whole[k])) is not None]
+    after = [shown for k in variant if (shown := model.following(theta, whole[k])) is not None]
     values = model.by_row(theta, length)
     read = linearise_reading(model.at(theta), values, state.flatten(0, 1), after, by_state=known is None)
     channels = list(model.rows.channels)
