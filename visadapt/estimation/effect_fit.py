@@ -142,16 +142,24 @@ def _fitted(system: System, effects: Effects, rows: Segments, present: Sequence[
     starts = [replace(base, theta=base.theta[:, order])]
     if list(present) != [value for effect in effects for value in neutral(effect)]:
         starts.append(replace(base, theta=torch.tensor([list(present)], dtype=torch.float64)))
+    if any(issubclass(effect, LateSensors) for effect in effects):
+        # With process noise a fit may end where noise explains what a longer delay would.
+        starts += [_best(system, effects, starts, rows, QUICK, process_noise=False)]
     return _best(system, effects, starts, rows, CAREFUL)
 
 
 def _best(
-    system: System, effects: Effects, starts: Sequence[FitState], rows: Segments, effort: tuple[int, int]
+    system: System,
+    effects: Effects,
+    starts: Sequence[FitState],
+    rows: Segments,
+    effort: tuple[int, int],
+    process_noise: bool = True,
 ) -> FitState:
     """The likeliest fit of one set of effects from several starts."""
     iterations, care = effort
     models = [CandidateModel(system, effects, rows, care) for _ in starts]
-    out = fit(models, stacked(starts), iterations)
+    out = fit(models, stacked(starts), iterations, process_noise)
     return single_fit(out, int(out.likelihood.nan_to_num(-math.inf).argmax()), len(models[0].table))
 
 
