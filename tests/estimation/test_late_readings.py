@@ -23,10 +23,10 @@ def motion(ticks, effects=()):
     generator = torch.Generator().manual_seed(3)
     commands = torch.rand(len(ticks), 1, generator=generator, dtype=torch.float64) - 0.5
     at = torch.tensor([[0.1, 0.4, 0.1, -0.3]], dtype=torch.float64)
-    world, track = World(CartPole(), effects, period=TICK).double().requires_grad_(False), [at]
+    world, states = World(CartPole(), effects, period=TICK).double().requires_grad_(False), [at]
     for command in commands.repeat_interleave(ticks, 0):
-        track.append(world.integrate(torch.zeros(1).double(), track[-1], command[None, None]))
-    track, index = torch.cat(track), ticks.cumsum(0) - ticks
+        states.append(world.integrate(torch.zeros(1).double(), states[-1], command[None, None]))
+    track, index = torch.cat(states), ticks.cumsum(0) - ticks
     stamps = TICK * index.double()
     period = float(stamps.diff().median())
     return track, cut([track[index]], [torch.ones(len(index), 4)], [commands], [stamps], (0, 1, 2, 3), period, 15)
