@@ -93,10 +93,14 @@ class CandidateModel:
 
     def commands(self, theta: Tensor) -> Tensor:
         """Commands after the actuation effects, (R, W, T, substeps, n_action), for R parameter vectors (R, P)."""
-        return self.acting(theta)[:, self.rows.episode[:, None], self.rows.index]
+        return self.in_windows(self.acting(theta))
+
+    def in_windows(self, acting: Tensor) -> Tensor:
+        """What acts after the windows' rows, (R, W, T, substeps, n_action), of what acts in whole episodes."""
+        return acting[:, self.rows.episode[:, None], self.rows.index]
 
     def acting(self, theta: Tensor) -> Tensor:
-        """The same of whole episodes, (R, E, L, substeps, n_action)."""
+        """The same as `commands` of whole episodes, (R, E, L, substeps, n_action)."""
         rows = self.rows
         episodes = len(rows.command)
         given, held = rows.command.repeat(len(theta), 1, 1), rows.held.repeat(len(theta), 1)
@@ -184,13 +188,14 @@ def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised
     variants = [0, *(1 + k for k in model.acting_parameters)]
     variant = [variants.index(k) if k in variants else 0 for k in range(len(shifted))]
     whole = model.acting(shifted[variants])
-    world, acting = model.stepping(theta, whole[:, model.rows.episode[:, None], model.rows.index[:, :-1]].flatten(1, 2))
+    world, acting = model.stepping(theta, model.in_windows(whole)[:, :, :-1].flatten(1, 2))
     time, duration = model.rows.time[:, :-1].flatten(), model.rows.duration[:, :-1].flatten()
     values = model.by_row(theta, length - 1)
     step = linearise_step(
         world, values, time, state[:, :-1].flatten(0, 1), acting[variant], by_state=known is None, duration=duration
     )
-    after = [shown for k in variant if (shown := model.following(theta, whole[k])) is not None]
+    followings = [shown for each in whole if (shown := model.following(theta, each)) is not None]
+    after = [followings[k] for k in variant] if followings else []
     values = model.by_row(theta, length)
     read = linearise_reading(model.at(theta), values, state.flatten(0, 1), after, by_state=known is None)
     channels = list(model.rows.channels)

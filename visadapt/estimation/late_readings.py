@@ -62,16 +62,13 @@ def _later(world: World, state: Tensor, following: Following, ahead: Tensor) -> 
 def rows_later(rows: Segments, delays: Delays, columns: Sequence[int]) -> list[int]:
     """By how many rows the readings of these states come after the row whose state they show: the least after which,
     everywhere in the episodes, more time than the delay has passed."""
-    clock = _clock(rows)
-    out = []
-    for column in columns:
-        count = 0
-        if column in delays:
-            count = 1 + int(delays[column] / rows.period)
-            while count < clock.shape[1] - 1 and float((clock[:, count:] - clock[:, :-count]).min()) <= delays[column]:
-                count += 1
-        out.append(count)
-    return out
+    out = dict.fromkeys(columns, 0)
+    for column in delays.keys() & out.keys():
+        clock, count = _clock(rows), 1 + int(delays[column] / rows.period)
+        while count < clock.shape[1] - 1 and float((clock[:, count:] - clock[:, :-count]).min()) <= delays[column]:
+            count += 1
+        out[column] = count
+    return list(out.values())
 
 
 def following(rows: Segments, delays: Delays, acting: Tensor, states: int, chosen: slice) -> Following:

@@ -229,11 +229,7 @@ def _of_systems(
     """
     here = forward(problem, process, noise)
 
-    def of_each(white: Tensor) -> Tensor:
-        """Whitened innovations (N, readings, M) of every system."""
-        return (white * used[..., None]).flatten(1, 2)
-
-    error, columns = of_each(here.white).tensor_split([1], -1)
+    error, columns = here.white.flatten(1, 2).tensor_split([1], -1)
     # The information of the log variances: that of inputs which are the smoothed noises of one group (Gilmour, Thompson
     # and Cullis 1995, Biometrics 51(4)), in the mean of the data and of data that the model draws. The data alone would
     # give steps that are too long far from the optimum, where they are unlike the model.
@@ -250,7 +246,7 @@ def _of_systems(
     # The smoothed w is minus Q times the adjoint; what inputs add to the states is subtracted from the readings.
     drive = (process[:, None, :, None] * adjoint[:, 1:])[..., None] * driven.T[:, None]
     reading = (noise[:, None, :, None] * weight)[..., None] * measured.T[:, None]
-    working = of_each(respond(here, drive.flatten(-2), reading.flatten(-2)))
+    working = respond(here, drive.flatten(-2), reading.flatten(-2)).flatten(1, 2)
     working = working.unflatten(-1, (2, len(driven))).flatten(1, 2)
     return (
         log_likelihood(here, counted),

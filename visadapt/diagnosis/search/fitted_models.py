@@ -150,8 +150,7 @@ class FittedModels:
         for each, fits in zip(sets, out, strict=True):
             if fits.likelihood > each.fits.likelihood + MIN_BETTER:
                 self._keep(each.effects, fits)
-        pairs = zip(sets, out, strict=True)
-        return [max(0.0, float(each.fits.likelihood - fits.likelihood)) for each, fits in pairs]
+        return [max(0.0, float(each.fits.likelihood - fits.likelihood)) for each, fits in zip(sets, out, strict=True)]
 
     def fit(
         self, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int], process_noise: bool = True
