@@ -12,44 +12,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import torch
 import tyro
 from torch import nn
 
+from experiments.cartpole_targets import TARGETS, Shown, experiment, source, target
 from experiments.kept_scores import kept_score
 from experiments.parallel import in_processes
 from experiments.result_tables import print_speed, speed_row, write_rows
-from renderers import DrawnCartPole
-from visadapt.effects import ActuatorDelay, ActuatorGain, ConstantForce, CoulombFriction, Residual
+from visadapt.effects import Residual
 from visadapt.evaluation import CartPoleScore
 from visadapt.policies import Policy
 from visadapt.policies.networks import ResidualNetwork, mlp
 from visadapt.setups.base import Setup
-from visadapt.setups.cartpole import cartpole_frames, cartpole_states
 from visadapt.storage.run_folder import open_run
-from visadapt.systems import CartPole
-from visadapt.targets import SyntheticTarget, no_effects, sine_force
-from visadapt.weights import shipped
 from visadapt.world import World
 
 SAMPLES = 200
 ROUND_SAMPLES = 100
-
-TARGETS: dict[str, Callable[..., SyntheticTarget]] = {
-    "2(sin t + 1) N": partial(SyntheticTarget, sine_force),
-    "dry friction 4 N": partial(SyntheticTarget, lambda batch, generator: [CoulombFriction(force=4.0)]),
-    "gain 0.7": partial(SyntheticTarget, lambda batch, generator: [ActuatorGain(scale=0.7)]),
-    "pole twice as heavy": partial(SyntheticTarget, no_effects, system=CartPole(pole_mass=2 * CartPole().pole_mass)),
-    "constant 2 N": partial(SyntheticTarget, lambda batch, generator: [ConstantForce(force=2.0)]),
-    "delay 0.05 s and 1 N": partial(
-        SyntheticTarget, lambda batch, generator: [ActuatorDelay(delay=0.05), ConstantForce(force=1.0)]
-    ),
-}
-
 
 Variant = Callable[[Setup], Setup]
 
@@ -102,7 +84,7 @@ VARIANTS: dict[str, Variant] = {
 class Settings:
     """What is run, and where."""
 
-    shown: Literal["frames", "states"] = "frames"
+    shown: Shown = "frames"
     """what the policy sees"""
     seeds: int = 3
     episodes: int = 60
@@ -120,7 +102,7 @@ def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
     rows = []
     if settings.shown == "states":
-        _source(settings)
+        source(settings.shown, settings.work)
     jobs = [
         (name, variant, seed)
         for name in settings.targets
@@ -130,45 +112,32 @@ def main(settings: Settings) -> None:
     unadapted = in_processes(_before, settings, [(name,) for name in settings.targets])
     found = in_processes(_after, settings, jobs)
     for name in settings.targets:
-        experiment = f"CartPole, {'pixels' if settings.shown == 'frames' else 'states'}, {name}"
-        rows.append(speed_row(experiment, "unadapted", "target", 0, [unadapted[(name,)]]))
+        rows.append(speed_row(experiment(name, settings.shown), "unadapted", "target", 0, [unadapted[(name,)]]))
         for variant in settings.variants:
             scores = [found[name, variant, seed] for seed in range(settings.seeds)]
-            rows.append(speed_row(experiment, variant, "adapted", SAMPLES, scores))
+            rows.append(speed_row(experiment(name, settings.shown), variant, "adapted", SAMPLES, scores))
     write_rows(settings.out, rows)
     for row in rows:
         print_speed(row)
-
-
-def _source(settings: Settings) -> tuple[Setup, Policy]:
-    if settings.shown == "frames":
-        setup = cartpole_frames()
-        return setup, setup.load(shipped("cartpole_frames"))
-    setup = cartpole_states(with_history=True)
-    return setup, setup.pretrain(settings.work / "source.safetensors", seed=0)
-
-
-def _target(settings: Settings, name: str) -> SyntheticTarget:
-    return TARGETS[name](camera=DrawnCartPole() if settings.shown == "frames" else None)
 
 
 def _before(settings: Settings, name: str) -> CartPoleScore:
     torch.set_num_threads(1)
     folder = settings.work / "unadapted"
     open_run(folder, {"shown": settings.shown, "episodes": settings.episodes})
-    _, policy = _source(settings)
-    return kept_score(folder / f"{name}.json", policy, _target(settings, name), settings.episodes)
+    _, policy = source(settings.shown, settings.work)
+    return kept_score(folder / f"{name}.json", policy, target(name, settings.shown), settings.episodes)
 
 
 def _after(settings: Settings, name: str, variant: str, seed: int) -> CartPoleScore:
     torch.set_num_threads(1)
-    shipped_setup, policy = _source(settings)
-    setup, target = VARIANTS[variant](shipped_setup), _target(settings, name)
+    shipped_setup, policy = source(settings.shown, settings.work)
+    setup, machine = VARIANTS[variant](shipped_setup), target(name, settings.shown)
     folder = settings.work / name / variant / f"seed-{seed}"
     about = {"shown": settings.shown, "seed": seed, "episodes": settings.episodes}
     open_run(folder, {**about, **setup.settings.numbers()})
-    setup.adapt(policy, target, folder, SAMPLES, ROUND_SAMPLES, seed)
-    return kept_score(folder / "score.json", policy, target, settings.episodes)
+    setup.adapt(policy, machine, folder, SAMPLES, ROUND_SAMPLES, seed)
+    return kept_score(folder / "score.json", policy, machine, settings.episodes)
 
 
 if __name__ == "__main__":

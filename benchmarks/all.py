@@ -115,6 +115,14 @@ COMMANDS = (
         work="--work",
     ),
     Command("ablations_flight", "ablations_flight.csv", ("benchmarks.ablations_flight",), 20, work="--work"),
+    Command("other_targets", "other_targets.csv", ("benchmarks.other_targets",), 40, work="--work"),
+    Command(
+        "other_targets_states",
+        "other_targets_states.csv",
+        ("benchmarks.other_targets", "--shown", "states", "--out", "results/other_targets_states.csv"),
+        20,
+        work="--work",
+    ),
     Command(
         "inverted_pendulum",
         "inverted_pendulum.csv",

@@ -58,6 +58,7 @@ TABLES = {
     "ablations": Table(adaptation.ablations, ("ablations",)),
     "ablations, states": Table(adaptation.ablations, ("ablations_states",)),
     "ablations, flights": Table(adaptation.flight_ablations, ("ablations_flight",)),
+    "other targets": Table(adaptation.other_targets, ("other_targets", "other_targets_states")),
     "pendulum": Table(adaptation.pendulum, ("inverted_pendulum",)),
     "dm_control": Table(adaptation.dm_control, ("dm_control",)),
     "vehicles": Table(adaptation.vehicles, ("flight",)),

@@ -10,13 +10,15 @@ from collections.abc import Callable, Iterable
 from benchmarks.cartpole_pixels import EXPERIMENT as PIXELS, OURS as FRAMES_ALONE
 from benchmarks.cartpole_states import CONSTANT, OURS, SINE
 from benchmarks.named_control import METHODS
+from benchmarks.other_targets import METHOD
 
 Row = dict[str, str]
 Rows = list[Row]
 Lines = list[list[str]]
 
 CURVE_SAMPLES = (50, 100, 200, 500, 1000)
-"""Counted target samples of the columns of `curve`."""
+SAMPLES_HEAD = ["counted target samples", "0", *(f"{samples:,}" for samples in CURVE_SAMPLES)]
+"""Counted target samples after which an adaptation is scored, and the columns of its table."""
 
 VEHICLES = {
     "quadrotor, drag": ("quadrotor, drag 0.3 1/s: mean tracking error", "0.05, 0.56, 0.07 (1,000)"),
@@ -54,16 +56,28 @@ def cartpole(pixels: Rows, states: Rows) -> Lines:
 
 
 def curve(pixels: Rows, states: Rows) -> Lines:
-    """Mean cart speed and episodes up over counted samples."""
-    lines = [["counted target samples", "0", *(f"{samples:,}" for samples in CURVE_SAMPLES)]]
-    for name, rows, experiment, method in (
-        ("frames alone, 2(sin t + 1) N", pixels, PIXELS, FRAMES_ALONE),
-        ("states, 2(sin t + 1) N", states, SINE, OURS),
-    ):
-        before = _speed(rows, experiment, "unadapted", "target", 0)
-        after = [_speed(rows, experiment, method, "adapted", samples) for samples in CURVE_SAMPLES]
-        lines.append([name, *(f"{speed} ({up})" if up else speed for speed, up, _ in (before, *after))])
+    """Mean cart speed and episodes up over counted samples, under the paper's time-variant force."""
+    lines = [
+        _over_samples("frames alone, 2(sin t + 1) N", pixels, PIXELS, FRAMES_ALONE),
+        _over_samples("states, 2(sin t + 1) N", states, SINE, OURS),
+    ]
+    return [SAMPLES_HEAD, *lines]
+
+
+def other_targets(pixels: Rows, states: Rows) -> Lines:
+    """The same on other targets, each from frames and from states."""
+    lines = [SAMPLES_HEAD]
+    for shown, rows in (("frames", pixels), ("states", states)):
+        names = dict.fromkeys(row["experiment"] for row in rows)
+        lines += [_over_samples(f"{shown}, {name.split(', ', 2)[2]}", rows, name, METHOD) for name in names]
     return lines
+
+
+def _over_samples(name: str, rows: Rows, experiment: str, method: str) -> list[str]:
+    """A line of SAMPLES_HEAD's columns."""
+    before = _speed(rows, experiment, "unadapted", "target", 0)
+    after = [_speed(rows, experiment, method, "adapted", samples) for samples in CURVE_SAMPLES]
+    return [name, *(f"{speed} ({up})" if up else speed for speed, up, _ in (before, *after))]
 
 
 def grounding(pixels: Rows) -> Lines:

@@ -13,13 +13,12 @@ from benchmarks.action_times import ONNX, RESIDUAL
 from benchmarks.baselines.table import BASELINES
 from benchmarks.cartpole_pixels import EXPERIMENT as PIXELS, OURS as FRAMES_ALONE
 from benchmarks.cartpole_states import CONSTANT, OURS, SINE
-from benchmarks.tables_adaptation import LOOP_SPEEDS, Lines, Rows
+from benchmarks.tables_adaptation import CURVE_SAMPLES, LOOP_SPEEDS, Lines, Rows
 from experiments.result_tables import ACTION_TIME
 
 SPEED = "mean cart speed"
 HEAD = ["paper", "here", "samples: paper, here", "kept up", "seeds", "verdict"]
 NOT_RUN = ["not run", "", "", "", "not run"]
-CURVE_SAMPLES = (50, 100, 200, 500, 1000)
 CURVE_HEAD = ["source", "0 samples", *(f"{count:,}" for count in CURVE_SAMPLES)]
 CLOSE_TO_ZERO = 5.0
 """%, of the gap, that counts as such: the paper draws its figure 8 without numbers"""

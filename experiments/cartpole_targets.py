@@ -1,0 +1,52 @@
+"""Targets that the CartPole is adapted to, and the source policy of each kind of observation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from renderers import DrawnCartPole
+from visadapt.effects import ActuatorDelay, ActuatorGain, ConstantForce, CoulombFriction
+from visadapt.policies import Policy
+from visadapt.setups.base import Setup
+from visadapt.setups.cartpole import cartpole_frames, cartpole_states
+from visadapt.systems import CartPole
+from visadapt.targets import SyntheticTarget, no_effects, sine_force
+from visadapt.weights import shipped
+
+Shown = Literal["frames", "states"]
+"""What a policy sees."""
+
+TARGETS: dict[str, Callable[..., SyntheticTarget]] = {
+    "2(sin t + 1) N": partial(SyntheticTarget, sine_force),
+    "dry friction 4 N": partial(SyntheticTarget, lambda batch, generator: [CoulombFriction(force=4.0)]),
+    "gain 0.7": partial(SyntheticTarget, lambda batch, generator: [ActuatorGain(scale=0.7)]),
+    "pole twice as heavy": partial(SyntheticTarget, no_effects, system=CartPole(pole_mass=2 * CartPole().pole_mass)),
+    "constant 2 N": partial(SyntheticTarget, lambda batch, generator: [ConstantForce(force=2.0)]),
+    "delay 0.05 s and 1 N": partial(
+        SyntheticTarget, lambda batch, generator: [ActuatorDelay(delay=0.05), ConstantForce(force=1.0)]
+    ),
+}
+"""By the name that the tables give them."""
+
+
+def target(name: str, shown: Shown) -> SyntheticTarget:
+    """The target of that name, with a camera where frames are shown."""
+    return TARGETS[name](camera=DrawnCartPole() if shown == "frames" else None)
+
+
+def experiment(name: str, shown: Shown) -> str:
+    """What the tables call the experiment."""
+    return f"CartPole, {'pixels' if shown == 'frames' else 'states'}, {name}"
+
+
+def source(shown: Shown, folder: Path) -> tuple[Setup, Policy]:
+    """The setup, and its source policy: from frames the shipped one; from states, where networks see 5 states and
+    actions, one that is trained and kept in `folder`."""
+    if shown == "frames":
+        setup = cartpole_frames()
+        return setup, setup.load(shipped("cartpole_frames"))
+    setup = cartpole_states(with_history=True)
+    return setup, setup.pretrain(folder / "source.safetensors", seed=0)
