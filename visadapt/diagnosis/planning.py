@@ -177,20 +177,25 @@ def _highest(values: Tensor) -> float:
 
 
 def explanations(found: Diagnosis) -> list[list[Effect]]:
-    """The effects of an ambiguous diagnosis, then these with one exchanged for another that fits equally well."""
+    """The effects of an ambiguous diagnosis, then these with some exchanged for others that fit equally well."""
     values = {cause.effect: {name: one.value for name, one in cause.parameters.items()} for cause in found.causes}
     alternatives = {cause.effect: cause.indistinguishable_from for cause in found.causes}
     # Repeated readings are found in the readings themselves: no experiment tells more, and no model has them.
     first = [effect for effect in found.effects() if not effect.repeats_readings]
-    exchanged = [
-        [*first[:k], EFFECTS[other](**values[other]), *first[k + 1 :]]
-        for k, effect in enumerate(first)
-        for other in alternatives[effect.name]
-        if other in values
-    ]
+    exchanged: dict[frozenset[str], list[Effect]] = {}
+    for effect in first:
+        rivals = [name for name in alternatives[effect.name] if name in values]
+        for rival in rivals:
+            # With those of the others that act together with it.
+            names = [rival]
+            for name in rivals:
+                if all(name != one and name not in alternatives[one] for one in names):
+                    names.append(name)
+            kept = [each for each in first if rival not in alternatives[each.name]]
+            exchanged.setdefault(frozenset(names), [*kept, *(EFFECTS[name](**values[name]) for name in names)])
     if not exchanged:
         raise ValueError("the diagnosis gives no values of the effects that it cannot tell apart: there is no plan")
-    return [first, *exchanged]
+    return [first, *exchanged.values()]
 
 
 def _start(source: FitState, effects: Sequence[Effect]) -> FitState:

@@ -126,10 +126,12 @@ def sentence(diagnosis: Diagnosis) -> str:
 
 def _alternatives(causes: Sequence[Cause]) -> list[list[Cause]]:
     """Causes grouped with those that they cannot be told from; the smallest groups first."""
-    groups: dict[frozenset[str], list[Cause]] = {}
+    groups: list[list[Cause]] = []
     for cause in causes:
-        groups.setdefault(frozenset((cause.effect, *cause.indistinguishable_from)), []).append(cause)
-    return sorted(groups.values(), key=len)
+        alike = [group for group in groups if any(cause.effect in other.indistinguishable_from for other in group)]
+        rest = [group for group in groups if group not in alike]
+        groups = [*rest, [*(other for group in alike for other in group), cause]]
+    return sorted(groups, key=len)
 
 
 def box(one: Box) -> str:

@@ -51,9 +51,12 @@ def alternatives(
     `effects` alone, and twins in their order."""
     out = []
     for effect, rivals in comparison.alternatives.items():
-        fitted = [(effect, comparison.models[0])]
-        fitted += [(e, rival) for rival in rivals for e in rival.model.effects if e not in comparison.best.effects]
-        out.append([Alternative(one, model, own) for own, model in fitted for one in _same(own, effects, system)])
+        likeliest = {effect: comparison.models[0]}
+        for rival in rivals:
+            new = [e for e in rival.model.effects if e not in comparison.best.effects]
+            likeliest |= {e: rival for e in new if e not in likeliest}
+        pairs = likeliest.items()
+        out.append([Alternative(one, model, own) for own, model in pairs for one in _same(own, effects, system)])
     return out
 
 
@@ -72,7 +75,7 @@ def causes(
     reopens = {e: gap_closed[best] - gap_closed[best - {e.name}] for e in comparison.best.effects}
     alone = {e: gap_closed.get(frozenset({e.name}), math.nan) for e in comparison.best.effects}
     carrying = [effect for effect, reopened in reopens.items() if not reopened < SLIGHT]
-    if best and not carrying and gap_closed[best] > SLIGHT:
+    if best and not carrying and gap_closed[best] - gap_closed[frozenset()] > SLIGHT:
         # Effects stand in for each other, so that none is missed: the verdict rests on the one that closes most alone.
         carrying = [max(alone, key=lambda effect: alone[effect])]
     models = {c.model.names: c.model for c in comparison.models if c.probability > NEGLIGIBLE}
@@ -83,8 +86,10 @@ def causes(
         lean = lean if effect in carrying else search.without(lean, effect)
     without_slight = _fitted(search, lean)
     for effect, group in zip(comparison.best.effects, groups, strict=True):
-        names = [one.effect.name for one in group]
         for one in group:
+            # Others that act together with it are no alternatives to it.
+            together = {e for e in one.compared.model.effects if e is not one.canonical}
+            names = [other.effect.name for other in group if other.canonical not in together]
             found = _averaged(search, comparison, one, fitted, without_slight)
             out.append(
                 Cause(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from visadapt.diagnosis.search.fitted_models import ScoredModel
+from visadapt.diagnosis.search.fitted_models import ScoredModel, key_of
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.unexplained import SmoothFunction, smooth_functions
 from visadapt.effects import Effect
@@ -26,7 +26,7 @@ SLIGHT_SHARE = 0.05
 """Share of the best model's gain in log likelihood below which what it leaves unexplained is negligible."""
 
 CLASS_PROBABILITY = 0.93
-"""Share of the probability of all models that differ in one effect, up to which alternatives are listed."""
+"""Share of the probability of all models that exchange an effect for others, up to which alternatives are listed."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class ModelComparison:
     leftover: float  # log likelihood that process noise adds to the best
     functions: list[SmoothFunction]  # each added alone to the best, the largest log odds first
     alternatives: dict[type[Effect], list[ComparedModel]]
-    """for each effect of the best: the models with another effect in its place that fit as well"""
+    """for each effect of the best: the models without it, with others in its place, that fit as well"""
     gained: float  # log likelihood of the best minus that of the source
     threshold: float  # log odds above which a function of a reading counts as something unexplained
     loads: tuple[str, ...]  # ports of the other functions: the system's loads
@@ -81,6 +81,7 @@ def compare(search: Search) -> ModelComparison:
     close = [f for f in search.ranked if f.log_odds >= search.best.log_odds - COMPARE_WITHIN]
     close = close[: search.profile.compared_models]
     leftover = search.leftover(close)
+    close = [search.fitted[key_of(f.effects)] for f in close]  # some of which may now have a better fit
     if all(f is not search.source for f in close):
         # So far behind that what process noise adds to it makes no difference.
         close.append(search.source)
@@ -99,13 +100,16 @@ def compare(search: Search) -> ModelComparison:
 
 
 def _alternatives(models: Sequence[ComparedModel], effect: type[Effect]) -> list[ComparedModel]:
-    """Models that differ from the first by another effect in the place of `effect`, and fit as well."""
+    """Models that have others in the place of `effect` of the first, and fit as well.
+
+    One effect may stand for two, as a slow periodic force does for a gust and a bias.
+    """
     first = models[0]
-    kept = {e for e in first.model.effects if e is not effect}
+    named = set(first.model.effects)
     rivals = []
     for other in models[1:]:
-        if len(other.model.effects) == len(first.model.effects) and kept < set(other.model.effects):
-            # An effect with more parameters but no gain only imitates the first under another name.
+        if effect not in other.model.effects and not set(other.model.effects) <= named:
+            # More parameters but no gain only imitate the first under another name.
             more = other.model.fits.theta.shape[1] - first.model.fits.theta.shape[1]
             gained = float(other.model.fits.likelihood[0] - first.model.fits.likelihood[0])
             if more <= 0 or gained > more:
