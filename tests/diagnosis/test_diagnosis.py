@@ -10,6 +10,7 @@ from visadapt import diagnose
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.effects import (
     ActuatorBacklash,
+    ActuatorBias,
     ActuatorGain,
     AngleDelay,
     AngleOffset,
@@ -18,7 +19,9 @@ from visadapt.effects import (
     CoulombFriction,
     DynamicsEffect,
     FrictionPatch,
+    Gust,
     Parameter,
+    PeriodicForce,
     PoleDamping,
     PoleFriction,
     PoleMass,
@@ -74,6 +77,19 @@ def test_a_gap_may_hide_in_the_noise_of_a_velocity_that_is_read_wrong():
     result = diagnose(dataclasses.replace(whole, episodes=episodes), SOURCE)
     assert result.verdict == "unexplained"
     assert "error of the reading of x dot" in result.next_experiment
+
+
+def test_one_effect_that_explains_as_much_as_two_is_listed_beside_them():
+    hidden = [Gust(start=0.4, end=1.3, force=-0.25), ActuatorBias(offset=-0.0015)]
+    recording = record(hidden, episodes=6, rows=50, seed=2, noise=(0.005, 0.01, 0.009, 0.01))
+    result = diagnose(recording, SOURCE, [PeriodicForce, Gust, ActuatorBias])
+    assert result.verdict == "ambiguous"
+    alike = {cause.effect: set(cause.indistinguishable_from) for cause in result.causes}
+    both = {"gust", "actuator_bias"}
+    assert alike == {"periodic_force": both, "gust": {"periodic_force"}, "actuator_bias": {"periodic_force"}}
+    assert len(result.causes) == 3
+    assert {effect.name for effect in result.effects()} in (both, {"periodic_force"})
+    assert str(result).startswith("ambiguous: Either ")
 
 
 def test_on_a_heavy_machine_effects_are_found_beyond_the_ranges_of_a_light_one():

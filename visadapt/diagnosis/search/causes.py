@@ -70,7 +70,7 @@ def causes(
     search: Search, comparison: ModelComparison, groups: Sequence[Sequence[Alternative]], gap_closed: GapClosed
 ) -> list[Cause]:
     """Every alternative as a cause; `gap_closed` holds each effect alone, and the best set, whole and without each."""
-    out = []
+    out: dict[str, Cause] = {}
     best = frozenset(comparison.best.names)
     reopens = {e: gap_closed[best] - gap_closed[best - {e.name}] for e in comparison.best.effects}
     alone = {e: gap_closed.get(frozenset({e.name}), math.nan) for e in comparison.best.effects}
@@ -87,22 +87,28 @@ def causes(
     without_slight = _fitted(search, lean)
     for effect, group in zip(comparison.best.effects, groups, strict=True):
         for one in group:
-            # Others that act together with it are no alternatives to it.
-            together = {e for e in one.compared.model.effects if e is not one.canonical}
-            names = [other.effect.name for other in group if other.canonical not in together]
+            name, slight, alike = one.effect.name, effect not in carrying, _alike(one, group)
+            if known := out.get(name):  # in the place of two effects of the best set
+                alike = tuple(dict.fromkeys((*known.indistinguishable_from, *alike)))
+                out[name] = replace(known, slight=known.slight and slight, indistinguishable_from=alike)
+                continue
             found = _averaged(search, comparison, one, fitted, without_slight)
-            out.append(
-                Cause(
-                    one.effect.name,
-                    found if one.effect is one.canonical else _twin(search, one, found),
-                    _probability(comparison, one, group),
-                    gap_closed.get(frozenset({one.canonical.name}), math.nan),
-                    reopens[effect],
-                    effect not in carrying,
-                    tuple(name for name in names if name != one.effect.name),
-                )
+            out[name] = Cause(
+                name,
+                found if one.effect is one.canonical else _twin(search, one, found),
+                _probability(comparison, one, group),
+                gap_closed.get(frozenset({one.canonical.name}), math.nan),
+                reopens[effect],
+                slight,
+                alike,
             )
-    return out
+    return list(out.values())
+
+
+def _alike(one: Alternative, group: Sequence[Alternative]) -> tuple[str, ...]:
+    """Those of a group that fit as well in the place of one of them, without those that act together with it."""
+    together = {effect for effect in one.compared.model.effects if effect is not one.canonical}
+    return tuple(other.effect.name for other in group if other is not one and other.canonical not in together)
 
 
 def _probability(comparison: ModelComparison, one: Alternative, group: Sequence[Alternative]) -> float:
