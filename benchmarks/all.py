@@ -224,7 +224,7 @@ COMMANDS = (
     ),
     _blind(
         "blind_frames",
-        "--seed 2050 --kinds film_plain film_textured --count 20 --jobs 2 --diagnosers ours "
+        "--seed 2060 --kinds film_plain film_textured --count 40 --jobs 2 --diagnosers ours "
         "--out results/blind_frames.csv",
         30,
         "blind_frames.csv",

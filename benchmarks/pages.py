@@ -73,6 +73,7 @@ TABLES = {
     "action times": Table(adaptation.action_times, ("action_times",)),
     "renderers": Table(adaptation.renderers, ("renderers",)),
     "blind": Table(diagnosis.blind, ("blind_hard", "blind_easy", "blind_2029")),
+    "blind strengths": Table(diagnosis.blind_strengths, ("blind_hard", "blind_2029")),
     "blind rigs": Table(diagnosis.blind_rigs, ("blind_rig", "blind_large", "blind_table")),
     "blind frames": Table(diagnosis.blind_frames, ("blind_frames",)),
     "blind flights": Table(diagnosis.blind_flights, ("blind_quadrotor", "blind_fixed_wing")),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
+from benchmarks.blind.tables import STRENGTH_EDGES
 from benchmarks.planned_experiments import OUTCOMES
 from benchmarks.tables_adaptation import Lines, Rows
 
@@ -25,6 +28,11 @@ MEASURES = {
 }
 """Measures of the sealed check, and their names in the tables."""
 
+BY_STRENGTH = {"single effects named": "single: named, nothing else", "foreign, unexplained": "foreign: unexplained"}
+"""Measures of the sealed check that are split by strength, by their names in the table."""
+
+DRAWS = ("first", "second")
+
 CRAZYFLIE = {
     "verdict": "verdict",
     "most probable": "most probable effects",
@@ -43,6 +51,19 @@ def blind(first: Rows, second: Rows) -> Lines:
     again = {row["measure"]: row for row in second if (row["kind"], row["diagnoser"]) == ("hard", "ours")}
     header, *lines = _check(first, ("easy", "hard"))
     return [[*header, "hard, second draw: ours"], *([*line, _cell(again.get(key))] for key, *line in lines)]
+
+
+def blind_strengths(first: Rows, second: Rows) -> Lines:
+    """Cart-poles, hard: shares by the strength of the hidden effect, for both draws."""
+    sets = [[row for row in rows if (row["kind"], row["diagnoser"]) == ("hard", "ours")] for rows in (first, second)]
+    found = [{row["measure"]: row for row in rows} for rows in sets]
+    lines = [["strength, times the noise", *(f"{name}, {draw} draw" for name in BY_STRENGTH for draw in DRAWS)]]
+    for low, high in pairwise(STRENGTH_EDGES):
+        keys = [f"{measure}, strength {low:g} to {high:g}" for measure in BY_STRENGTH.values()]
+        cells = [_cell(rows.get(key)) for key in keys for rows in found]
+        if any(cells):
+            lines.append([f"{low:g} to {high:g}", *cells])
+    return lines
 
 
 def blind_rigs(rows: Rows) -> Lines:

@@ -59,7 +59,7 @@ class Score:
     top3: bool | None = None
     """whether the true set is among the first three of the ranking"""
     strength: float | None = None
-    """of a single effect"""
+    """of a single or foreign effect"""
     closed: float | None = None
     """gap.closed of an identified answer"""
     probability: float | None = None
@@ -139,6 +139,8 @@ def _one_each(wanted: Sequence[str], groups: Sequence[Collection[str]]) -> bool:
 def score(truth: Truth, answer: Answer) -> Score:
     """Score one answer."""
     result = Score(truth.kind, answer["verdict"])
+    if truth.kind in ("single", "foreign"):
+        result.strength = next(iter(truth.strengths.values()))
     if answer["verdict"] == "identified":
         result.closed = (answer.get("gap") or {}).get("closed")
     # An effect that no recording can show is not to be found.
@@ -157,8 +159,6 @@ def score(truth: Truth, answer: Answer) -> Score:
     result.exact = result.found and all(group & effects or not group & carrying for group in groups)
     result.stage = stages_match(effects, [group for group in groups if group & carrying])
     result.top3 = any(set(entry["effects"]) == effects for entry in ranking[:3])
-    if truth.kind == "single":
-        result.strength = next(iter(truth.strengths.values()))
     if groups:
         for cause in answer["causes"]:
             if cause["effect"] in effects:

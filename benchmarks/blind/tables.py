@@ -92,8 +92,11 @@ def tabulate(kind: str, diagnoser: str, scores: Sequence[Score], seconds: Sequen
     if overlaps:
         number("region overlap, mean", float(np.mean(overlaps)), len(overlaps))
     for low, high in pairwise(STRENGTH_EDGES):
-        inside = [s for s in of("single") if s.strength is not None and low <= s.strength < high]
-        share(f"single: named, nothing else, strength {low:g} to {high:g}", [s.exact for s in inside])
+        inside = [s for s in scores if s.strength is not None and low <= s.strength < high]
+        strength = f"strength {low:g} to {high:g}"
+        share(f"single: named, nothing else, {strength}", [s.exact for s in inside if s.kind == "single"])
+        unexplained = [s.verdict == "unexplained" for s in inside if s.kind == "foreign"]
+        share(f"foreign: unexplained, {strength}", unexplained)
     _calibration(scores, share, number)
     middle("seconds", seconds)
     share("failed", [s.verdict == "failed" for s in scores])
