@@ -105,10 +105,12 @@ def _alternatives(models: Sequence[ComparedModel], effect: type[Effect]) -> list
     One effect may stand for two, as a slow periodic force does for a gust and a bias.
     """
     first = models[0]
-    named = set(first.model.effects)
-    rivals = []
+    rivals: list[ComparedModel] = []
     for other in models[1:]:
-        if effect not in other.model.effects and not set(other.model.effects) <= named:
+        # A part of the first only lacks something; a set that holds a likelier rival only adds to it.
+        lacks = set(other.model.effects) <= set(first.model.effects)
+        adds = any(set(rival.model.effects) <= set(other.model.effects) for rival in rivals)
+        if effect not in other.model.effects and not lacks and not adds:
             # More parameters but no gain only imitate the first under another name.
             more = other.model.fits.theta.shape[1] - first.model.fits.theta.shape[1]
             gained = float(other.model.fits.likelihood[0] - first.model.fits.likelihood[0])
