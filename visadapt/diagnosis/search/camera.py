@@ -145,7 +145,7 @@ def find_camera(
     if best.camera:
         best = fit_camera(renderer, shown, best.camera, best.values, best.place, fixed, smooth=True)
         # A turned picture is softer than the drawn one, which a shift by a part of a pixel would seem to explain.
-        still = _still(best, fixed)
+        still = may_do_nothing(best, fixed)
         if 0 < len(still) < len(best.camera):
             best = fit_camera(renderer, shown, *_without(best, still), best.place, fixed, smooth=True)
             without = without_each(best)
@@ -159,14 +159,21 @@ def _without(fit: CameraFit, left_out: Collection[type[CameraEffect]]) -> tuple[
     return tuple(kind for kind in fit.camera if kind not in left_out), fit.values[keep]
 
 
-def _still(fit: CameraFit, fixed: frozenset[str]) -> set[type[CameraEffect]]:
-    """The effects whose parameters all have their neutral value within the 90 % interval, or are fixed."""
+def may_do_nothing(fit: CameraFit, fixed: frozenset[str]) -> set[type[CameraEffect]]:
+    """The effects that may do nothing: those whose parameters all have their neutral value within the 90 % interval, or
+    are fixed, and a covered box that may be empty."""
     parameters = [(kind, p) for kind in fit.camera for p in kind.table]
     away = {
         kind
         for (kind, p), value, variance in zip(parameters, fit.values, fit.covariance.diagonal(), strict=True)
         if p.name not in fixed and (p.neutral is None or (value - p.neutral).abs() > Z_90 * variance.sqrt())
     }
+    names = [p.name for _, p in parameters]
+    for start, end in (("left", "right"), ("top", "bottom")) if Occlusion in fit.camera else ():
+        across = torch.zeros_like(fit.values)
+        across[names.index(start)], across[names.index(end)] = -1.0, 1.0
+        if across @ fit.values < Z_90 * (across @ fit.covariance @ across).sqrt():
+            away -= {Occlusion}
     return set(fit.camera) - away
 
 
