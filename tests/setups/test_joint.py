@@ -8,6 +8,7 @@ from visadapt.effects import AngleOffset, Residual
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.joint import adapt
 from visadapt.learning.ledger import BudgetExceeded, Ledger
+from visadapt.learning.perception import PerceptionSettings
 from visadapt.learning.policy import TuneSettings
 from visadapt.learning.setup_settings import SetupSettings
 from visadapt.policies import StatePolicy
@@ -15,7 +16,7 @@ from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import read_recording
 from visadapt.setups.base import Setup
 from visadapt.setups.policy_file import residual_for
-from visadapt.storage.checkpoints import CheckpointError, load_tree
+from visadapt.storage.checkpoints import CheckpointError, load_tree, save_tree
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, TargetError
 from visadapt.targets.synthetic import constant_force
@@ -299,3 +300,34 @@ class TestPretraining:
         again = self.setup(fine).pretrain(path, 0).state_dict()
         for key, value in whole.items():
             assert torch.equal(value, again[key]), key
+
+    @pytest.mark.parametrize("key", ["refinement", "perception"])
+    def test_a_policy_that_was_refined_or_learnt_to_see_in_another_way_is_not_taken_for_this_one(self, tmp_path, key):
+        fine = dataclasses.replace(TUNE, iterations=2, recorded=0.0)
+        setup, path = self.setup(fine), tmp_path / "policy.safetensors"
+        setup.pretrain(path, 0)
+        other = {"refinement": dataclasses.replace(fine, learning_rate=1e-5), "perception": PerceptionSettings()}
+        changed = dataclasses.replace(setup, settings=dataclasses.replace(setup.settings, **{key: other[key]}))
+        with pytest.raises(CheckpointError, match=f"trained with other values of {key}: remove it"):
+            changed.pretrain(path, 0)
+
+    def test_a_policy_that_does_not_say_how_it_was_refined_is_taken_as_it_is(self, tmp_path):
+        setup, path = self.setup(dataclasses.replace(TUNE, iterations=2, recorded=0.0)), tmp_path / "policy.safetensors"
+        trained = setup.pretrain(path, 0)
+        tree = load_tree(path)
+        earlier = {key: value for key, value in tree["settings"].items() if key not in ("refinement", "perception")}
+        save_tree(path, {**tree, "settings": earlier})
+        read = setup.pretrain(path, 0)
+        for key, value in trained.state_dict().items():
+            assert torch.equal(value, read.state_dict()[key]), key
+
+    def test_numbers_may_differ_by_rounding(self, tmp_path):
+        setup, path = self.setup(None), tmp_path / "policy.safetensors"
+        setup.pretrain(path, 0)
+        tree = load_tree(path)
+        rate = tree["settings"]["learning_rate"]
+        save_tree(path, {**tree, "settings": {**tree["settings"], "learning_rate": rate * (1 + 1e-14)}})
+        setup.pretrain(path, 0)
+        save_tree(path, {**tree, "settings": {**tree["settings"], "learning_rate": rate * (1 + 1e-6)}})
+        with pytest.raises(CheckpointError, match="trained with other values of learning_rate"):
+            setup.pretrain(path, 0)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -91,17 +92,26 @@ class TrainingState:
             save_tree(self.path, tree)
 
 
-def train_or_load(path: Path, network: nn.Module, about: Mapping[str, Any], train: Callable[[Path], object]) -> None:
+def train_or_load(
+    path: Path,
+    network: nn.Module,
+    about: Mapping[str, Any],
+    train: Callable[[Path], object],
+    may_be_unstated: Collection[str] = (),
+) -> None:
     """Give `network` the weights in `path`; where there is no such file, train it and write it, described by `about`.
 
-    `train` is given the file, beside `path`, of its training state, from which an interrupted training goes on.
+    Args:
+        train: is given the file, beside `path`, of its training state, from which an interrupted training goes on.
+        may_be_unstated: keys of `about` that a file may lack.
 
     Raises:
         CheckpointError: `path` holds another network, or one that was trained in another way.
     """
     if path.exists():
         kept = load_network(path, network)
-        if other := [key for key, value in about.items() if key not in kept or _plain(kept[key]) != _plain(value)]:
+        stated = {key: value for key, value in about.items() if key in kept or key not in may_be_unstated}
+        if other := [key for key, value in stated.items() if key not in kept or not _same(kept[key], value)]:
             raise CheckpointError(
                 f"{path}: was trained with other values of {', '.join(other)}: remove it, or name another file"
             )
@@ -112,10 +122,16 @@ def train_or_load(path: Path, network: nn.Module, about: Mapping[str, Any], trai
     partial.unlink(missing_ok=True)
 
 
-def _plain(value: Any) -> Any:
-    """A value with lists in the place of tensors and tuples, as it may come back from a file."""
-    if isinstance(value, Tensor):
-        return value.tolist()
-    if isinstance(value, Mapping):
-        return {key: _plain(each) for key, each in value.items()}
-    return [_plain(each) for each in value] if isinstance(value, list | tuple) else value
+def _same(kept: Any, wanted: Any) -> bool:
+    """Whether two values are equal, with numbers up to rounding: a file may come from another machine.
+
+    Tensors and tuples equal lists, as which they may come back from a file.
+    """
+    kept, wanted = (each.tolist() if isinstance(each, Tensor) else each for each in (kept, wanted))
+    if isinstance(kept, Mapping) and isinstance(wanted, Mapping):
+        return kept.keys() == wanted.keys() and all(_same(kept[key], wanted[key]) for key in kept)
+    if isinstance(kept, list | tuple) and isinstance(wanted, list | tuple):
+        return len(kept) == len(wanted) and all(map(_same, kept, wanted))
+    if isinstance(kept, float) and isinstance(wanted, float):
+        return math.isclose(kept, wanted, rel_tol=1e-9)
+    return bool(kept == wanted)

@@ -29,6 +29,9 @@ from visadapt.world import World
 Prepare = Callable[[Policy, Path, int, Report | None], None]
 """Prepares a new policy for training, from (policy, file, seed, report); takes what it has written to the file."""
 
+NEWER = ("perception", "refinement")
+"""Settings that policy files of earlier versions do not state; such files are taken as they are."""
+
 
 @dataclass(frozen=True)
 class Setup:
@@ -73,19 +76,23 @@ class Setup:
         prepared = path.with_suffix(".prepared.safetensors")
         if self.prepare is not None and not path.exists():
             self.prepare(policy, prepared, seed, report)
-        numbers = self.settings.numbers()["source"]
-        about = {"arguments": policy.arguments, "source": describe(self.source), "seed": seed, **numbers}
+        numbers = self.settings.numbers()
+        given = {"arguments": policy.arguments, "source": describe(self.source), "seed": seed}
+        about = {**given, **numbers["source"], "perception": numbers["perception"]}
+        whole = {**about, "refinement": numbers["refinement"]}
         rough, fine = path.with_suffix(".rough.safetensors"), self.settings.refinement
-        stages = [(path, self.settings.source)] if fine is None else [(rough, self.settings.source), (path, fine)]
+        stages = [(path, self.settings.source, whole)]
+        if fine is not None:
+            stages = [(rough, self.settings.source, about), (path, fine, whole)]
         # `prepare` draws from a generator of `seed` itself, so training uses the seeds after it.
         first = seed if self.prepare is None else seed + 1
-        for draws, (made, settings) in enumerate(stages, first):
+        for draws, (made, settings, described) in enumerate(stages, first):
             if made == path or not path.exists():
                 generator = torch.Generator().manual_seed(draws)
                 stage = "source policy" if draws == first else "source policy, refined"
                 progress = staged(report, f"{self.source.system.name}: {stage}")
                 args = (policy, self.source, self.observe, settings, generator, None, progress)
-                train_or_load(made, policy, about, partial(tune, *args))
+                train_or_load(made, policy, described, partial(tune, *args), NEWER)
         for finished in (prepared, rough):
             finished.unlink(missing_ok=True)
         return policy.eval()
