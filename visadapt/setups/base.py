@@ -20,8 +20,7 @@ from visadapt.learning.windows import Observe
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
 from visadapt.setups.explained import explained
-from visadapt.setups.policy_file import describe
-from visadapt.storage.checkpoints import load_network
+from visadapt.setups.policy_file import describe, load_into
 from visadapt.targets import Target
 from visadapt.tasks.base import Task
 from visadapt.world import World
@@ -98,10 +97,12 @@ class Setup:
         return policy.eval()
 
     def load(self, path: Path) -> Policy:
-        """A policy that `pretrain` wrote; raises CheckpointError where there is none, or one of another network."""
-        policy = self.policy()
-        load_network(path, policy)
-        return policy.eval()
+        """A policy that `pretrain`, or after `adapt` `save_policy`, wrote, with the residual that it reads.
+
+        Raises:
+            CheckpointError: there is no file, or one of another network.
+        """
+        return load_into(path, self.policy(), self.residual)
 
     def tune(self, policy: Policy, seed: int, report: Report | None = None) -> list[float]:
         """Tune `policy`, in place, in the source with its effects, without a target; returns the loss by iteration.

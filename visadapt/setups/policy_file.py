@@ -6,7 +6,7 @@ grounded, so a policy is loaded from the file alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -16,11 +16,13 @@ import torch
 from torch import Tensor
 
 from visadapt.effects import EFFECTS, Effect, Residual
+from visadapt.effects.own import is_own, own_effects
 from visadapt.learning.perception import PerceptionSettings, scale
 from visadapt.policies import FlightPolicy, FollowPolicy, ImagePolicy, Policy, ReachPolicy, StatePolicy
 from visadapt.policies.networks import FlightResidualNetwork, ImageResidualNetwork, StateResidualNetwork
 from visadapt.storage.checkpoints import CheckpointError, fitting, load_tree, load_weights, save_network
 from visadapt.systems import SYSTEMS, RigidBody
+from visadapt.systems.base import NAMED
 from visadapt.world import World, WorldState
 
 KINDS: dict[str, type[Policy]] = {kind.__name__: kind for kind in (ImagePolicy, StatePolicy, FollowPolicy, ReachPolicy)}
@@ -38,7 +40,9 @@ def save_policy(path: str | Path, policy: Policy, about: Mapping[str, Any] | Non
     >>> type(va.load_policy(path)).__name__
     'FollowPolicy'
     """
-    made = {"arguments": policy.arguments, "grounded_in": policy.grounded_in}
+    made: dict[str, Any] = {"arguments": policy.arguments, "grounded_in": policy.grounded_in}
+    if policy.residual is not None and isinstance(policy.residual.network, FlightResidualNetwork):
+        made["with_history"] = policy.residual.network.predict is not None
     save_network(Path(path), policy, {**made, **(about or {})})
 
 
@@ -55,19 +59,50 @@ def load_policy(path: str | Path) -> Policy:
     """
     path = Path(path)
     tree = _load(path)
+    if tree["class"] not in KINDS:
+        raise CheckpointError(
+            f"{path}: holds a {tree['class']}, a policy ({', '.join(sorted(KINDS))}) is needed; a policy of a Setup of "
+            "your own is read by the `load` of that setup"
+        )
     with fitting(path):
-        made = tree["settings"]
+        made, weights = tree["settings"], tree["weights"]
         policy = KINDS[tree["class"]](**made["arguments"])
-        weights = tree["weights"]
-        if made.get("grounded_in") is not None:
-            policy.grounded_in = made["grounded_in"]
-            source = _world(made["grounded_in"], path)
-            policy.residual = residual_for(policy, source)
-            key = "residual.network.head.weight"
-            if key in weights and weights[key].shape != policy.state_dict()[key].shape:
-                policy.residual = residual_for(policy, source, with_history=True)
-        load_weights(policy, weights, path)
+        residual: Callable[[Policy, World], Residual]
+        if "with_history" in made:
+            residual = partial(residual_for, with_history=made["with_history"])
+        else:  # an earlier version wrote it
+            residual = partial(_residual_of_width, weights.get("residual.network.head.weight"))
+        return _restored(policy, tree, path, residual)
+
+
+def load_into(path: Path, policy: Policy, residual: Callable[[Policy, World], Residual]) -> Policy:
+    """Give `policy` what a file holds, and the residual in it, if there is one, made by `residual`.
+
+    Raises:
+        CheckpointError: the file is missing, torn, or holds another network.
+    """
+    tree = _load(path)
+    if tree["class"] != type(policy).__name__:
+        raise CheckpointError(f"{path}: holds a {tree['class']}, a {type(policy).__name__} is needed")
+    with fitting(path):
+        return _restored(policy, tree, path, residual)
+
+
+def _restored(
+    policy: Policy, tree: Mapping[str, Any], path: Path, residual: Callable[[Policy, World], Residual]
+) -> Policy:
+    if (grounded_in := tree["settings"].get("grounded_in")) is not None:
+        policy.grounded_in = grounded_in
+        policy.residual = residual(policy, _world(grounded_in, path))
+    load_weights(policy, tree["weights"], path)
     return policy.eval()
+
+
+def _residual_of_width(head: Tensor | None, policy: Policy, source: World) -> Residual:
+    """The residual whose head has as many inputs as the weights `head`: without a history, or with one."""
+    made = residual_for(policy, source)
+    fits = head is None or made.state_dict()["network.head.weight"].shape == head.shape
+    return made if fits else residual_for(policy, source, with_history=True)
 
 
 def load_source(path: str | Path) -> World:
@@ -92,10 +127,9 @@ def load_source(path: str | Path) -> World:
 
 def _load(path: Path) -> dict[str, Any]:
     tree = load_tree(path)
-    if not isinstance(tree, dict) or not {"class", "settings", "weights"} <= tree.keys():
+    keys = {"class", "settings", "weights"}
+    if not isinstance(tree, dict) or not keys <= tree.keys() or not isinstance(tree["settings"], dict):
         raise CheckpointError(f"{path}: a checkpoint, but not of a policy")
-    if tree["class"] not in KINDS or not isinstance(tree["settings"], dict) or "arguments" not in tree["settings"]:
-        raise CheckpointError(f"{path}: holds a {tree['class']}, a policy ({', '.join(sorted(KINDS))}) is needed")
     return tree
 
 
@@ -118,18 +152,20 @@ def describe(world: World) -> dict[str, Any]:
 
 def _world(description: Mapping[str, Any], path: Path) -> World:
     """The world that `describe` described; raises CheckpointError where its system or an effect is not known."""
-    names = [description["system"], *(one["effect"] for one in description["effects"])]
-    for name in names:
-        if name not in SYSTEMS and name not in EFFECTS:
-            raise CheckpointError(
-                f"{path}: needs {name!r}, which is not known here: import the file that defines it, or name it by "
-                "--effects"
-            )
-    system = SYSTEMS[description["system"]](**description["parameters"])
+
+    def known(name: str, where: Mapping[str, Any], option: str = "") -> Any:
+        if name not in where:
+            line = f"{path}: needs {name!r}, which is not known here: import the file that defines it{option}"
+            raise CheckpointError(line)
+        return where[name]
+
+    kind = known(description["system"], {**NAMED, **SYSTEMS})
+    if is_own(kind):
+        own_effects(kind)  # which makes them known
     given = [dict(one) for one in description["effects"]]
-    effects = [EFFECTS[values.pop("effect")](**values) for values in given]
+    effects = [known(values.pop("effect"), EFFECTS, ", or name it by --effects")(**values) for values in given]
     clock = {name: description[name] for name in ("period", "integrator", "substeps")}
-    return World(system, effects, **clock)
+    return World(kind(**description["parameters"]), effects, **clock)
 
 
 def residual_for(

@@ -1,0 +1,81 @@
+"""Policy files: the residual comes back as it was, and a policy of one's own by its own setup."""
+
+import pytest
+import torch
+
+import visadapt as va
+from tests.own_systems import Pendulum
+from tests.scenes import stir
+from visadapt.effects import EFFECTS
+from visadapt.effects.own import own_effects
+from visadapt.history import LENGTH, History
+from visadapt.learning.policy import TuneSettings
+from visadapt.learning.setup_settings import SetupSettings
+from visadapt.policies import ReachPolicy, StatePolicy
+from visadapt.policies.networks import StateResidualNetwork
+from visadapt.setups.policy_file import describe, load_policy, load_source, residual_for, save_policy
+from visadapt.storage.checkpoints import CheckpointError, load_tree, save_tree
+from visadapt.tasks.balance import Balance, Cost
+
+
+@pytest.mark.parametrize("with_history", [False, True])
+@pytest.mark.parametrize("stated", [False, True])
+def test_a_flights_residual_comes_back_with_the_history_that_it_reads(tmp_path, with_history, stated):
+    world, path = va.World(va.FixedWing()), tmp_path / "policy.safetensors"
+    policy = stir(ReachPolicy()).eval()
+    policy.residual, policy.grounded_in = stir(residual_for(policy, world, with_history)), describe(world)
+    save_policy(path, policy)
+    tree = load_tree(path)
+    assert tree["settings"]["with_history"] == with_history
+    if not stated:  # as files of earlier versions are
+        del tree["settings"]["with_history"]
+        save_tree(path, tree)
+    read = load_policy(path)
+    assert (read.residual.network.predict is not None) == with_history
+    history = History(torch.randn(3, LENGTH, *policy.observation_shape), torch.zeros(3, LENGTH, 4))
+    assert torch.equal(read.act(history), policy.act(history))
+
+
+class OwnPolicy(StatePolicy):
+    pass
+
+
+def own_setup(source):
+    task = Balance(Cost((1.0, 0.1)), (0.1, 0.1), (0.0, 0.0), (1.0, 5.0))
+    tune = TuneSettings(task, iterations=2, batch=4)
+
+    def residual(policy, world):
+        return va.Residual(StateResidualNetwork(2), torch.ones(2))
+
+    return va.Setup(source, lambda: OwnPolicy(2), residual, SetupSettings(tune, tune, longest_episode=10))
+
+
+class TestOwnSetup:
+    def test_a_policy_of_ones_own_is_refused_with_what_reads_it(self, tmp_path):
+        path = tmp_path / "policy.safetensors"
+        own_setup(va.World(Pendulum())).pretrain(path, 0)
+        with pytest.raises(
+            CheckpointError, match=r"holds a OwnPolicy, a policy .* is read by the `load` of that setup"
+        ):
+            load_policy(path)
+        assert load_source(path).system == Pendulum()
+
+    def test_its_setup_reads_it_with_its_residual_and_the_world_that_this_completes(self, tmp_path):
+        effect = next(each for each in own_effects(Pendulum) if each.name == "joint.viscous_friction")
+        setup, path = own_setup(va.World(Pendulum())), tmp_path / "policy.safetensors"
+        policy = stir(setup.policy()).eval()
+        grounded = va.World(Pendulum(), [effect(coefficient=0.02)])
+        policy.residual, policy.grounded_in = stir(setup.residual(policy, grounded)), describe(grounded)
+        save_policy(path, policy)
+        for each in own_effects(Pendulum):  # as in a process that has not asked for them yet
+            del EFFECTS[each.name]
+        read = setup.load(path)
+        for key, value in policy.state_dict().items():
+            assert torch.equal(value, read.state_dict()[key]), key
+        assert load_source(path).effects[0].name == "joint.viscous_friction"
+
+    def test_a_system_that_is_not_known_is_named(self, tmp_path):
+        path = tmp_path / "policy.safetensors"
+        save_policy(path, StatePolicy(4), {"source": {**describe(va.World(va.CartPole())), "system": "unicycle"}})
+        with pytest.raises(CheckpointError, match="needs 'unicycle', which is not known here: import the file"):
+            load_source(path)
