@@ -1,8 +1,11 @@
+import math
+
 import pytest
 import torch
 from torch import nn
 from torch.func import functional_call
 
+from tests.own_systems import DoublePendulum, Pendulum
 from tests.worlds import Mass, columns, run
 from visadapt.effects import (
     EFFECTS,
@@ -15,12 +18,15 @@ from visadapt.effects import (
     ConstantForce,
     Dropout,
     Effect,
+    FrictionPatch,
     MeasurementDelay,
     Residual,
     RotorEfficiency,
+    SensorScale,
     Spring,
     ViscousFriction,
 )
+from visadapt.effects.catalogue import catalogue
 from visadapt.history import History
 from visadapt.systems import CartPole, Quadrotor
 from visadapt.world import World
@@ -281,6 +287,24 @@ def test_an_effect_of_another_system_is_refused():
         World(Quadrotor(), [Spring(stiffness=1.0, rest=0.0)])
     with pytest.raises(TypeError, match="rotor_efficiency acts on a quadrotor, not on a cartpole"):
         World(CartPole(), [RotorEfficiency(scale_1=1.0, scale_2=1.0, scale_3=1.0, scale_4=1.0)])
+
+
+def test_on_a_system_of_ones_own_so_is_one_that_would_act_on_other_columns():
+    with pytest.raises(TypeError, match="friction_patch acts on a cartpole, not on a pendulum"):
+        World(Pendulum(), [FrictionPatch(start=-0.1, end=0.1, coefficient=1.0)])
+    with pytest.raises(TypeError, match="sensor_scale acts on a cartpole, not on a double_pendulum"):
+        World(DoublePendulum(), [SensorScale(position=1.1, angle=1.0)])
+    state, action = torch.full((1, 2), 0.1), torch.zeros(1, 1)
+    for effect in catalogue(Pendulum()):  # those that are made for it, and those that act on every system
+        world = World(Pendulum(), [effect(**{each.name: each.high for each in effect.table})])
+        assert world.step(world.start(state), action).state.isfinite().all()
+
+
+def test_on_a_system_of_ones_own_with_the_same_columns_one_of_a_cart_pole_acts():
+    state, action = torch.tensor([[0.0, 1.0, 0.0, 0.0]]), torch.zeros(1, 1)
+    world = World(Mass(), [FrictionPatch(start=-1.0, end=1.0, coefficient=2.0)])
+    after = world.step(world.start(state), action).state.detach()
+    assert float(after[0, 1]) == pytest.approx(math.exp(-2 / 2 * 0.05), rel=1e-5)
 
 
 REMEMBERING = {

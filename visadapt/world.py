@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from visadapt.batch import Batch
 from visadapt.dynamics import Dynamics
 from visadapt.effects import ActuationEffect, CameraEffect, DynamicsEffect, Effect, Parameter, Residual, SensingEffect
-from visadapt.effects.base import expect
+from visadapt.effects.base import check_acts_on
 from visadapt.effects.camera import seen_by
 from visadapt.history import History
-from visadapt.systems import SYSTEMS, System
+from visadapt.systems import System
 from visadapt.systems.integrators import INTEGRATORS, Duration
 
 
@@ -64,9 +64,7 @@ class World(nn.Module):
         if not period > 0 or substeps < 1:
             raise ValueError(f"period and substeps must be positive, got {period!r} s and {substeps!r}")
         for effect in effects:
-            # A system of one's own may be near enough to the one that an effect was written for.
-            if type(system) in SYSTEMS.values():
-                expect(system, effect)
+            check_acts_on(system, effect)
         self.system = system
         self.period = period
         self.integrator = integrator

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Self, TypeAlias
 import torch
 from torch import Tensor, nn
 
-from visadapt.systems import System
+from visadapt.systems import SYSTEMS, System
 from visadapt.systems.integrators import Duration
 
 
@@ -288,6 +288,21 @@ def expect(system: System, effect: Effect | type[Effect]) -> Any:
         kinds = " or a ".join(getattr(kind, "name", kind.__name__) for kind in effect.systems)
         raise TypeError(f"{effect.name} acts on a {kinds}, not on a {system.name}")
     return system
+
+
+def check_acts_on(system: System, effect: Effect) -> None:
+    """Raise TypeError where an effect does not act on a system.
+
+    An effect of a library's system also acts on a system of one's own with the same states, in the same columns, and as
+    many loads: on a cart-pole of one's own, say.
+    """
+
+    def columns(kind: type[System]) -> tuple[list[str], int]:
+        return [state.name for state in getattr(kind, "states", ())], len(getattr(kind, "loads", ()))
+
+    own = type(system)
+    if own in SYSTEMS.values() or columns(own) not in map(columns, effect.systems):
+        expect(system, effect)
 
 
 def inside(place: Tensor, start: Tensor, end: Tensor, width: float) -> Tensor:
