@@ -4,8 +4,8 @@
 
 A CartPole policy was trained in the source simulator. On the target a hidden force of 2 (sin t + 1) N pushes the
 cart. The demo executes the policy there for at most `budget` counted samples, learns what is different from the
-camera's frames alone, tunes the policy by backpropagation through the physics, with the residual's correction held over
-each plan, and writes
+camera's frames alone, tunes the policy in closed loop by backpropagation through renderer, residual and physics, and
+writes
 
     film.mp4      source, target before, target after, side by side
     film.png      a still of it
