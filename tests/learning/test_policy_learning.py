@@ -258,6 +258,10 @@ class UnevenTrack(DynamicsEffect):
 
 
 class TestClosedLoop:
+    def test_with_kept_states_it_is_refused(self):
+        with pytest.raises(ValueError, match=r"closed_loop decides at every step, .* got streams = 4"):
+            TuneSettings(Balance(PAPER_CARTPOLE), 1, streams=4, closed_loop=True)
+
     """The policy decides anew at every step that is imagined."""
 
     def test_the_gradient_is_the_change_of_the_loss(self):

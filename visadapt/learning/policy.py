@@ -36,7 +36,11 @@ class DivergedError(RuntimeError):
 
 @dataclass(frozen=True)
 class TuneSettings:
-    """How a policy is trained in a world."""
+    """How a policy is trained in a world.
+
+    Raises:
+        ValueError: `closed_loop` with `streams`, whose visited states are kept to be planned from.
+    """
 
     task: Task
     iterations: int
@@ -54,6 +58,10 @@ class TuneSettings:
     """whether streams start closer to the reference, and restart closer to it, early on; False for a trained policy"""
     recorded: float = 0.0  # share of the starts that are recorded windows of the target, with their histories
     observation_noise: float = 0.01  # standard deviation of white noise on what the policy sees
+
+    def __post_init__(self) -> None:
+        if self.closed_loop and self.streams is not None:
+            raise ValueError(f"closed_loop decides at every step, so no states are kept: got streams = {self.streams}")
 
 
 def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None:
