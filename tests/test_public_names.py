@@ -40,6 +40,20 @@ def test_a_name_that_is_not_there_is_an_attribute_error():
         getattr(va, name)
 
 
+def test_the_names_of_the_effects_are_all_effects_and_what_states_them():
+    from types import ModuleType
+
+    from tests.effects.registry import LIBRARY
+
+    names = {name: value for name, value in vars(va.effects).items() if not name.startswith("_")}
+    exported = {name for name, value in names.items() if not isinstance(value, ModuleType)}
+    effects = {name for name in exported if inspect.isclass(names[name]) and issubclass(names[name], va.Effect)}
+    assert exported - effects == {"EFFECTS", "Parameter", "Role", "Stage"}
+    assert {effect.__name__ for effect in LIBRARY.values()} <= effects
+    modules = {name for name, value in names.items() if isinstance(value, ModuleType)}
+    assert all(names[name].__name__ == f"visadapt.effects.{name}" for name in modules)
+
+
 SHORTER = {
     "source.system), source)": "source.system), source, [va.effects.ConstantForce])",
     ", world)": ", world, iterations=60)",

@@ -1,7 +1,7 @@
 """Effects: everything that separates the target from the source.
 
-Each module lists here once, and each of its classes is then a name of this package: a new effect in one of them needs
-no other edit. The catalogue, the command line and the diagnosis find it in `EFFECTS`, where it registers itself.
+The names of this package are those that the modules list in `__all__`: their effects, and what one's own derive from.
+The catalogue, the command line and the diagnosis find an effect in `EFFECTS`, where it registers itself.
 
 >>> import visadapt as va
 >>> sorted(va.effects.EFFECTS)[:3]
@@ -16,7 +16,6 @@ from visadapt.effects.forces import *
 from visadapt.effects.friction import *
 from visadapt.effects.hinge import *
 from visadapt.effects.late_sensors import *
-from visadapt.effects.laws import *
 from visadapt.effects.parameters import *
 from visadapt.effects.residual import *
 from visadapt.effects.sensing import *

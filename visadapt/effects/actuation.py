@@ -19,6 +19,16 @@ from torch.nn.functional import pad
 from visadapt.effects.base import ActuationEffect, Parameter, Role
 from visadapt.systems.integrators import Duration
 
+__all__ = [
+    "ActuatorBacklash",
+    "ActuatorBias",
+    "ActuatorDeadzone",
+    "ActuatorDelay",
+    "ActuatorGain",
+    "ActuatorLag",
+    "ActuatorSaturation",
+]
+
 
 class ActuatorDelay(ActuationEffect):
     """A pure delay of any length, also a fraction of a substep.

@@ -17,6 +17,8 @@ from visadapt.effects.base import DynamicsEffect, Parameter, Role, expect
 from visadapt.systems import FixedWing, Quadrotor, System
 from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, beside, rotation, times
 
+__all__ = ["LinearDrag", "PeriodicWind", "RotorDrag", "TranslationalLift", "Wind"]
+
 Vehicle: TypeAlias = Quadrotor | FixedWing
 VEHICLES: tuple[type[System], ...] = (Quadrotor, FixedWing)  # The systems that have a wind
 

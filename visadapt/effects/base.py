@@ -20,6 +20,8 @@ from torch import Tensor, nn
 from visadapt.systems import SYSTEMS, System
 from visadapt.systems.integrators import Duration
 
+__all__ = ["EFFECTS", "ActuationEffect", "DynamicsEffect", "Effect", "Parameter", "Role", "SensingEffect", "Stage"]
+
 
 class Stage(StrEnum):
     """Where along a step an effect acts."""

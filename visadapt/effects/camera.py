@@ -17,6 +17,18 @@ from visadapt.effects.base import Effect, Parameter, Reading, Stage
 from visadapt.effects.lossy import Lossy
 from visadapt.systems import CartPole
 
+__all__ = [
+    "Blur",
+    "Brightness",
+    "CameraEffect",
+    "CameraRotation",
+    "CameraShift",
+    "CameraZoom",
+    "FrameDrop",
+    "Gamma",
+    "Occlusion",
+]
+
 FAINTEST = 1e-12  # Grey level up to which gamma does nothing: at 0 the slope of a power may be infinite
 
 SHARPEST = 0.05  # px, least sigma that is computed: at this one a blur changes no grey level

@@ -13,6 +13,8 @@ from visadapt.effects.base import DynamicsEffect, Parameter, Role, expect
 from visadapt.effects.laws import ConstantLaw, JointLoad, PeriodicLaw, PulseLaw, SpringLaw
 from visadapt.systems import CartPole, RigidBody, System
 
+__all__ = ["CartForce", "ConstantForce", "Gust", "PeriodicForce", "Spring", "TrackTilt"]
+
 
 class CartForce(JointLoad):
     """A force on the cart alone; subclasses give its size in `push`, N."""

@@ -14,6 +14,16 @@ from visadapt.effects.forces import CartForce
 from visadapt.effects.laws import CoulombLaw, DirectionalLaw, LoadDependentLaw, StribeckLaw, ViscousLaw
 from visadapt.systems import CartPole, System
 
+__all__ = [
+    "CoulombFriction",
+    "DirectionalFriction",
+    "FrictionPatch",
+    "LoadDependentFriction",
+    "QuadraticDrag",
+    "StribeckFriction",
+    "ViscousFriction",
+]
+
 
 class ViscousFriction(ViscousLaw):
     """Friction proportional to the cart's speed."""

@@ -10,6 +10,8 @@ from visadapt.effects.base import Parameter
 from visadapt.effects.laws import CoulombLaw, JointLoad, ViscousLaw
 from visadapt.systems import CartPole, System
 
+__all__ = ["PoleDamping", "PoleFriction", "PoleSpring"]
+
 HINGE = 1  # The joint
 
 

@@ -11,6 +11,8 @@ from visadapt.effects.base import Effect, Parameter, Reading, SensingEffect
 from visadapt.effects.camera import CameraEffect
 from visadapt.systems import CartPole
 
+__all__ = ["AngleDelay", "CameraDelay", "LateSensors", "MeasurementDelay", "PositionDelay"]
+
 
 class Late(Effect):
     """Shows some of the states as they were `delay` s ago, and the others as they are.

@@ -8,6 +8,8 @@ from typing import ClassVar
 from visadapt.effects.base import DynamicsEffect, Parameter, expect
 from visadapt.systems import CartPole, System
 
+__all__ = ["CartMass", "ParameterScale", "ParameterShift", "PoleLength", "PoleMass"]
+
 
 class ParameterScale(DynamicsEffect):
     """Scale factors on parameters of the system that a subclass acts on; adds no load."""

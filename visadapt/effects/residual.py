@@ -10,6 +10,8 @@ from torch import Tensor, nn
 from visadapt.effects.base import Effect, Stage
 from visadapt.history import History
 
+__all__ = ["Residual"]
+
 
 class Residual(Effect):
     """Adds to the state after each period a correction that a network computes from recent observations and actions.

@@ -11,6 +11,8 @@ from visadapt.effects.base import Parameter, Reading, Role, SensingEffect, insid
 from visadapt.effects.lossy import Lossy
 from visadapt.systems import CartPole
 
+__all__ = ["AngleOffset", "Dropout", "FrozenZone", "PositionOffset", "SensorScale"]
+
 
 class FrozenZone(SensingEffect):
     """A worn potentiometer: while the angle is between start and end, the reading holds its last value from outside.

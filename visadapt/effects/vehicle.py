@@ -21,6 +21,18 @@ from visadapt.systems import Quadrotor, System
 from visadapt.systems.integrators import Duration
 from visadapt.systems.rigid_body import beside
 
+__all__ = [
+    "BatterySag",
+    "CenterOfMassOffset",
+    "GroundEffect",
+    "Inertia",
+    "MotorLag",
+    "Payload",
+    "RateDamping",
+    "RotorEfficiency",
+    "ThrustGain",
+]
+
 
 def with_thrust(vehicle: Vehicle, factor: Tensor) -> Vehicle:
     """The vehicle whose thrust is multiplied by a factor, () or (B,), at every command."""

@@ -10,6 +10,8 @@ from visadapt.effects.base import DynamicsEffect, Parameter, expect
 from visadapt.effects.parameters import ParameterScale
 from visadapt.systems import FixedWing, System
 
+__all__ = ["ControlEffectiveness", "Drag", "LiftSlope", "Mass", "TrimOffset"]
+
 
 class Mass(ParameterScale):
     """An aircraft heavier or lighter than the source's, with the same moments of inertia."""
