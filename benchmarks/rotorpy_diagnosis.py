@@ -31,6 +31,7 @@ import tyro
 
 from datasets import quadrotor_references
 from datasets.blind import flights as blind_flights
+from experiments.rotorpy_published import published
 from visadapt import diagnose
 from visadapt.diagnosis.search.causes import Z_90
 from visadapt.diagnosis.search.preparation import prepare
@@ -75,8 +76,8 @@ FOUND: dict[str, tuple[str, float, tuple[tuple[str, str], ...]]] = {
     "lag": ("s", 1.0, (("motor_lag", "time_constant"),)),
     **{f"wind_{axis}": ("m/s", 1.0, (("wind", f"velocity_{axis}"),)) for axis in "xy"},
 }
-"""What rotorpy publishes, by the names of `RotorpyTarget.published`: the unit, by what a parameter of ours is divided,
-and which effects and parameters stand for it. Drags add."""
+"""What rotorpy publishes, by the names of `published`: the unit, by what a parameter of ours is divided, and which effects
+and parameters stand for it. Drags add."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def main(settings: Settings) -> None:
             record(target, policy, settings.seed, path)
         answer = once(path.with_suffix(".json"), partial(asked, path))
         sizes = once(path.with_suffix(".sizes.json"), partial(sized, path))
-        true = target.published()
+        true = published(target)
         rows += rows_of(kind, answer, sizes, true if air is not None else {"lag": true["lag"]})
     write(settings.results, rows)
     for row in rows:

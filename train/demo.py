@@ -23,6 +23,7 @@ from pathlib import Path
 import tyro
 
 from experiments.curves import plot_losses
+from experiments.film_runs import film_run
 from experiments.kept_scores import kept_score
 from renderers import DrawnCartPole
 from train import renderer as renderer_training
@@ -32,7 +33,7 @@ from visadapt.progress import reporting, staged
 from visadapt.setups.cartpole import cartpole_frames
 from visadapt.storage.run_folder import open_run, write_json
 from visadapt.targets import SyntheticTarget, Target, TargetError, no_effects, sine_force
-from visadapt.targets.rollout import Run, film_run
+from visadapt.targets.rollout import Run
 from visadapt.weights import shipped
 
 

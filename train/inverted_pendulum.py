@@ -28,6 +28,7 @@ import torch
 import tyro
 
 from experiments.curves import plot_losses
+from experiments.film_runs import film_run
 from experiments.kept_scores import kept_score
 from experiments.learnt_camera import learnt_renderer
 from experiments.result_tables import Row, speed_row, write_rows
@@ -42,7 +43,7 @@ from visadapt.storage.run_folder import open_run, write_json
 from visadapt.targets import Observation, SyntheticTarget, Target, TargetError
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.targets.inverted_pendulum import MAP, REACH_M, SOURCE, START, inverted_pendulum
-from visadapt.targets.rollout import Run, film_run
+from visadapt.targets.rollout import Run
 from visadapt.world import World
 
 ANGLE_LIMIT = 0.2

@@ -21,6 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.curves import save_figure
+from experiments.film_runs import film_run
 from experiments.kept_scores import kept_score
 from renderers import DrawnCartPole
 from visadapt.diagnosis.report.text import estimate, interval, plain, with_unit
@@ -32,7 +33,7 @@ from visadapt.progress import reporting
 from visadapt.setups.cartpole import cartpole_frames
 from visadapt.storage.run_folder import open_run, read_json, write_json
 from visadapt.targets import SyntheticTarget
-from visadapt.targets.rollout import Run, film_run
+from visadapt.targets.rollout import Run
 from visadapt.weights import shipped
 
 HIDDEN = {"camera_rotation": 0.05, "actuator_gain": 0.6}

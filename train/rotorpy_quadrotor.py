@@ -34,6 +34,7 @@ from datasets import quadrotor_references
 from experiments.flights import flight_target
 from experiments.kept_scores import kept_score
 from experiments.result_tables import Row, miss_row, write_rows
+from experiments.rotorpy_published import published
 from visadapt.evaluation import FlightScore
 from visadapt.policies import Policy
 from visadapt.progress import reporting
@@ -98,7 +99,7 @@ def main(settings: Settings) -> None:
                 adapted = setups[method].adapt(adapting, target, work, *counted, seed, report)
                 after[method].append(_scored(settings, f"after-{name}", targets["target"], adapting))
                 gaps.append(once(settings.out / f"gap-{name}.json", partial(explain, adapted.episodes)))
-    true = RotorpyTarget(test).published()
+    true = published(RotorpyTarget(test))
     write_json(settings.out / "metrics.json", {"gaps": gaps, "published": true, **about})
     write_rows(settings.results, _rows(settings, before, after, gaps))
     for key, unit in UNITS.items():

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from benchmarks.rotorpy_diagnosis import rows_of
+from experiments.rotorpy_published import published
 from tests.flying import PERIOD, seeded, straight, waves
 from train.rotorpy_quadrotor import explain
 from visadapt.recordings import Episode
@@ -217,7 +218,7 @@ def test_a_turn_is_braked_as_published(axis, name):
     target = RotorpyTarget(level(), air=STILL, changes={"tau_m": 0.011})
     rates = fly(target, commands)[-1, 0, RATES]
     gain = float(SOURCE.roll_gain)
-    expected = 0.2 * SOURCE.max_rate * gain / (gain + target.published()[f"damping_{name}"])
+    expected = 0.2 * SOURCE.max_rate * gain / (gain + published(target)[f"damping_{name}"])
     assert float(rates[axis]) == pytest.approx(expected, rel=0.03)
 
 

@@ -39,9 +39,6 @@ def see_goals(observation: Observation) -> Tensor:
     return torch.cat((observation.state, observation.goal), 1)
 
 
-FILM_SEED = 12
-"""Seed of the episodes that films show."""
-
 SHOWN: dict[str, See] = {"state": see_states, "frame": see_frames, "state and goal": see_goals}
 """By `Policy.shown`, what a policy is shown of an observation."""
 
@@ -110,11 +107,6 @@ def run(
         history = history.acting(action).observing(see(observation))
     rows.append((observation, torch.zeros(batch, target.n_action)))
     return [_cut(rows, b, int(length[b]), bool(running[b]), target.period) for b in range(batch)]
-
-
-def film_run(target: Target, policy: Policy, steps: int = 250) -> Run:
-    """The episode that films show: its start and hidden effects are neither those of a training nor of a score."""
-    return run(target, policy.eval(), 1, steps, torch.Generator().manual_seed(FILM_SEED))[0]
 
 
 def _check_finite(target: Target, observation: Observation, rows: Tensor, which: str) -> None:

@@ -1,0 +1,17 @@
+"""The episodes that the experiments' films show."""
+
+from __future__ import annotations
+
+import torch
+
+from visadapt.policies import Policy
+from visadapt.targets import Target
+from visadapt.targets.rollout import Run, run
+
+FILM_SEED = 12
+"""Seed of these episodes: neither that of a training nor that of a score."""
+
+
+def film_run(target: Target, policy: Policy, steps: int = 250) -> Run:
+    """One episode, with a start and hidden effects that are neither those of a training nor of a score."""
+    return run(target, policy.eval(), 1, steps, torch.Generator().manual_seed(FILM_SEED))[0]
