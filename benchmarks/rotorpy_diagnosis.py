@@ -76,8 +76,8 @@ FOUND: dict[str, tuple[str, float, tuple[tuple[str, str], ...]]] = {
     "lag": ("s", 1.0, (("motor_lag", "time_constant"),)),
     **{f"wind_{axis}": ("m/s", 1.0, (("wind", f"velocity_{axis}"),)) for axis in "xy"},
 }
-"""What rotorpy publishes, by the names of `published`: the unit, by what a parameter of ours is divided, and which effects
-and parameters stand for it. Drags add."""
+"""What rotorpy publishes, by the names of `published`: the unit, by what a parameter of ours is divided, and which
+effects and parameters stand for it. Drags add."""
 
 
 @dataclass(frozen=True)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor, uint8
 
 from renderers.learnt import LayeredRenderer, MLPRenderer
+from renderers.tensor_file import read_tensors, sealed, unsealed
 
 KINDS: dict[str, type[LayeredRenderer] | type[MLPRenderer]] = {"layered": LayeredRenderer, "mlp": MLPRenderer}
 FORMAT_VERSION = 1
@@ -35,30 +33,6 @@ def save_renderer(path: Path, renderer: LayeredRenderer | MLPRenderer, training:
     save_file(weights, path, {HEADER_KEY: sealed(json.dumps(header), weights)})
 
 
-def sealed(text: str, tensors: Mapping[str, Tensor]) -> str:
-    """The JSON that says what tensors are, after a checksum of both.
-
-    One entry of a header, since safetensors writes several in an order that changes from run to run.
-    """
-    return f"{_checksum(text, tensors)} {text}"
-
-
-def unsealed(entry: str, tensors: Mapping[str, Tensor]) -> str | None:
-    """The JSON of what `sealed` gave; None where the checksum does not fit. Older files have none."""
-    if entry.startswith("{"):
-        return entry
-    checksum, _, text = entry.partition(" ")
-    return text if checksum == _checksum(text, tensors) else None
-
-
-def _checksum(text: str, tensors: Mapping[str, Tensor]) -> str:
-    found = hashlib.sha256(text.encode())
-    for name, values in sorted(tensors.items()):
-        found.update(f"{name} {values.dtype} {tuple(values.shape)}".encode())
-        found.update(values.detach().cpu().contiguous().reshape(-1).view(uint8).numpy().tobytes())
-    return found.hexdigest()
-
-
 def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRenderer | MLPRenderer:
     """The renderer in a file, of the class that was saved, on the CPU; `size` is the (height, width) it must have.
 
@@ -66,17 +40,8 @@ def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRen
         RendererError: the file is missing, incomplete, or not a renderer's; or the renderer has another architecture
             or frame size.
     """
-    try:
-        path.open("rb").close()  # since safetensors reports any failure to open as a missing file
-        with safe_open(path, framework="pt") as file:
-            entry = (file.metadata() or {}).get(HEADER_KEY)
-            weights = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except FileNotFoundError as error:
-        raise RendererError(f"{path}: there is no such renderer") from error
-    except OSError as error:
-        raise RendererError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except SafetensorError as error:
-        raise RendererError(f"{path}: not a complete safetensors file ({error})") from error
+    metadata, weights = read_tensors(path, "renderer", RendererError)
+    entry = metadata.get(HEADER_KEY)
     if entry is None:
         raise RendererError(f"{path}: a safetensors file, but not a renderer's")
     if (text := unsealed(entry, weights)) is None:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from safetensors.torch import load as load_tensors, save as save_tensors
 
-from renderers.weights import sealed
+from renderers.tensor_file import sealed
 
 WORDS = (
     *("nan", "inf", "-inf", "1e400", "-1e308", "1e-320", "0", "-0", "-1", "0.5", "9" * 400, "1_0", "0x1f", "true"),

@@ -12,11 +12,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from renderers.weights import HEADER_KEY, sealed, unsealed
+from renderers.tensor_file import read_tensors, sealed, unsealed
+from renderers.weights import HEADER_KEY
 from visadapt.storage.atomic_files import replacing
 
 TREE_KEY = "visadapt.tree"
@@ -37,20 +37,10 @@ def save_tree(path: Path, tree: Any) -> None:
 
 def load_tree(path: Path) -> Any:
     """Read a tree; raises CheckpointError if the file is missing, damaged, or not written by `save_tree`."""
-    try:
-        path.open("rb").close()  # since safetensors reports any failure to open as a missing file
-        with safe_open(path, framework="pt") as file:
-            entry = (file.metadata() or {}).get(TREE_KEY)
-            holds_renderer = HEADER_KEY in (file.metadata() or {})
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except FileNotFoundError as error:
-        raise CheckpointError(f"{path}: there is no such checkpoint") from error
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except SafetensorError as error:
-        raise CheckpointError(f"{path}: not a complete safetensors file ({error})") from error
+    metadata, tensors = read_tensors(path, "checkpoint", CheckpointError)
+    entry = metadata.get(TREE_KEY)
     if entry is None:
-        what = "holds a renderer" if holds_renderer else "a safetensors file that visadapt did not write"
+        what = "holds a renderer" if HEADER_KEY in metadata else "a safetensors file that visadapt did not write"
         raise CheckpointError(f"{path}: {what}; a policy, or what a run kept, is needed")
     if (skeleton := unsealed(entry, tensors)) is None:
         raise CheckpointError(f"{path}: is damaged: its checksum is not that of what it holds")

@@ -1,0 +1,51 @@
+"""Safetensors files with JSON in the header that says what the tensors are, after a checksum of both."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from torch import Tensor, uint8
+
+
+def sealed(text: str, tensors: Mapping[str, Tensor]) -> str:
+    """The JSON that says what tensors are, after a checksum of both.
+
+    One entry of a header, since safetensors writes several in an order that changes from run to run.
+    """
+    return f"{_checksum(text, tensors)} {text}"
+
+
+def unsealed(entry: str, tensors: Mapping[str, Tensor]) -> str | None:
+    """The JSON of what `sealed` gave; None where the checksum does not fit. Older files have none."""
+    if entry.startswith("{"):
+        return entry
+    checksum, _, text = entry.partition(" ")
+    return text if checksum == _checksum(text, tensors) else None
+
+
+def read_tensors(path: Path, kind: str, error: type[ValueError]) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """The header's entries and the tensors of a file; raises `error`, in one line, where it cannot be read.
+
+    `kind` is what the file should hold, in words.
+    """
+    try:
+        path.open("rb").close()  # since safetensors reports any failure to open as a missing file
+        with safe_open(path, framework="pt") as file:
+            return file.metadata() or {}, {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except FileNotFoundError as caught:
+        raise error(f"{path}: there is no such {kind}") from caught
+    except OSError as caught:
+        raise error(f"{path}: cannot be read: {caught.strerror or caught}") from caught
+    except SafetensorError as caught:
+        raise error(f"{path}: not a complete safetensors file ({caught})") from caught
+
+
+def _checksum(text: str, tensors: Mapping[str, Tensor]) -> str:
+    found = hashlib.sha256(text.encode())
+    for name, values in sorted(tensors.items()):
+        found.update(f"{name} {values.dtype} {tuple(values.shape)}".encode())
+        found.update(values.detach().cpu().contiguous().reshape(-1).view(uint8).numpy().tobytes())
+    return found.hexdigest()
