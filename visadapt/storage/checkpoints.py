@@ -56,15 +56,16 @@ def fitting(path: Path) -> Iterator[None]:
     >>> with fitting(pathlib.Path("a.safetensors")):
     ...     {"weights": 1}["settings"]
     Traceback (most recent call last):
-    visadapt.storage.checkpoints.CheckpointError: a.safetensors: holds not what is needed here (KeyError: 'settings')
+    visadapt.storage.checkpoints.CheckpointError: a.safetensors: is incomplete or of another kind: has no 'settings'
     """
     try:
         yield
     except CheckpointError:
         raise
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
-        what = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        raise CheckpointError(f"{path}: holds not what is needed here ({what})") from error
+        what = " ".join(str(error).split())
+        what = f"has no {what}" if isinstance(error, KeyError) else f"{type(error).__name__}: {what}"
+        raise CheckpointError(f"{path}: is incomplete or of another kind: {what}") from error
 
 
 def load_weights(module: nn.Module, weights: Mapping[str, Tensor], origin: Path) -> None:
