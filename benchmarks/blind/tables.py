@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.blind.scoring import Answer, Score, Truth, classes
-from visadapt.evaluation.scoring import wilson
+from visadapt.confidence import wilson
 from visadapt.storage.atomic_files import replacing
 
 STRENGTH_EDGES = (0.0, 1.0, 1.5, 2.5, 4.0, 8.0, 15.0, np.inf)

@@ -11,8 +11,8 @@ from benchmarks.blind.baselines import afternoon, chance
 from benchmarks.blind.diagnosis import Settings, diagnose_one, read_log, run_one, write
 from benchmarks.blind.scoring import Truth, classes, matches, region_of, score, sizes
 from benchmarks.blind.tables import Row, confusion, label, read_table, tabulate
+from visadapt.confidence import wilson
 from visadapt.effects.catalogue import catalogue
-from visadapt.evaluation.scoring import wilson
 
 
 def cause(effect, alike=(), **parameters):

@@ -1,4 +1,4 @@
-"""Scores: a cart's speed and how far flights miss, failed episodes counted apart; intervals of what was counted."""
+"""Scores: a cart's speed and how far flights miss, failed episodes counted apart."""
 
 from __future__ import annotations
 
@@ -124,13 +124,3 @@ def _score_flights(runs: Sequence[Run], target: FlightTarget) -> FlightScore:
     mean = float(means.mean())
     std = float(means.std()) if math.isfinite(mean) else math.inf
     return FlightScore(len(runs), int((worst > FAR).sum()), mean, std, float(worst.max()))
-
-
-def wilson(hits: int, n: int, z: float = 1.959964) -> tuple[float, float]:
-    """Confidence interval of a share, `z` standard deviations to either side (Wilson 1927); NaN without trials."""
-    if n == 0:
-        return math.nan, math.nan
-    p = hits / n
-    centre, scale = p + z * z / (2 * n), 1 + z * z / n
-    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from visadapt.confidence import wilson
 from visadapt.diagnosis.result import Cause, Estimate
 from visadapt.diagnosis.search import heldout
 from visadapt.diagnosis.search.causes import Z_90
@@ -20,7 +21,6 @@ from visadapt.effects import Dropout, Effect, FrozenZone
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.repeated_readings import SMOOTHING_RATIO, zone
 from visadapt.estimation.segments import Segments
-from visadapt.evaluation.scoring import wilson
 
 MIN_REPEATS = 2  # Repeated readings required for a cause
 
