@@ -42,7 +42,6 @@ from benchmarks.flight import Settings as FlightSettings
 from datasets import quadrotor_references
 from experiments.flights import EXPERIMENTS, flight_target
 from visadapt.evaluation import SCORE_SEED
-from visadapt.evaluation.scoring import EPISODE_STEPS
 from visadapt.learning.windows import Windows
 from visadapt.policies import Policy
 from visadapt.setups.base import Setup
@@ -51,6 +50,7 @@ from visadapt.storage.run_folder import once
 from visadapt.systems.rigid_body import POSITION
 from visadapt.targets import FlightTarget, SyntheticTarget, Target, constant_force
 from visadapt.targets.rollout import run
+from visadapt.tasks.balance import EPISODE_STEPS
 from visadapt.tasks.base import Task
 from visadapt.tasks.follow import Follow
 from visadapt.tasks.reach import Reach

@@ -38,8 +38,8 @@ from visadapt.progress import reporting, staged
 from visadapt.storage.checkpoints import load_network
 from visadapt.storage.run_folder import once, open_run
 from visadapt.systems import CartPole
-from visadapt.targets import Observation, Start, SyntheticTarget
-from visadapt.targets.rollout import run
+from visadapt.targets import Start, SyntheticTarget
+from visadapt.targets.rollout import run, see_within_a_turn
 from visadapt.tasks.balance import SettlingCost, SwingUp, within_a_turn
 from visadapt.world import World
 
@@ -157,7 +157,7 @@ def make_film(settings: Settings) -> None:
     policy = StatePolicy(n_state=4)
     load_network(settings.work / "seed-0" / POLICY, policy)
     target = SyntheticTarget(start=Filmed(), angle_limit=math.inf)
-    runs = run(target, policy.eval(), len(FILMED), STEPS, torch.Generator(), see=see)
+    runs = run(target, policy.eval(), len(FILMED), STEPS, torch.Generator(), see=see_within_a_turn)
     panels = [CartPolePanel(title, each, angle_limit=math.inf) for title, each in zip(FILMED, runs, strict=True)]
     film = CartPoleFilm(panels, target.period, SWING * target.period)
     film.write_still(settings.still, STILL)
@@ -185,7 +185,7 @@ def _seed(settings: Settings, seed: int) -> Score:
 def score(policy: StatePolicy, episodes: int) -> Score:
     """Run episodes from anywhere."""
     target = SyntheticTarget(start=Start(*ANYWHERE), angle_limit=math.inf)
-    runs = run(target, policy, episodes, STEPS, torch.Generator().manual_seed(SCORE_SEED), see=see)
+    runs = run(target, policy, episodes, STEPS, torch.Generator().manual_seed(SCORE_SEED), see=see_within_a_turn)
     states = torch.stack([within_a_turn(torch.as_tensor(each.episode.state)) for each in runs])
     held = states[:, SWING + 1 :]
     good = (held[..., 2].abs() < UP).all(1)
@@ -195,11 +195,6 @@ def score(policy: StatePolicy, episodes: int) -> Score:
         float(held[good][..., 1].abs().mean()),
         float(held[good][..., 0].abs().mean()),
     )
-
-
-def see(observation: Observation) -> Tensor:
-    """States with the angle between -pi and pi."""
-    return within_a_turn(observation.state)
 
 
 if __name__ == "__main__":

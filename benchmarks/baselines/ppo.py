@@ -25,13 +25,13 @@ from benchmarks.baselines.pets import model_inputs
 from benchmarks.baselines.problem import COST, TUNING_SEED, Problem, Sizes, Stage, score_path
 from visadapt.effects import Effect
 from visadapt.evaluation import score
-from visadapt.evaluation.scoring import EPISODE_STEPS
 from visadapt.history import History
 from visadapt.policies import Policy
 from visadapt.storage.run_folder import read_json
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget
 from visadapt.targets.synthetic import fine_world, no_effects
+from visadapt.tasks.balance import EPISODE_STEPS
 from visadapt.world import World
 
 MACHINES = 64

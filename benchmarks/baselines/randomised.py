@@ -13,8 +13,8 @@ from pathlib import Path
 import torch
 
 from benchmarks.baselines.problem import Problem, Sizes, Stage, drawn
-from visadapt.learning.streams import EPISODE_STEPS
 from visadapt.setups.cartpole import cartpole_states
+from visadapt.tasks.balance import EPISODE_STEPS
 
 DRAWS = EPISODE_STEPS
 """one for each stream; as many as streams are probed with for a dependence on time"""

@@ -13,11 +13,10 @@ import torch
 from visadapt.policies import Policy
 from visadapt.targets import FlightTarget, Target
 from visadapt.targets.rollout import Run, run
+from visadapt.tasks.balance import EPISODE_STEPS
 
 SCORE_SEED = 2026
 """Seed of the starts and hidden effects that policies are scored on; seeds of trainings count from 0."""
-EPISODE_STEPS = 250
-"""Steps of a cart-pole's episode that is scored."""
 FAR = 1.0
 """m, error above which a flight has failed."""
 

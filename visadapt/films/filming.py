@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 
 import torch
-from torch import Tensor
 
 from renderers import DrawnCartPole
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
@@ -16,10 +15,9 @@ from visadapt.films.flight_panel import FlightPanel
 from visadapt.policies import Policy
 from visadapt.progress import Progress
 from visadapt.systems import CartPole
-from visadapt.targets import FlightTarget, Observation, SyntheticTarget, Target
+from visadapt.targets import FlightTarget, SyntheticTarget, Target
 from visadapt.targets.gymnasium import GymnasiumTarget
-from visadapt.targets.rollout import Run, See, run
-from visadapt.tasks.balance import within_a_turn
+from visadapt.targets.rollout import Run, See, run, see_within_a_turn
 from visadapt.tasks.follow import Follow
 
 
@@ -82,13 +80,9 @@ def _run(policy: Policy, target: Target, seconds: float, seed: int, see: See | N
         and isinstance(target, SyntheticTarget)
         and math.isinf(target.angle_limit)
     ):
-        see = _see_within_a_turn
+        see = see_within_a_turn
     generator = torch.Generator().manual_seed(seed)
     return run(target, policy.eval(), 1, steps, generator, strict=False, see=see)[0]
-
-
-def _see_within_a_turn(observation: Observation) -> Tensor:
-    return within_a_turn(observation.state)
 
 
 def _film(runs: Mapping[str, Run], target: Target, due: float) -> Film:

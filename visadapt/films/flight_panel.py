@@ -9,7 +9,7 @@ from torch import Tensor
 from visadapt.evaluation.scoring import FAR
 from visadapt.films.widgets import Floats, running_mean
 from visadapt.systems import RigidBody
-from visadapt.systems.rigid_body import ATTITUDE, POSITION, VELOCITY, rotation
+from visadapt.systems.rigid_body import ATTITUDE, POSITION, VELOCITY, continuous_quaternion, rotation
 from visadapt.targets.rollout import Run
 from visadapt.tasks.base import FlightTask
 from visadapt.tasks.follow import Follow
@@ -78,10 +78,7 @@ class FlightPanel:
         self.rows = np.minimum((self.times / task.period + 1e-6).astype(int), len(states) - 1)
         self.position = self._smooth(states[:, POSITION], states[:, VELOCITY], self.times)
         self.speed = self._between(np.linalg.norm(states[:, VELOCITY], axis=1))
-        turns = states[:, ATTITUDE]
-        # A quaternion and its negative are the same attitude: choose signs so that neighbouring rows are close.
-        flips = np.where((turns[1:] * turns[:-1]).sum(1) < 0, -1.0, 1.0)
-        turns = turns * np.concatenate([[1.0], flips.cumprod()])[:, None]
+        turns = continuous_quaternion(torch.from_numpy(states[:, ATTITUDE])).numpy()
         self.attitude: Floats = rotation(torch.from_numpy(self._between(turns))).numpy()
         force = run.force[: len(states)].clip(-LARGEST_DRAWN, LARGEST_DRAWN)
         self.force = self._between(force if force.ndim == 2 else np.zeros((len(states), 3)))

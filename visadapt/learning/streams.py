@@ -11,12 +11,9 @@ from torch import Tensor
 from visadapt.batch import Batch
 from visadapt.history import History
 from visadapt.learning.windows import Observe, Windows
+from visadapt.tasks.balance import EPISODE_STEPS
 from visadapt.tasks.base import FlightTask, Task
 from visadapt.world import World, WorldState
-
-EPISODE_STEPS = 250
-"""Steps of a cart-pole's episode; where the world depends on time and there is no recording, streams start anywhere in
-an episode."""
 
 PROBE = 0.5
 """Command under which a world is tested for a dependence on time: not zero, since some effects scale commands."""

@@ -75,7 +75,7 @@ class Tracker:
         load = load_effect(type(system))
         nothing = load(**{parameter.name: 0.0 for parameter in load.table})
         self._pushed = world.with_effects((nothing,))
-        self.poses = PoseFinder(renderer, max(-across.low, across.high), LEAN)
+        self.poses = PoseFinder(renderer, across.largest, LEAN)
 
     def track(self, episodes: Sequence[Episode]) -> list[Episode]:
         """The episodes with states estimated from their frames and actions alone; one noise model is fitted to all.
@@ -147,7 +147,7 @@ class Tracker:
         """The physics linearised along the path (T, n_state + n_load); readings scaled to unit variance."""
         states, n = len(self.world.system.states), path.shape[1]
         before = path[:-1]
-        acting = command.clamp(-1, 1)[:, None].expand(-1, self.world.substeps, -1)
+        acting = self.world.system.within_range(command)[:, None].expand(-1, self.world.substeps, -1)
         tangent = linearise_step(
             self._pushed, before[:, states:], torch.zeros(len(before)).to(path), before[:, :states], acting
         )

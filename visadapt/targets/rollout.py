@@ -15,6 +15,7 @@ from visadapt.history import History
 from visadapt.policies import Policy
 from visadapt.recordings import Episode
 from visadapt.targets import Observation, Target, TargetError
+from visadapt.tasks.balance import within_a_turn
 
 See = Callable[[Observation], Tensor]
 """What the policy is shown of an observation: (B, ...) floating point."""
@@ -30,6 +31,11 @@ def see_frames(observation: Observation) -> Tensor:
 def see_states(observation: Observation) -> Tensor:
     """States (B, n_state)."""
     return observation.state
+
+
+def see_within_a_turn(observation: Observation) -> Tensor:
+    """States (B, 4) of a cart-pole with the angle between -pi and pi, as a policy that swings up is shown them."""
+    return within_a_turn(observation.state)
 
 
 def see_goals(observation: Observation) -> Tensor:

@@ -17,6 +17,9 @@ from visadapt.estimation.linearise import linearise_step
 from visadapt.tasks.base import Task, curriculum
 from visadapt.world import World
 
+EPISODE_STEPS = 250
+"""Steps of a cart-pole's episode, in training and in scores."""
+
 RICCATI_STEPS = 1000  # 50 s at 0.05 s: later steps add next to nothing
 
 
