@@ -41,7 +41,7 @@ from visadapt.progress import reporting
 from visadapt.recordings import Episode
 from visadapt.setups.flight import quadrotor
 from visadapt.storage.run_folder import once, open_run, write_json
-from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, rotation, times
+from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, matvec, rotation
 from visadapt.targets import TargetError
 from visadapt.targets.rotorpy import BREEZE, SOURCE, RotorpyTarget
 from visadapt.targets.synthetic import FlightTarget
@@ -119,14 +119,14 @@ def explain(episodes: Sequence[Episode]) -> dict[str, float]:
     """
     parts = [_missing(episode) for episode in episodes]
     missing, velocity, turned = (torch.cat([part[k] for part in parts]) for k in range(3))
-    own = times(turned.mT, velocity)
+    own = matvec(turned.mT, velocity)
     found: dict[str, float] = {}
     level = []
     for k, axis in enumerate("xy"):
         slope, pushed = _least_squares(missing[:, k], own[:, k], turned[:, k, k])
         found |= {f"drag_{axis}": -slope, f"wind_{axis}": -pushed / slope}
         level.append(slope * own[:, k] + pushed * turned[:, k, k])
-    air = times(turned.mT, velocity - torch.tensor([found["wind_x"], found["wind_y"], 0.0]))
+    air = matvec(turned.mT, velocity - torch.tensor([found["wind_x"], found["wind_y"], 0.0]))
     across = air[:, :2].square().sum(1)
     best = float("inf")
     for lag in (0.002 * k for k in range(1, 76)):
@@ -149,7 +149,7 @@ def _missing(episode: Episode) -> tuple[Tensor, Tensor, Tensor]:
     turned = rotation(middle[:, ATTITUDE])
     period = float(episode.time[1] - episode.time[0])
     gained = state[:, VELOCITY].diff(dim=0) / period + torch.tensor([0.0, 0.0, float(SOURCE.gravity)])
-    missing = times(turned.mT, gained)
+    missing = matvec(turned.mT, gained)
     missing[:, 2] -= SOURCE.thrust(torch.as_tensor(episode.action))[:-1]
     return missing, middle[:, VELOCITY], turned
 

@@ -3,11 +3,20 @@ from typing import ClassVar
 
 import numpy as np
 import torch
+from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.rigid_bodies import HEAVY, fly, random_states
 from visadapt.systems import Quadrotor, RigidBody
-from visadapt.systems.rigid_body import ATTITUDE, RATES, VELOCITY, continuous_quaternion, from_angles, rotation, turning
+from visadapt.systems.rigid_body import (
+    ATTITUDE,
+    RATES,
+    VELOCITY,
+    continuous_quaternion,
+    from_angles,
+    quaternion_rate,
+    rotation,
+)
 
 
 @dataclass(frozen=True)
@@ -71,13 +80,34 @@ def test_attitudes_agree_with_scipy():
     np.testing.assert_allclose(rotation(from_angles(angles)), made.as_matrix(), atol=1e-12)
 
 
+NUMBERS = st.floats(-10, 10, allow_subnormal=False)
+QUATERNIONS = st.tuples(*[NUMBERS] * 4).filter(lambda q: sum(each * each for each in q) > 1e-4)
+VECTORS = st.tuples(*[NUMBERS] * 3)
+
+
+def product(p, q):
+    """Hamilton's product, (4,), of quaternions (w, x, y, z), with a scalar and a vector part."""
+    cross = torch.linalg.cross(p[1:], q[1:])
+    return torch.cat(((p[0] * q[0] - p[1:] @ q[1:])[None], p[0] * q[1:] + q[0] * p[1:] + cross))
+
+
+@given(QUATERNIONS, VECTORS)
+def test_a_vector_is_rotated_and_an_attitude_turns_by_the_quaternion_product(q, v):
+    q, vector = torch.tensor(q, dtype=torch.float64), torch.tensor((0.0, *v), dtype=torch.float64)
+    conjugate = q * torch.tensor([1, -1, -1, -1])
+    sandwich = product(product(q, vector), conjugate) / q.square().sum()
+    torch.testing.assert_close(rotation(q[None])[0] @ vector[1:], sandwich[1:], rtol=1e-12, atol=1e-12)
+    rate = quaternion_rate(q[None], vector[None, 1:])[0]
+    torch.testing.assert_close(rate, product(q, vector) / 2, rtol=1e-12, atol=1e-12)
+
+
 def test_a_steady_turn_ends_where_scipy_says():
     rates = random_states(8)[:, :3]
     start = random_states(8, seed=1)[:, ATTITUDE]
     attitude, h = start, 0.001
     for _ in range(1000):
-        middle = attitude + h / 2 * turning(attitude, rates)
-        attitude = attitude + h * turning(middle, rates)
+        middle = attitude + h / 2 * quaternion_rate(attitude, rates)
+        attitude = attitude + h * quaternion_rate(middle, rates)
     # Rates are about the body's axes, so the turn comes first.
     expected = Rotation.from_quat(start.numpy(), scalar_first=True) * Rotation.from_rotvec(rates.numpy())
     np.testing.assert_allclose(rotation(attitude), expected.as_matrix(), atol=1e-5)

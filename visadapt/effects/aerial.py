@@ -15,7 +15,7 @@ from torch.nn.functional import pad
 
 from visadapt.effects.base import DynamicsEffect, Parameter, Role, expect
 from visadapt.systems import FixedWing, Quadrotor, System
-from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, beside, rotation, times
+from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, matvec, rotation, stack_parameters
 
 __all__ = ["LinearDrag", "PeriodicWind", "RotorDrag", "TranslationalLift", "Wind"]
 
@@ -28,7 +28,7 @@ def airspeed(state: Tensor, vehicle: Vehicle) -> Tensor:
     wind = (vehicle.wind_x, vehicle.wind_y, vehicle.wind_z)
     if not any(isinstance(value, Tensor) or value for value in wind):
         return state[:, VELOCITY]
-    return state[:, VELOCITY] - beside(wind, state)
+    return state[:, VELOCITY] - stack_parameters(wind, state)
 
 
 class AirDrag(DynamicsEffect):
@@ -70,9 +70,9 @@ class RotorDrag(DynamicsEffect):
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         turned = rotation(state[:, ATTITUDE])
-        velocity = times(turned.mT, airspeed(state, expect(system, self)))
+        velocity = matvec(turned.mT, airspeed(state, expect(system, self)))
         coefficients = torch.stack([self.value(p.name, state) for p in self.table], -1)
-        return pad(-times(turned, coefficients * velocity), (0, 3))
+        return pad(-matvec(turned, coefficients * velocity), (0, 3))
 
 
 class TranslationalLift(DynamicsEffect):
@@ -88,7 +88,7 @@ class TranslationalLift(DynamicsEffect):
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         turned = rotation(state[:, ATTITUDE])
-        velocity = times(turned.mT, airspeed(state, expect(system, self)))
+        velocity = matvec(turned.mT, airspeed(state, expect(system, self)))
         lift = self.value("coefficient", state) * velocity[:, :2].square().sum(1)
         return pad(lift[:, None] * turned[:, :, 2], (0, 3))
 

@@ -19,7 +19,7 @@ from visadapt.effects.base import ActuationEffect, DynamicsEffect, Parameter, ex
 from visadapt.effects.parameters import ParameterScale, ParameterShift
 from visadapt.systems import Quadrotor, System
 from visadapt.systems.integrators import Duration
-from visadapt.systems.rigid_body import beside
+from visadapt.systems.rigid_body import stack_parameters
 
 __all__ = [
     "BatterySag",
@@ -123,7 +123,8 @@ class MotorLag(ActuationEffect):
         a command of 1, (..., n_action, 2)."""
         none = (0.0,) * commands.shape[2]
         gain, damping = (
-            length[..., None] * beside(values, commands).unsqueeze(-2) for values in self.loops or (none, none)
+            length[..., None] * stack_parameters(values, commands).unsqueeze(-2)
+            for values in self.loops or (none, none)
         )
         # As in actuator_lag: with exp(-1000) the limit is exact, and nothing divides by 0.
         rate = ratio.clamp_min(1e-3).reciprocal()[..., None]

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from visadapt.history import HORIZON, History
 from visadapt.policies.base import Policy, ignore_correction
 from visadapt.policies.networks import N_DISTURBANCE, FlightResidualNetwork, mlp
-from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY, RigidBody, rotation, times
+from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY, RigidBody, matvec, rotation
 
 FARTHEST, FASTEST = 0.5, 1.0
 """m and m/s, the errors of position and velocity above which `FollowPolicy` reacts no more strongly."""
@@ -52,7 +52,7 @@ class FlightPolicy(Policy):
         shown = history.observations[:, -1]
         state, goal = shown[:, : self.n_state], shown[:, self.n_state :]
         velocity, turned = state[:, VELOCITY], rotation(state[:, ATTITUDE])
-        moving = (velocity, times(turned.mT, velocity), turned[:, :, :2].flatten(1), state[:, RATES])
+        moving = (velocity, matvec(turned.mT, velocity), turned[:, :, :2].flatten(1), state[:, RATES])
         return torch.cat((*moving, self.aim(state, goal), self.disturbance(history)), 1)
 
     def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:
@@ -117,4 +117,4 @@ class ReachPolicy(FlightPolicy):
         distance = to.norm(dim=1, keepdim=True).clamp_min(1.0)
         way, path = to / distance, velocity / velocity.norm(dim=1, keepdim=True).clamp_min(1.0)
         aside = 10 * (way - path)
-        return torch.cat((distance / 50, times(rotation(state[:, ATTITUDE]).mT, way), aside, aside / distance), 1)
+        return torch.cat((distance / 50, matvec(rotation(state[:, ATTITUDE]).mT, way), aside, aside / distance), 1)

@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from visadapt.systems.base import Variable, holds
-from visadapt.systems.rigid_body import POSITION, VELOCITY, RigidBody, beside, from_angles, times
+from visadapt.systems.rigid_body import POSITION, VELOCITY, RigidBody, from_angles, matvec, stack_parameters
 
 _EFFECTS = ("drag", "side", "lift", "roll", "pitch", "yaw")
 _CAUSES = ("zero", "sideslip", "attack", "elevator", "aileron", "rudder", "roll_rate", "pitch_rate", "yaw_rate")
@@ -127,14 +127,16 @@ class FixedWing(RigidBody):
             return super().derivative(state, command, load)
         # All derivatives but the position's are those in still air at the velocity relative to the air.
         velocity = state[:, VELOCITY]
-        airborne = torch.cat((state[:, POSITION], velocity - beside(wind, state), state[:, VELOCITY.stop :]), 1)
+        airborne = torch.cat(
+            (state[:, POSITION], velocity - stack_parameters(wind, state), state[:, VELOCITY.stop :]), 1
+        )
         change = super().derivative(airborne, command, load)
         return torch.cat((velocity, change[:, VELOCITY.start :]), 1)
 
     def inertia(self, like: Tensor) -> Tensor:
         # With z up, the product of inertia has the opposite sign of the book's.
         x, y, z, xz = self.inertia_x, self.inertia_y, self.inertia_z, self.inertia_xz
-        return beside((x, 0.0, xz, 0.0, y, 0.0, xz, 0.0, z), like).unflatten(-1, (3, 3))
+        return stack_parameters((x, 0.0, xz, 0.0, y, 0.0, xz, 0.0, z), like).unflatten(-1, (3, 3))
 
     def wrench(self, velocity: Tensor, rates: Tensor, command: Tensor) -> tuple[Tensor, Tensor]:
         """Beard and McLain's section 4.2, and thrust; force and torque (B, 3) each."""
@@ -147,7 +149,7 @@ class FixedWing(RigidBody):
         angles = torch.atan2(velocity[:, 1:], torch.cat((in_plane, ahead), -1)).clamp(-limit, limit)
         # The causes times V. Forces are V times their sum: rates enter as c q / (2 V), and no division by V is left.
         causes = torch.cat((speed, speed * torch.cat((angles, command[:, 1:]), -1), rates), -1)
-        effects = speed * times(table, causes)
+        effects = speed * matvec(table, causes)
         drag, side, lift = effects[:, :3].unbind(-1)
         forward, upward = (plane / in_plane).unbind(-1)
         thrust = self.max_thrust * (command[:, 0] + 1) / 2
@@ -204,7 +206,7 @@ class FixedWing(RigidBody):
             for row, names in enumerate(_TABLE)
             for column, name in enumerate(names)
         ]
-        gathered = beside([*values, self.linear_range], like)
+        gathered = stack_parameters([*values, self.linear_range], like)
         return gathered[..., :-1].unflatten(-1, (len(_EFFECTS), len(_CAUSES))), gathered[..., -1:]
 
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from visadapt.systems.base import Variable, holds
-from visadapt.systems.rigid_body import RigidBody, beside, columns, constant, times
+from visadapt.systems.rigid_body import RigidBody, as_column, constant, matvec, stack_parameters
 
 
 @dataclass(frozen=True)
@@ -73,14 +73,14 @@ class Quadrotor(RigidBody):
     def inertia(self, like: Tensor) -> Tensor:
         known = self.known_inertia(like)
         scales = (self.inertia_scale_x, self.inertia_scale_y, self.inertia_scale_z)
-        return known * beside(scales, like)[..., None] if _differ(scales, 1.0) else known
+        return known * stack_parameters(scales, like)[..., None] if _differ(scales, 1.0) else known
 
     def known_inertia(self, like: Tensor) -> Tensor:
         """Moments of inertia that the rate loops assume, kg m2: (3, 3), or (B, 3, 3).
 
         Flightmare's plate with rotors: m l^2 / 12 times (4.5, 4.5, 7) about x, y and z.
         """
-        size = beside(((self.mass - self.payload) * self.arm_length**2 / 12,), like)
+        size = stack_parameters(((self.mass - self.payload) * self.arm_length**2 / 12,), like)
         return size[..., None] * constant((4.5, 0.0, 0.0, 0.0, 4.5, 0.0, 0.0, 0.0, 7.0), like.dtype, like.device).view(
             3, 3
         )
@@ -91,18 +91,18 @@ class Quadrotor(RigidBody):
         return middle + half * command[:, 0]
 
     def wrench(self, velocity: Tensor, rates: Tensor, command: Tensor) -> tuple[Tensor, Tensor]:
-        commanded = columns(self.max_rate) * command[:, 1:]
-        gain = beside((self.roll_gain, self.roll_gain, self.yaw_gain), rates)
+        commanded = as_column(self.max_rate) * command[:, 1:]
+        gain = stack_parameters((self.roll_gain, self.roll_gain, self.yaw_gain), rates)
         inertia = self.known_inertia(rates)
-        torque = times(inertia, gain * (commanded - rates)) + torch.linalg.cross(rates, times(inertia, rates))
+        torque = matvec(inertia, gain * (commanded - rates)) + torch.linalg.cross(rates, matvec(inertia, rates))
         thrust = (self.mass - self.payload) * self.thrust(command)
         if _differ((self.rotor_1, self.rotor_2, self.rotor_3, self.rotor_4), 1.0):
             thrust, torque = self._delivered(thrust, torque)
         if _differ((self.centre_x, self.centre_y), 0.0):
-            torque = torque + thrust[:, None] * beside((-self.centre_y, self.centre_x, 0.0), torque)
+            torque = torque + thrust[:, None] * stack_parameters((-self.centre_y, self.centre_x, 0.0), torque)
         damping = (self.damping_x, self.damping_y, self.damping_z)
         if _differ(damping, 0.0):
-            torque = torque - times(inertia, beside(damping, rates) * rates)
+            torque = torque - matvec(inertia, stack_parameters(damping, rates) * rates)
         force = torch.zeros_like(velocity)
         force[:, 2] = thrust
         return force, torque
@@ -115,9 +115,9 @@ class Quadrotor(RigidBody):
     def _delivered(self, thrust: Tensor, torque: Tensor) -> tuple[Tensor, Tensor]:
         """Thrust (B,) and torque (B, 3) where each rotor delivers a share of the thrust that is commanded of it."""
         reach = self.arm_length / math.sqrt(2)
-        levers = beside((1.0, reach, reach, self.torque_to_thrust), torque)
+        levers = stack_parameters((1.0, reach, reach, self.torque_to_thrust), torque)
         mixer = torque.new_tensor(_MIXER)
-        shares = beside((self.rotor_1, self.rotor_2, self.rotor_3, self.rotor_4), torque)
+        shares = stack_parameters((self.rotor_1, self.rotor_2, self.rotor_3, self.rotor_4), torque)
         # The mixer's rows are orthogonal and of length 2: its transpose is 4 times its inverse.
         commanded = torch.cat((thrust[:, None], torque), 1) / levers @ mixer / 4
         delivered = (shares * commanded) @ mixer.mT * levers

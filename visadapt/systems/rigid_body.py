@@ -15,26 +15,37 @@ from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
-from torch.nn.functional import one_hot
 
 from visadapt.systems.base import System, Variable
 
 POSITION, VELOCITY, ATTITUDE, RATES = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13)
 """Columns of the state."""
 
-
-_HAMILTON = torch.tensor([[1, 2, 3, 4], [2, -1, 4, -3], [3, -4, -1, 2], [4, 3, -2, -1]])
-"""The product of the quaternion units i and j: its sign, and 1 + its index."""
-_PRODUCT = one_hot(_HAMILTON.abs() - 1) * _HAMILTON.sign()[..., None]
-"""(4, 4, 4): (p q)_k = sum over i, j of p_i q_j _PRODUCT[i, j, k]."""
-
 # Matrices (I J, K) that map the flattened products of two vectors, (I,) and (J,), to a vector (K,): one matrix product
 # is faster than many small operations.
-_TURNING = _PRODUCT[:, 1:].flatten(0, 1) / 2  # q' = q (0, rates) / 2
-_CONJUGATE = torch.tensor([1, -1, -1, -1])
-_TURNED = torch.einsum("iml,ljk,j->kmij", _PRODUCT[:, 1:], _PRODUCT[..., 1:], _CONJUGATE)
-_ROTATION = (_TURNED.triu() + _TURNED.tril(-1).mT).reshape(9, 16).T.contiguous().float()
-"""R v = q (0, v) q*, with the entries of R by rows; q_i q_j = q_j q_i is counted once."""
+# fmt: off
+_ROTATION = torch.tensor([
+    #w:w  x  y  z    x:w  x  y  z    y:w  x  y  z    z:w  x  y  z
+    (1, 0, 0, 0,     0, 1, 0, 0,     0, 0, -1, 0,    0, 0, 0, -1),  # R11 = w^2 + x^2 - y^2 - z^2
+    (0, 0, 0, -2,    0, 0, 2, 0,     0, 0, 0, 0,     0, 0, 0, 0),   # R12 = 2 (x y - w z)
+    (0, 0, 2, 0,     0, 0, 0, 2,     0, 0, 0, 0,     0, 0, 0, 0),   # R13 = 2 (x z + w y)
+    (0, 0, 0, 2,     0, 0, 2, 0,     0, 0, 0, 0,     0, 0, 0, 0),   # R21 = 2 (x y + w z)
+    (1, 0, 0, 0,     0, -1, 0, 0,    0, 0, 1, 0,     0, 0, 0, -1),  # R22 = w^2 - x^2 + y^2 - z^2
+    (0, -2, 0, 0,    0, 0, 0, 0,     0, 0, 0, 2,     0, 0, 0, 0),   # R23 = 2 (y z - w x)
+    (0, 0, -2, 0,    0, 0, 0, 2,     0, 0, 0, 0,     0, 0, 0, 0),   # R31 = 2 (x z - w y)
+    (0, 2, 0, 0,     0, 0, 0, 0,     0, 0, 0, 2,     0, 0, 0, 0),   # R32 = 2 (y z + w x)
+    (1, 0, 0, 0,     0, -1, 0, 0,    0, 0, -1, 0,    0, 0, 0, 1),   # R33 = w^2 - x^2 - y^2 + z^2
+]).T.contiguous().float()
+"""From the products of (w, x, y, z) with itself, (16,), to the rotation matrix by rows, (9,), of a unit quaternion."""
+_RATE = torch.tensor([
+    #w:p  q  r    x:p  q  r    y:p  q  r    z:p  q  r
+    (0, 0, 0,     -1, 0, 0,    0, -1, 0,    0, 0, -1),  # 2 w' = -x p - y q - z r
+    (1, 0, 0,     0, 0, 0,     0, 0, 1,     0, -1, 0),  # 2 x' = w p + y r - z q
+    (0, 1, 0,     0, 0, -1,    0, 0, 0,     1, 0, 0),   # 2 y' = w q - x r + z p
+    (0, 0, 1,     0, 1, 0,     -1, 0, 0,    0, 0, 0),   # 2 z' = w r + x q - y p
+]).T.contiguous() / 2
+"""From the products of (w, x, y, z) with the body rates (p, q, r), (12,), to the rates of (w, x, y, z), (4,)."""
+# fmt: on
 
 
 class RigidBody(System):
@@ -78,13 +89,13 @@ class RigidBody(System):
     def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:
         velocity, attitude, rates = state[:, VELOCITY], state[:, ATTITUDE], state[:, RATES]
         turned = rotation(attitude)
-        force, torque = self.wrench(times(turned.mT, velocity), rates, command)
+        force, torque = self.wrench(matvec(turned.mT, velocity), rates, command)
         inertia = self.inertia(state)
         inverse = _inverse_inertia(self, state.dtype, state.device) if self.is_constant else inertia.inverse()
-        whole = torque + load[:, 3:] - torch.linalg.cross(rates, times(inertia, rates))
-        weight = columns(self.gravity) * constant((0.0, 0.0, 1.0), state.dtype, state.device)
-        acceleration = (times(turned, force) + load[:, :3]) / columns(self.mass) - weight
-        return torch.cat((velocity, acceleration, turning(attitude, rates), times(inverse, whole)), 1)
+        whole = torque + load[:, 3:] - torch.linalg.cross(rates, matvec(inertia, rates))
+        weight = as_column(self.gravity) * constant((0.0, 0.0, 1.0), state.dtype, state.device)
+        acceleration = (matvec(turned, force) + load[:, :3]) / as_column(self.mass) - weight
+        return torch.cat((velocity, acceleration, quaternion_rate(attitude, rates), matvec(inverse, whole)), 1)
 
     @cached_property
     def is_constant(self) -> bool:
@@ -93,12 +104,12 @@ class RigidBody(System):
         return not any(isinstance(getattr(parameters, each.name), Tensor) for each in fields(parameters))
 
 
-def columns(value: float | Tensor) -> float | Tensor:
+def as_column(value: float | Tensor) -> float | Tensor:
     """A parameter, () or (B,), in a shape that multiplies (B, n)."""
     return value[:, None] if isinstance(value, Tensor) and value.dim() else value
 
 
-def beside(values: Sequence[float | Tensor], like: Tensor) -> Tensor:
+def stack_parameters(values: Sequence[float | Tensor], like: Tensor) -> Tensor:
     """Parameters gathered in a tensor (n,), or (B, n) if one of them is (B,). It is not to be written to."""
     tensors = {i: value for i, value in enumerate(values) if isinstance(value, Tensor)}
     numbers = tuple(0.0 if isinstance(value, Tensor) else value for value in values)
@@ -123,21 +134,21 @@ def _inverse_inertia(system: RigidBody, dtype: torch.dtype, device: torch.device
         return system.inertia(torch.empty(0, dtype=dtype, device=device)).inverse()
 
 
-def times(matrix: Tensor, vector: Tensor) -> Tensor:
+def matvec(matrix: Tensor, vector: Tensor) -> Tensor:
     """A matrix (3, 3), or one for each row (B, 3, 3), times vectors (B, 3)."""
     return (matrix @ vector[..., None])[..., 0] if matrix.dim() > 2 else vector @ matrix.mT
 
 
 def rotation(attitude: Tensor) -> Tensor:
-    """Rotation matrices (B, 3, 3) from body to world axes, of attitudes (B, 4)."""
+    """Rotation matrices (B, 3, 3) from body to world axes, of attitudes (B, 4) (`_ROTATION`)."""
     products = (attitude[:, :, None] * attitude[:, None]).flatten(1)
     unit = products / attitude.square().sum(-1, keepdim=True)
     return (unit @ _ROTATION.to(attitude)).unflatten(-1, (3, 3))
 
 
-def turning(attitude: Tensor, rates: Tensor) -> Tensor:
-    """Time derivative (B, 4) of attitudes (B, 4) under body rates (B, 3)."""
-    return (attitude[:, :, None] * rates[:, None]).flatten(1) @ _TURNING.to(attitude)
+def quaternion_rate(attitude: Tensor, rates: Tensor) -> Tensor:
+    """Time derivative (B, 4) of attitudes (B, 4) under body rates (B, 3): q' = q (0, rates) / 2 (`_RATE`)."""
+    return (attitude[:, :, None] * rates[:, None]).flatten(1) @ _RATE.to(attitude)
 
 
 def from_angles(angles: Tensor) -> Tensor:
