@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from visadapt.effects.base import ActuationEffect, Parameter, Role
+from visadapt.effects.recurrence import linear_recurrence
 from visadapt.systems.integrators import Duration
 
 __all__ = [
@@ -229,13 +230,8 @@ class ActuatorLag(ActuationEffect):
         # exp(-1000) is 0 in every precision, and so are its derivatives: the limit is exact, and nothing divides by 0.
         rate = ratio.clamp_min(1e-3).reciprocal()
         left = (-rate).exp()  # share of the old value that remains after a substep
-        # u after each substep from an initial 0: all prefixes of a linear recurrence in log2(S) rounds.
-        after = -(-rate).expm1() * commands
-        reach, weight = 1, left
-        while reach < commands.shape[1]:
-            after = torch.cat((after[:, :reach], after[:, reach:] + weight[:, reach:] * after[:, :-reach]), 1)
-            weight = torch.cat((weight[:, :reach], weight[:, reach:] * weight[:, :-reach]), 1)
-            reach *= 2
+        # u after each substep from an initial 0
+        after, weight = linear_recurrence(left, -(-rate).expm1() * commands)
         after = after + weight * memory
         before = torch.cat((memory, after[:, :-1]), 1)
         # The mean of command + (before - command) exp(-t / time_constant) over the substep.
