@@ -14,7 +14,7 @@ from visadapt.targets.rollout import Run
 from visadapt.tasks.base import FlightTask
 from visadapt.tasks.follow import Follow
 from visadapt.tasks.reach import Reach
-from visadapt.tasks.references import cubic
+from visadapt.tasks.references import Reference, cubic
 
 INSTANT_PERIOD_S = 0.02
 """s between the instants at which a flight is interpolated"""
@@ -67,9 +67,8 @@ class FlightPanel:
         self.follows = isinstance(task, Follow)
         states = np.array(state, float)
         states[:, : VELOCITY.stop] = states[:, : VELOCITY.stop].clip(-LARGEST_DRAWN, LARGEST_DRAWN)
+        misses = _misses(task, states, task_state) if isinstance(task, Reach) else np.empty(0)
         if isinstance(task, Reach):
-            steps = torch.from_numpy(np.stack([states[:-1], states[1:]], 1))
-            misses = np.asarray(task.misses(steps, task_state.double().expand(len(steps), 3))[:, 0])
             first = int(misses.argmin()) + 1 if len(misses) else 0
             states = states[: first + 1 + round(0.5 / task.period)]
         self.states = states
@@ -84,30 +83,37 @@ class FlightPanel:
         self.force = self._between(force if force.ndim == 2 else np.zeros((len(states), 3)))
         lost = None if run.survived else self.end
         if isinstance(task, Follow):
-            course, which, start = task.references, int(task_state[0]), int(task_state[1])
-            places, slopes = (part[which, start:].double().numpy() for part in (course.positions, course.velocities))
-            count = round((len(places) - 1) * course.period / INSTANT_PERIOD_S) + 1
-            self.reference = self._smooth(places, slopes, np.arange(count) * INSTANT_PERIOD_S)
-            self.goal = self.reference[: len(self.times)]
-            self.away: Floats = np.linalg.norm(self.position - self.goal, axis=1)
-            at_rows = np.linalg.norm(states[:, POSITION] - places[: len(states)], axis=1)
-            self.score: Floats = np.concatenate([at_rows[:1], running_mean(at_rows[1:])])[self.rows]
-            self.worst, self.passed = float(self.away.max()), self.end
-            far = np.flatnonzero(self.away > FAR)
-            self.failed = float(self.times[far[0]]) if len(far) else lost
+            self._along(task.references, int(task_state[0]), int(task_state[1]), lost)
         else:
-            point = task_state.double().numpy()
-            self.reference = np.stack([states[0, POSITION], point])
-            self.goal = np.tile(point, (len(self.times), 1))
-            self.away = np.linalg.norm(self.position - self.goal, axis=1)
-            least = np.minimum.accumulate(np.concatenate([self.away[:1], misses[: len(states) - 1]]))
-            self.score, self.worst, row = least[self.rows], float(least[-1]), int(least.argmin())
-            self.away[self.away.argmin()] = self.worst
-            self.passed = row * task.period
-            self.failed = self.passed if self.worst > FAR else lost
-            before, way = states[max(row - 1, 0), POSITION], states[row, POSITION] - states[max(row - 1, 0), POSITION]
-            share = float((point - before) @ way / max(float(way @ way), 1e-12))
-            self.nearest: Floats = before + min(max(share, 0.0), 1.0) * way
+            self._past(task_state.double().numpy(), misses[: len(states) - 1], lost)
+
+    def _along(self, course: Reference, which: int, start: int, lost: float | None) -> None:
+        """What is shown of a flight along one of the references, from its row `start` on."""
+        places, slopes = (part[which, start:].double().numpy() for part in (course.positions, course.velocities))
+        count = round((len(places) - 1) * course.period / INSTANT_PERIOD_S) + 1
+        self.reference = self._smooth(places, slopes, np.arange(count) * INSTANT_PERIOD_S)
+        self.goal = self.reference[: len(self.times)]
+        self.away: Floats = np.linalg.norm(self.position - self.goal, axis=1)
+        at_rows = np.linalg.norm(self.states[:, POSITION] - places[: len(self.states)], axis=1)
+        self.score: Floats = np.concatenate([at_rows[:1], running_mean(at_rows[1:])])[self.rows]
+        self.worst, self.passed = float(self.away.max()), self.end
+        far = np.flatnonzero(self.away > FAR)
+        self.failed = float(self.times[far[0]]) if len(far) else lost
+
+    def _past(self, point: Floats, misses: Floats, lost: float | None) -> None:
+        """What is shown of a flight through a point (3,), which it misses by `misses` (rows - 1,) m in each period."""
+        states = self.states
+        self.reference = np.stack([states[0, POSITION], point])
+        self.goal = np.tile(point, (len(self.times), 1))
+        self.away = np.linalg.norm(self.position - self.goal, axis=1)
+        least = np.minimum.accumulate(np.concatenate([self.away[:1], misses]))
+        self.score, self.worst, row = least[self.rows], float(least[-1]), int(least.argmin())
+        self.away[self.away.argmin()] = self.worst
+        self.passed = row * self.period
+        self.failed = self.passed if self.worst > FAR else lost
+        before, way = states[max(row - 1, 0), POSITION], states[row, POSITION] - states[max(row - 1, 0), POSITION]
+        share = float((point - before) @ way / max(float(way @ way), 1e-12))
+        self.nearest: Floats = before + min(max(share, 0.0), 1.0) * way
 
     def command(self, instant: int) -> Floats | None:
         """(4,) in [-1, 1], held from a row to the next; None in the episode's last row"""
@@ -136,6 +142,12 @@ class FlightPanel:
         row = np.minimum(self.rows, max(len(values) - 2, 0))
         share = (self.times / self.period - row).reshape(-1, *[1] * (values.ndim - 1))
         return np.asarray(values[row] * (1 - share) + values[np.minimum(row + 1, len(values) - 1)] * share)
+
+
+def _misses(task: Reach, states: Floats, point: Tensor) -> Floats:
+    """(rows - 1,) m by which a flight misses the point (3,) in each period."""
+    steps = torch.from_numpy(np.stack([states[:-1], states[1:]], 1))
+    return np.asarray(task.misses(steps, point.double().expand(len(steps), 3))[:, 0])
 
 
 def length(metres: float, digits: int | None = 1) -> str:
