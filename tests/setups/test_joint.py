@@ -311,11 +311,12 @@ class TestPretraining:
         with pytest.raises(CheckpointError, match=f"trained with other values of {key}: remove it"):
             changed.pretrain(path, 0)
 
-    def test_a_policy_that_does_not_say_how_it_was_refined_is_taken_as_it_is(self, tmp_path):
+    def test_a_policy_of_an_earlier_version_that_does_not_say_how_it_was_refined_is_taken_as_it_is(self, tmp_path):
         setup, path = self.setup(dataclasses.replace(TUNE, iterations=2, recorded=0.0)), tmp_path / "policy.safetensors"
         trained = setup.pretrain(path, 0)
         tree = load_tree(path)
         earlier = {key: value for key, value in tree["settings"].items() if key not in ("refinement", "perception")}
+        earlier["task"]["cost_of"] = earlier["task"].pop("plan_cost")  # its name then
         save_tree(path, {**tree, "settings": earlier})
         read = setup.pretrain(path, 0)
         for key, value in trained.state_dict().items():

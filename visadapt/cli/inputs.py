@@ -23,7 +23,7 @@ from visadapt.cli.own_effects import complaints as complaints_of_effect
 from visadapt.diagnosis.report.text import with_unit
 from visadapt.diagnosis.saved import load_effects
 from visadapt.effects import EFFECTS, Effect
-from visadapt.effects.base import expect
+from visadapt.effects.base import require_system
 from visadapt.effects.catalogue import catalogue, sized
 from visadapt.progress import Report, reporting
 from visadapt.storage.run_folder import open_run
@@ -112,7 +112,7 @@ def _effect(text: str, system: System) -> Effect:
         hint = f"did you mean {near[0]}? " if near else ""
         raise InputError(f"--effect {text}: there is no effect {name!r}; {hint}`visadapt effects` lists them")
     try:
-        expect(system, EFFECTS[name])
+        require_system(system, EFFECTS[name])
     except TypeError as error:
         raise InputError(f"--effect {text}: {error}") from error
     values: dict[str, float] = {}

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from visadapt.effects.base import DynamicsEffect, Parameter, Role, expect
+from visadapt.effects.base import DynamicsEffect, Parameter, Role, require_system
 from visadapt.systems import FixedWing, Quadrotor, System
 from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, matvec, rotation, stack_parameters
 
@@ -37,7 +37,7 @@ class AirDrag(DynamicsEffect):
     systems = VEHICLES
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        velocity = airspeed(state, expect(system, self))
+        velocity = airspeed(state, require_system(system, self))
         return pad(-self.value("coefficient", state)[..., None] * velocity, (0, 3))
 
 
@@ -70,7 +70,7 @@ class RotorDrag(DynamicsEffect):
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         turned = rotation(state[:, ATTITUDE])
-        velocity = matvec(turned.mT, airspeed(state, expect(system, self)))
+        velocity = matvec(turned.mT, airspeed(state, require_system(system, self)))
         coefficients = torch.stack([self.value(p.name, state) for p in self.table], -1)
         return pad(-matvec(turned, coefficients * velocity), (0, 3))
 
@@ -88,7 +88,7 @@ class TranslationalLift(DynamicsEffect):
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         turned = rotation(state[:, ATTITUDE])
-        velocity = matvec(turned.mT, airspeed(state, expect(system, self)))
+        velocity = matvec(turned.mT, airspeed(state, require_system(system, self)))
         lift = self.value("coefficient", state) * velocity[:, :2].square().sum(1)
         return pad(lift[:, None] * turned[:, :, 2], (0, 3))
 
@@ -110,7 +110,7 @@ class Wind(AirDrag):
     )
 
     def alter(self, system: System) -> System:
-        air = expect(system, self)
+        air = require_system(system, self)
         return replace(air, **{f"wind_{k}": getattr(air, f"wind_{k}") + getattr(self, f"velocity_{k}") for k in "xyz"})
 
 
@@ -135,7 +135,7 @@ class PeriodicWind(AirDrag):
     )
 
     def vary(self, system: System, time: Tensor, state: Tensor) -> System:
-        air = expect(system, self)
+        air = require_system(system, self)
         angle = 2 * math.pi * self.value("frequency", state) * time + self.value("phase", state)
         speed, direction = self.value("amplitude", state) * angle.cos(), self.value("direction", state)
         return replace(air, wind_x=air.wind_x + speed * direction.cos(), wind_y=air.wind_y + speed * direction.sin())

@@ -280,7 +280,7 @@ class SensingEffect(Effect):
         raise NotImplementedError
 
 
-def expect(system: System, effect: Effect | type[Effect]) -> Any:
+def require_system(system: System, effect: Effect | type[Effect]) -> Any:
     """The system, where it is one that the effect acts on.
 
     Raises:
@@ -304,7 +304,7 @@ def check_acts_on(system: System, effect: Effect) -> None:
 
     own = type(system)
     if own in SYSTEMS.values() or columns(own) not in map(columns, effect.systems):
-        expect(system, effect)
+        require_system(system, effect)
 
 
 def inside(place: Tensor, start: Tensor, end: Tensor, width: float) -> Tensor:

@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from visadapt.effects.base import DynamicsEffect, Parameter, Role, expect
+from visadapt.effects.base import DynamicsEffect, Parameter, Role, require_system
 from visadapt.effects.laws import ConstantLaw, JointLoad, PeriodicLaw, PulseLaw, SpringLaw
 from visadapt.systems import CartPole, RigidBody, System
 
@@ -107,7 +107,7 @@ class TrackTilt(DynamicsEffect):
     systems = (CartPole,)
 
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
-        cart_pole = expect(system, self)
+        cart_pole = require_system(system, self)
         tilt, theta = self.value("angle", state), state[:, 2]
         weight = (cart_pole.cart_mass + cart_pole.pole_mass) * cart_pole.gravity
         moment = cart_pole.pole_mass * cart_pole.pole_half_length * cart_pole.gravity

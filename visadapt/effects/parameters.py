@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import ClassVar
 
-from visadapt.effects.base import DynamicsEffect, Parameter, expect
+from visadapt.effects.base import DynamicsEffect, Parameter, require_system
 from visadapt.systems import CartPole, System
 
 __all__ = ["CartMass", "ParameterScale", "ParameterShift", "PoleLength", "PoleMass"]
@@ -17,7 +17,7 @@ class ParameterScale(DynamicsEffect):
     scaled: ClassVar[dict[str, str]]  # the system's parameter for each of the effect's
 
     def alter(self, system: System) -> System:
-        own = expect(system, self)
+        own = require_system(system, self)
         values = {field: getattr(self, factor) * getattr(own, field) for factor, field in self.scaled.items()}
         return replace(own, **values)
 
@@ -28,7 +28,7 @@ class ParameterShift(DynamicsEffect):
     shifted: ClassVar[dict[str, str]]  # the effect's parameter for each of the system's
 
     def alter(self, system: System) -> System:
-        own = expect(system, self)
+        own = require_system(system, self)
         values = {field: getattr(own, field) + getattr(self, amount) for field, amount in self.shifted.items()}
         return replace(own, **values)
 

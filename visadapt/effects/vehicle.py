@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from visadapt.effects.aerial import VEHICLES, Vehicle
-from visadapt.effects.base import ActuationEffect, DynamicsEffect, Parameter, expect
+from visadapt.effects.base import ActuationEffect, DynamicsEffect, Parameter, require_system
 from visadapt.effects.parameters import ParameterScale, ParameterShift
 from visadapt.effects.recurrence import linear_recurrence
 from visadapt.systems import Quadrotor, System
@@ -57,7 +57,7 @@ class ThrustGain(DynamicsEffect):
     scale: Tensor
 
     def alter(self, system: System) -> System:
-        return with_thrust(expect(system, self), self.scale)
+        return with_thrust(require_system(system, self), self.scale)
 
 
 class MotorLag(ActuationEffect):
@@ -85,7 +85,7 @@ class MotorLag(ActuationEffect):
     """1/s, gain and damping of the loop around each command: 0 for the thrust; None (no loop) until bound"""
 
     def acting_on(self, system: System) -> Self:
-        own = expect(system, self)
+        own = require_system(system, self)
         scales = (own.inertia_scale_x, own.inertia_scale_y, own.inertia_scale_z)
         gains = zip((own.roll_gain, own.roll_gain, own.yaw_gain), scales, strict=True)
         dampings = zip((own.damping_x, own.damping_y, own.damping_z), scales, strict=True)
@@ -159,7 +159,7 @@ class BatterySag(DynamicsEffect):
     systems = (Quadrotor,)
 
     def vary(self, system: System, time: Tensor, state: Tensor) -> System:
-        return with_thrust(expect(system, self), (-self.value("rate", state) * time).exp())
+        return with_thrust(require_system(system, self), (-self.value("rate", state) * time).exp())
 
 
 class GroundEffect(DynamicsEffect):
@@ -181,7 +181,7 @@ class GroundEffect(DynamicsEffect):
     LEAST: ClassVar[float] = 1e-30  # m8, keeps the root positive where both height and radius are 0
 
     def vary(self, system: System, time: Tensor, state: Tensor) -> System:
-        vehicle = expect(system, self)
+        vehicle = require_system(system, self)
         height = (state[:, 2] - self.value("ground", state)).clamp_min(0)
         square = self.value("radius", state).square()
         # x / (1 + (4 x)^4)^(1/4), multiplied out: neither a height of 0 nor a radius of 0 is divided by.

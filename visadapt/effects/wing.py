@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 from typing import ClassVar
 
-from visadapt.effects.base import DynamicsEffect, Parameter, expect
+from visadapt.effects.base import DynamicsEffect, Parameter, require_system
 from visadapt.effects.parameters import ParameterScale
 from visadapt.systems import FixedWing, System
 
@@ -78,7 +78,7 @@ class TrimOffset(DynamicsEffect):
     systems = (FixedWing,)
 
     def alter(self, system: System) -> System:
-        wing = expect(system, self)
+        wing = require_system(system, self)
         return replace(
             wing,
             lift_zero=wing.lift_zero + wing.lift_elevator * self.elevator,

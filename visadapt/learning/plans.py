@@ -109,7 +109,7 @@ class KeptPlans(Plans):
         assert self.past is not None
         drawn = self.past[torch.randint(len(self.past.inputs), (self.batch,), generator=self.generator)]
         plan = self.policy.decide(drawn.inputs, drawn.expected)
-        states = held(streams.world, drawn.at, plan, drawn.correction)
+        states = rollout_with_constant_correction(streams.world, drawn.at, plan, drawn.correction)
         return streams.task.cost(states, plan, drawn.at.state, drawn.task_state).mean()
 
     def tree(self) -> dict[str, Any]:
@@ -165,7 +165,7 @@ def visit(policy: Policy, world: World, stream: StreamState, shown: History) -> 
     return visited, action, world.step(stream.at, action, correction=correction)
 
 
-def held(world: World, at: WorldState, plan: Tensor, correction: Tensor) -> Tensor:
+def rollout_with_constant_correction(world: World, at: WorldState, plan: Tensor, correction: Tensor) -> Tensor:
     """The states (B, K, n_state) that follow a plan (B, K, n_action) under a constant correction (B, n_state)."""
     states = []
     for k in range(plan.shape[1]):

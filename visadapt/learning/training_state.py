@@ -24,6 +24,9 @@ from visadapt.storage.checkpoints import (
 CHECKPOINT_ITERATIONS = 100
 """Iterations between two checkpoints."""
 
+RENAMED = {"cost_of": "plan_cost"}
+"""Fields of settings, by the names that files of earlier versions give them."""
+
 
 @dataclass
 class TrainingState:
@@ -129,6 +132,7 @@ def _same(kept: Any, wanted: Any) -> bool:
     """
     kept, wanted = (each.tolist() if isinstance(each, Tensor) else each for each in (kept, wanted))
     if isinstance(kept, Mapping) and isinstance(wanted, Mapping):
+        kept = {RENAMED.get(key, key): value for key, value in kept.items()}
         return kept.keys() == wanted.keys() and all(_same(kept[key], wanted[key]) for key in kept)
     if isinstance(kept, list | tuple) and isinstance(wanted, list | tuple):
         return len(kept) == len(wanted) and all(map(_same, kept, wanted))

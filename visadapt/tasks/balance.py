@@ -109,7 +109,7 @@ weight of 1 on the velocity it would draw back faster, but resonate with such a 
 class Balance(Task):
     """Come to rest at the origin and stay there. The task state is empty: (B, 0)."""
 
-    cost_of: Cost
+    plan_cost: Cost
     start_spread: tuple[float, ...] = (0.5, 0.3, 0.15, 0.3)
     """half-widths of the uniform distribution of states that streams start from"""
     kick: tuple[float, ...] = (0.0, 0.3, 0.0, 0.5)
@@ -125,7 +125,7 @@ class Balance(Task):
         return state, state[:, :0]
 
     def cost(self, states: Tensor, plan: Tensor, now: Tensor, task_state: Tensor) -> Tensor:
-        return self.cost_of(states, plan, now)
+        return self.plan_cost(states, plan, now)
 
     def diverged(self, state: Tensor, task_state: Tensor, progress: float) -> Tensor:
         return ~(state.abs() <= self._limit(progress)).all(1)  # also where a state is not a number

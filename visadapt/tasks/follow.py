@@ -66,7 +66,7 @@ class Follow(FlightTask):
     """Fly along one of many references, from its first row to its last. A task state is (reference, row)."""
 
     references: Reference  # (N, T, 3)
-    cost_of: FollowCost = FollowCost()
+    plan_cost: FollowCost = FollowCost()
     start_spread: tuple[float, float] = (0.1, 0.2)  # standard deviation in m and m/s of the start around the reference
     divergence: float = 2.0
     """m, delta_div at the end of the curriculum: a stream further from its reference starts anew"""
@@ -104,7 +104,7 @@ class Follow(FlightTask):
         return state, torch.stack((which, row), 1)
 
     def cost(self, states: Tensor, plan: Tensor, now: Tensor, task_state: Tensor) -> Tensor:
-        return self.cost_of(states, plan, self.ahead(task_state))
+        return self.plan_cost(states, plan, self.ahead(task_state))
 
     def diverged(self, state: Tensor, task_state: Tensor, progress: float) -> Tensor:
         limit = self.divergence * curriculum(self.first_divergence, progress)
