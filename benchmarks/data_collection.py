@@ -32,7 +32,7 @@ from experiments.result_tables import Row, miss_row, read_rows, write_rows
 from visadapt.effects import Residual
 from visadapt.evaluation import SCORE_SEED, FlightScore
 from visadapt.learning.grounding import gap, left_over
-from visadapt.learning.windows import Windows
+from visadapt.learning.transitions import Transitions
 from visadapt.policies import AutoregressivePolicy, Policy
 from visadapt.setups.base import Setup
 from visadapt.storage.run_folder import once
@@ -189,15 +189,15 @@ def _stand(settings: Settings, setup: Setup, name: str, folder: Path, key: str, 
     def mismatch() -> dict[str, float]:
         generator = torch.Generator().manual_seed(SCORE_SEED)
         flown = run(target, policy, settings.flights, target.task.steps, generator, strict=False)
-        windows = Windows.cut([each.episode for each in flown], "state")
-        return {"mean": float(_error(policy.residual, setup, windows)[:, VELOCITY].norm(dim=1).mean())}
+        transitions = Transitions.cut([each.episode for each in flown], "state")
+        return {"mean": float(_error(policy.residual, setup, transitions)[:, VELOCITY].norm(dim=1).mean())}
 
     return Stand(found, once(folder / f"mismatch-{key}.json", mismatch)["mean"])
 
 
-def _error(residual: Residual | None, setup: Setup, windows: Windows) -> torch.Tensor:
+def _error(residual: Residual | None, setup: Setup, transitions: Transitions) -> torch.Tensor:
     """Of one step of the simulator (N, n_state)."""
-    return gap(setup.source, windows) if residual is None else left_over(residual, setup.source, windows)
+    return gap(setup.source, transitions) if residual is None else left_over(residual, setup.source, transitions)
 
 
 if __name__ == "__main__":

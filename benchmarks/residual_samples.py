@@ -27,7 +27,7 @@ from experiments.flights import EXPERIMENTS, flight_target
 from experiments.result_tables import Row, read_rows, write_rows
 from visadapt.effects import Residual
 from visadapt.learning.grounding import gap, ground, left_over, rescale
-from visadapt.learning.windows import Windows
+from visadapt.learning.transitions import Transitions
 from visadapt.policies import Policy
 from visadapt.policies.networks import FlightResidualNetwork, ResidualNetwork, StateResidualNetwork
 from visadapt.setups.base import Setup
@@ -93,15 +93,15 @@ def _draw(settings: Settings) -> None:
     plot_charts(settings.picture, [panel])
 
 
-def _flown(setup: Setup, policy: Policy, seed: int) -> Windows:
+def _flown(setup: Setup, policy: Policy, seed: int) -> Transitions:
     """Samples of flights in the target."""
     target = flight_target(setup, EXPERIMENT.effects(setup), test=False)
     generator = torch.Generator().manual_seed(seed)
     runs = run(target, policy, FLIGHTS, target.task.steps, generator, NOISE)
-    return Windows.cut([each.episode for each in runs], "state")
+    return Transitions.cut([each.episode for each in runs], "state")
 
 
-def _share(setup: Setup, method: str, train: Windows, samples: int, test: Windows, seed: int) -> float:
+def _share(setup: Setup, method: str, train: Transitions, samples: int, test: Transitions, seed: int) -> float:
     """The share of the gap in velocity that a residual leaves on `test`."""
     torch.manual_seed(seed)
     source, own = setup.source, setup.settings.ground
@@ -118,9 +118,9 @@ def _share(setup: Setup, method: str, train: Windows, samples: int, test: Window
     return _size(left_over(residual, source, test)) / _size(gap(source, test))
 
 
-def _first(windows: Windows, count: int) -> Windows:
-    """The first windows only, of the same episodes."""
-    return dataclasses.replace(windows, rows=windows.rows[:count])
+def _first(transitions: Transitions, count: int) -> Transitions:
+    """The first transitions only, of the same episodes."""
+    return dataclasses.replace(transitions, rows=transitions.rows[:count])
 
 
 def _size(change: Tensor) -> float:

@@ -42,7 +42,7 @@ from benchmarks.flight import Settings as FlightSettings
 from datasets import quadrotor_references
 from experiments.flights import EXPERIMENTS, flight_target
 from visadapt.evaluation import SCORE_SEED
-from visadapt.learning.windows import Windows
+from visadapt.learning.transitions import Transitions
 from visadapt.policies import Policy
 from visadapt.setups.base import Setup
 from visadapt.storage.atomic_files import replacing
@@ -187,13 +187,13 @@ def measured(setup: Setup, policy: Policy, target: Target, episodes: int = EPISO
     steps = target.task.steps if isinstance(target, FlightTarget) else EPISODE_STEPS
     drawn = torch.Generator().manual_seed(SCORE_SEED)
     runs = run(target, policy.eval(), episodes, steps, drawn, strict=False)
-    windows = to_come(task, Windows.cut([each.episode for each in runs], "state"))
-    nu, columns = reference(task, windows)
+    transitions = to_come(task, Transitions.cut([each.episode for each in runs], "state"))
+    nu, columns = reference(task, transitions)
     residual = [] if policy.residual is None else [copy.deepcopy(policy.residual).double()]
     model = source.with_effects([*source.effects, *residual]).requires_grad_(False)
-    at = windows.start(model).map(Tensor.double)
-    history = windows.history(torch.arange(len(windows))).map(Tensor.double)
-    none = at.state.new_zeros(len(windows), len(source.system.loads))
+    at = transitions.start(model).map(Tensor.double)
+    history = transitions.history(torch.arange(len(transitions))).map(Tensor.double)
+    none = at.state.new_zeros(len(transitions), len(source.system.loads))
 
     def step(action: Tensor) -> Tensor:
         return model.step(at, action, history).state[:, columns]
@@ -201,9 +201,9 @@ def measured(setup: Setup, policy: Policy, target: Target, episodes: int = EPISO
     def rate(action: Tensor) -> Tensor:
         return source.system.derivative(at.state, action, none)
 
-    own = windows.action.double()
+    own = transitions.action.double()
     best = best_action(step, nu, own)
-    after, predicted = windows.next_state.double()[:, columns], step(own)
+    after, predicted = transitions.next_state.double()[:, columns], step(own)
     left, gap = (after - nu).norm(dim=1), (after - predicted).norm(dim=1)
     control, zeta = (predicted - nu).norm(dim=1), (step(best) - nu).norm(dim=1)
     apart, rates = (own - best).norm(dim=1), lipschitz(rate, own)
@@ -214,7 +214,7 @@ def measured(setup: Setup, policy: Policy, target: Target, episodes: int = EPISO
     # L may be a little larger between the points than at them.
     holding = left <= (gap + between * apart + zeta) * (1 + 1e-6)
     return Terms(
-        steps=len(windows),
+        steps=len(transitions),
         left=float(left.mean()),
         delta=float(gap.mean()),
         lipschitz_median=float(here.median()),
@@ -232,17 +232,17 @@ def measured(setup: Setup, policy: Policy, target: Target, episodes: int = EPISO
     )
 
 
-def to_come(task: Task, windows: Windows) -> Windows:
+def to_come(task: Task, transitions: Transitions) -> Transitions:
     """The steps that have a reference: those of a fixed wing end where it passes its point."""
     if not isinstance(task, Reach):
-        return windows
-    ahead = windows.state[:, 0] < windows.task_states[windows.rows[:, -1], 0]
-    return replace(windows, rows=windows.rows[ahead])
+        return transitions
+    ahead = transitions.state[:, 0] < transitions.task_states[transitions.rows[:, -1], 0]
+    return replace(transitions, rows=transitions.rows[ahead])
 
 
-def reference(task: Task, windows: Windows) -> tuple[Tensor, slice]:
+def reference(task: Task, transitions: Transitions) -> tuple[Tensor, slice]:
     """nu (N, n) in float64, what each state should be one period on, and the columns of the state that it says."""
-    state, task_state = windows.state.double(), windows.task_states[windows.rows[:, -1]]
+    state, task_state = transitions.state.double(), transitions.task_states[transitions.rows[:, -1]]
     if isinstance(task, Follow):
         return task.ahead(task_state.long())[:, 0].double(), slice(0, 6)
     if isinstance(task, Reach):

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from benchmarks.baselines.mppi import carried
 from benchmarks.baselines.problem import COST, Problem, Sizes, Stage, in_rounds
 from visadapt.history import HORIZON, LENGTH, History
-from visadapt.learning.windows import Windows
+from visadapt.learning.transitions import Transitions
 from visadapt.policies import Policy
 from visadapt.world import World
 
@@ -162,11 +162,11 @@ def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[
     yield Stage("source", 0, unfitted())
     yield Stage("target", 0, unfitted())
 
-    def learn(windows: Windows, generator: torch.Generator) -> Callable[[], Policy]:
-        history = windows.history(torch.arange(len(windows))).acting(windows.action)
+    def learn(transitions: Transitions, generator: torch.Generator) -> Callable[[], Policy]:
+        history = transitions.history(torch.arange(len(transitions))).acting(transitions.action)
         ensemble = copy.deepcopy(source)
         seen = model_inputs(history, with_history)
-        ensemble.fit(seen, windows.next_state - windows.state, TARGET_UPDATES, TARGET_RATE, generator)
+        ensemble.fit(seen, transitions.next_state - transitions.state, TARGET_UPDATES, TARGET_RATE, generator)
         return partial(EnsemblePlanner, ensemble, with_history)
 
     yield from in_rounds(problem, sizes, seed, lambda: (unfitted, learn))

@@ -20,7 +20,7 @@ from visadapt.effects.base import Role
 from visadapt.learning.grounding import ground, rescale
 from visadapt.learning.ledger import Ledger
 from visadapt.learning.rounds import collect
-from visadapt.learning.windows import Windows
+from visadapt.learning.transitions import Transitions
 from visadapt.policies import Policy
 from visadapt.recordings import Episode
 from visadapt.setups.base import Setup
@@ -118,7 +118,7 @@ def score_path(folder: Path, stage: Stage) -> Path:
     return folder / f"score-{stage.domain}-{stage.samples}.json"
 
 
-Learn = Callable[[Windows, torch.Generator], Callable[[], Policy]]
+Learn = Callable[[Transitions, torch.Generator], Callable[[], Policy]]
 """All samples of the target so far to what makes the policy that has learnt from them, anew each time."""
 
 
@@ -138,7 +138,7 @@ def in_rounds(
             new = collect(made(), problem.target(), min(round_samples, ledger.left), longest, generator)
             ledger.count("data", sum(episode.samples for episode in new))
             episodes += new
-            made = learn(Windows.cut(episodes, "state"), generator)
+            made = learn(Transitions.cut(episodes, "state"), generator)
             if ledger.used in sizes.scored:
                 yield Stage("adapted", ledger.used, made())
 
@@ -156,12 +156,12 @@ def grounded(
         residual = setup.residual(setup.policy(), setup.source)
         scaled = False
 
-        def learn(windows: Windows, generator: torch.Generator) -> Callable[[], Policy]:
+        def learn(transitions: Transitions, generator: torch.Generator) -> Callable[[], Policy]:
             nonlocal scaled
             if not scaled:
-                rescale(residual, setup.source, windows, setup.settings.ground.negligible)
+                rescale(residual, setup.source, transitions, setup.settings.ground.negligible)
                 scaled = True
-            ground(residual, setup.source, windows, setup.settings.ground, generator)
+            ground(residual, setup.source, transitions, setup.settings.ground, generator)
             return partial(planner, residual)
 
         return partial(planner, None), learn

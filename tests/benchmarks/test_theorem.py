@@ -9,7 +9,7 @@ import torch
 from benchmarks.theorem import best_action, lipschitz, measured, to_come
 from experiments.flights import flight_target
 from tests.flying import drag, seeded, small_quadrotor
-from visadapt.learning.windows import Windows
+from visadapt.learning.transitions import Transitions
 from visadapt.recordings import Episode
 from visadapt.setups.cartpole import cartpole_states
 from visadapt.setups.flight import fixed_wing
@@ -101,5 +101,5 @@ def test_a_wing_that_has_passed_its_point_has_no_reference():
     state[:, 0] = torch.tensor([48.0, 49.0, 50.0, 51.0, 52.0])
     point = torch.tensor([[50.0, 1.0, 2.0]]).expand(5, 3)
     episode = Episode(0.05 * np.arange(5), np.zeros((5, 4)), state.numpy(), None, point.numpy())
-    kept = to_come(Reach(), Windows.cut([episode], "state"))
+    kept = to_come(Reach(), Transitions.cut([episode], "state"))
     assert kept.state[:, 0].tolist() == [48.0, 49.0]

@@ -14,7 +14,7 @@ from visadapt.estimation.episode_phases import in_step, with_episode_phases
 from visadapt.estimation.fit_states import Effects
 from visadapt.estimation.segments import cut
 from visadapt.learning.grounding import fit_named, gap
-from visadapt.learning.windows import Windows
+from visadapt.learning.transitions import Transitions
 from visadapt.systems import CartPole
 from visadapt.world import World
 
@@ -72,9 +72,9 @@ def test_one_force_is_fitted_to_all_episodes_and_leaves_nothing_in_any(recording
 def test_the_gap_that_a_residual_learns_is_that_beside_the_force_in_every_episode():
     clean = record([running()], measured=STATES, noise=[1e-3 * noise for noise in NOISE])
     source = World(CartPole(), [PeriodicForce(amplitude=0.0, frequency=1.0, phase=0.0, offset=0.0)], substeps=10)
-    windows = Windows.cut(clean.episodes, "state")
-    missing = gap(source, windows).square().mean(0).sqrt()
-    left = gap(source, fit_named(source, windows)).square().mean(0).sqrt()
+    transitions = Transitions.cut(clean.episodes, "state")
+    missing = gap(source, transitions).square().mean(0).sqrt()
+    left = gap(source, fit_named(source, transitions)).square().mean(0).sqrt()
     assert (left < 0.03 * missing).all()
 
 

@@ -13,7 +13,7 @@ from visadapt.effects import ActuatorLag, LinearDrag, PeriodicForce, Residual
 from visadapt.history import LENGTH, History
 from visadapt.learning.grounding import GroundSettings, gap, ground, rescale
 from visadapt.learning.plans import imagine
-from visadapt.learning.windows import Windows
+from visadapt.learning.transitions import Transitions
 from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.recordings import Episode
 from visadapt.setups.policy_file import source_steps
@@ -52,26 +52,26 @@ def swaying(count, seed):
     return [PeriodicForce(amplitude=2.0, frequency=0.2, phase=phase, offset=0.0)]
 
 
-def fitted(network, windows):
+def fitted(network, transitions):
     residual = Residual(network, torch.ones(13))
-    rescale(residual, SOURCE, windows)
-    ground(residual, SOURCE, windows, GroundSettings(ridge=0.1), seeded())
+    rescale(residual, SOURCE, transitions)
+    ground(residual, SOURCE, transitions, GroundSettings(ridge=0.1), seeded())
     return residual
 
 
-def left(residual, windows):
+def left(residual, transitions):
     """Root mean squares (13,) of what remains of the gap."""
     with torch.no_grad():
-        every = torch.arange(len(windows))
-        delta = residual.delta(windows.history(every).acting(windows.action))
-    return (gap(SOURCE, windows) - delta).square().mean(0).sqrt()
+        every = torch.arange(len(transitions))
+        delta = residual.delta(transitions.history(every).acting(transitions.action))
+    return (gap(SOURCE, transitions) - delta).square().mean(0).sqrt()
 
 
 @pytest.fixture(scope="module")
 def residual():
-    windows = Windows.cut(flights([LinearDrag(coefficient=RATE)], 30, 11), "state")
-    assert len(windows) == 300
-    return fitted(a_network(), windows)
+    transitions = Transitions.cut(flights([LinearDrag(coefficient=RATE)], 30, 11), "state")
+    assert len(transitions) == 300
+    return fitted(a_network(), transitions)
 
 
 class TestDrag:
@@ -87,46 +87,48 @@ class TestDrag:
         assert weight[VELOCITY.stop :].abs().max() < 1e-4
 
     def test_on_flights_not_seen_nine_tenths_of_the_gap_are_closed(self, residual):
-        windows = Windows.cut(flights([LinearDrag(coefficient=RATE)], 30, 11, seed=1), "state")
-        before, after = gap(SOURCE, windows).square().mean(0).sqrt(), left(residual, windows)
+        transitions = Transitions.cut(flights([LinearDrag(coefficient=RATE)], 30, 11, seed=1), "state")
+        before, after = gap(SOURCE, transitions).square().mean(0).sqrt(), left(residual, transitions)
         assert (after[: VELOCITY.stop] < 0.1 * before[: VELOCITY.stop]).all()
 
 
 class TestForceThatChanges:
     def test_with_a_history_it_is_followed_whatever_its_phase_and_without_one_it_is_not(self):
-        windows = Windows.cut(flights(swaying(8, 0), 8, 51), "state")
-        unseen = Windows.cut(flights(swaying(8, 1), 8, 51, seed=1), "state")
+        transitions = Transitions.cut(flights(swaying(8, 0), 8, 51), "state")
+        unseen = Transitions.cut(flights(swaying(8, 1), 8, 51, seed=1), "state")
         before = gap(SOURCE, unseen).square().mean(0).sqrt()[VELOCITY.start]
-        seeing, blind = (left(fitted(a_network(history), windows), unseen)[VELOCITY.start] for history in (True, False))
+        seeing, blind = (
+            left(fitted(a_network(history), transitions), unseen)[VELOCITY.start] for history in (True, False)
+        )
         assert seeing < 0.25 * before
         assert blind > 0.8 * before
 
     def test_imagined_on_from_a_seventh_row_it_goes_on_for_seconds_as_it_does_in_truth(self):
         """Fed with what it says itself, the residual neither dies down nor runs away."""
-        residual = fitted(a_network(True), Windows.cut(flights(swaying(8, 0), 8, 51), "state"))
+        residual = fitted(a_network(True), Transitions.cut(flights(swaying(8, 0), 8, 51), "state"))
         unseen = flights(swaying(8, 1), 8, 51, seed=1)
-        windows = Windows.cut(unseen, "state")
-        rows = torch.arange(6, len(windows), 50)
-        plan = torch.stack([windows.action[rows + k] for k in range(40)], 1)
-        truth = torch.stack([windows.next_state[rows + k] for k in range(40)], 1)
+        transitions = Transitions.cut(unseen, "state")
+        rows = torch.arange(6, len(transitions), 50)
+        plan = torch.stack([transitions.action[rows + k] for k in range(40)], 1)
+        truth = torch.stack([transitions.next_state[rows + k] for k in range(40)], 1)
         off = []
         for effects in ([residual], []):
             world = World(Quadrotor(), effects, PERIOD, substeps=2)
             with torch.no_grad():
                 states, _ = imagine(
-                    world, lambda state: state, world.start(windows.state[rows]), windows.history(rows), plan
+                    world, lambda state: state, world.start(transitions.state[rows]), transitions.history(rows), plan
                 )
             off.append((states - truth)[..., VELOCITY.start].square().mean().sqrt())
         assert off[0] < 0.02 * off[1]
 
     def test_before_a_flight_begins_stands_what_its_first_period_left_unexplained(self):
-        windows = Windows.cut(
+        transitions = Transitions.cut(
             flights([PeriodicForce(amplitude=2.0, frequency=0.2, phase=0.5, offset=0.0)], 4, 4), "state"
         )
         network = a_network(True)
 
         def found(row):
-            history = windows.history(torch.arange(row, len(windows), 3)).acting(torch.zeros(4, 4))
+            history = transitions.history(torch.arange(row, len(transitions), 3)).acting(torch.zeros(4, 4))
             return network.unexplained(predict, history.observations, history.actions).unflatten(1, (-1, 6))
 
         assert not found(0).any()
@@ -135,18 +137,18 @@ class TestForceThatChanges:
         assert torch.equal(found(2)[:, :-1], found(1)[:, 1:])
 
     def test_samples_whose_past_is_not_whole_are_not_learnt_from(self):
-        network, windows = a_network(True), Windows.cut(flights(swaying(8, 0), 8, 11), "state")
-        fitted(network, windows)
-        seen = network.embed(windows.history(torch.arange(len(windows))).acting(windows.action))
+        network, transitions = a_network(True), Transitions.cut(flights(swaying(8, 0), 8, 11), "state")
+        fitted(network, transitions)
+        seen = network.embed(transitions.history(torch.arange(len(transitions))).acting(transitions.action))
         assert network.informed(seen).tolist() == ([False] * 4 + [True] * 6) * 8
         assert a_network().informed(seen).all()
 
     def test_what_the_source_left_unexplained_is_the_force_over_the_mass_and_nothing_else(self):
         force = PeriodicForce(amplitude=2.0, frequency=0.2, phase=0.5, offset=0.0)
-        windows = Windows.cut(flights([force], 4, LENGTH + 1), "state")
-        history = windows.history(torch.arange(LENGTH - 1, len(windows), LENGTH))
-        states = torch.stack([windows.state[k : k + LENGTH] for k in range(0, len(windows), LENGTH)])
-        actions = torch.stack([windows.action[k : k + LENGTH] for k in range(0, len(windows), LENGTH)])
+        transitions = Transitions.cut(flights([force], 4, LENGTH + 1), "state")
+        history = transitions.history(torch.arange(LENGTH - 1, len(transitions), LENGTH))
+        states = torch.stack([transitions.state[k : k + LENGTH] for k in range(0, len(transitions), LENGTH)])
+        actions = torch.stack([transitions.action[k : k + LENGTH] for k in range(0, len(transitions), LENGTH)])
         assert torch.equal(history.observations, states)
         found = a_network(True).unexplained(predict, states, actions).unflatten(1, (LENGTH - 1, 6))
         ends = 2 * (2 * math.pi * 0.2 * PERIOD * torch.arange(LENGTH) + 0.5).sin() / (2 * math.pi * 0.2)
@@ -157,16 +159,16 @@ class TestForceThatChanges:
 
     def test_it_tells_how_much_pushes_and_how_fast_that_changes(self):
         force = PeriodicForce(amplitude=2.0, frequency=0.2, phase=0.5, offset=0.0)
-        windows = Windows.cut(flights([force], 4, LENGTH + 1), "state")
-        rows = torch.arange(LENGTH - 1, len(windows), LENGTH)
-        estimate = a_network(True).disturbance(windows.history(rows).acting(windows.action[rows]))
+        transitions = Transitions.cut(flights([force], 4, LENGTH + 1), "state")
+        rows = torch.arange(LENGTH - 1, len(transitions), LENGTH)
+        estimate = a_network(True).disturbance(transitions.history(rows).acting(transitions.action[rows]))
         turn = 2 * math.pi * 0.2
         # In units of 2 m/s2 and 2 m/s3: half a period, and two periods, before the last row.
         now, middle = (0.5 + turn * PERIOD * (LENGTH - 1 - back) for back in (0.5, 2.0))
         torch.testing.assert_close(estimate[:, 0], torch.full((4,), math.cos(now)), rtol=0, atol=0.01)
         torch.testing.assert_close(estimate[:, 6], torch.full((4,), -turn * math.sin(middle)), rtol=0, atol=0.03)
         assert estimate[:, [1, 2, 3, 4, 5]].abs().max() < 0.01
-        assert not a_network().disturbance(windows.history(torch.arange(4))).any()
+        assert not a_network().disturbance(transitions.history(torch.arange(4))).any()
 
 
 @pytest.mark.parametrize("with_history", [False, True])

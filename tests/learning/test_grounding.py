@@ -16,7 +16,7 @@ from visadapt.learning.grounding import (
     rescale,
     split,
 )
-from visadapt.learning.windows import Windows
+from visadapt.learning.transitions import Transitions
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import Episode
 from visadapt.systems import CartPole
@@ -45,18 +45,18 @@ def recorded(seed, count=16, rows=SAMPLES + 1):
 SOURCE = World(CartPole())
 
 
-def fit(residual, source, windows, settings, generator):
+def fit(residual, source, transitions, settings, generator):
     """The first round's grounding."""
-    rescale(residual, source, windows)
-    return ground(residual, source, windows, settings, generator)
+    rescale(residual, source, transitions)
+    return ground(residual, source, transitions, settings, generator)
 
 
-def gap_left(windows, residual):
+def gap_left(transitions, residual):
     world = World(CartPole(), [residual])
-    index = torch.arange(len(windows))
+    index = torch.arange(len(transitions))
     with torch.no_grad():
-        state = world.step(world.start(windows.state), windows.action, windows.history(index)).state
-    return windows.next_state - state
+        state = world.step(world.start(transitions.state), transitions.action, transitions.history(index)).state
+    return transitions.next_state - state
 
 
 class TestOnStates:
@@ -64,9 +64,9 @@ class TestOnStates:
     def test_more_than_nine_tenths_of_the_one_step_gap_closes_on_episodes_not_seen(self, with_history, count):
         torch.manual_seed(0)
         residual = Residual(state_residual_network(with_history), torch.ones(4))
-        windows, unseen = Windows.cut(recorded(1, count), "state"), Windows.cut(recorded(2), "state")
+        transitions, unseen = Transitions.cut(recorded(1, count), "state"), Transitions.cut(recorded(2), "state")
         settings = GroundSettings(steps=500)
-        losses = fit(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
+        losses = fit(residual, SOURCE, transitions, settings, torch.Generator().manual_seed(0))
         before, after = gap(SOURCE, unseen), gap_left(unseen, residual)
         # What reads a history sees a force in the periods behind it.
         shown = (torch.arange(len(unseen)) % SAMPLES >= LENGTH - 1) | torch.tensor(not with_history)
@@ -81,116 +81,116 @@ class TestOnStates:
         upright = np.zeros((2, 4))
         acceleration = NEWTONS / (1.0 + 0.1 / 4)
         upright[1] = [0.0, 0.05 * acceleration, 0.0, -0.05 * 1.5 * acceleration]
-        windows = Windows.cut([Episode(np.array([0.0, 0.05]), np.zeros((2, 1)), upright)], "state")
+        transitions = Transitions.cut([Episode(np.array([0.0, 0.05]), np.zeros((2, 1)), upright)], "state")
         source = World(CartPole(), integrator="euler")
-        np.testing.assert_allclose(gap(source, windows).numpy()[0], upright[1], atol=1e-6)
+        np.testing.assert_allclose(gap(source, transitions).numpy()[0], upright[1], atol=1e-6)
         pushed = World(CartPole(), [ConstantForce(force=NEWTONS)], integrator="euler").requires_grad_(False)
-        np.testing.assert_allclose(gap(pushed, windows).numpy(), 0.0, atol=1e-6)
+        np.testing.assert_allclose(gap(pushed, transitions).numpy(), 0.0, atol=1e-6)
 
     def test_what_is_left_over_is_the_error_of_a_world_with_the_residual(self):
-        windows = Windows.cut(recorded(0), "state")
+        transitions = Transitions.cut(recorded(0), "state")
         residual = Residual(state_residual_network(False), torch.ones(4))
-        fit(residual, SOURCE, windows, GroundSettings(steps=50), torch.Generator().manual_seed(0))
-        left = left_over(residual, SOURCE, windows)
-        torch.testing.assert_close(left, gap_left(windows, residual), rtol=1e-4, atol=1e-6)
-        assert left.square().mean() < gap(SOURCE, windows).square().mean()
+        fit(residual, SOURCE, transitions, GroundSettings(steps=50), torch.Generator().manual_seed(0))
+        left = left_over(residual, SOURCE, transitions)
+        torch.testing.assert_close(left, gap_left(transitions, residual), rtol=1e-4, atol=1e-6)
+        assert left.square().mean() < gap(SOURCE, transitions).square().mean()
 
     def test_the_scale_is_the_root_mean_square_of_the_gap(self):
         residual = Residual(StateResidualNetwork(4), torch.ones(4))
-        windows = Windows.cut(recorded(1), "state")
-        rescale(residual, SOURCE, windows)
+        transitions = Transitions.cut(recorded(1), "state")
+        rescale(residual, SOURCE, transitions)
         with torch.no_grad():
-            stepped = SOURCE.step(SOURCE.start(windows.state), windows.action).state
-        wanted = np.sqrt(np.mean((windows.next_state - stepped).numpy() ** 2, 0))
+            stepped = SOURCE.step(SOURCE.start(transitions.state), transitions.action).state
+        wanted = np.sqrt(np.mean((transitions.next_state - stepped).numpy() ** 2, 0))
         np.testing.assert_allclose(residual.scale.numpy(), wanted, rtol=1e-4, atol=1e-8)
 
     def test_a_gap_that_is_nought_but_rounding_is_not_heard_beside_the_others(self):
         """Under a hundredth of what a state changes by, the unit is that hundredth."""
         residual = Residual(StateResidualNetwork(4), torch.ones(4))
-        windows = Windows.cut(recorded(1), "state")
+        transitions = Transitions.cut(recorded(1), "state")
         right = World(CartPole(), [ConstantForce(force=NEWTONS)]).requires_grad_(False)
-        rescale(residual, right, windows, negligible=1e-2)
-        change = np.sqrt(np.mean((windows.next_state - windows.state).numpy() ** 2, 0))
+        rescale(residual, right, transitions, negligible=1e-2)
+        change = np.sqrt(np.mean((transitions.next_state - transitions.state).numpy() ** 2, 0))
         np.testing.assert_allclose(residual.scale.numpy(), 1e-2 * change, rtol=1e-4)
 
     def test_a_source_that_is_right_leaves_numbers_finite_and_corrections_nought(self):
         residual = Residual(StateResidualNetwork(4), torch.ones(4))
         right = World(CartPole(), [ConstantForce(force=NEWTONS)]).requires_grad_(False)
-        windows = Windows.cut(recorded(1), "state")
-        losses = fit(residual, right, windows, GroundSettings(steps=25), torch.Generator().manual_seed(0))
+        transitions = Transitions.cut(recorded(1), "state")
+        losses = fit(residual, right, transitions, GroundSettings(steps=25), torch.Generator().manual_seed(0))
         assert all(np.isfinite((loss.train, loss.held_out)).all() for loss in losses)
         with torch.no_grad():
-            assert residual.delta(windows.history(torch.arange(len(windows)))).abs().max() < 1e-6
+            assert residual.delta(transitions.history(torch.arange(len(transitions)))).abs().max() < 1e-6
 
     def test_the_weights_kept_are_those_that_did_best_on_what_was_held_out(self):
-        windows, overshot = Windows.cut(recorded(1), "state"), []
+        transitions, overshot = Transitions.cut(recorded(1), "state"), []
         # Most of these are far too fast and jump about, so that the last weights are not the best.
         for rate in (0.03, 0.1, 0.3, 1.0, 3.0):
             torch.manual_seed(0)
             residual = Residual(StateResidualNetwork(4), torch.ones(4))
             settings = GroundSettings(steps=60, every=10, patience=30, learning_rate=rate)
-            losses = fit(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
-            _, held = split(len(windows), settings.held_out, torch.Generator().manual_seed(0))
-            error = gap_left(windows, residual)[held] / residual.scale
+            losses = fit(residual, SOURCE, transitions, settings, torch.Generator().manual_seed(0))
+            _, held = split(len(transitions), settings.held_out, torch.Generator().manual_seed(0))
+            error = gap_left(transitions, residual)[held] / residual.scale
             best = min(loss.held_out for loss in losses)
             assert float(error.square().mean()) == pytest.approx(best, rel=1e-3)
             overshot.append(losses[-1].held_out > 1.05 * best)
         assert any(overshot)
 
     def test_the_same_seed_gives_the_same_weights_and_fitted_again_it_goes_on_from_them(self):
-        windows = Windows.cut(recorded(1), "state")
+        transitions = Transitions.cut(recorded(1), "state")
         settings = GroundSettings(steps=100)
         found = []
         for _ in range(2):
             torch.manual_seed(0)
             residual = Residual(StateResidualNetwork(4), torch.ones(4))
-            first = fit(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
+            first = fit(residual, SOURCE, transitions, settings, torch.Generator().manual_seed(0))
             found.append((residual.state_dict(), first))
         for key, value in found[0][0].items():
             assert torch.equal(value, found[1][0][key]), key
         assert found[0][1] == found[1][1]
-        second = fit(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
+        second = fit(residual, SOURCE, transitions, settings, torch.Generator().manual_seed(0))
         assert second[0].held_out == pytest.approx(min(loss.held_out for loss in first), rel=1e-3)
 
 
 class TestOnFrames:
     @pytest.fixture
     def seen(self):
-        """A residual network that sees frames, and windows of a world with a force."""
+        """A residual network that sees frames, and transitions of a world with a force."""
         torch.manual_seed(0)
         renderer = small_renderer()
-        windows = Windows.cut(recorded(1, count=4, rows=11), "rendered", observing(renderer))
-        return Residual(image_residual_network(renderer), torch.ones(4)), windows
+        transitions = Transitions.cut(recorded(1, count=4, rows=11), "rendered", observing(renderer))
+        return Residual(image_residual_network(renderer), torch.ones(4)), transitions
 
     def test_the_head_is_fitted_and_what_sees_stays_as_it_is(self, seen):
-        residual, windows = seen
+        residual, transitions = seen
         before = {key: value.clone() for key, value in residual.state_dict().items()}
-        losses = fit(residual, SOURCE, windows, GroundSettings(), torch.Generator().manual_seed(0))
+        losses = fit(residual, SOURCE, transitions, GroundSettings(), torch.Generator().manual_seed(0))
         for key, value in residual.state_dict().items():
             if key.startswith("network.encoder"):
                 assert torch.equal(value, before[key]), key
         assert losses[1].held_out < 0.5 * losses[0].held_out
 
     def test_a_linear_head_solves_the_ridge_equations_on_all_samples(self, seen):
-        residual, windows = seen
+        residual, transitions = seen
         ridge = 3.0
-        fit(residual, SOURCE, windows, GroundSettings(ridge=ridge), torch.Generator().manual_seed(0))
+        fit(residual, SOURCE, transitions, GroundSettings(ridge=ridge), torch.Generator().manual_seed(0))
         head = residual.network.head
         with torch.no_grad():
-            history = windows.history(torch.arange(len(windows))).acting(windows.action)
+            history = transitions.history(torch.arange(len(transitions))).acting(transitions.action)
             inputs = residual.network.embed(history).double()
         weight = head.weight.detach().double()
-        left = gap(SOURCE, windows).double() / residual.scale - inputs @ weight.T
+        left = gap(SOURCE, transitions).double() / residual.scale - inputs @ weight.T
         # The gradient of the squared errors and the penalty vanishes.
         np.testing.assert_allclose((left.T @ inputs).numpy(), (ridge * weight).numpy(), atol=1e-3)
 
     def test_what_it_says_of_held_out_samples_comes_from_the_others_alone(self, seen):
-        residual, windows = seen
+        residual, transitions = seen
         settings = GroundSettings()
-        losses = fit(residual, SOURCE, windows, settings, torch.Generator().manual_seed(0))
-        _, held = split(len(windows), settings.held_out, torch.Generator().manual_seed(0))
+        losses = fit(residual, SOURCE, transitions, settings, torch.Generator().manual_seed(0))
+        _, held = split(len(transitions), settings.held_out, torch.Generator().manual_seed(0))
         assert [loss.step for loss in losses] == [0, 1]
-        error = (gap_left(windows, residual)[held] / residual.scale).square().mean()
+        error = (gap_left(transitions, residual)[held] / residual.scale).square().mean()
         assert losses[1].held_out > float(error)
 
 
@@ -221,14 +221,14 @@ class TestNamed:
 
     def fitted(self, *effects):
         source = World(CartPole(), effects)
-        fit_named(source, Windows.cut(recorded(3), "state"))
+        fit_named(source, Transitions.cut(recorded(3), "state"))
         return source
 
     def test_the_right_one_is_found_and_nothing_is_left(self):
         source = self.fitted(ConstantForce(force=0.0))
         assert source.effects[0].force.item() == pytest.approx(NEWTONS, abs=1e-3)
-        windows = Windows.cut(recorded(4), "state")
-        assert gap(source, windows).abs().max() < 1e-3 * gap(SOURCE, windows).abs().max()
+        transitions = Transitions.cut(recorded(4), "state")
+        assert gap(source, transitions).abs().max() < 1e-3 * gap(SOURCE, transitions).abs().max()
 
     def test_a_wrong_one_beside_it_stays_at_what_does_nothing(self):
         _, friction = self.fitted(ConstantForce(force=0.0), ViscousFriction(coefficient=1.0)).effects
@@ -241,15 +241,15 @@ class TestNamed:
 
     def test_the_true_states_behind_a_biased_sensor_are_learnt_from_and_the_readings_are_shown(self):
         true, bias = recorded(3), np.array([0.0, 0.0, 0.05, 0.0], np.float32)
-        windows = Windows.cut([replace(episode, state=episode.state + bias) for episode in true], "state")
+        transitions = Transitions.cut([replace(episode, state=episode.state + bias) for episode in true], "state")
         source = World(CartPole(), [ConstantForce(force=0.0), AngleOffset(offset=0.0)])
-        found = fit_named(source, windows)
+        found = fit_named(source, transitions)
         assert [each.item() for each in source.parameters()] == pytest.approx([NEWTONS, 0.05], abs=2e-3)
         assert gap(source, found).abs().max() < 1e-3
-        wanted = Windows.cut(true, "state")
+        wanted = Transitions.cut(true, "state")
         torch.testing.assert_close(found.state, wanted.state, rtol=0, atol=1e-3)
         torch.testing.assert_close(found.next_state, wanted.next_state, rtol=0, atol=1e-3)
-        assert torch.equal(found.observations, windows.observations)
+        assert torch.equal(found.observations, transitions.observations)
 
     def test_a_source_without_effects_is_left_as_it_is(self):
         assert not list(self.fitted().parameters())

@@ -17,7 +17,7 @@ from visadapt.history import History
 from visadapt.learning.plans import ClosedLoop, imagine
 from visadapt.learning.policy import DivergedError, TuneSettings, initialise_feedforward, tune
 from visadapt.learning.streams import Streams
-from visadapt.learning.windows import Windows
+from visadapt.learning.transitions import Transitions
 from visadapt.policies import ImagePolicy, StatePolicy
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import Episode
@@ -162,7 +162,7 @@ class TestOnStates:
         """The policy is tuned where the target was: here at a state that random starts never reach."""
         row = [0.0, 0.0, 0.3, 0.0]
         recorded = Episode(torch.arange(2.0).numpy(), torch.zeros(2, 1).numpy(), torch.tensor([row, row]).numpy())
-        windows = Windows.cut([recorded], "state")
+        transitions = Transitions.cut([recorded], "state")
         weighs_angle = Cost((0.0, 0.0, 1.0, 0.0), action=0.0)
         costs = []
         for share in (0.0, 1.0):
@@ -176,7 +176,7 @@ class TestOnStates:
                 observation_noise=0.0,
             )
             world = World(CartPole())
-            losses = tune(StatePolicy(4), world, identity, settings, torch.Generator().manual_seed(0), windows)
+            losses = tune(StatePolicy(4), world, identity, settings, torch.Generator().manual_seed(0), transitions)
             costs.append(losses[0])
         assert costs[1] > 3 * costs[0]
 

@@ -1,4 +1,4 @@
-"""Where recorded windows and streams begin: at their own time, with the memory of their own past, seen by sensors."""
+"""Where recorded transitions and streams begin: at their own time, with the memory of their past, seen by sensors."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from visadapt.history import History
 from visadapt.learning.grounding import gap
 from visadapt.learning.plans import imagine
 from visadapt.learning.streams import Streams
-from visadapt.learning.windows import Windows
+from visadapt.learning.transitions import Transitions
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import Episode
 from visadapt.systems import CartPole
@@ -45,8 +45,8 @@ def episodes_of(world, lengths=(30, 12, 21), seed=0):
     return made
 
 
-def streams_of(world, task=WIDE, observe=None, windows=None, recorded=0.0, count=40):
-    made = Streams(world, task, observe, windows, count, 1000, recorded)
+def streams_of(world, task=WIDE, observe=None, transitions=None, recorded=0.0, count=40):
+    made = Streams(world, task, observe, transitions, count, 1000, recorded)
     made.start(1.0, torch.Generator().manual_seed(1))
     return made
 
@@ -54,37 +54,37 @@ def streams_of(world, task=WIDE, observe=None, windows=None, recorded=0.0, count
 @pytest.mark.parametrize("name", HIDDEN)
 def test_the_world_that_was_recorded_leaves_no_gap_in_any_window(name):
     world = world_with(EFFECTS[name](**HIDDEN[name]))
-    windows = Windows.cut(episodes_of(world), "state")
-    assert gap(world, windows).abs().max() < 1e-5
-    assert gap(world_with(), windows).abs().max() > 0.01
+    transitions = Transitions.cut(episodes_of(world), "state")
+    assert gap(world, transitions).abs().max() < 1e-5
+    assert gap(world_with(), transitions).abs().max() > 0.01
 
 
 @pytest.mark.parametrize("name", HIDDEN)
 def test_streams_that_start_in_a_recording_go_on_as_it_did(name):
     world = world_with(EFFECTS[name](**HIDDEN[name]))
-    windows = Windows.cut(episodes_of(world), "state")
-    streams = streams_of(world, windows=windows, recorded=1.0)
-    rows = (windows.state[:, None] == streams.now.at.state).all(2).int().argmax(0)
+    transitions = Transitions.cut(episodes_of(world), "state")
+    streams = streams_of(world, transitions=transitions, recorded=1.0)
+    rows = (transitions.state[:, None] == streams.now.at.state).all(2).int().argmax(0)
     assert len(rows.unique()) > 15
-    after = world.step(streams.now.at, windows.action[rows]).state
-    torch.testing.assert_close(after, windows.next_state[rows], rtol=0, atol=1e-5)
-    torch.testing.assert_close(streams.now.at.time, windows.time[rows])
+    after = world.step(streams.now.at, transitions.action[rows]).state
+    torch.testing.assert_close(after, transitions.next_state[rows], rtol=0, atol=1e-5)
+    torch.testing.assert_close(streams.now.at.time, transitions.time[rows])
 
 
 class TestTimeOfOtherStarts:
     def test_where_effects_depend_on_time_all_times_of_the_recording_are_met(self):
         world = world_with(EFFECTS["gust"](**HIDDEN["gust"]))
-        windows = Windows.cut(episodes_of(world), "state")
-        time = streams_of(world, windows=windows).now.at.time
+        transitions = Transitions.cut(episodes_of(world), "state")
+        time = streams_of(world, transitions=transitions).now.at.time
         assert float(time.max()) > 1.0
         assert len(time.unique()) > 10
-        assert set(time.tolist()) <= set(windows.time.tolist())
+        assert set(time.tolist()) <= set(transitions.time.tolist())
 
     @pytest.mark.parametrize("name", ["actuator_delay", "actuator_backlash"])
     def test_elsewhere_they_begin_at_zero(self, name):
         world = world_with(EFFECTS[name](**HIDDEN[name]))
-        windows = Windows.cut(episodes_of(world), "state")
-        assert not streams_of(world, windows=windows).now.at.time.any()
+        transitions = Transitions.cut(episodes_of(world), "state")
+        assert not streams_of(world, transitions=transitions).now.at.time.any()
 
     def test_without_a_recording_all_times_of_an_episode_are_met(self):
         time = streams_of(world_with(EFFECTS["gust"](start=8.0, end=9.0, force=4.0)), count=400).now.at.time
@@ -107,16 +107,16 @@ class TestSensors:
 
     def test_late_measurements_stay_late_in_streams_and_recorded_ones_begin_with_their_past(self):
         delay = MeasurementDelay(delay=0.1)
-        windows = Windows.cut(episodes_of(world_with()), "state")
+        transitions = Transitions.cut(episodes_of(world_with()), "state")
         world = world_with(delay)
-        streams = streams_of(world, windows=windows, recorded=1.0)
-        before = (windows.state[:, None] == streams.now.at.state).all(2).int().argmax(0)
-        late = windows.time[before] > 1.5 * world.period
+        streams = streams_of(world, transitions=transitions, recorded=1.0)
+        before = (transitions.state[:, None] == streams.now.at.state).all(2).int().argmax(0)
+        late = transitions.time[before] > 1.5 * world.period
         action = torch.zeros(40, 1)
         streams.advance(world.step(streams.now.at, action), action, 1.0, torch.Generator().manual_seed(2))
         shown = streams.now.history.observations[:, -1]
         # Two periods late: a row after the start, that is the row before it.
-        torch.testing.assert_close(shown[late], windows.state[before - 1][late], rtol=0, atol=1e-5)
+        torch.testing.assert_close(shown[late], transitions.state[before - 1][late], rtol=0, atol=1e-5)
 
     def test_a_camera_shows_the_true_state(self):
         streams = streams_of(world_with(AngleOffset(offset=0.1)), observe=lambda state: 2 * state)

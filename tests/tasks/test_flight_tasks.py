@@ -12,7 +12,7 @@ from visadapt.history import HORIZON, LENGTH, History
 from visadapt.learning.plans import imagine
 from visadapt.learning.policy import TuneSettings, tune
 from visadapt.learning.streams import Streams
-from visadapt.learning.windows import Windows
+from visadapt.learning.transitions import Transitions
 from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.setups.policy_file import source_steps
@@ -240,8 +240,8 @@ class TestStreams:
         target = FlightTarget(task, Quadrotor(), push(2.0))
         torch.manual_seed(0)
         flown = run(target, FollowPolicy(PERIOD), 2, 12, seeded(4))
-        windows = Windows.cut([each.episode for each in flown], "state")
-        made = Streams(self.WORLD, task, identity, windows, 40, 1000, 1.0)
+        transitions = Transitions.cut([each.episode for each in flown], "state")
+        made = Streams(self.WORLD, task, identity, transitions, 40, 1000, 1.0)
         made.start(0.0, seeded(5))
         network = FlightResidualNetwork(Quadrotor(), PERIOD, partial(source_steps, self.WORLD))
 
@@ -252,15 +252,17 @@ class TestStreams:
             return state[..., : VELOCITY.stop] - task.on(*task_state.long().unbind(-1))[..., : VELOCITY.stop]
 
         now, found = made.now, set()
-        every = windows.history(torch.arange(len(windows)))
+        every = transitions.history(torch.arange(len(transitions)))
         for b in range(40):
             alike = (every.actions - now.history.actions[b]).abs().amax((1, 2)) == 0
-            alike &= (windows.state - now.at.state[b])[:, VELOCITY.stop :].abs().amax(1) == 0
+            alike &= (transitions.state - now.at.state[b])[:, VELOCITY.stop :].abs().amax(1) == 0
             row = int(alike.nonzero()[0])
             found.add(row)
-            here, there = off(now.at.state[b : b + 1], now.task_state[b : b + 1]), windows.state[row : row + 1]
-            torch.testing.assert_close(here, off(there, windows.task_states[windows.rows[row, -1:]]), rtol=0, atol=1e-5)
-            past = unexplained(windows.history(torch.tensor([row])))
+            here, there = off(now.at.state[b : b + 1], now.task_state[b : b + 1]), transitions.state[row : row + 1]
+            torch.testing.assert_close(
+                here, off(there, transitions.task_states[transitions.rows[row, -1:]]), rtol=0, atol=1e-5
+            )
+            past = unexplained(transitions.history(torch.tensor([row])))
             torch.testing.assert_close(unexplained(now.history[b : b + 1]), past, rtol=0, atol=2e-3)
         assert len(found) > 12
         assert set(now.task_state[:, 0].tolist()) - set(target.first[:, 0].tolist())
@@ -272,17 +274,17 @@ class TestStreams:
         target = FlightTarget(task, FixedWing(), push(2.0))
         torch.manual_seed(0)
         flown = run(target, ReachPolicy(), 2, 12, seeded(4))
-        windows = Windows.cut([each.episode for each in flown], "state")
-        made = Streams(World(FixedWing(), period=0.05), task, identity, windows, 20, 1000, 1.0)
+        transitions = Transitions.cut([each.episode for each in flown], "state")
+        made = Streams(World(FixedWing(), period=0.05), task, identity, transitions, 20, 1000, 1.0)
         made.start(0.0, seeded(5))
         for b in range(20):
             # Both flights begin in the same state: their points tell them apart.
-            there = (windows.task_states[windows.rows[:, -1]] == made.now.task_state[b]).all(1)
-            row = int(((windows.state == made.now.at.state[b]).all(1) & there).nonzero()[0])
-            seen = windows.history(torch.tensor([row])).observations[0]
+            there = (transitions.task_states[transitions.rows[:, -1]] == made.now.task_state[b]).all(1)
+            row = int(((transitions.state == made.now.at.state[b]).all(1) & there).nonzero()[0])
+            seen = transitions.history(torch.tensor([row])).observations[0]
             assert torch.equal(made.now.history.observations[b, :, :13], seen)
             assert torch.equal(made.now.history.observations[b, :, 13:], made.now.task_state[b].expand(LENGTH, -1))
-            assert torch.equal(made.now.history.actions[b], windows.history(torch.tensor([row])).actions[0])
+            assert torch.equal(made.now.history.actions[b], transitions.history(torch.tensor([row])).actions[0])
 
     def test_tuned_along_references_the_cost_of_a_plan_falls(self):
         torch.manual_seed(0)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from visadapt.effects import CameraEffect, Effect, Residual, SensingEffect
 from visadapt.effects.catalogue import sized
 from visadapt.estimation.effect_fit import fit_effects
-from visadapt.learning.windows import Windows
+from visadapt.learning.transitions import Transitions
 from visadapt.policies.networks import ResidualNetwork
 from visadapt.progress import Progress
 from visadapt.world import World
@@ -49,75 +49,77 @@ class GroundLoss(NamedTuple):
     held_out: float
 
 
-def gap(world: World, windows: Windows) -> Tensor:
+def gap(world: World, transitions: Transitions) -> Tensor:
     """s*_{t+1} - f(s_t, a_t) (N, n_state): what the source leaves out in one step."""
     with torch.no_grad():
-        return windows.next_state - world.step(windows.start(world), windows.action).state
+        return transitions.next_state - world.step(transitions.start(world), transitions.action).state
 
 
-def left_over(residual: Residual, source: World, windows: Windows) -> Tensor:
+def left_over(residual: Residual, source: World, transitions: Transitions) -> Tensor:
     """The gap minus the residual's correction, (N, n_state)."""
-    every = torch.arange(len(windows))
+    every = torch.arange(len(transitions))
     with torch.no_grad():
-        return gap(source, windows) - residual.delta(windows.history(every).acting(windows.action))
+        return gap(source, transitions) - residual.delta(transitions.history(every).acting(transitions.action))
 
 
-def fit_named(source: World, windows: Windows) -> Windows:
+def fit_named(source: World, transitions: Transitions) -> Transitions:
     """Fit the parameters of the source's own effects to all episodes so far, in place, within their ranges.
 
     By maximum likelihood over whole episodes (`estimation.effect_fit`). Where the source has sensing effects, the
-    windows returned have smoothed true states in place of those recorded: the residual corrects true states, and
+    transitions returned have smoothed true states in place of those recorded: the residual corrects true states, and
     streams start from them; what policies see stays as recorded. Where the phase of a periodic effect differs from
-    episode to episode, the windows returned have times at which the first episode's phase is right. Effects of the
+    episode to episode, the transitions returned have times at which the first episode's phase is right. Effects of the
     camera, which states do not show, keep their values.
     """
     named = [effect for effect in source.effects if isinstance(effect, Effect) and not isinstance(effect, CameraEffect)]
     if not named:
-        return windows
-    measured, commands = (list(values.split(windows.lengths)) for values in (windows.states, windows.actions))
+        return transitions
+    measured, commands = (
+        list(values.split(transitions.lengths)) for values in (transitions.states, transitions.actions)
+    )
     fit = fit_effects(source.system, named, measured, commands, source.period)
     for effect in named:
         kind = sized(type(effect), source.system)
         for parameter, value in zip(kind.table, fit.values[kind].tolist(), strict=True):
             getattr(effect, parameter.name).data.fill_(min(max(value, parameter.low), parameter.high))
     if bool(fit.shifts.any()):
-        later = fit.shifts.repeat_interleave(torch.tensor(windows.lengths))
-        windows = replace(windows, times=windows.times + later.to(windows.times))
+        later = fit.shifts.repeat_interleave(torch.tensor(transitions.lengths))
+        transitions = replace(transitions, times=transitions.times + later.to(transitions.times))
     if not any(isinstance(effect, SensingEffect) for effect in named):
-        return windows
-    return replace(windows, states=torch.cat(fit.states).to(windows.states))
+        return transitions
+    return replace(transitions, states=torch.cat(fit.states).to(transitions.states))
 
 
-def rescale(residual: Residual, source: World, windows: Windows, negligible: float = 0.0) -> None:
+def rescale(residual: Residual, source: World, transitions: Transitions, negligible: float = 0.0) -> None:
     """Set the residual's scale, the unit of its corrections, to the root mean square of the gap in each state.
 
     The scale is at least `negligible` times the root mean square change of the state in a period: gaps that come from
     rounding or from the integrator must not weigh as much as real ones.
     """
-    missing = gap(source, windows).square().mean(0).sqrt()
-    change = (windows.next_state - windows.state).square().mean(0).sqrt()
+    missing = gap(source, transitions).square().mean(0).sqrt()
+    change = (transitions.next_state - transitions.state).square().mean(0).sqrt()
     residual.scale.copy_(torch.maximum(missing, negligible * change).clamp(min=1e-9))
 
 
 def ground(
     residual: Residual,
     source: World,
-    windows: Windows,
+    transitions: Transitions,
     settings: GroundSettings,
     generator: torch.Generator,
     progress: Progress | None = None,
 ) -> list[GroundLoss]:
-    """Fit the head of the residual's network, in place, to the windows; returns losses in units of its scale.
+    """Fit the head of the residual's network, in place, to the transitions; returns losses in units of its scale.
 
-    Windows whose history the network says is incomplete are left out, unless all are.
+    Transitions whose history the network says is incomplete are left out, unless all are.
     """
-    target = gap(source, windows) / residual.scale
+    target = gap(source, transitions) / residual.scale
     network = residual.network
     if not isinstance(network, ResidualNetwork):
         raise TypeError(f"grounding fits the head of a ResidualNetwork, not a {type(network).__name__}")
     with torch.no_grad():
-        parts = torch.arange(len(windows)).split(256)
-        seen = torch.cat([network.embed(windows.history(p).acting(windows.action[p])) for p in parts])
+        parts = torch.arange(len(transitions)).split(256)
+        seen = torch.cat([network.embed(transitions.history(p).acting(transitions.action[p])) for p in parts])
     informed = network.informed(seen)
     if bool(informed.any()):
         seen, target = seen[informed], target[informed]

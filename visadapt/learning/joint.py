@@ -16,7 +16,7 @@ from visadapt.learning.explanation import Explain
 from visadapt.learning.ledger import Ledger
 from visadapt.learning.rounds import JointLearning, Label, Round, RoundFolder
 from visadapt.learning.setup_settings import SetupSettings
-from visadapt.learning.windows import Observe
+from visadapt.learning.transitions import Observe
 from visadapt.policies import Policy
 from visadapt.progress import Report
 from visadapt.recordings import Episode

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from visadapt.history import HORIZON, History
 from visadapt.learning.streams import Streams, StreamState, Visited, look
-from visadapt.learning.windows import Observe
+from visadapt.learning.transitions import Observe
 from visadapt.policies import Policy
 from visadapt.world import World, WorldState
 

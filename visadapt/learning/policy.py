@@ -23,7 +23,7 @@ from visadapt.history import HORIZON
 from visadapt.learning.plans import ClosedLoop, KeptPlans, Plans
 from visadapt.learning.streams import Streams
 from visadapt.learning.training_state import TrainingState
-from visadapt.learning.windows import Observe, Windows
+from visadapt.learning.transitions import Observe, Transitions
 from visadapt.policies import Policy
 from visadapt.progress import Progress
 from visadapt.tasks.base import Task
@@ -56,7 +56,7 @@ class TuneSettings:
     """whether the policy decides anew at every step that is imagined; False: its plan is carried out whole"""
     curriculum: bool = True
     """whether streams start closer to the reference, and restart closer to it, early on; False for a trained policy"""
-    recorded: float = 0.0  # share of the starts that are recorded windows of the target, with their histories
+    recorded: float = 0.0  # share of the starts that are recorded transitions of the target, with their histories
     observation_noise: float = 0.01  # standard deviation of white noise on what the policy sees
 
     def __post_init__(self) -> None:
@@ -83,7 +83,7 @@ def tune(
     observe: Observe | None,
     settings: TuneSettings,
     generator: torch.Generator,
-    windows: Windows | None = None,
+    transitions: Transitions | None = None,
     progress: Progress | None = None,
     checkpoint: Path | None = None,
 ) -> list[float]:
@@ -92,7 +92,7 @@ def tune(
     Args:
         observe: the camera through which the policy sees, differentiable, since a residual may read its frames; None
             for a policy on states, which sees what the world's sensors measure.
-        windows: recorded starts, where settings.recorded asks for them, and the times at which other starts begin.
+        transitions: recorded starts, where settings.recorded asks for them, and the times at which other starts begin.
         checkpoint: file of the training state, from which an interrupted training goes on; None: none is written.
 
     Raises:
@@ -106,7 +106,7 @@ def tune(
     steps = settings.iterations
     training = TrainingState(policy, optimiser, generator, settings.learning_rate, steps, progress, checkpoint)
     count = settings.streams or settings.batch
-    streams = Streams(world, settings.task, observe, windows, count, settings.longest, settings.recorded)
+    streams = Streams(world, settings.task, observe, transitions, count, settings.longest, settings.recorded)
     given = (policy, streams, settings.observation_noise, generator)
     if settings.closed_loop:
         plans: Plans = ClosedLoop(*given)

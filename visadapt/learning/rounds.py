@@ -20,7 +20,7 @@ from visadapt.learning.grounding import GroundLoss, fit_named, ground, rescale
 from visadapt.learning.ledger import Ledger
 from visadapt.learning.policy import initialise_feedforward, tune
 from visadapt.learning.setup_settings import SetupSettings
-from visadapt.learning.windows import Observe, Windows
+from visadapt.learning.transitions import Observe, Transitions
 from visadapt.policies import Policy
 from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, read_recording, write_recording
@@ -132,8 +132,8 @@ class JointLearning:
             self.residual.network.load_state_dict(self.untrained)
             tuning = self._tune_with_names(folder)
         else:
-            losses, windows = self._ground(folder)
-            tuning = self._tune_with_residual(folder, windows)
+            losses, transitions = self._ground(folder)
+            tuning = self._tune_with_residual(folder, transitions)
         return Round(self.ledger.used, losses, tuning, self.found)
 
     def _collect(self, folder: RoundFolder, samples: int) -> None:
@@ -149,33 +149,33 @@ class JointLearning:
             self.recorded.append(episode)
             self.waiting.append(episode)
 
-    def _windows(self) -> Windows:
-        """Windows of all episodes. Only the residual needs their states, and from the frames of a faulty camera none
+    def _transitions(self) -> Transitions:
+        """Those of all episodes. Only the residual needs their states, and from the frames of a faulty camera none
         could be estimated."""
         self.labelled += self.label(self.waiting) if self.label else self.waiting
         self.waiting = []
-        return Windows.cut(self.labelled, self.settings.observations, self.observe)
+        return Transitions.cut(self.labelled, self.settings.observations, self.observe)
 
-    def _ground(self, folder: RoundFolder) -> tuple[list[GroundLoss], Windows]:
-        """Fit the named effects and the residual to all samples; the residual's losses, and the windows with the states
-        and times that `fit_named` gives them."""
-        windows, known = self._windows(), self.known
+    def _ground(self, folder: RoundFolder) -> tuple[list[GroundLoss], Transitions]:
+        """Fit the named effects and the residual to all samples; the residual's losses, and the transitions with the
+        states and times that `fit_named` gives them."""
+        transitions, known = self._transitions(), self.known
         world = known.with_effects([*known.effects, self.residual])
         if not folder.residual.exists():
-            true = fit_named(known, windows)
+            true = fit_named(known, transitions)
             if not self.grounded:
                 rescale(self.residual, known, true, self.settings.ground.negligible)
             progress = self._progress(folder, "ground")
             losses = ground(self.residual, known, true, self.settings.ground, folder.generator(1), progress)
-            changed = {} if true is windows else {"states": true.states, "times": true.times}
+            changed = {} if true is transitions else {"states": true.states, "times": true.times}
             save_tree(folder.residual, {"weights": world.state_dict(), "losses": losses, "windows": changed})
         tree = load_tree(folder.residual)
         with fitting(folder.residual):
             load_weights(world, tree["weights"], folder.residual)
-            windows = replace(windows, **tree["windows"])
-            return [GroundLoss(*each) for each in tree["losses"]], windows
+            transitions = replace(transitions, **tree["windows"])
+            return [GroundLoss(*each) for each in tree["losses"]], transitions
 
-    def _tune_with_residual(self, folder: RoundFolder, windows: Windows) -> list[float]:
+    def _tune_with_residual(self, folder: RoundFolder, transitions: Transitions) -> list[float]:
         """Tune the policy in the source with the named effects and the residual; the loss of every iteration."""
         if not self.grounded and self.settings.feedforward:
             initialise_feedforward(self.policy, self.source, self.residual.scale)
@@ -187,7 +187,7 @@ class JointLearning:
         world = known.with_effects([*known.effects, self.residual])
 
         def tuned(partial: Path) -> list[float]:
-            about = self.settings.tuning, folder.generator(2), windows, self._progress(folder, "tune"), partial
+            about = self.settings.tuning, folder.generator(2), transitions, self._progress(folder, "tune"), partial
             return tune(self.policy, world, self.observe, *about)
 
         return self._kept(folder.policy, tuned)

@@ -26,7 +26,7 @@ class SetupSettings:
     ground: GroundSettings = field(default_factory=GroundSettings)
     """fit of the residual"""
     observations: str = "state"
-    """what grounding shows the residual: one of `learning.windows.SOURCES`"""
+    """what grounding shows the residual: one of `learning.transitions.SOURCES`"""
     longest_episode: int = 250
     """most steps of an episode of the target while data are collected"""
     feedforward: bool = True

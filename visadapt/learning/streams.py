@@ -10,7 +10,7 @@ from torch import Tensor
 
 from visadapt.batch import Batch
 from visadapt.history import History
-from visadapt.learning.windows import Observe, Windows
+from visadapt.learning.transitions import Observe, Transitions
 from visadapt.tasks.balance import EPISODE_STEPS
 from visadapt.tasks.base import FlightTask, Task
 from visadapt.world import World, WorldState
@@ -76,21 +76,21 @@ class Streams:
     world: World
     task: Task
     observe: Observe | None  # the camera through which the policy sees; None where it sees what the sensors measure
-    windows: Windows | None  # recorded starts, each at its time in its episode, with the memory that effects have there
+    transitions: Transitions | None  # recorded starts, each at its time, with the memory that effects have there
     count: int
     longest: int  # steps after which a stream starts anew
-    recorded: float  # share of the starts that are windows, with their histories
+    recorded: float  # share of the starts that are transitions, with their histories
 
     def __post_init__(self) -> None:
         self.now: StreamState
         self.age: Tensor
         self._recorded: WorldState | None = None
         with torch.no_grad():
-            if self.windows is None:
+            if self.transitions is None:
                 times, state = an_episode(self.world, self.task)
             else:
-                times, state = self.windows.time, self.windows.state[:1]
-                self._recorded = self.windows.start(self.world) if self.recorded > 0 else None
+                times, state = self.transitions.time, self.transitions.state[:1]
+                self._recorded = self.transitions.start(self.world) if self.recorded > 0 else None
             self._times = times if depends_on_time(self.world, times.unique(), state) else None
 
     @torch.no_grad()
@@ -121,7 +121,7 @@ class Streams:
 
     def _fresh(self, ended: Tensor, progress: float, generator: torch.Generator) -> StreamState:
         """New starts for the streams `ended`: drawn for all streams, but only these are rendered."""
-        count, windows = self.count, self.windows
+        count, transitions = self.count, self.transitions
         state, task_state = (each[ended] for each in self.task.training_start(count, progress, generator))
         at = self.world.start(state)
         if self._times is not None:
@@ -133,17 +133,17 @@ class Streams:
         seen, at = look(self.world, self.observe, at, generator)
         history = History.start(self.task.show(seen, task_state), len(self.world.system.actions))
         fresh = StreamState(at, history, task_state)
-        if windows is None or self._recorded is None:
+        if transitions is None or self._recorded is None:
             return fresh
-        task_states = windows.task_states[windows.rows].to(task_state)
+        task_states = transitions.task_states[transitions.rows].to(task_state)
         # Recorded falls are left out: a stream that starts beyond delta_div ends at once, at a cost above all others.
-        near = (~self.task.diverged(windows.state, task_states[:, -1], progress)).nonzero()[:, 0]
+        near = (~self.task.diverged(transitions.state, task_states[:, -1], progress)).nonzero()[:, 0]
         if not len(near):
             return fresh
         from_record = torch.rand(count, generator=generator)[ended] < self.recorded
         rows = near[torch.randint(len(near), (count,), generator=generator)][ended]
-        past = windows.history(rows)
-        seen, now, where = self.task.augment(past.observations, windows.state[rows], task_states[rows], generator)
+        past = transitions.history(rows)
+        seen, now, where = self.task.augment(past.observations, transitions.state[rows], task_states[rows], generator)
         shown = self.task.show(seen.flatten(0, 1), where.flatten(0, 1)).unflatten(0, seen.shape[:2])
         # The history ends with the recorded reading of this row, so the sensors have read it.
         _, at = look(self.world, self.observe, replace(self._recorded[rows], state=now), generator)

@@ -16,7 +16,7 @@ from visadapt.learning.policy import tune
 from visadapt.learning.rounds import Label
 from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.training_state import train_or_load
-from visadapt.learning.windows import Observe
+from visadapt.learning.transitions import Observe
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
 from visadapt.setups.explained import explained

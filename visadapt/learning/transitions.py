@@ -1,4 +1,4 @@
-"""Recorded episodes cut into windows: the observations and actions up to a step, and the state after it."""
+"""Recorded episodes cut into transitions: observations and actions up to a step, and the state after it."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ Observe = Callable[[Tensor], Tensor]
 """True states (B, n_state) to frames (B, H, W): a camera. Without one (None) a policy sees what the sensors measure."""
 
 SOURCES = ("camera", "rendered", "state")
-"""What a window shows: the camera's frames, frames rendered from the states, or the states themselves."""
+"""What a transition shows: the camera's frames, frames rendered from the states, or the states themselves."""
 
 
 @dataclass(frozen=True)
-class Windows:
+class Transitions:
     """N samples (s_t, a_t, s_{t+1}) of E recorded episodes, each with the history a policy had before a_t.
 
-    All is kept once, for the R rows of the recording, one episode after the other; a window refers to its rows.
+    All is kept once, for the R rows of the recording, one episode after the other; a transition refers to its
+    rows.
     """
 
     lengths: list[int]  # (E,) rows of each episode
@@ -36,11 +37,11 @@ class Windows:
     times: Tensor  # (R,) s since the start of the episode
     task_states: Tensor  # (R, n_task_state); of width 0 where the target has none
     rows: Tensor
-    """(N, LENGTH) rows that a window shows, up to that of s_t; before an episode its first row is repeated"""
+    """(N, LENGTH) rows of the history, up to that of s_t; before an episode its first row is repeated"""
 
     @classmethod
-    def cut(cls, episodes: Sequence[Episode], source: str, observe: Observe | None = None) -> Windows:
-        """Windows of all samples of the episodes.
+    def cut(cls, episodes: Sequence[Episode], source: str, observe: Observe | None = None) -> Transitions:
+        """Transitions of all samples of the episodes.
 
         Raises:
             ValueError: an unknown source, episodes without what it needs, or no sample at all.
@@ -89,7 +90,7 @@ class Windows:
         return self.times[self.rows[:, -1]]
 
     def start(self, world: World) -> WorldState:
-        """`world` at s_t of every window (N rows): its time, its state, and the effects' memory of what came before.
+        """`world` at s_t of every transition (N rows): its time, its state, and the effects' memory of the past.
 
         The sensors have not read these rows yet.
         """
@@ -103,7 +104,7 @@ class Windows:
         return WorldState(self.time, self.state, tuple(memory))
 
     def history(self, index: Tensor) -> History:
-        """What the policy had seen and done before the action of these windows."""
+        """What the policy had seen and done before the action of these transitions."""
         rows = self.rows[index]
         seen = self.observations[rows]
         if seen.dtype == torch.uint8:

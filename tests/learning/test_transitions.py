@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from visadapt.history import LENGTH, History
-from visadapt.learning.windows import Windows
+from visadapt.learning.transitions import Transitions
 from visadapt.recordings import Episode
 
 
@@ -30,18 +30,18 @@ TWO = [episode(1, 8), episode(2, 3)]
 
 class TestAlignment:
     def test_a_sample_is_a_state_the_action_there_and_the_state_after(self):
-        windows = Windows.cut(TWO, "state")
-        assert len(windows) == 9
-        assert windows.state[:, 0].tolist() == [100, 101, 102, 103, 104, 105, 106, 200, 201]
-        assert windows.next_state[:, 0].tolist() == [101, 102, 103, 104, 105, 106, 107, 201, 202]
-        assert windows.state[:, 1].tolist() == [value + 0.25 for value in windows.state[:, 0].tolist()]
+        transitions = Transitions.cut(TWO, "state")
+        assert len(transitions) == 9
+        assert transitions.state[:, 0].tolist() == [100, 101, 102, 103, 104, 105, 106, 200, 201]
+        assert transitions.next_state[:, 0].tolist() == [101, 102, 103, 104, 105, 106, 107, 201, 202]
+        assert transitions.state[:, 1].tolist() == [value + 0.25 for value in transitions.state[:, 0].tolist()]
         actions = [0.010, 0.011, 0.012, 0.013, 0.014, 0.015, 0.016, 0.020, 0.021]
-        assert windows.action[:, 0].tolist() == pytest.approx(actions)
-        assert windows.lengths == [8, 3]
+        assert transitions.action[:, 0].tolist() == pytest.approx(actions)
+        assert transitions.lengths == [8, 3]
 
     def test_the_history_shows_the_5_latest_rows_and_stands_still_before_the_episode(self):
-        windows = Windows.cut(TWO, "state")
-        history = windows.history(torch.arange(9))
+        transitions = Transitions.cut(TWO, "state")
+        history = transitions.history(torch.arange(9))
         wanted = {
             0: [100, 100, 100, 100, 100],
             2: [100, 100, 100, 101, 102],
@@ -53,7 +53,7 @@ class TestAlignment:
             assert history.observations[row, :, 0].tolist() == states
 
     def test_past_actions_are_those_before_the_one_taken_now_and_zero_before_the_episode(self):
-        windows = Windows.cut(TWO, "state")
+        transitions = Transitions.cut(TWO, "state")
         wanted = {
             0: [0, 0, 0, 0, 0],
             2: [0, 0, 0, 0.010, 0.011],
@@ -62,37 +62,39 @@ class TestAlignment:
             8: [0, 0, 0, 0, 0.020],
         }
         for row, actions in wanted.items():
-            assert windows.history(torch.tensor([row])).actions[0, :, 0].tolist() == pytest.approx(actions)
+            assert transitions.history(torch.tensor([row])).actions[0, :, 0].tolist() == pytest.approx(actions)
 
     def test_it_is_the_history_that_a_policy_had_when_it_chose_the_action(self):
-        windows = Windows.cut(TWO, "state")
+        transitions = Transitions.cut(TWO, "state")
         state = torch.as_tensor(TWO[0].state, dtype=torch.float32)
         action = torch.as_tensor(TWO[0].action, dtype=torch.float32)
         lived = History.start(state[:1], 1)
         for t in range(7):
-            found = windows.history(torch.tensor([t]))
+            found = transitions.history(torch.tensor([t]))
             assert torch.equal(found.observations, lived.observations)
             assert torch.equal(found.actions, lived.actions)
             lived = lived.acting(action[t : t + 1]).observing(state[t + 1 : t + 2])
 
     def test_task_states_are_those_of_the_rows_that_it_shows_and_none_where_there_are_none(self):
         placed = [replace(each, task_state=np.stack([each.time, -each.time], 1)) for each in TWO]
-        windows = Windows.cut(placed, "state")
-        assert windows.task_states[windows.rows].shape == (len(windows), LENGTH, 2)
+        transitions = Transitions.cut(placed, "state")
+        assert transitions.task_states[transitions.rows].shape == (len(transitions), LENGTH, 2)
         for row in (0, 3, 6):
             first = [max(row - back, 0) for back in range(LENGTH - 1, -1, -1)]
-            np.testing.assert_array_equal(windows.task_states[windows.rows[row], 0], TWO[0].time[first])
-        assert Windows.cut(TWO, "state").task_states.shape == (11, 0)
+            np.testing.assert_array_equal(transitions.task_states[transitions.rows[row], 0], TWO[0].time[first])
+        assert Transitions.cut(TWO, "state").task_states.shape == (11, 0)
 
     def test_the_action_of_the_last_row_was_not_executed_and_is_nowhere(self):
-        windows = Windows.cut(TWO, "state")
-        assert windows.action.max() < 1
-        assert windows.history(torch.arange(9)).actions.max() < 1
+        transitions = Transitions.cut(TWO, "state")
+        assert transitions.action.max() < 1
+        assert transitions.history(torch.arange(9)).actions.max() < 1
 
     def test_an_episode_of_one_row_adds_no_sample_and_shifts_no_other(self):
-        windows = Windows.cut([episode(1, 3), episode(3, 1), episode(2, 3)], "camera")
-        assert windows.state[:, 0].tolist() == [100, 101, 200, 201]
-        assert (255 * windows.history(torch.tensor([3])).observations[0, :, 0, 0]).round().tolist() == [40] * 4 + [41]
+        transitions = Transitions.cut([episode(1, 3), episode(3, 1), episode(2, 3)], "camera")
+        assert transitions.state[:, 0].tolist() == [100, 101, 200, 201]
+        assert (255 * transitions.history(torch.tensor([3])).observations[0, :, 0, 0]).round().tolist() == [40] * 4 + [
+            41
+        ]
 
 
 class TestSources:
@@ -101,20 +103,22 @@ class TestSources:
             return ((state[:, 0] - 100) / 10)[:, None, None].expand(-1, 2, 3)
 
         row = torch.tensor([6])
-        camera, rendered = Windows.cut(TWO[:1], "camera", observe), Windows.cut(TWO[:1], "rendered", observe)
-        for windows, wanted in ((camera, [22, 23, 24, 25, 26]), (rendered, [51, 76, 102, 128, 153])):
-            seen = windows.history(row).observations
+        camera, rendered = Transitions.cut(TWO[:1], "camera", observe), Transitions.cut(TWO[:1], "rendered", observe)
+        for transitions, wanted in ((camera, [22, 23, 24, 25, 26]), (rendered, [51, 76, 102, 128, 153])):
+            seen = transitions.history(row).observations
             assert seen.shape == (1, LENGTH, 2, 3)
             assert seen.dtype == torch.float32
             assert (255 * seen[0, :, 1, 2]).round().tolist() == pytest.approx(wanted, abs=1)
         assert torch.equal(camera.next_state, rendered.next_state)
 
     def test_rendered_frames_need_no_camera_and_bytes_do_not_overflow(self):
-        windows = Windows.cut([episode(1, 3, frames=False)], "rendered", lambda state: state[:, :, None] - 101.0)
-        assert windows.observations[:, 0, 0].tolist() == [0, 0, 255]
+        transitions = Transitions.cut(
+            [episode(1, 3, frames=False)], "rendered", lambda state: state[:, :, None] - 101.0
+        )
+        assert transitions.observations[:, 0, 0].tolist() == [0, 0, 255]
 
     def test_states_are_shown_as_they_are(self):
-        seen = Windows.cut(TWO, "state").history(torch.tensor([8])).observations
+        seen = Transitions.cut(TWO, "state").history(torch.tensor([8])).observations
         assert seen[0].tolist() == [[200.0, 200.25]] * 4 + [[201.0, 201.25]]
 
 
@@ -122,21 +126,21 @@ class TestErrors:
     @pytest.mark.parametrize("source", ["camera", "rendered", "state"])
     def test_an_episode_without_states_is_named(self, source):
         with pytest.raises(ValueError, match="episode 1 has no states"):
-            Windows.cut([TWO[0], episode(2, 3, states=False)], source, lambda state: state)
+            Transitions.cut([TWO[0], episode(2, 3, states=False)], source, lambda state: state)
 
     def test_an_episode_without_frames_is_named(self):
         with pytest.raises(ValueError, match="episode 1 has no camera frames"):
-            Windows.cut([TWO[0], episode(2, 3, frames=False)], "camera")
+            Transitions.cut([TWO[0], episode(2, 3, frames=False)], "camera")
 
     def test_rendered_without_a_renderer(self):
         with pytest.raises(ValueError, match="need a renderer"):
-            Windows.cut(TWO, "rendered")
+            Transitions.cut(TWO, "rendered")
 
     def test_an_unknown_source_is_quoted_and_those_there_are_listed(self):
         with pytest.raises(ValueError, match="'frames'; there are camera, rendered, state"):
-            Windows.cut(TWO, "frames")
+            Transitions.cut(TWO, "frames")
 
     @pytest.mark.parametrize("episodes", [[], [episode(1, 1)]])
     def test_no_sample_at_all(self, episodes):
         with pytest.raises(ValueError, match="no sample"):
-            Windows.cut(episodes, "state")
+            Transitions.cut(episodes, "state")
