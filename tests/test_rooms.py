@@ -46,3 +46,16 @@ def test_each_room_of_the_library_imports_only_rooms_above_it_in_the_architectur
         if room != "__init__":
             names = {name.split(".")[1] for name in modules(path) if name.startswith("visadapt.")} - {room}
             assert not [name for name in names if order[name] >= order[room]], path
+
+
+def test_the_report_is_written_from_the_result_and_imported_by_the_command_alone():
+    diagnosis = ROOT / "visadapt" / "diagnosis"
+    report = "visadapt.diagnosis.report"
+    for path in (diagnosis / "report").rglob("*.py"):
+        of_diagnosis = {name.split(".")[2] for name in modules(path) if name.startswith("visadapt.diagnosis.")}
+        assert of_diagnosis <= {"report", "result", "words"}, path
+    users = {
+        path for path in (ROOT / "visadapt").rglob("*.py") if any(name.startswith(report) for name in modules(path))
+    }
+    outside = {path for path in users if path.parent != diagnosis / "report"}
+    assert outside == {diagnosis / "result.py", ROOT / "visadapt" / "cli" / "diagnose.py"}

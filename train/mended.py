@@ -24,8 +24,8 @@ from experiments.curves import save_figure
 from experiments.film_runs import film_run
 from experiments.kept_scores import kept_score
 from renderers import DrawnCartPole
-from visadapt.diagnosis.report.text import estimate, interval, plain, with_unit
 from visadapt.diagnosis.result import Estimate
+from visadapt.diagnosis.words import estimate, interval, plain, with_unit
 from visadapt.effects import ActuatorGain, CameraRotation
 from visadapt.evaluation import CartPoleScore
 from visadapt.films.widgets import INK, MUTED, STYLE, TEAL

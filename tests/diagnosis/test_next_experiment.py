@@ -1,6 +1,6 @@
 import pytest
 
-from visadapt.diagnosis.report.next_experiment import explain, separate
+from visadapt.diagnosis.next_experiment import explain, separate
 from visadapt.effects import (
     ActuatorBias,
     ConstantForce,

@@ -9,7 +9,7 @@ import torch
 from tests.own_systems import Pendulum
 from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.report.html import as_html
-from visadapt.diagnosis.report.text import plain
+from visadapt.diagnosis.words import plain
 from visadapt.effects.catalogue import catalogue
 from visadapt.recordings import Episode, Recording
 from visadapt.world import World

@@ -14,7 +14,7 @@ import pytest
 
 from visadapt import diagnosis as package
 from visadapt.diagnosis.report.html import as_html, write_report
-from visadapt.diagnosis.report.text import as_text, estimate, interval, number, sentence
+from visadapt.diagnosis.report.text import as_text, sentence
 from visadapt.diagnosis.result import (
     VERDICTS,
     Box,
@@ -34,6 +34,7 @@ from visadapt.diagnosis.result import (
     Region,
     Where,
 )
+from visadapt.diagnosis.words import estimate, interval, number
 
 DATA_URL = re.compile(r"data:image/png;base64,([\w+/=]+)")
 STATES = ("x", "x_dot", "theta", "theta_dot")

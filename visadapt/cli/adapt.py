@@ -12,7 +12,7 @@ import torch
 from renderers import load_renderer
 from visadapt.cli.inputs import InputError, checked, fingerprint, given_effects, import_effects, progress
 from visadapt.cli.target import load_both
-from visadapt.diagnosis.report.text import number, with_unit
+from visadapt.diagnosis.words import number, with_unit
 from visadapt.effects import Effect, Parameter
 from visadapt.learning.explanation import Explanation
 from visadapt.policies import ImagePolicy, Policy

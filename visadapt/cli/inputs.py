@@ -20,8 +20,8 @@ from typing import Any
 import torch
 
 from visadapt.cli.own_effects import complaints as complaints_of_effect
-from visadapt.diagnosis.report.text import with_unit
 from visadapt.diagnosis.saved import load_effects
+from visadapt.diagnosis.words import with_unit
 from visadapt.effects import EFFECTS, Effect
 from visadapt.effects.base import require_system
 from visadapt.effects.catalogue import catalogue, sized

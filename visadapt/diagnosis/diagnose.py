@@ -10,9 +10,9 @@ import torch
 from torch import nn
 
 from visadapt.diagnosis import policy_bound
+from visadapt.diagnosis.figures_data import disturbances, figure_data, film_frames
 from visadapt.diagnosis.frames import UNSEEN, FramesError, watch, with_camera
 from visadapt.diagnosis.measured_gap import MeasuredGap, measure
-from visadapt.diagnosis.report.figures_data import disturbances, figure_data, film_frames
 from visadapt.diagnosis.result import (
     AMBIGUOUS,
     IDENTIFIED,

@@ -14,11 +14,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from visadapt.diagnosis.report import next_experiment
-from visadapt.diagnosis.report.text import estimate
+from visadapt.diagnosis import next_experiment
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Diagnosis, Gap, Pixels
 from visadapt.diagnosis.search.camera import CameraFindings, find_camera
 from visadapt.diagnosis.search.pixels import judged, left_over, usual
+from visadapt.diagnosis.words import estimate
 from visadapt.effects import (
     EFFECTS,
     AngleDelay,

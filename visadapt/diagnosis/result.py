@@ -260,7 +260,7 @@ class Diagnosis:
             raise ValueError(f"the verdict {self.verdict!r} does not go with {len(self.causes)} causes")
 
     def __str__(self) -> str:
-        # Imported here: the report is written from this result.
+        # Imported here: the report is above this module, and is written from it.
         from visadapt.diagnosis.report.text import as_text
 
         return as_text(self)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from visadapt.diagnosis.report import next_experiment
-from visadapt.diagnosis.report.text import with_unit
+from visadapt.diagnosis import next_experiment
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Gap, without_slight
 from visadapt.diagnosis.search.causes import Alternative
 from visadapt.diagnosis.search.heldout import MIN_GAP
@@ -14,6 +13,7 @@ from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import CoarseSteps
 from visadapt.diagnosis.search.unexplained import smooth_functions
+from visadapt.diagnosis.words import with_unit
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.systems import System
 

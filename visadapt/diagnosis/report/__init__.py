@@ -1,1 +1,1 @@
-"""What a diagnosis says, in words and figures."""
+"""What a diagnosis says, as text for the terminal and as an HTML page with figures; written from the result."""

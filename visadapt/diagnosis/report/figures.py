@@ -14,8 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from visadapt.diagnosis.report.text import plain
 from visadapt.diagnosis.result import Chart, Prediction, Region
+from visadapt.diagnosis.words import plain
 from visadapt.systems import System
 
 INK, MUTED, LINE = "#1f2933", "#6e7a88", "#d8dde3"

@@ -1,4 +1,4 @@
-"""The data of the report's figures."""
+"""The data of the figures that the report plots."""
 
 from __future__ import annotations
 

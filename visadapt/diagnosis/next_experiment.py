@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from visadapt.diagnosis.report.text import listed, plain
+from visadapt.diagnosis.words import listed, plain
 from visadapt.effects import Effect, Stage
 from visadapt.effects.catalogue import separable
 from visadapt.estimation.profiles import SystemProfile, profile_of

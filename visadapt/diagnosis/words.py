@@ -1,0 +1,63 @@
+"""Numbers, units, names and lists in words, as reports, warnings and the command line state them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from visadapt.diagnosis.result import Estimate
+
+UNKNOWN = "unknown"
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number with this many significant digits; with an exponent below 1e-4 and from 1e6 on."""
+    if not math.isfinite(value):
+        return UNKNOWN
+    if value == 0:
+        return "0"
+    if not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}"
+    return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
+
+
+def percent(share: float) -> str:
+    """A share as a percentage; "unknown" for NaN."""
+    return f"{100 * share:.0f} %" if math.isfinite(share) else UNKNOWN
+
+
+def with_unit(text: str, unit: str) -> str:
+    """A number and its unit, which is "1" where there is none."""
+    return text if unit in ("1", "") else f"{text} {unit}"
+
+
+def estimate(one: Estimate) -> str:
+    """A parameter's value, rounded to two significant digits of its interval's width."""
+    return with_unit(_rounded(one.value, one), one.unit)
+
+
+def interval(one: Estimate) -> str:
+    """A parameter's 90 % interval."""
+    low, high = (_rounded(edge, one) if math.isfinite(edge) else "open" for edge in one.ci90)
+    return with_unit(f"{low} to {high}", one.unit)
+
+
+def _rounded(value: float, one: Estimate) -> str:
+    width = one.ci90[1] - one.ci90[0]
+    if not math.isfinite(width) or width <= 0 or not math.isfinite(value) or width < 1e-6 * abs(value):
+        return number(value)
+    decimals = 1 - math.floor(math.log10(width))
+    if decimals > 6:
+        digits = decimals + math.floor(math.log10(abs(value))) if value else 0
+        return f"{value:.{max(0, digits)}e}"
+    return f"{value:.{decimals}f}" if decimals > 0 else f"{round(value, decimals):.0f}"
+
+
+def plain(name: str) -> str:
+    """A standard name with spaces."""
+    return name.replace("_", " ").replace(".", " ")
+
+
+def listed(words: Sequence[str], last: str = "and") -> str:
+    """ "a", "a and b", "a, b and c"."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
