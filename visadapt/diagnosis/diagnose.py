@@ -224,9 +224,8 @@ def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effec
     # Of a late command and late readings, the readings: then commands change between rows, not within a step, which is
     # exact also where a joint stops.
     for effect in sorted(effects, key=lambda effect: not issubclass(effect, LateSensors)):
-        if not (
-            twins(effect, out, system) or effect.repeats_readings or remembers(effect) or effect.stage is Stage.CAMERA
-        ):
+        fitted_here = not (effect.repeats_readings or remembers(effect, system) or effect.stage is Stage.CAMERA)
+        if fitted_here and not twins(effect, out, system):
             out.append(effect)
     return out
 

@@ -80,7 +80,7 @@ def fit_effects(
     kinds = [with_episode_phases(sized(type(effect), system), len(measured)) for effect in effects]
     fitted = tuple(kind for kind in kinds if not kind.repeats_readings)
     for kind in fitted:
-        if remembers(kind):
+        if remembers(kind, system):
             raise ValueError(f"{kind.name} cannot be fitted: what it measures depends on earlier rows")
     if {ActuatorDelay, MeasurementDelay} <= set(kinds) or len(set(kinds)) < len(kinds):
         raise ValueError(
@@ -120,11 +120,12 @@ def fit_effects(
     return EffectFit(values, spreads, states, _shifts(fitted, columns, found.theta[0], len(measured)))
 
 
-def remembers(effect: type[Effect]) -> bool:
-    """Whether it is a sensor whose reading depends on earlier rows in another way than by being late."""
+def remembers(effect: type[Effect], system: System) -> bool:
+    """Whether it is a sensor of the system whose reading depends on earlier rows in another way than by being late."""
     if not issubclass(effect, SensingEffect) or issubclass(effect, LateSensors):
         return False
-    return effect(**dict.fromkeys((p.name for p in effect.table), 0.0)).memory(torch.zeros(1, 4), 1.0).numel() > 0
+    without_effect = effect(**dict.fromkeys((p.name for p in effect.table), 0.0))
+    return without_effect.memory(torch.zeros(1, len(system.states)), 1.0).numel() > 0
 
 
 def _fitted(system: System, effects: Effects, rows: Segments, present: Sequence[float]) -> FitState:
