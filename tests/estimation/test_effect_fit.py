@@ -4,13 +4,42 @@ import pytest
 import torch
 
 import visadapt as va
-from visadapt.effects import EFFECTS, MeasurementDelay
+from visadapt.effects import EFFECTS, ActuatorBias, ActuatorDelay, ConstantForce, MeasurementDelay, Payload, ThrustGain
 from visadapt.estimation.effect_fit import fit_effects, remembers
 
 
 def fitted(system, *effects):
     state, command = (torch.zeros(30, len(each)) for each in (system.states, system.actions))
     return fit_effects(system, effects, [state + 1e-3 * torch.randn(state.shape)], [command], 0.05)
+
+
+@pytest.mark.parametrize(
+    ("system", "effects"),
+    [
+        (va.CartPole(), (ActuatorDelay(delay=0.0), MeasurementDelay(delay=0.0))),
+        (va.CartPole(), (ActuatorBias(offset=0.0), ConstantForce(force=0.0))),
+        (va.CartPole(cart_mass=5.0), (ConstantForce(force=0.0), ActuatorBias(offset=0.0))),
+        (va.Quadrotor(), (ThrustGain(scale=1.0), Payload(mass=0.0))),
+    ],
+)
+def test_twins_are_refused_by_name(system, effects):
+    one, other = (effect.name for effect in effects)
+    with pytest.raises(ValueError, match=f"passive data cannot tell apart {one} and {other}: leave one of them out"):
+        fitted(system, *effects)
+
+
+def test_twins_that_data_of_the_system_separate_are_fitted_together():
+    names = {kind.name for kind in fitted(va.Quadrotor(), *made(va.Quadrotor())).values}
+    assert names == {"actuator_bias", "constant_force"}
+
+
+def made(system):
+    return [kind(**dict.fromkeys((p.name for p in kind.table), 0.0)) for kind in (ActuatorBias, ConstantForce)]
+
+
+def test_an_effect_that_is_given_twice_is_refused():
+    with pytest.raises(ValueError, match="constant_force is given more than once"):
+        fitted(va.CartPole(), ConstantForce(force=0.0), ConstantForce(force=1.0))
 
 
 class SlowGyros(va.SensingEffect):

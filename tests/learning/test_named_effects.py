@@ -193,5 +193,5 @@ def test_the_values_that_effects_have_are_one_of_the_starts():
 
 def test_two_that_passive_data_cannot_tell_apart_are_refused():
     pair = [made(EFFECTS[name], {"delay": 0.0}) for name in ("measurement_delay", "actuator_delay")]
-    with pytest.raises(ValueError, match=r"cannot tell apart .* measurement_delay, actuator_delay"):
+    with pytest.raises(ValueError, match="cannot tell apart measurement_delay and actuator_delay"):
         fit_effects(CartPole(), pair, [torch.zeros(3, 4)], [torch.zeros(3, 1)], 0.05)

@@ -13,17 +13,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from visadapt.effects import (
-    ActuatorDelay,
-    Dropout,
-    Effect,
-    FrozenZone,
-    LateSensors,
-    MeasurementDelay,
-    Role,
-    SensingEffect,
-)
-from visadapt.effects.catalogue import sized
+from visadapt.effects import Dropout, Effect, FrozenZone, LateSensors, Role, SensingEffect
+from visadapt.effects.catalogue import sized, twins
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.episode_phases import has_episode_phases, in_step, with_episode_phases, with_own_phases
 from visadapt.estimation.fit_states import (
@@ -75,18 +66,14 @@ def fit_effects(
         period: s between rows.
 
     Raises:
-        ValueError: an effect that cannot be fitted, or effects that passive data cannot tell apart.
+        ValueError: an effect cannot be fitted or is given twice, or passive data cannot tell two apart.
     """
     kinds = [with_episode_phases(sized(type(effect), system), len(measured)) for effect in effects]
     fitted = tuple(kind for kind in kinds if not kind.repeats_readings)
     for kind in fitted:
         if remembers(kind, system):
             raise ValueError(f"{kind.name} cannot be fitted: what it measures depends on earlier rows")
-    if {ActuatorDelay, MeasurementDelay} <= set(kinds) or len(set(kinds)) < len(kinds):
-        raise ValueError(
-            f"passive data cannot tell apart some of the effects {', '.join(kind.name for kind in kinds)}: "
-            "leave out those that do the same as another"
-        )
+    _check_separable(kinds, system)
     columns, first = {}, 0
     for kind in fitted:
         columns[kind] = slice(first, first + len(kind.table))
@@ -126,6 +113,16 @@ def remembers(effect: type[Effect], system: System) -> bool:
         return False
     without_effect = effect(**dict.fromkeys((p.name for p in effect.table), 0.0))
     return without_effect.memory(torch.zeros(1, len(system.states)), 1.0).numel() > 0
+
+
+def _check_separable(kinds: Sequence[type[Effect]], system: System) -> None:
+    """Raise ValueError, which names them, for two effects that passive data of the system cannot tell apart."""
+    for place, kind in enumerate(kinds):
+        others = [*kinds[:place], *kinds[place + 1 :]]
+        if kind in others:
+            raise ValueError(f"{kind.name} is given more than once: leave all but one out")
+        for twin in twins(kind, others, system):
+            raise ValueError(f"passive data cannot tell apart {kind.name} and {twin.name}: leave one of them out")
 
 
 def _fitted(system: System, effects: Effects, rows: Segments, present: Sequence[float]) -> FitState:
