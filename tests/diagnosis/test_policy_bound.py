@@ -11,9 +11,10 @@ import torch
 
 from tests.diagnosed import GAINS, record
 from tests.diagnosis.test_report import SCHEMA
+from tests.own_systems import Pendulum
 from visadapt import diagnose
 from visadapt.cli import main as cli
-from visadapt.diagnosis.policy_bound import check, policy_terms
+from visadapt.diagnosis.policy_bound import actions, check, policy_terms
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.search import Search
 from visadapt.effects import (
@@ -26,7 +27,7 @@ from visadapt.effects import (
 )
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import CAREFUL
-from visadapt.history import HORIZON
+from visadapt.history import HORIZON, History
 from visadapt.policies import ImagePolicy, Policy, StatePolicy
 from visadapt.recordings import write_recording
 from visadapt.setups.policy_file import save_policy
@@ -216,3 +217,21 @@ class TestNoPolicy:
     def test_is_refused_before_the_search(self):
         with pytest.raises(ValueError, match="sees frames"):
             diagnose(record(), World(CartPole()), policy=ImagePolicy(torch.zeros(100, 120), 1.0))
+
+
+class TestActions:
+    """Of a pendulum whose motor is commanded from -2 to 2 N m."""
+
+    history = History.start(torch.zeros(3, 2, dtype=torch.float64), 1)
+
+    @pytest.mark.parametrize(("torque", "limited"), [(1.5, 1.5), (-9.0, -2.0), (9.0, 2.0)])
+    def test_are_limited_to_the_range_of_the_system(self, torque, limited):
+        chosen = actions(lambda states: torque * torch.ones(len(states), 1), Pendulum(), self.history)
+        assert chosen.tolist() == [[limited]] * 3
+
+    def test_of_another_shape_are_refused_with_the_range(self):
+        message = (
+            r"for states \(3, 2\) the policy gave the shape \(3, 2\); actions \(3, 1\) are right: torque from -2 to 2$"
+        )
+        with pytest.raises(ValueError, match=message):
+            actions(lambda states: states, Pendulum(), self.history)

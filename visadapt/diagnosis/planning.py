@@ -266,7 +266,7 @@ def _simulate(
     history = History.start(read(measured), added.shape[-1])
     readings, commands, inside = [measured], [], (at.state.abs() <= MARGIN * ranges).all(1)
     for t in range(added.shape[1]):
-        command = added[:, t] if policy is None else actions(policy, history).to(added) + added[:, t]
+        command = added[:, t] if policy is None else actions(policy, system, history).to(added) + added[:, t]
         command = system.within_range(command)
         at = world.step(at, command)
         measured, at = world.measure(at, generator)

@@ -38,7 +38,7 @@ from visadapt.policies import ImagePolicy, Policy
 from visadapt.systems import CartPole, System
 
 StatesToActions = Policy | Callable[[Tensor], Any]
-"""A policy on states: a `Policy`, or a function from states (N, n_state) to actions (N, n_action) in [-1, 1]."""
+"""A policy on states: a `Policy`, or a function from states (N, n_state) to actions (N, n_action)."""
 
 COMMAND_POINTS = 41  # Commands from -1 to 1 at which a step is computed; between them it is interpolated linearly
 
@@ -57,11 +57,11 @@ def check(policy: StatesToActions, system: System) -> None:
             f"diagnose: the policy is made for {policy.n_state} states and {policy.n_action} actions; "
             f"{system.name} has {n} and {n_action}"
         )
-    actions(policy, History.start(torch.zeros(2, n, dtype=torch.float64), n_action))
+    actions(policy, system, History.start(torch.zeros(2, n, dtype=torch.float64), n_action))
 
 
-def actions(policy: StatesToActions, history: History) -> Tensor:
-    """The policy's actions (B, n_action), clamped to [-1, 1], after a history of states; float64."""
+def actions(policy: StatesToActions, system: System, history: History) -> Tensor:
+    """The policy's actions (B, n_action), limited to the system's range, after a history of states; float64."""
     if isinstance(policy, Policy):
         dtype = next(policy.parameters()).dtype
         chosen = policy.act(History(history.observations.to(dtype), history.actions.to(dtype)))
@@ -70,11 +70,12 @@ def actions(policy: StatesToActions, history: History) -> Tensor:
     batch, _, n_action = history.actions.shape
     if chosen.shape != (batch, n_action) or not bool(chosen.isfinite().all()):
         what = "values that are not finite" if chosen.shape == (batch, n_action) else f"the shape {tuple(chosen.shape)}"
+        ranges = ", ".join(f"{each.name} from {each.low:g} to {each.high:g}" for each in system.actions)
         raise ValueError(
-            f"diagnose: for states ({batch}, {history.observations.shape[-1]}) the policy gave {what}; "
-            f"actions ({batch}, {n_action}) in [-1, 1] are right"
+            f"for states ({batch}, {history.observations.shape[-1]}) the policy gave {what}; "
+            f"actions ({batch}, {n_action}) are right: {ranges}"
         )
-    return chosen.double().clamp(-1, 1)
+    return system.within_range(chosen.double())
 
 
 def policy_terms(policy: StatesToActions, system: System, rows: Segments, best: ScoredModel) -> PolicyTerms:
@@ -85,7 +86,7 @@ def policy_terms(policy: StatesToActions, system: System, rows: Segments, best: 
     corrected = CandidateModel(system, best.effects, rows)
     state, disturbance, variance = _estimated_steps(corrected, best)
     histories, complete = _histories(corrected.at(best.fits.theta[0]).reading(state.flatten(0, 1)), rows)
-    acted = actions(policy, histories).reshape(variance.shape)
+    acted = actions(policy, system, histories).reshape(variance.shape)
     source, no_values = CandidateModel(system, (), rows), best.fits.theta[0, :0]
     before = _steps(source, no_values, state, acted, complete)
     after = _steps(corrected, best.fits.theta[0], state, acted, complete)
