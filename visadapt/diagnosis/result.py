@@ -245,7 +245,9 @@ class Diagnosis:
     recording: RecordingSummary
     verdict: str  # one of VERDICTS
     where: Where
-    causes: tuple[Cause, ...]  # empty for no_gap and unexplained; for ambiguous, all that fit equally well
+    causes: tuple[Cause, ...]
+    """those of a camera, those of repeated readings, then each effect of the most probable set, followed by those that
+    fit as well in its place; empty for no_gap and unexplained"""
     ranking: tuple[Ranked, ...]  # all sets that were compared, the most probable first
     gap: Gap
     next_experiment: str  # what to record to settle open questions; empty where there are none
@@ -268,8 +270,8 @@ class Diagnosis:
     def effects(self) -> list[Effect]:
         """The causes as effects at their found values, for a `World` that explains the recording.
 
-        Of effects that this recording cannot tell apart the first in `causes` is taken, which is the likeliest; the
-        others are its `indistinguishable_from`.
+        Of effects that this recording cannot tell apart the first in `causes` is taken: that of the most probable set,
+        or a twin that does exactly the same. The others are its `indistinguishable_from`.
 
         Raises:
             ValueError: the diagnosis named no cause (no_gap or unexplained), or a parameter has no finite value.
