@@ -1,6 +1,7 @@
 """A diagnosis of a system of one's own: a friction, a gain, a delay, and nothing, of a driven pendulum."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -73,3 +74,16 @@ def test_what_is_there_is_found(name, values):
 def test_nothing_is_found_where_nothing_is():
     found = diagnose(recording(), World(Pendulum(), period=PERIOD), SEARCHED)
     assert (found.verdict, found.causes) == ("no_gap", ())
+
+
+@pytest.mark.parametrize("catalogue", [None, SEARCHED])
+def test_a_system_that_does_not_say_what_its_loads_act_on_is_refused(catalogue):
+    @dataclass(frozen=True)
+    class Bare(Pendulum):
+        name = "bare_pendulum"
+        coordinates = ()  # type: ignore[assignment]
+
+    with pytest.raises(
+        ValueError, match=r"^bare_pendulum cannot be diagnosed: its coordinates are \(\); a pair .* right$"
+    ):
+        diagnose(recording(), World(Bare(), period=PERIOD), catalogue)

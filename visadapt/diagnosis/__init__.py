@@ -2,6 +2,5 @@
 
 from visadapt.diagnosis.diagnose import diagnose
 from visadapt.diagnosis.result import Diagnosis
-from visadapt.estimation.profiles import DIAGNOSABLE
 
-__all__ = ["DIAGNOSABLE", "Diagnosis", "diagnose"]
+__all__ = ["Diagnosis", "diagnose"]

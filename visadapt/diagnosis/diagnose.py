@@ -44,6 +44,7 @@ from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized, twins
 from visadapt.effects.late_sensors import LateSensors
 from visadapt.estimation.effect_fit import remembers
+from visadapt.estimation.profiles import profile_of
 from visadapt.processes import one_thread
 from visadapt.progress import Report, staged
 from visadapt.recordings import Recording
@@ -83,7 +84,8 @@ def diagnose(
 
     Raises:
         FramesError: there are frames and no renderer, or this one does not explain them.
-        ValueError: the world has effects, its system cannot be diagnosed, or `policy` is not one on its states.
+        ValueError: the world has effects, its system does not state its `coordinates`, or `policy` is not one on its
+            states.
 
     >>> import pathlib, tempfile, torch, visadapt as va
     >>> target = va.SyntheticTarget(va.constant_force(2.0))
@@ -100,6 +102,7 @@ def diagnose(
     if len(world.effects):
         raise ValueError("diagnose: the world is the source and has no effects; give the bare system")
     system = world.system
+    profile = profile_of(system)
     if policy is not None:
         policy_bound.check(policy, system)
     effects = all_effects(system) if catalogue is None else [sized(effect, system) for effect in catalogue]
@@ -120,7 +123,7 @@ def diagnose(
     measured = measure(search, comparison, groups, errors_with_repeats(prepared, search) if repeats else None, jobs)
     verdict, found = _judge(explored, measured)
     before, after = disturbances(search, comparison)
-    regions = _regions(found, before if found else after, explored.effects, search.profile.region_variables, seed)
+    regions = _regions(found, before if found else after, explored.effects, profile.region_variables, seed)
     found_before = [(EFFECTS[cause.effect].stage, cost) for cause, cost in explored.repeats]
     if film is not None and film.camera.best.camera:
         found_before.append((Stage.CAMERA, film.camera.lost))

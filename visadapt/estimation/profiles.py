@@ -135,12 +135,13 @@ PROFILES: dict[type[System], SystemProfile] = {
 }
 """The profile of each system class."""
 
-DIAGNOSABLE: dict[str, type[System]] = {system.name: system for system in PROFILES}
-"""The systems that can be diagnosed, by name."""
-
 
 def profile_of(system: System) -> SystemProfile:
-    """The profile of a system, or of the class that it derives from; of a system of one's own, made from its class."""
+    """The profile of a system, or of the class that it derives from; of a system of one's own, made from its class.
+
+    Raises:
+        ValueError: a system of one's own does not state `coordinates` for each of its loads.
+    """
     for kind, profile in PROFILES.items():
         if isinstance(system, kind):
             return profile
@@ -154,6 +155,11 @@ FIRST_STATE_SHARE = 0.3
 @cache
 def _own_profile(system: type[System]) -> SystemProfile:
     """From the states, actions, loads and coordinates of a system of one's own, each sensor and each joint alone."""
+    if not system.coordinates or len(system.coordinates) != len(system.loads):
+        raise ValueError(
+            f"{system.name} cannot be diagnosed: its coordinates are {system.coordinates!r}; a pair (column of the "
+            f"position, column of the velocity) for each of its {len(system.loads)} loads, as in ((0, 1),), is right"
+        )
     names, units = [state.name for state in system.states], [state.unit for state in system.states]
     positions, velocities = ([pair[k] for pair in system.coordinates] for k in (0, 1))
     places = {units[p]: names[p] for p in positions if sum(units[p] == units[q] for q in positions) == 1}
