@@ -96,12 +96,11 @@ class _Readings:
 
     def whole(self, convention: Convention | None) -> Recording:
         """Episodes from end to end, repeated readings filled in, in the signs of the source."""
-        convention = convention or Convention("nothing", ())
-        sign = sensor_checks.signs(convention, self.channels)
+        sign, command_sign = sensor_checks.signs(convention, self.channels), convention.command if convention else 1.0
         parts = zip(self.recording.episodes, self.stamps, self.commands, self.states, self.repeats.used, strict=True)
         episodes = []
         for episode, time, command, state, used in parts:
-            action, filled = (convention.command * command).numpy(), (sign * _filled(state, used, time)).numpy()
+            action, filled = (command_sign * command).numpy(), (sign * _filled(state, used, time)).numpy()
             episodes.append(replace(episode, time=time.numpy(), action=action, state=filled))
         return replace(self.recording, episodes=tuple(episodes))
 
@@ -185,10 +184,10 @@ def _without_defective_angles(draft: _Draft, source: FitState) -> _Draft:
     if defect is None:
         return draft
     band, full_turns = defect
-    angle = readings.channels.index(sensor[0])
+    angle, name = readings.channels.index(sensor[0]), readings.system.states[sensor[0]].name
     bad = [sensor_checks.between(values[:, angle], *band) for values in readings.states]
     told = (
-        f"{sum(int(b.sum()) for b in bad)} readings of theta between {band[0]:.2f} and {band[1]:.2f} rad "
+        f"{sum(int(b.sum()) for b in bad)} readings of {name} between {band[0]:.2f} and {band[1]:.2f} rad "
         "contradict those around them and the physics: the sensor is defective there; they were set aside"
     )
     stretches = sensor_checks.stretches_without(bad)

@@ -67,9 +67,10 @@ def _likelihood(search: Search) -> float:
     return float(search.best.fits.likelihood[0])
 
 
-def signs(convention: Convention, channels: Sequence[int]) -> Tensor:
-    """(m,) factors, 1 or -1, of these columns of the state from another convention to that of the source."""
-    return torch.tensor([-1.0 if channel in convention.columns else 1.0 for channel in channels], dtype=torch.float64)
+def signs(convention: Convention | None, channels: Sequence[int]) -> Tensor:
+    """(m,) factors, 1 or -1, of these columns of the state from another convention, if any, to that of the source."""
+    turned = convention.columns if convention else ()
+    return torch.tensor([-1.0 if channel in turned else 1.0 for channel in channels], dtype=torch.float64)
 
 
 def to_source(rows: Segments, convention: Convention) -> Segments:
@@ -165,14 +166,19 @@ def angle_defect(system: System, rows: Segments, fits: FitState) -> tuple[tuple[
     Its edges in rad, and whether the pole turns all the way round; None where there is no such band. The lower edge
     lies in [-pi, pi], the upper one above it, so beyond pi where the band holds the hanging pole.
     """
-    angle_sensor = profile_of(system).angle_sensor
-    if not angle_sensor or float(fits.log_process[0, 1]) < SUSPICIOUS_LOG_PROCESS:
+    profile = profile_of(system)
+    if not profile.angle_sensor:
+        return None
+    angle, rate = profile.angle_sensor
+    driven = next(k for k, velocities in enumerate(profile.driven) if rate in velocities)
+    if float(fits.log_process[0, driven]) < SUSPICIOUS_LOG_PROCESS:
         return None
     found = disturbance(CandidateModel(system, (), rows), fits, fits.log_process)
     here = found.valid > 0
-    theta = found.variables[system.states[angle_sensor[0]].name][here]
+    theta = found.variables[system.states[angle].name][here]
     band = ((theta + math.pi).remainder(2 * math.pi) / BAND).long().clamp(max=BANDS - 1)
-    power = found.load[..., 1][here].square()
+    torque = found.load[..., system.coordinates.index((angle, rate))]
+    power = torque[here].square()
     count = torch.zeros(BANDS, dtype=power.dtype).index_add_(0, band, torch.ones_like(power))
     mean = torch.zeros_like(count).index_add_(0, band, power) / count.clamp(min=1)
     defective = (mean > POWER_RATIO * mean[count > 0].median()) & (count >= MIN_BAND_ROWS)

@@ -53,7 +53,7 @@ def smooth_functions(model: CandidateModel, fits: FitState) -> list[SmoothFuncti
     # One after the other: together they would need much memory.
     for block in _blocks(model, fits):
         response = innovations.response(block.drive, block.reading)
-        out.append(SmoothFunction(block.port, block.variable, _regression(response, innovations.error)[1]))
+        out.append(SmoothFunction(block.port, block.variable, _log_odds(response, innovations.error)))
     return sorted(out, key=lambda function: -function.log_odds)
 
 
@@ -108,17 +108,17 @@ def _bumps(values: Tensor, inside: Tensor) -> Tensor:
     return torch.exp(-0.5 * ((values[..., None] - centres) / width).square())
 
 
-def _regression(responses: Tensor, error: Tensor) -> tuple[Tensor, float]:
-    """Posterior mean weights (M,) of responses (N, M) that cancel `error` (N,), and their log odds against zero."""
+def _log_odds(responses: Tensor, error: Tensor) -> float:
+    """Log odds that responses (N, M) with weights cancel a part of `error` (N,), against weights of zero."""
     normal = responses.T @ responses
     gradient = -(responses.T @ error)
     scale = 1 / (normal.diagonal().mean() + 1e-300)
     identity = torch.eye(len(gradient), dtype=normal.dtype)
-    best, weights = -math.inf, torch.zeros_like(gradient)
+    best = -math.inf
     for size in PRIOR_DEVIATIONS:
         variance = scale * size**2 * BUMPS
-        inner = torch.linalg.solve(normal + identity / variance, gradient)
-        value = float(0.5 * gradient @ inner - 0.5 * torch.linalg.slogdet(identity + variance * normal)[1])
+        weights = torch.linalg.solve(normal + identity / variance, gradient)
+        value = float(0.5 * gradient @ weights - 0.5 * torch.linalg.slogdet(identity + variance * normal)[1])
         if value > best:
-            best, weights = value, inner
-    return weights, best - math.log(len(PRIOR_DEVIATIONS))
+            best = value
+    return best - math.log(len(PRIOR_DEVIATIONS))
