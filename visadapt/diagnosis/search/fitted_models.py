@@ -139,11 +139,12 @@ class FittedModels:
         found = screen(self.system, base.effects, base.fits, self.rows, [effect])
         return with_effect(base.fits, found[0].values if found else neutral(effect))
 
-    def leftover(self, sets: Sequence[ScoredModel]) -> list[float]:
-        """Log likelihood that process noise adds to each set: a measure of what it leaves unexplained.
+    def refit_without_process_noise(self, sets: Sequence[ScoredModel]) -> list[float]:
+        """Fit each set without process noise; return the log likelihood that process noise adds to it, a measure of
+        what it leaves unexplained.
 
-        Where a set is likelier without, that fit is kept: the other one has ended where process noise explains what
-        other parameters would.
+        Where a set is likelier without, that fit replaces the other one, which has ended where process noise explains
+        what other parameters would.
         """
         starts = [(each.effects, each.fits) for each in sets]
         out = self._fits(starts, CAREFUL, -math.inf, process_noise=False)

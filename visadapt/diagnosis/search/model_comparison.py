@@ -80,7 +80,7 @@ def compare(search: Search) -> ModelComparison:
     """Compare the best models that a search has fitted, and the source."""
     close = [f for f in search.ranked if f.log_odds >= search.best.log_odds - COMPARE_WITHIN]
     close = close[: search.profile.compared_models]
-    leftover = search.leftover(close)
+    leftover = search.refit_without_process_noise(close)
     close = [search.fitted[key_of(f.effects)] for f in close]  # some of which may now have a better fit
     if all(f is not search.source for f in close):
         # So far behind that what process noise adds to it makes no difference.

@@ -13,13 +13,16 @@ from dataclasses import replace
 from itertools import combinations
 
 from visadapt.diagnosis.search.fitted_models import FittedModels, ScoredModel, key_of, less
+from visadapt.effects import Effect
 from visadapt.effects.late_sensors import LateSensors
 from visadapt.estimation.episode_phases import has_episode_phases, with_episode_phases
 from visadapt.estimation.fit_states import CAREFUL, QUICK, Effects, neutral, with_effect
 from visadapt.estimation.fitting import OUT_OF_REACH
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.screening import Candidate, screen
+from visadapt.estimation.segments import Segments
 from visadapt.progress import Progress
+from visadapt.systems import System
 
 MAX_EFFECTS = 6  # Effects in a set at most
 
@@ -52,12 +55,21 @@ fewer parameters, since a quick fit of the right set may keep too much process n
 class Search(FittedModels):
     """How sets grow from the source, and which sets near the best are tried."""
 
-    _exchanged: set[tuple[frozenset[str], frozenset[str]]]
-    """sets of which effects were exchanged, and what was kept of them"""
+    def __init__(
+        self,
+        system: System,
+        rows: Segments,
+        catalogue: Sequence[type[Effect]],
+        source: FitState | None = None,
+        jobs: int = 1,
+        rival: float = -math.inf,
+    ) -> None:
+        super().__init__(system, rows, catalogue, source, jobs, rival)
+        self._exchanged: set[tuple[frozenset[str], frozenset[str]]] = set()
+        """sets of which effects were exchanged, and what was kept of them"""
 
     def run(self, progress: Progress | None = None) -> None:
         """Grow sets while that raises the posterior odds, then try sets near the best."""
-        self._exchanged = set()
         beam = [self.source]
         for size in range(MAX_EFFECTS):
             if progress is not None:
@@ -70,7 +82,7 @@ class Search(FittedModels):
             if beam[0].log_odds < before.log_odds:
                 break
         self._settle()
-        if self._unexplained():
+        if self._improve_while_unexplained() > WIDEN_ABOVE:
             # Perhaps by two effects that only together beat single effects which fit fairly.
             for size in (1, 2):
                 bases = [f for f in self.ranked if len(f.effects) == size and f.log_odds > -math.inf]
@@ -98,16 +110,17 @@ class Search(FittedModels):
         """Fit the first few sets, which promise most, then the others, which stop early where they fall far behind."""
         return self.fit(starts[:LEADERS], QUICK) + self.fit(starts[LEADERS:], QUICK)
 
-    def _unexplained(self) -> bool:
-        """Whether process noise explains much that the best set does not; the best set may become another one."""
+    def _improve_while_unexplained(self) -> float:
+        """Refit the best set without process noise, prune and settle, until it stays the best; return the log
+        likelihood that process noise then adds to it."""
         before, left = None, 0.0
         while self.best is not before:
             before = self.best
-            left = self.leftover([before])[0]
+            (left,) = self.refit_without_process_noise([before])
             if self.best is not before:
                 self._prune()
                 self._settle()
-        return left > WIDEN_ABOVE
+        return left
 
     def _prune(self) -> None:
         """Remove effects of the best set one by one while that raises the odds, in fits without process noise: with it,
@@ -138,15 +151,15 @@ class Search(FittedModels):
         """Exchange, remove and fit carefully until the best set stays the best."""
         for _ in range(3):
             before = self.best
-            self.neighbours(before)
-            self.polish()
+            self._fit_neighbours(before)
+            self._polish()
             if self.best.names == before.names:
                 return
 
     def _phases_of_episodes(self) -> None:
         """Where something is unexplained, try periodic effects with a phase for each episode; keep them if they win."""
         catalogue = tuple(with_episode_phases(effect, len(self.rows.command)) for effect in self.catalogue)
-        if catalogue == self.catalogue or self.leftover([self.best])[0] <= WIDEN_ABOVE:
+        if catalogue == self.catalogue or self.refit_without_process_noise([self.best])[0] <= WIDEN_ABOVE:
             return
         rival, fitted, in_step = self.best, self.fitted, self.catalogue
         periodic = {effect.name for effect in catalogue if has_episode_phases(effect)}
@@ -193,7 +206,7 @@ class Search(FittedModels):
 
         return [one for one in screened if one.gain >= required(one)]
 
-    def neighbours(self, centre: ScoredModel) -> None:
+    def _fit_neighbours(self, centre: ScoredModel) -> None:
         """Fit the sets with one effect removed, with one exchanged for another, and with two exchanged for one."""
         # Also sets that were fitted before: from the larger set's parameters a fit may reach a better optimum.
         self.fit([less(centre, [removed]) for removed in centre.effects], QUICK)
@@ -212,7 +225,7 @@ class Search(FittedModels):
                 exchanges.append(((*kept, candidate.effect), start))
         self.fit(exchanges, QUICK)
 
-    def polish(self) -> None:
+    def _polish(self) -> None:
         """Fit carefully the sets close to the best, and the best set less each effect, with which it is compared."""
         self.fit([(f.effects, f.fits) for f in self.close()], CAREFUL)
 
