@@ -88,8 +88,7 @@ def watch(recording: Recording, system: System, renderer: nn.Module, report: Rep
     Raises:
         FramesError: frames of another size or scene than the renderer's, or that never change.
     """
-    across = system.states[system.index("x")]
-    reach = max(-across.low, across.high)
+    reach = system.states[system.index("x")].largest
     finder = PoseFinder(renderer, reach, LEAN)
     check_frames(recording, finder.size)
     every = torch.cat([torch.from_numpy(np.ascontiguousarray(episode.frame)) for episode in recording.episodes])

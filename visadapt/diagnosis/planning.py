@@ -256,7 +256,7 @@ def _simulate(
     """Readings without noise (N, T + 1, n) and commands (N, T + 1, n_action) under each of N excitations, and (N,)
     whether all states stay within their ranges; the policy sees readings with noise."""
     world = World(system, effects, recording.period, substeps=math.ceil(recording.period / SUBSTEP)).double()
-    ranges = torch.tensor([max(-v.low, v.high) for v in system.states], dtype=torch.float64)
+    ranges = torch.tensor([variable.largest for variable in system.states], dtype=torch.float64)
 
     def read(at: Tensor) -> Tensor:
         return at + noise * torch.randn(at.shape, generator=generator, dtype=at.dtype)

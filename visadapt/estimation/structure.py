@@ -5,6 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+MAX_FRAME_RATIO = 10.0
+"""Mean square residual of a frame, over the median of frames, above which it shows something else: a flash, or no
+picture."""
+
 NEIGHBOURS = 3  # px, side of the squares over which noise is averaged away
 
 

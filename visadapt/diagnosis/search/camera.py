@@ -17,7 +17,7 @@ from visadapt.effects import Blur, Brightness, CameraEffect, CameraRotation, Cam
 from visadapt.effects.camera import moved
 from visadapt.estimation.camera_fit import Camera, CameraFit, fit_camera, made, through
 from visadapt.estimation.poses import PoseFinder
-from visadapt.estimation.structure import evenly_spaced, white_noise
+from visadapt.estimation.structure import MAX_FRAME_RATIO, evenly_spaced, white_noise
 from visadapt.progress import Progress
 
 SEARCHED: Camera = (CameraRotation, CameraZoom, CameraShift, Occlusion, Blur, Gamma, Brightness)
@@ -33,8 +33,6 @@ EQUAL_FIT = 0.005  # Share by which another effect's misfit may exceed the best 
 MOST_EFFECTS = 3
 
 ASTRAY = 2.0  # Mean square residual of a frame, over the median of frames, above which its pose may be wrong
-
-OF_ANOTHER_KIND = 10.0  # The same above which a frame is left out: a flash, or no picture
 
 COVERED = 10 / 255  # Mean misfit of a pixel above which something may cover it
 COVERED_PIXELS = 6
@@ -91,7 +89,7 @@ def find_camera(
     place = finder(frames[rows]).place
     unchanged = fit_camera(renderer, shown, (), torch.zeros(0), place, frozenset())
     own = unchanged.residual.square().mean((1, 2))
-    usual = own <= OF_ANOTHER_KIND * own.median()
+    usual = own <= MAX_FRAME_RATIO * own.median()
     if not usual.all():
         shown, place = shown[usual], unchanged.place[usual]
         unchanged = fit_camera(renderer, shown, (), torch.zeros(0), place, frozenset())

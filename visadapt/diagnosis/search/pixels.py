@@ -14,10 +14,9 @@ from visadapt.diagnosis.result import Box, Pixels
 from visadapt.effects import CameraEffect, CameraShift
 from visadapt.effects.camera import moved
 from visadapt.estimation.camera_fit import within_frame
-from visadapt.estimation.structure import evenly_spaced, size_of, structure
+from visadapt.estimation.structure import MAX_FRAME_RATIO, evenly_spaced, size_of, structure
 
-OF_ANOTHER_KIND, FEW = 10.0, 0.1
-"""Mean squares of a frame, over their median, above which it is left out, and share of the frames that may be."""
+MAX_LEFT_OUT = 0.1  # Share of the frames that may be left out because their residual is far larger than most
 
 FRAMES = 96  # Frames, spread over the film, whose pixels are looked at
 
@@ -41,7 +40,7 @@ def left_over(seen: nn.Module, camera: Sequence[CameraEffect], frames: Tensor, p
     drawn = seen(x, theta)
     residual = (frames[rows].float() / 255 - drawn) * within_frame(camera, drawn)
     own = residual.square().mean((1, 2))
-    return structure(residual[own <= torch.maximum(OF_ANOTHER_KIND * own.median(), own.quantile(1 - FEW))])
+    return structure(residual[own <= torch.maximum(MAX_FRAME_RATIO * own.median(), own.quantile(1 - MAX_LEFT_OUT))])
 
 
 def usual(renderer: nn.Module, camera: Sequence[CameraEffect], place: Tensor) -> float:
