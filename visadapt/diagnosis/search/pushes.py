@@ -30,19 +30,22 @@ SPACING = 0.3  # Distance between the bumps of a width that are tried, over that
 
 EDGE = 2.45  # Deviations of a bump from its middle where it has 5 % of its peak: there a push starts and ends
 
-FIRST, CANDIDATE, CLEAR = 3.5, 3.0, 5.0
+MIN_SCORE_FIRST, MIN_SCORE_FURTHER, MIN_SCORE_PUSH = 3.5, 3.0, 5.0
 """Height of a bump, over its standard deviation, from which the first one on a part is fitted with all else, from which
 further ones are, and from which a bump is called a push: high, since errors of a model are not normally distributed."""
 
-CORRECTION = 0.1  # Height over that of an overlapping bump, below which a bump is a correction of its shape
+MAX_CORRECTION = 0.1  # Height over that of an overlapping bump, below which a bump is a correction of its shape
 
 SHAPE_ERROR = 0.15  # Deviation of an impulse, as a share of it, because a push need not have the shape of a bump
 
-MOST = 6  # Bumps on an episode at most
+MAX_BUMPS = 6  # Bumps on an episode at most
 
-PRIOR = 0.3  # Deviation of the load that a column explains, over the size of the unexplained load
+COLUMN_PRIOR = 0.3
+"""Prior standard deviation of the load that a column explains, over the size of the unexplained load."""
 
-OWN = 0.5  # Deviation of an episode's weights of columns from those of all episodes, over that of these
+EPISODE_PRIOR = 0.5
+"""Prior standard deviation of an episode's weights about the common weights, in units of the common weights' prior
+deviation."""
 
 LAGS = 8  # Order of the autoregression of errors
 
@@ -50,13 +53,15 @@ ROUNDS, ROUNDS_AGAIN = 6, 3  # Rounds in which columns and errors are fitted in 
 
 OUTLIER = 2.5  # Errors, in deviations, above which they count less (Huber)
 
-CUT = 9.0  # Squared errors over their median, at which they are cut off when the size of errors is fitted
+MAX_POWER = 9.0
+"""Squared errors, over their median or over those expected, that count when the size of errors is fitted: larger ones
+count as this."""
 
-WHITE = 0.03  # Share of the errors' variance that is taken as white, so that errors can be whitened
+WHITE_SHARE = 0.03  # Share of the errors' variance that is taken as white, so that errors can be whitened
 
-DISTINCT = 0.15  # Least share of a bump's information that columns and other bumps leave to it
+MIN_DISTINCT = 0.15  # Least share of a bump's information that columns and other bumps leave to it
 
-TALL = 10.0  # Prior deviation of a bump's height, over the size of the unexplained load
+BUMP_PRIOR = 10.0  # Prior standard deviation of a bump's height, over the size of the unexplained load
 
 
 def pushes(recording: Recording, world: World) -> tuple[Push, ...]:
@@ -94,7 +99,7 @@ class _Bump:
         """Whether it only corrects the shape of a higher bump on the same joint: its middle lies in that one, or it is
         far lower and overlaps it."""
         apart, share = abs(self.middle - other.middle), abs(self.height) / abs(other.height)
-        reach = other.width + (self.width if share < CORRECTION else 0.0)
+        reach = other.width + (self.width if share < MAX_CORRECTION else 0.0)
         return share < 1 and apart < EDGE * reach and (self.part, self.joint) == (other.part, other.joint)
 
     def on(self, track: LoadTrack) -> Tensor:
@@ -142,8 +147,8 @@ class _Fit:
         """The bumps that stand out clearly."""
         self._fit(ROUNDS)
         searched: Sequence[int] = range(len(self.tracks))
-        for k in range(MOST):
-            needed = CANDIDATE if k else FIRST
+        for k in range(MAX_BUMPS):
+            needed = MIN_SCORE_FURTHER if k else MIN_SCORE_FIRST
             found = [one for part in searched if (one := self._highest(part)).score > needed]
             if not found:
                 break
@@ -152,7 +157,9 @@ class _Fit:
             self._fit(ROUNDS_AGAIN)
         while self.bumps:
             self.bumps = self._measured()
-            weakest = {one.part: one for one in sorted(self.bumps, key=lambda one: -one.score) if one.score < CLEAR}
+            weakest = {
+                one.part: one for one in sorted(self.bumps, key=lambda one: -one.score) if one.score < MIN_SCORE_PUSH
+            }
             if not weakest:
                 break
             self.bumps = [one for one in self.bumps if one not in weakest.values()]
@@ -163,8 +170,8 @@ class _Fit:
         """(K, N, J) loads of unit prior deviation: of the columns, and of the bumps on this part."""
         track = self.tracks[part]
         columns = track.columns - torch.einsum("knij,nj->kni", track.reaction, self.left[part])
-        bumps = [TALL * self.size * one.on(track) for one in self.bumps if one.part == part]
-        return torch.cat((PRIOR * self.size * columns, *(one[None] for one in bumps)))
+        bumps = [BUMP_PRIOR * self.size * one.on(track) for one in self.bumps if one.part == part]
+        return torch.cat((COLUMN_PRIOR * self.size * columns, *(one[None] for one in bumps)))
 
     def _whitened(self, part: int, values: Tensor) -> Tensor:
         """Loads (..., N, J) over the errors' deviation, less their autoregressive prediction; (..., N J)."""
@@ -201,14 +208,14 @@ class _Fit:
                 gone = torch.linalg.solve(bumps, normal[count:, :count]).mT
                 normal = normal[:count, :count] - gone @ normal[count:, :count]
                 gradient = gradient[:count] - gone @ gradient[count:]
-                inner = identity + OWN**2 * normal
+                inner = identity + EPISODE_PRIOR**2 * normal
                 total, along = total + torch.linalg.solve(inner, normal), along + torch.linalg.solve(inner, gradient)
         common = torch.linalg.solve(total, along)
         for part, (normal, gradient) in enumerate(problems):
             precision = torch.ones(len(normal), dtype=torch.float64)
             if several:
-                precision[:count] = OWN**-2
-                gradient = gradient + pad(OWN**-2 * common, (0, len(normal) - count))
+                precision[:count] = EPISODE_PRIOR**-2
+                gradient = gradient + pad(EPISODE_PRIOR**-2 * common, (0, len(normal) - count))
             self.roots[part] = torch.linalg.cholesky(normal + torch.diag(precision))
             self.weights[part] = torch.cholesky_solve(gradient[:, None], self.roots[part])[:, 0]
             explained = torch.einsum("k,knj->nj", self.weights[part], self._design(part))
@@ -231,7 +238,7 @@ class _Fit:
         for j in range(len(self.innovation)):
             left = [each[:, j] for each in self.left]
             own = [each[..., j] for each in taken]
-            most = CUT * torch.cat(left).square().median()
+            most = MAX_POWER * torch.cat(left).square().median()
             power = torch.cat(
                 [_local_mean(e.square().clamp(max=most) + v.square().sum(0)) for e, v in zip(left, own, strict=True)]
             )
@@ -249,7 +256,7 @@ class _Fit:
                     end = len(each) - lag
                     moments[lag] += white[lag:] @ white[:end] + (more[:, lag:] * more[:, :end]).sum()
             moments = moments / sum(lengths)
-            moments[0] *= 1 + WHITE
+            moments[0] *= 1 + WHITE_SHARE
             lags = torch.arange(LAGS)
             self.autoregression[j] = torch.linalg.solve(moments[(lags[:, None] - lags).abs()], moments[1:])
             self.innovation[j] = (moments[0] - self.autoregression[j] @ moments[1:]).clamp(min=1e-9).sqrt()
@@ -258,7 +265,7 @@ class _Fit:
         """() the size of a joint's dry friction."""
         track = self.tracks[part]
         column = track.dry[joint]
-        return PRIOR * self.size * self.weights[part][column].abs() * track.columns[column].abs().amax()
+        return COLUMN_PRIOR * self.size * self.weights[part][column].abs() * track.columns[column].abs().amax()
 
     def _highest(self, part: int) -> _Bump:
         """The bump on a part that stands out most beside what is fitted."""
@@ -272,7 +279,7 @@ class _Fit:
             shapes = self._whitened(part, pad(tried, (joint, joints - 1 - joint)))[:, joint::joints]
             shared = torch.linalg.solve_triangular(self.roots[part], design[..., joint] @ shapes.mT, upper=False)
             alone = shapes.square().sum(1)
-            information = (alone - shared.square().sum(0)).clamp(min=DISTINCT * alone)
+            information = (alone - shared.square().sum(0)).clamp(min=MIN_DISTINCT * alone)
             height = shapes @ left[:, joint] / information
             k = int((height.abs() * information.sqrt()).argmax())
             return _Bump(part, joint, float(middles[k]), width, float(height[k]), float(information[k] ** -0.5))
@@ -291,7 +298,7 @@ class _Fit:
             own = [one for one in self.bumps if one.part == part]
             if not own:
                 continue
-            unit = TALL * float(self.size)
+            unit = BUMP_PRIOR * float(self.size)
             deviation = unit * torch.cholesky_inverse(self.roots[part]).diagonal().sqrt()
             heights = unit * self.weights[part]
             for k, one in enumerate(own, len(heights) - len(own)):
@@ -306,7 +313,7 @@ def _log_power(basis: Tensor, power: Tensor) -> Tensor:
     ridge[0] = 0.0
     slopes = torch.linalg.solve(basis.T @ basis + torch.diag(ridge), basis.T @ logs)
     expected = basis @ torch.cat((slopes[:1], slopes[1:].clamp(min=0)))
-    return expected + (power / expected.exp()).clamp(max=CUT).mean().log()
+    return expected + (power / expected.exp()).clamp(max=MAX_POWER).mean().log()
 
 
 def _local_mean(values: Tensor, reach: int = 4) -> Tensor:
