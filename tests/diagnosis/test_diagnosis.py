@@ -58,6 +58,12 @@ def test_a_recording_of_the_source_has_no_gap():
     assert result.gap.before == pytest.approx(result.gap.floor, rel=0.05)
 
 
+def test_a_source_with_effects_is_refused_by_their_names():
+    world = World(CartPole(), [ViscousFriction(coefficient=0.8), AngleOffset(offset=0.02)])
+    with pytest.raises(ValueError, match="the world has viscous_friction and angle_offset; give the source without"):
+        diagnose(record(), world)
+
+
 @pytest.mark.parametrize(("step", "verdict"), [(0.002, "no_gap"), (0.1, "unexplained")])
 def test_a_gap_may_hide_in_coarse_steps_of_an_encoder(step, verdict):
     whole = record()

@@ -192,6 +192,14 @@ class TestBadInput:
     def test_a_film_without_a_renderer(self, still, capsys):
         assert "--renderer" in refused(capsys, still)
 
+    def test_a_film_without_a_renderer_in_python(self, still):
+        system = va.CartPole()
+        recording = va.load_recording(still, system, frames=True)
+        with pytest.raises(
+            ValueError, match=r"holds frames alone: give the scene's renderer, by renderer= or --renderer"
+        ):
+            va.diagnose(recording, va.World(system))
+
     def test_another_size(self, still, capsys):
         path = rewritten(still, frame=lambda frame: frame[:, :, :100])
         assert "frames of 100 x 100 px (height x width); the renderer draws 100 x 120 px" in refused(

@@ -40,6 +40,7 @@ from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.verdict import at_bounds, left_unexplained, next_step, verdict_of
+from visadapt.diagnosis.words import listed
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized, twins
 from visadapt.effects.late_sensors import LateSensors
@@ -100,7 +101,8 @@ def diagnose(
     ('identified', ['constant_force'])
     """
     if len(world.effects):
-        raise ValueError("diagnose: the world is the source and has no effects; give the bare system")
+        names = listed([effect.name for effect in world.effects if isinstance(effect, Effect)])
+        raise ValueError(f"diagnose: the world has {names}; give the source without effects, World(world.system)")
     system = world.system
     profile = profile_of(system)
     if policy is not None:
@@ -111,7 +113,9 @@ def diagnose(
         effects = [effect for effect in effects if effect.stage is not Stage.CAMERA]
     else:
         if renderer is None:
-            raise FramesError(f"{recording.sources[0]}: frames are diagnosed with the renderer that draws the scene")
+            raise FramesError(
+                f"{recording.sources[0]}: holds frames alone: give the scene's renderer, by renderer= or --renderer"
+            )
         effects = [effect for effect in effects if effect not in UNSEEN]
         film = watch(recording, system, renderer, progress)
         recording = film.positions

@@ -49,9 +49,9 @@ MISFIT = "root mean square of frames less those drawn by the renderer, in grey l
 UNSEEN = (Dropout, FrozenZone, MeasurementDelay, PositionDelay, AngleDelay)
 """Faults of sensors that a camera cannot have: it shows cart and pole in one frame. A late camera is a camera's."""
 
-WITHIN = 1.0
-"""Error of the source's predictions, over the noise of positions, below which motion shows no gap: errors of the
-renderer, larger where a moved camera's frames are interpolated, also add to it and are not noise."""
+MIN_MOTION_ERROR = 1.0
+"""Error of the source's predictions, over the noise of positions, from which motion shows a gap. Below, it may be the
+renderer's own error, which is no noise, and is larger where a moved camera's frames are interpolated."""
 
 LEAN = 0.5  # rad, largest |theta| at which the pole is looked for
 
@@ -112,7 +112,7 @@ def with_camera(motion: Diagnosis, film: Film, system: System) -> Diagnosis:
     """
     camera = film.camera
     causes = camera.causes()
-    if motion.gap.before < WITHIN:
+    if motion.gap.before < MIN_MOTION_ERROR:
         motion = _without_gap(motion, bool(causes), system)
     motion = replace(motion, where=replace(motion.where, pixels=film.pixels))
     if film.pixels.unexplained:

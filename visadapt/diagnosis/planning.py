@@ -127,12 +127,10 @@ def plan(
     >>> found = va.diagnose(run, source, catalogue=[va.effects.ConstantForce])
     >>> va.plan(found, run, source, policy)
     Traceback (most recent call last):
-    ValueError: the verdict is no_gap: there is nothing to settle; ambiguous diagnoses are planned for
+    ValueError: only an ambiguous diagnosis needs an experiment; the verdict is no_gap
     """
     if found.verdict != AMBIGUOUS:
-        raise ValueError(
-            f"the verdict is {found.verdict}: there is nothing to settle; ambiguous diagnoses are planned for"
-        )
+        raise ValueError(f"only an ambiguous diagnosis needs an experiment; the verdict is {found.verdict}")
     if not recording.measured:
         raise ValueError("a plan needs a recording of states, not of frames")
     sets, system = explanations(found), source.system

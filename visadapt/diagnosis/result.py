@@ -308,7 +308,10 @@ def named_effects(verdict: str, causes: Sequence[Cause]) -> list[Effect]:
     for cause in taken:
         for name, estimate in cause.parameters.items():
             if not math.isfinite(estimate.value):
-                raise ValueError(f"{cause.effect}: the recording does not determine its {name}; record what does")
+                raise ValueError(
+                    f"{cause.effect}: the recording does not determine its {name}; record motions that show it, or "
+                    "pass the effect with a value of your own"
+                )
     return [EFFECTS[cause.effect](**{name: one.value for name, one in cause.parameters.items()}) for cause in taken]
 
 

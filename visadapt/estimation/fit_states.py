@@ -19,8 +19,8 @@ from visadapt.systems import System
 Effects = tuple[type[Effect], ...]
 
 QUICK, CAREFUL, FINAL = (12, COARSE), (20, FINE), (7, FINE)
-"""Iterations and integration accuracy of a fit in the search, of one whose result is reported, and of one to all rows
-that starts from such a one to some of them."""
+"""Iterations and integration accuracy of a fit. QUICK: during the search. CAREFUL: results that are reported. FINAL:
+refit to all rows, starting from a CAREFUL fit to some of them."""
 
 
 def initial_fit(system: System, rows: Segments) -> FitState:

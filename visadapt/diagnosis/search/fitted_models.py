@@ -89,8 +89,8 @@ class FittedModels:
             self.fitted[frozenset()] = ScoredModel((), source, float(source.likelihood[0]))
         if not math.isfinite(self.source.log_odds):
             raise NoFitError(
-                f"no states of a {system.name} come near this recording, so that nothing can be computed of it; "
-                "readings and parameters that a machine may have are right"
+                f"the likelihood of a {system.name} on this recording is not finite; check units, signs and the "
+                "parameters of the rig (--params)"
             )
 
     @property

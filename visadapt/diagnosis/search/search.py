@@ -43,8 +43,8 @@ WIDEN_MODELS = 6
 best sets of one and of two effects."""
 
 LATE_SHARE, LATE_BASES = 0.3, 3
-"""Share of the longest delay from which a late sensor is fitted without a lead, and to how many of the best sets of one
-effect it is added, beside the source and the best set."""
+"""Late sensors are fitted even where the screening proposes none: from LATE_SHARE of the longest delay, added to the
+source, the best set and the LATE_BASES best single effects."""
 
 POLISH_WITHIN, POLISH_SIMPLER_WITHIN = 8.0, 60.0
 POLISH_MODELS = 8
