@@ -206,19 +206,19 @@ COMMANDS = (
     _blind("blind_easy", "--seed 2028 --kinds easy --count 24 --jobs 2", 10),
     _blind(
         "blind_rig",
-        "--seed 2044 --kinds rig --effects all --count 48 --jobs 2 --diagnosers ours --out results/blind_rigs.csv",
+        "--seed 2045 --kinds rig --effects all --count 48 --jobs 2 --diagnosers ours --out results/blind_rigs.csv",
         10,
         "blind_rigs.csv",
     ),
     _blind(
         "blind_large",
-        "--seed 2044 --kinds large --effects all --count 24 --jobs 2 --diagnosers ours --out results/blind_rigs.csv",
+        "--seed 2045 --kinds large --effects all --count 24 --jobs 2 --diagnosers ours --out results/blind_rigs.csv",
         10,
         "blind_rigs.csv",
     ),
     _blind(
         "blind_table",
-        "--seed 2044 --kinds table --jobs 2 --diagnosers ours --out results/blind_rigs.csv",
+        "--seed 2045 --kinds table --jobs 2 --diagnosers ours --out results/blind_rigs.csv",
         10,
         "blind_rigs.csv",
     ),
