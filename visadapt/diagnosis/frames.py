@@ -5,7 +5,7 @@ Velocities are never differentiated: they are unknowns of the fits, as of any re
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -208,70 +208,91 @@ def positions(recording: Recording, found: Sequence[Poses]) -> tuple[Recording, 
     Raises:
         FramesError: the renderer explains hardly any frame.
     """
-    places, explained, contrasts, deviations, fresh = [], [], [], [], []
-    for episode, poses in zip(recording.episodes, found, strict=True):
-        assert episode.frame is not None
-        new = np.ones(len(episode.frame), dtype=bool)
-        new[1:] = (episode.frame[1:] != episode.frame[:-1]).any((1, 2))
-        shown = np.flatnonzero(new)[np.cumsum(new) - 1]
-        places.append(poses.place.nan_to_num().numpy()[shown])
-        explained.append(poses.explained.numpy()[shown])
-        # A late camera repeats its first frame, until it has seen another one: no frame was lost.
-        fresh.append(np.ones(len(new), dtype=bool))
-        fresh[-1][1 : 1 + int(new[1:].argmax())] = False
-        contrasts.append(poses.contrast.numpy())
-        deviations.append(poses.covariance.diagonal(dim1=1, dim2=2).sqrt().nan_to_num(torch.inf).numpy()[shown])
-    # A pole that is out of the frame may have any angle.
-    most = np.maximum(RESOLUTION, VAGUE * np.median(np.concatenate(deviations), 0))
-    explained = [found & (own <= most).all(1) for found, own in zip(explained, deviations, strict=True)]
-    total, seen = sum(map(len, explained)), sum(int(each.sum()) for each in explained)
-    if seen < LEAST_EXPLAINED * total:
-        raise FramesError(
-            f"{recording.sources[0]}: the renderer explains {seen} of {total} frames (where it draws cart and pole, "
-            f"they differ by {100 * float(np.median(np.concatenate(contrasts))):.0f} % of the contrast, at most "
-            f"{100 * HIDDEN:.0f} % is right): it is of another scene; `visadapt renderer` trains one on frames of this "
-            "one"
-        )
-    episodes: list[Episode] = []
-    usable: list[NDArray[np.bool_]] = []
-    sources: list[str] = []
-    frames: list[NDArray[np.uint8]] = []
-    parts = zip(recording.episodes, places, explained, fresh, recording.sources, strict=True)
-    for episode, place, used, first_seen, source in parts:
-        for first, last in _stretches(used, recording.period):
-            rows = slice(first, last)
-            episodes.append(
-                replace(
-                    episode,
-                    **{key: getattr(episode, key)[rows] for key in ("time", "action")},
-                    state=place[rows],
-                    frame=None,
-                )
-            )
-            usable.append((used & first_seen)[rows])
-            sources.append(source)
-            assert episode.frame is not None
-            frames.append(episode.frame[rows])
-    if not episodes:
+    seen = [_seen(episode, poses) for episode, poses in zip(recording.episodes, found, strict=True)]
+    clear = _clear(seen)
+    _check_scene(recording, clear, found)
+    parts = list(_parts(recording, seen, clear))
+    if not parts:
         raise FramesError(f"{recording.sources[0]}: no {FEWEST_POSES} frames close to each other are explained")
-    warnings = recording.warnings
-    if seen < total:
-        episode_number = next(k for k, used in enumerate(explained) if not used.all())
-        row = int((~explained[episode_number]).argmax())
-        warnings += (
-            f"no pose was found in {total - seen} of {total} frames, row {row + 1} of "
-            f"{recording.sources[episode_number]} the first; they were left out",
-        )
+    episodes, usable, sources, frames = zip(*parts, strict=True)
     shown_in = replace(
         recording,
-        episodes=tuple(episodes),
+        episodes=episodes,
         measured=POSE,
-        sources=tuple(sources),
-        warnings=warnings,
-        usable=tuple(usable),
+        sources=sources,
+        warnings=(*recording.warnings, *_misses(recording, clear)),
+        usable=usable,
         resolution=RESOLUTION,
     )
-    return shown_in, frames
+    return shown_in, list(frames)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """The poses that the frames of an episode show, row by row."""
+
+    place: NDArray[np.floating]  # (T, 2)
+    explained: NDArray[np.bool_]  # (T,) whether the renderer explains the frame
+    deviation: NDArray[np.floating]  # (T, 2) standard deviation of the pose
+    usual: NDArray[np.bool_]  # (T,) False in the copies of its first frame with which a late camera begins
+
+
+def _seen(episode: Episode, poses: Poses) -> _Seen:
+    """The poses found in the frames of an episode; an exact copy of the frame before it has the same."""
+    assert episode.frame is not None
+    new = np.ones(len(episode.frame), dtype=bool)
+    new[1:] = (episode.frame[1:] != episode.frame[:-1]).any((1, 2))
+    original = np.flatnonzero(new)[np.cumsum(new) - 1]  # the row that each row is a copy of
+    # A late camera repeats its first frame, until it has seen another one: no frame was lost.
+    usual = np.ones(len(new), dtype=bool)
+    usual[1 : 1 + int(new[1:].argmax())] = False
+    deviation = poses.covariance.diagonal(dim1=1, dim2=2).sqrt().nan_to_num(torch.inf).numpy()
+    place, explained = poses.place.nan_to_num().numpy(), poses.explained.numpy()
+    return _Seen(place[original], explained[original], deviation[original], usual)
+
+
+def _clear(seen: Sequence[_Seen]) -> list[NDArray[np.bool_]]:
+    """(T,) of each episode: whether a frame is explained and shows the pose; a pole that is out of it may have any
+    angle."""
+    most = np.maximum(RESOLUTION, VAGUE * np.median(np.concatenate([each.deviation for each in seen]), 0))
+    return [each.explained & (each.deviation <= most).all(1) for each in seen]
+
+
+def _check_scene(recording: Recording, clear: Sequence[NDArray[np.bool_]], found: Sequence[Poses]) -> None:
+    """Raises FramesError where so few frames are clear that the renderer is of another scene."""
+    total, count = sum(map(len, clear)), sum(int(each.sum()) for each in clear)
+    if count < LEAST_EXPLAINED * total:
+        contrast = float(np.median(np.concatenate([poses.contrast.numpy() for poses in found])))
+        raise FramesError(
+            f"{recording.sources[0]}: the renderer explains {count} of {total} frames (where it draws cart and pole, "
+            f"they differ by {100 * contrast:.0f} % of the contrast, at most {100 * HIDDEN:.0f} % is right): it is of "
+            "another scene; `visadapt renderer` trains one on frames of this one"
+        )
+
+
+def _parts(
+    recording: Recording, seen: Sequence[_Seen], clear: Sequence[NDArray[np.bool_]]
+) -> Iterator[tuple[Episode, NDArray[np.bool_], str, NDArray[np.uint8]]]:
+    """The stretches of the episodes without long misses: poses, which rows are usable, source, and frames."""
+    for episode, own, used, source in zip(recording.episodes, seen, clear, recording.sources, strict=True):
+        assert episode.frame is not None
+        for first, last in _stretches(used, recording.period):
+            rows = slice(first, last)
+            time, action = episode.time[rows], episode.action[rows]
+            part = replace(episode, time=time, action=action, state=own.place[rows], frame=None)
+            yield part, (used & own.usual)[rows], source, episode.frame[rows]
+
+
+def _misses(recording: Recording, clear: Sequence[NDArray[np.bool_]]) -> Iterator[str]:
+    """A warning that counts the frames that are left out, if there are any."""
+    missed = sum(int((~each).sum()) for each in clear)
+    if missed:
+        episode = next(k for k, each in enumerate(clear) if not each.all())
+        row = int((~clear[episode]).argmax())
+        yield (
+            f"no pose was found in {missed} of {sum(map(len, clear))} frames, row {row + 1} of "
+            f"{recording.sources[episode]} the first; they were left out"
+        )
 
 
 def _stretches(used: NDArray[np.bool_], period: float) -> list[tuple[int, int]]:
