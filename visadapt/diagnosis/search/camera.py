@@ -84,71 +84,119 @@ def find_camera(
     renderer: nn.Module, finder: PoseFinder, frames: Tensor, progress: Progress | None = None
 ) -> CameraFindings:
     """Search the camera of frames (T, H, W) uint8."""
-    rows = evenly_spaced(len(frames), FRAMES)
-    shown = frames[rows].float() / 255
-    place = finder(frames[rows]).place
-    unchanged = fit_camera(renderer, shown, (), torch.zeros(0), place, frozenset())
-    own = unchanged.residual.square().mean((1, 2))
-    usual = own <= MAX_FRAME_RATIO * own.median()
-    if not usual.all():
-        shown, place = shown[usual], unchanged.place[usual]
-        unchanged = fit_camera(renderer, shown, (), torch.zeros(0), place, frozenset())
-    fixed = frozenset({"dx"}) if _track_is_featureless(finder, unchanged) else frozenset()
-    done, least = 0, 2 * len(SEARCHED)
+    search = _CameraSearch(renderer, finder, frames[evenly_spaced(len(frames), FRAMES)], progress)
+    grown, alone, alike = search.grow()
+    needed, without = search.drop_idle(grown)
+    best, without = search.sharpen(needed, without)
+    alone = {kind: alone.get(kind, search.unchanged) for kind in best.camera}
+    return CameraFindings(search.unchanged, best, alone, without, alike, search.fixed)
 
-    def fitted(camera: Camera, values: Tensor, at: Tensor) -> CameraFit:
-        nonlocal done
-        fit = fit_camera(renderer, shown, camera, values, at, fixed)
-        own = fit.residual.square().mean((1, 2))
-        astray = own > ASTRAY * own.median()
-        if astray.any():  # looked for again through the camera that explains the others
-            there = torch.where(astray[:, None], _nearest(finder, fit.effects, shown)[0].to(fit.place), fit.place)
-            fit = min(fit, fit_camera(renderer, shown, camera, fit.values, there, fixed), key=lambda one: one.misfit)
-        if progress is not None:
-            done += 1
-            progress(min(done, least), least, fit.mean_square)
+
+Fits = dict[type[CameraEffect], CameraFit]
+"""Fits of a camera with or without one effect, by that effect."""
+
+
+class _CameraSearch:
+    """Fits of cameras to the same frames, of which those that show something else are left out.
+
+    Args:
+        frames: (N, H, W) uint8.
+        progress: called with (fits made, fits at least, mean square of the last one).
+    """
+
+    def __init__(
+        self, renderer: nn.Module, finder: PoseFinder, frames: Tensor, progress: Progress | None = None
+    ) -> None:
+        self._renderer, self._finder, self._progress = renderer, finder, progress
+        self._done = 0
+        self._shown = frames.float() / 255  # (N, H, W)
+        self.fixed: frozenset[str] = frozenset()
+        self.unchanged = self._fit((), torch.zeros(0), finder(frames).place)
+        square = self.unchanged.residual.square().mean((1, 2))
+        usual = square <= MAX_FRAME_RATIO * square.median()
+        if not usual.all():
+            self._shown = self._shown[usual]
+            self.unchanged = self._fit((), torch.zeros(0), self.unchanged.place[usual])
+        if _track_is_featureless(finder, self.unchanged):
+            self.fixed = frozenset({"dx"})
+
+    def grow(self) -> tuple[CameraFit, Fits, dict[type[CameraEffect], tuple[str, ...]]]:
+        """The camera that grows by the best effect while that lowers the misfit enough; each effect alone; and, for
+        each effect of the camera, those that did as well when it was added."""
+        best, alike = self.unchanged, {}
+        alone: Fits = {}
+        while len(best.camera) < MOST_EFFECTS:
+            tried = self._with_each(best)
+            if not best.camera:
+                alone = tried
+            chosen = min(tried, key=lambda kind: tried[kind].misfit)
+            if tried[chosen].misfit > (1 - MIN_CLOSED) * best.misfit:
+                break
+            best = tried[chosen]
+            alike[chosen] = tuple(
+                kind.name
+                for kind, fit in tried.items()
+                if kind is not chosen and fit.misfit < (1 + EQUAL_FIT) * best.misfit
+            )
+        return best, alone, alike
+
+    def drop_idle(self, best: CameraFit) -> tuple[CameraFit, Fits]:
+        """The camera without effects that the others do without, and this camera without each of its effects."""
+        while True:
+            without = self._without_each(best)
+            idle = [kind for kind, fit in without.items() if best.misfit > (1 - MIN_CLOSED) * fit.misfit]
+            if not idle:
+                return best, without
+            best = without[idle[0]]
+
+    def sharpen(self, best: CameraFit, without: Fits) -> tuple[CameraFit, Fits]:
+        """The camera fitted to smoothed frames, less the effects that these show to do nothing; arguments and result as
+        in `drop_idle`.
+
+        A turned picture is softer than the drawn one, which a shift by a part of a pixel would seem to explain.
+        """
+        if not best.camera:
+            return best, without
+        best = self._fit(best.camera, best.values, best.place, smooth=True)
+        still = may_do_nothing(best, self.fixed)
+        if 0 < len(still) < len(best.camera):
+            best = self._fit(*_without(best, still), best.place, smooth=True)
+            without = self._without_each(best)
+        return best, without
+
+    def _with_each(self, best: CameraFit) -> Fits:
+        """The camera with one effect more."""
+        tried = {}
+        for kind in SEARCHED:
+            start = None if kind in best.camera else _start(kind, self._finder, self._shown, best, self.fixed)
+            if start is not None:
+                values, place = start
+                tried[kind] = self._fit_all((*best.camera, kind), torch.cat((best.values, values)), place)
+        return tried
+
+    def _without_each(self, best: CameraFit) -> Fits:
+        """The camera with one effect less."""
+        rests = {kind: _without(best, {kind}) for kind in best.camera}
+        return {kind: self._fit_all(*rest, best.place) if rest[0] else self.unchanged for kind, rest in rests.items()}
+
+    def _fit_all(self, camera: Camera, values: Tensor, place: Tensor) -> CameraFit:
+        """A fit to all frames: poses that are wrong are looked for again, through the camera that explains the
+        others."""
+        fit = self._fit(camera, values, place)
+        square = fit.residual.square().mean((1, 2))
+        astray = square > ASTRAY * square.median()
+        if astray.any():
+            nearest = _nearest(self._finder, fit.effects, self._shown)[0].to(fit.place)
+            again = self._fit(camera, fit.values, torch.where(astray[:, None], nearest, fit.place))
+            fit = min(fit, again, key=lambda one: one.misfit)
+        if self._progress is not None:
+            self._done += 1
+            least = 2 * len(SEARCHED)
+            self._progress(min(self._done, least), least, fit.mean_square)
         return fit
 
-    best, alike = unchanged, {}
-    alone: dict[type[CameraEffect], CameraFit] = {}
-    while len(best.camera) < MOST_EFFECTS:
-        tried: dict[type[CameraEffect], CameraFit] = {}
-        for kind in SEARCHED:
-            start = None if kind in best.camera else _start(kind, finder, shown, best, fixed)
-            if start is not None:
-                values, at = start
-                tried[kind] = fitted((*best.camera, kind), torch.cat((best.values, values)), at)
-        if not best.camera:
-            alone = tried
-        chosen = min(tried, key=lambda kind: tried[kind].misfit)
-        if tried[chosen].misfit > (1 - MIN_CLOSED) * best.misfit:
-            break
-        best = tried[chosen]
-        alike[chosen] = tuple(
-            kind.name
-            for kind, fit in tried.items()
-            if kind is not chosen and fit.misfit < (1 + EQUAL_FIT) * best.misfit
-        )
-
-    def without_each(best: CameraFit) -> dict[type[CameraEffect], CameraFit]:
-        rests = {kind: _without(best, {kind}) for kind in best.camera}
-        return {kind: fitted(*rest, best.place) if rest[0] else unchanged for kind, rest in rests.items()}
-
-    while True:
-        without = without_each(best)
-        idle = [kind for kind, fit in without.items() if best.misfit > (1 - MIN_CLOSED) * fit.misfit]
-        if not idle:
-            break
-        best = without[idle[0]]
-    if best.camera:
-        best = fit_camera(renderer, shown, best.camera, best.values, best.place, fixed, smooth=True)
-        # A turned picture is softer than the drawn one, which a shift by a part of a pixel would seem to explain.
-        still = may_do_nothing(best, fixed)
-        if 0 < len(still) < len(best.camera):
-            best = fit_camera(renderer, shown, *_without(best, still), best.place, fixed, smooth=True)
-            without = without_each(best)
-    alone = {kind: alone.get(kind, unchanged) for kind in best.camera}
-    return CameraFindings(unchanged, best, alone, without, alike, fixed)
+    def _fit(self, camera: Camera, values: Tensor, place: Tensor, smooth: bool = False) -> CameraFit:
+        return fit_camera(self._renderer, self._shown, camera, values, place, self.fixed, smooth)
 
 
 def _without(fit: CameraFit, left_out: Collection[type[CameraEffect]]) -> tuple[Camera, Tensor]:
