@@ -133,39 +133,81 @@ def plan(
         raise ValueError(f"only an ambiguous diagnosis needs an experiment; the verdict is {found.verdict}")
     if not recording.measured:
         raise ValueError("a plan needs a recording of states, not of frames")
-    sets, system = explanations(found), source.system
-    noise, start, measured = _noise_and_start(sets[0], recording, system)
-    generator = torch.Generator().manual_seed(seed)
-    names, added = _excitations(system, recording.period, samples, generator)
-    sizes = torch.tensor(SIZES, dtype=added.dtype)[:, None, None, None]
-    tried = (sizes * added).flatten(0, 1)  # (sizes times excitations, T, n_action)
-    shown = [_simulate(each, system, recording, tried, policy, noise, start, generator) for each in sets]
-    admissible = torch.stack([each[1] for each in shown]).all(0).unflatten(0, (len(SIZES), len(names)))
-    largest = admissible.long().cumprod(0).sum(0) - 1  # of each excitation; -1 without any
-    if bool((largest < 0).all()):
-        hint = "" if policy else ": give the policy of the rig"
-        raise ValueError(f"the machine leaves the ranges of its states under every excitation{hint}")
-    worth = torch.full((len(names),), math.nan)
-    for done, k in enumerate(torch.nonzero(largest >= 0)[:, 0].tolist()):
-        row = int(largest[k]) * len(names) + k
-        runs = [(states[row], commands[row]) for (states, commands), _ in shown]
-        recordings = [_recording(recording, system, measured, *each, noise) for each in runs]
-        worth[k] = min(
-            _lead(sets[truth], sets[other], recordings[truth], system)
-            for rival in range(1, len(sets))
-            for truth, other in ((0, rival), (rival, 0))
-        )
-        if progress is not None:
-            progress(done + 1, len(names), float(worth.nan_to_num(-math.inf).max()))
+    sets = explanations(found)
+    trials = _Trials.of(sets, recording, source.system, policy, samples, torch.Generator().manual_seed(seed))
+    worth = trials.worth(sets, progress)
     best = int(worth.nan_to_num(-math.inf).argmax())
-    size = SIZES[int(largest[best])]
-    excitation = f"{names[best]} of {size:g} of half its range"
-    time = recording.period * np.arange(samples)
-    command = tried[int(largest[best]) * len(names) + best].numpy()
-    labels = tuple(tuple(effect.name for effect in each) for each in sets)
-    commands = tuple(action.name for action in system.actions)
-    white = [k for k, name in enumerate(names) if name.startswith("white")]
-    return Plan(labels, excitation, time, command, commands, float(worth[best]), _highest(worth[white]))
+    white = [k for k, name in enumerate(trials.names) if name.startswith("white")]
+    return Plan(
+        explanations=tuple(tuple(effect.name for effect in each) for each in sets),
+        excitation=f"{trials.names[best]} of {SIZES[int(trials.largest[best])]:g} of half its range",
+        time=recording.period * np.arange(samples),
+        added=trials.added[trials.row(best)].numpy(),
+        actions=tuple(action.name for action in source.system.actions),
+        log_odds=float(worth[best]),
+        white=_highest(worth[white]),
+    )
+
+
+@dataclass(frozen=True)
+class _Trials:
+    """Every explanation simulated under every excitation, in each of the SIZES."""
+
+    recording: Recording  # whose period, noise and measured states the experiment has
+    system: System
+    measured: tuple[int, ...]  # columns of the state
+    noise: Tensor  # (n,) standard deviation of the readings of each state
+    names: list[str]  # of the E excitations, in words
+    added: Tensor  # (sizes times E, T, n_action) to the commands
+    shown: list[tuple[Tensor, Tensor]]  # of each explanation the readings and the commands, a row for each of `added`
+    largest: Tensor  # (E,) the largest admissible of the SIZES of each excitation, by index; -1 without any
+
+    @classmethod
+    def of(
+        cls,
+        sets: Sequence[Sequence[Effect]],
+        recording: Recording,
+        system: System,
+        policy: StatesToActions | None,
+        samples: int,
+        generator: torch.Generator,
+    ) -> _Trials:
+        """Simulate them from the first state of the recording.
+
+        Raises:
+            ValueError: the machine leaves the ranges of its states under every excitation.
+        """
+        noise, start, measured = _noise_and_start(sets[0], recording, system)
+        names, unit = _excitations(system, recording.period, samples, generator)
+        sizes = torch.tensor(SIZES, dtype=unit.dtype)[:, None, None, None]
+        added = (sizes * unit).flatten(0, 1)
+        runs = [_simulate(each, system, recording, added, policy, noise, start, generator) for each in sets]
+        admissible = torch.stack([inside for _, inside in runs]).all(0).unflatten(0, (len(SIZES), len(names)))
+        largest = admissible.long().cumprod(0).sum(0) - 1
+        if bool((largest < 0).all()):
+            hint = "" if policy else ": give the policy of the rig"
+            raise ValueError(f"the machine leaves the ranges of its states under every excitation{hint}")
+        return cls(recording, system, measured, noise, names, added, [shown for shown, _ in runs], largest)
+
+    def row(self, excitation: int) -> int:
+        """Where `added` and what is shown have an excitation in its largest admissible size."""
+        return int(self.largest[excitation]) * len(self.names) + excitation
+
+    def worth(self, sets: Sequence[Sequence[Effect]], progress: Progress | None) -> Tensor:
+        """Log odds (E,) of the true against the other explanation, in the worst case; NaN where no size is admitted."""
+        worth = torch.full((len(self.names),), math.nan)
+        for done, k in enumerate(torch.nonzero(self.largest >= 0)[:, 0].tolist()):
+            row = self.row(k)
+            runs = [(states[row], commands[row]) for states, commands in self.shown]
+            recordings = [_recording(self.recording, self.system, self.measured, *run, self.noise) for run in runs]
+            worth[k] = min(
+                _lead(sets[truth], sets[other], recordings[truth], self.system)
+                for rival in range(1, len(sets))
+                for truth, other in ((0, rival), (rival, 0))
+            )
+            if progress is not None:
+                progress(done + 1, len(self.names), float(worth.nan_to_num(-math.inf).max()))
+        return worth
 
 
 def _highest(values: Tensor) -> float:
@@ -238,9 +280,6 @@ def _excitations(system: System, period: float, samples: int, generator: torch.G
     return names, torch.stack(shapes)
 
 
-Shown = tuple[tuple[Tensor, Tensor], Tensor]
-
-
 def _simulate(
     effects: Sequence[Effect],
     system: System,
@@ -250,7 +289,7 @@ def _simulate(
     noise: Tensor,
     first: Tensor,
     generator: torch.Generator,
-) -> Shown:
+) -> tuple[tuple[Tensor, Tensor], Tensor]:
     """Readings without noise (N, T + 1, n) and commands (N, T + 1, n_action) under each of N excitations, and (N,)
     whether all states stay within their ranges; the policy sees readings with noise."""
     world = World(system, effects, recording.period, substeps=math.ceil(recording.period / SUBSTEP)).double()
