@@ -29,6 +29,9 @@ CLASS_PROBABILITY = 0.93
 """Share of the probability of all models that exchange an effect for others, up to which alternatives are listed."""
 
 
+MIN_PROBABILITY = 0.3  # Of a model with two effects in the place of one, or one for two, to be an alternative
+
+
 @dataclass(frozen=True)
 class ComparedModel:
     """A fitted model and its posterior probability."""
@@ -100,17 +103,19 @@ def compare(search: Search) -> ModelComparison:
 
 
 def _alternatives(models: Sequence[ComparedModel], effect: type[Effect]) -> list[ComparedModel]:
-    """Models that have others in the place of `effect` of the first, and fit as well.
+    """Models that have another effect in the place of `effect` of the first, and fit as well.
 
-    One effect may stand for two, as a slow periodic force does for a gust and a bias.
+    Two may also stand for one, or one for two, as a slow periodic force does for a gust and a bias: where such a model
+    is about as probable.
     """
     first = models[0]
-    rivals: list[ComparedModel] = []
+    named = set(first.model.effects)
+    rivals = []
     for other in models[1:]:
-        # A part of the first only lacks something; a set that holds a likelier rival only adds to it.
-        lacks = set(other.model.effects) <= set(first.model.effects)
-        adds = any(set(rival.model.effects) <= set(other.model.effects) for rival in rivals)
-        if effect not in other.model.effects and not lacks and not adds:
+        gone, new = named - set(other.model.effects), set(other.model.effects) - named
+        one_for_one = len(gone) == len(new) == 1
+        with_two = {len(gone), len(new)} == {1, 2} and other.probability > MIN_PROBABILITY
+        if effect in gone and (one_for_one or with_two):
             # More parameters but no gain only imitate the first under another name.
             more = other.model.fits.theta.shape[1] - first.model.fits.theta.shape[1]
             gained = float(other.model.fits.likelihood[0] - first.model.fits.likelihood[0])
