@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors.torch import save_file
 
 from renderers.learnt import LayeredRenderer, MLPRenderer
@@ -52,17 +53,22 @@ def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRen
             raise RendererError(f"{path}: format {header['format']}, this version reads {FORMAT_VERSION}")
         if min(header["arguments"]["height"], header["arguments"]["width"]) < 1:
             raise ValueError("frames without pixels")
-        renderer = KINDS[header["kind"]](**header["arguments"])
-        renderer.error = _error(header["training"])
-    except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, RuntimeError) as error:
-        if isinstance(error, RendererError):
+        kind, arguments = KINDS[header["kind"]], header["arguments"]
+        with torch.device("meta"):  # without memory: a damaged header may ask for more than there is
+            sizes = kind(**arguments)
+        error = _error(header["training"])
+    except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, RuntimeError) as caught:
+        if isinstance(caught, RendererError):
             raise
-        what = " ".join(str(error).split())
-        raise RendererError(f"{path}: its header does not describe a known renderer ({what})") from error
+        what = " ".join(str(caught).split())
+        raise RendererError(f"{path}: its header does not describe a known renderer ({what})") from caught
     try:
-        renderer.load_state_dict(weights)
-    except RuntimeError as error:
-        raise RendererError(f"{path}: made for another architecture: {' '.join(str(error).split())}") from error
+        sizes.load_state_dict(weights, assign=True)
+    except RuntimeError as caught:
+        raise RendererError(f"{path}: made for another architecture: {' '.join(str(caught).split())}") from caught
+    renderer = kind(**arguments)
+    renderer.load_state_dict(weights)
+    renderer.error = error
     if size is not None and renderer.size != size:
         raise RendererError(
             f"{path}: its frames are {renderer.size[1]} x {renderer.size[0]} px, {size[1]} x {size[0]} are needed"

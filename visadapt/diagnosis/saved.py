@@ -44,7 +44,7 @@ def load_effects(path: str | os.PathLike[str]) -> tuple[str, list[Effect]]:
         return content["system"], named_effects(content["verdict"], causes)
     except (KeyError, TypeError, AttributeError) as error:
         raise DiagnosisFileError(f"{path}: not a whole diagnosis: {error}") from error
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise DiagnosisFileError(f"{path}: {error}") from error
 
 

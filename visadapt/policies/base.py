@@ -42,6 +42,8 @@ class Policy(nn.Module):
         observation_shape: tuple[int, ...] | None = None,
     ) -> None:
         super().__init__()
+        if n_state < 1 or n_action < 1:
+            raise ValueError(f"a policy of {n_state} states and {n_action} actions; at least one of each is right")
         self.arguments = dict(arguments or {})
         """those of the constructor, with which a policy file makes the policy again"""
         self.grounded_in: dict[str, Any] | None = None

@@ -118,18 +118,20 @@ def load_source(path: str | Path) -> World:
     """
     path = Path(path)
     made = _load(path)["settings"]
-    description = made.get("grounded_in") or made.get("source")
-    if description is None:
-        raise CheckpointError(f"{path}: does not say in which world the policy was trained; train it again")
     with fitting(path):
+        description = made.get("grounded_in") or made.get("source")
+        if description is None:
+            raise CheckpointError(f"{path}: does not say in which world the policy was trained; train it again")
         return _world(description, path)
 
 
 def _load(path: Path) -> dict[str, Any]:
     tree = load_tree(path)
     keys = {"class", "settings", "weights"}
-    if not isinstance(tree, dict) or not keys <= tree.keys() or not isinstance(tree["settings"], dict):
+    if not isinstance(tree, dict) or not keys <= tree.keys() or not isinstance(tree["class"], str):
         raise CheckpointError(f"{path}: a checkpoint, but not of a policy")
+    if not isinstance(tree["settings"], dict):
+        raise CheckpointError(f"{path}: a checkpoint, but not of a policy: its settings are not a table")
     return tree
 
 

@@ -24,6 +24,8 @@ from visadapt.tasks.differential_flatness import commands
 
 SPEEDS = ("x_dot", "y_dot", "z_dot")
 
+MAX_PERIODS = 1_000_000  # Periods that a reference of one's own may last: 28 hours of 0.1 s
+
 LOOP_RADIUS = 7.0
 """m, one for all speeds, so that faster is harder. The rule: the smallest at which the paper's fastest power loop,
 5 m/s, leaves the controller a tenth of the range of commands (`smallest_loop`), rounded up to half a metre."""
@@ -131,6 +133,10 @@ def read_reference(path: str | os.PathLike[str], period: float = 0.1, max_speed:
     if len(values) < 3 or lasts < 2 * period * (1 - 1e-6):
         raise RecordingError(
             f"{path}: {len(values)} rows over {lasts:g} s; at least 3 rows over {2 * period:g} s are right"
+        )
+    if lasts > MAX_PERIODS * period:
+        raise RecordingError(
+            f"{path}: it lasts {lasts:g} s; at most {MAX_PERIODS * period:g} s are right (are times in s?)"
         )
     time, places = torch.from_numpy(values[:, 0] - values[0, 0]), values[:, 1:4]
     slopes = values[:, 4:] if len(names) > 4 else np.gradient(places, values[:, 0], axis=0, edge_order=2)
