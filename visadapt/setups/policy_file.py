@@ -20,7 +20,7 @@ from visadapt.effects.own import is_own, own_effects
 from visadapt.learning.perception import PerceptionSettings, scale
 from visadapt.policies import FlightPolicy, FollowPolicy, ImagePolicy, Policy, ReachPolicy, StatePolicy
 from visadapt.policies.networks import FlightResidualNetwork, ImageResidualNetwork, StateResidualNetwork
-from visadapt.storage.checkpoints import CheckpointError, fitting, load_tree, load_weights, save_network
+from visadapt.storage.checkpoints import CheckpointError, check_sizes, fitting, load_tree, load_weights, save_network
 from visadapt.systems import SYSTEMS, RigidBody
 from visadapt.systems.base import NAMED
 from visadapt.world import World, WorldState
@@ -66,7 +66,11 @@ def load_policy(path: str | Path) -> Policy:
         )
     with fitting(path):
         made, weights = tree["settings"], tree["weights"]
-        policy = KINDS[tree["class"]](**made["arguments"])
+        kind, arguments = KINDS[tree["class"]], made["arguments"]
+        with torch.device("meta"):  # without memory: a damaged file may ask for more than there is
+            sizes = kind(**arguments).state_dict()
+        check_sizes(sizes, {key: value for key, value in weights.items() if not key.startswith("residual.")}, path)
+        policy = kind(**arguments)
         residual: Callable[[Policy, World], Residual]
         if "with_history" in made:
             residual = partial(residual_for, with_history=made["with_history"])

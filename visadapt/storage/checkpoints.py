@@ -74,17 +74,21 @@ def load_weights(module: nn.Module, weights: Mapping[str, Tensor], origin: Path)
     Raises:
         CheckpointError: a key is missing or extra, or differs in shape or dtype; the message names it and `origin`.
     """
-    found, needed = (
-        {key: f"{tuple(value.shape)} {value.dtype}" for key, value in each.items()}
-        for each in (weights, module.state_dict())
-    )
-    for key in (*needed, *sorted(found)):
-        there, right = found.get(key, "missing"), needed.get(key, "none of that name")
-        if there != right:
-            raise CheckpointError(
-                f"{origin}: made for another architecture: {key} is {there}, this network needs {right}"
-            )
+    check_sizes(module.state_dict(), weights, origin)
     module.load_state_dict(dict(weights))
+
+
+def check_sizes(needed: Mapping[str, Tensor], found: Mapping[str, Tensor], origin: Path) -> None:
+    """Raise CheckpointError, which names the key, where one is missing or extra, or differs in shape or dtype."""
+    there, right = (
+        {key: f"{tuple(value.shape)} {value.dtype}" for key, value in each.items()} for each in (found, needed)
+    )
+    for key in (*right, *sorted(there)):
+        if there.get(key) != right.get(key):
+            raise CheckpointError(
+                f"{origin}: made for another architecture: {key} is {there.get(key, 'missing')}, "
+                f"this network needs {right.get(key, 'none of that name')}"
+            )
 
 
 def save_network(path: Path, network: nn.Module, settings: Mapping[str, Any]) -> None:
