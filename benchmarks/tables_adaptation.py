@@ -64,13 +64,10 @@ def curve(pixels: Rows, states: Rows) -> Lines:
     return [SAMPLES_HEAD, *lines]
 
 
-def other_targets(pixels: Rows, states: Rows) -> Lines:
-    """The same on other targets, each from frames and from states."""
-    lines = [SAMPLES_HEAD]
-    for shown, rows in (("frames", pixels), ("states", states)):
-        names = dict.fromkeys(row["experiment"] for row in rows)
-        lines += [_over_samples(f"{shown}, {name.split(', ', 2)[2]}", rows, name, METHOD) for name in names]
-    return lines
+def other_targets(rows: Rows) -> Lines:
+    """The same on other targets."""
+    names = dict.fromkeys(row["experiment"] for row in rows)
+    return [SAMPLES_HEAD, *(_over_samples(name.split(", ", 2)[2], rows, name, METHOD) for name in names)]
 
 
 def _over_samples(name: str, rows: Rows, experiment: str, method: str) -> list[str]:
