@@ -291,7 +291,7 @@ def test_probabilities_sum_to_one(pushed):
 
 
 def test_a_source_with_effects_is_refused():
-    with pytest.raises(ValueError, match="bare system"):
+    with pytest.raises(ValueError, match="the world has viscous_friction; give the source without effects"):
         diagnose(record(), World(CartPole(), [ViscousFriction(coefficient=1.0)]))
 
 
