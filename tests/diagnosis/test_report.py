@@ -259,6 +259,12 @@ class TestWords:
         text = sentence(a_diagnosis("ambiguous", causes=(PATCH, GAIN, MASS)))
         assert re.match(r"Friction patch \(.*\) and either actuator gain \(.*\) or cart mass \(.*\) close 96 %", text)
 
+    def test_one_that_stands_for_two(self):
+        one, two, three = replace(GAIN, indistinguishable_from=("friction_patch", "cart_mass")), PATCH, MASS
+        two, three = (replace(cause, indistinguishable_from=(GAIN.effect,)) for cause in (two, three))
+        text = sentence(a_diagnosis("ambiguous", causes=(one, two, three)))
+        assert re.match(r"Either actuator gain \(.*\), or friction patch \(.*\) and cart mass \(.*\) closes 96 %", text)
+
     @pytest.mark.parametrize(
         ("value", "text"),
         [(0, "0"), (0.0123456, "0.0123"), (1234.5, "1234"), (2.5e-7, "2.50e-07"), (math.nan, "unknown")],

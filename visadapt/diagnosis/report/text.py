@@ -64,8 +64,7 @@ def sentence(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == IDENTIFIED:
         return f"{_capitalised(listed([_described(cause) for cause in carrying]))} {_closes(diagnosis)}."
     if diagnosis.verdict == AMBIGUOUS:
-        groups = [listed([_described(cause) for cause in group], "or") for group in _alternatives(carrying)]
-        whole = listed([f"either {group}" if " or " in group else group for group in groups])
+        whole = listed([_either(group) for group in _alternatives(carrying)])
         return f"{_capitalised(whole)} {_closes(diagnosis)}; this recording cannot tell which."
     return _unexplained(diagnosis)
 
@@ -78,6 +77,25 @@ def _alternatives(causes: Sequence[Cause]) -> list[list[Cause]]:
         rest = [group for group in groups if group not in alike]
         groups = [*rest, [*(other for group in alike for other in group), cause]]
     return sorted(groups, key=len)
+
+
+def _either(group: Sequence[Cause]) -> str:
+    """A group of alternatives: "either a or b"; where one of them stands for two, "either a, or b and c"."""
+    relatives: dict[frozenset[str], list[Cause]] = {}
+    for cause in group:
+        relatives.setdefault(frozenset((cause.effect, *cause.indistinguishable_from)), []).append(cause)
+    # Causes of the same relatives are alternatives; of the others, those that are no alternatives act together.
+    options: list[list[list[Cause]]] = []
+    for alike in relatives.values():
+        rivals = {name for cause in alike for name in cause.indistinguishable_from}
+        for option in options:
+            if not any(cause.effect in rivals for taken in option for cause in taken):
+                option.append(alike)
+                break
+        else:
+            options.append([alike])
+    texts = [listed([listed([_described(one) for one in alike], "or") for alike in option]) for option in options]
+    return ("either " if len(group) > 1 else "") + ", or ".join(texts)
 
 
 def box(one: Box) -> str:
