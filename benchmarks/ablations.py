@@ -18,7 +18,7 @@ import torch
 import tyro
 from torch import nn
 
-from experiments.cartpole_targets import TARGETS, Shown, experiment, source, target
+from experiments.cartpole_targets import TARGETS, Shown, experiment, source, target, unadapted_score
 from experiments.kept_scores import kept_score
 from experiments.parallel import in_processes
 from experiments.result_tables import print_speed, speed_row, write_rows
@@ -109,7 +109,7 @@ def main(settings: Settings) -> None:
         for variant in settings.variants
         for seed in range(settings.seeds)
     ]
-    unadapted = in_processes(_before, settings, [(name,) for name in settings.targets])
+    unadapted = in_processes(unadapted_score, settings, [(name,) for name in settings.targets])
     found = in_processes(_after, settings, jobs)
     for name in settings.targets:
         rows.append(speed_row(experiment(name, settings.shown), "unadapted", "target", 0, [unadapted[(name,)]]))
@@ -119,14 +119,6 @@ def main(settings: Settings) -> None:
     write_rows(settings.out, rows)
     for row in rows:
         print_speed(row)
-
-
-def _before(settings: Settings, name: str) -> CartPoleScore:
-    torch.set_num_threads(1)
-    folder = settings.work / "unadapted"
-    open_run(folder, {"shown": settings.shown, "episodes": settings.episodes})
-    _, policy = source(settings.shown, settings.work)
-    return kept_score(folder / f"{name}.json", policy, target(name, settings.shown), settings.episodes)
 
 
 def _after(settings: Settings, name: str, variant: str, seed: int) -> CartPoleScore:

@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 import tyro
 
-from experiments.cartpole_targets import Shown, experiment, source, target
+from experiments.cartpole_targets import Shown, experiment, source, target, unadapted_score
 from experiments.kept_scores import kept_score
 from experiments.parallel import in_processes
 from experiments.result_tables import print_speed, speed_row, write_rows
@@ -49,7 +49,7 @@ class Settings:
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
     source(settings.shown, settings.work)  # trained here, once, where it is not shipped
-    before = in_processes(_before, settings, [(name,) for name in settings.targets])
+    before = in_processes(unadapted_score, settings, [(name,) for name in settings.targets])
     jobs = [(name, seed) for name in settings.targets for seed in range(settings.seeds)]
     after = in_processes(_after, settings, jobs)
     rows = []
@@ -62,15 +62,6 @@ def main(settings: Settings) -> None:
     write_rows(settings.out, rows)
     for row in rows:
         print_speed(row)
-
-
-def _before(settings: Settings, name: str) -> CartPoleScore:
-    """The score of the source policy."""
-    torch.set_num_threads(1)
-    folder = settings.work / "unadapted"
-    open_run(folder, {"shown": settings.shown, "episodes": settings.episodes})
-    _, policy = source(settings.shown, settings.work)
-    return kept_score(folder / f"{name}.json", policy, target(name, settings.shown), settings.episodes)
 
 
 def _after(settings: Settings, name: str, seed: int) -> dict[int, CartPoleScore]:

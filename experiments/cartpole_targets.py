@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
+import torch
+
+from experiments.kept_scores import kept_score
 from renderers import DrawnCartPole
 from visadapt.effects import ActuatorDelay, ActuatorGain, ConstantForce, CoulombFriction
+from visadapt.evaluation import CartPoleScore
 from visadapt.policies import Policy
 from visadapt.setups.base import Setup
 from visadapt.setups.cartpole import cartpole_frames, cartpole_states
+from visadapt.storage.run_folder import open_run
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, no_effects, sine_force
 from visadapt.weights import shipped
@@ -50,3 +55,31 @@ def source(shown: Shown, folder: Path) -> tuple[Setup, Policy]:
         return setup, setup.load(shipped("cartpole_frames"))
     setup = cartpole_states(with_history=True)
     return setup, setup.pretrain(folder / "source.safetensors", seed=0)
+
+
+class Adaptations(Protocol):
+    """Settings of an experiment that adapts a source policy to TARGETS."""
+
+    @property
+    def shown(self) -> Shown:
+        """What the policy sees."""
+        ...
+
+    @property
+    def episodes(self) -> int:
+        """Episodes of a score."""
+        ...
+
+    @property
+    def work(self) -> Path:
+        """Folder of intermediate results."""
+        ...
+
+
+def unadapted_score(settings: Adaptations, name: str) -> CartPoleScore:
+    """The score of the source policy on the target of that name, kept in the folder of the experiment."""
+    torch.set_num_threads(1)
+    folder = settings.work / "unadapted"
+    open_run(folder, {"shown": settings.shown, "episodes": settings.episodes})
+    _, policy = source(settings.shown, settings.work)
+    return kept_score(folder / f"{name}.json", policy, target(name, settings.shown), settings.episodes)

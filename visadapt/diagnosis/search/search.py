@@ -10,19 +10,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from itertools import combinations
 
 from visadapt.diagnosis.search.fitted_models import FittedModels, ScoredModel, key_of, less
-from visadapt.effects import Effect
 from visadapt.effects.late_sensors import LateSensors
 from visadapt.estimation.episode_phases import has_episode_phases, with_episode_phases
 from visadapt.estimation.fit_states import CAREFUL, QUICK, Effects, neutral, with_effect
 from visadapt.estimation.fitting import OUT_OF_REACH
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.screening import Candidate, screen
-from visadapt.estimation.segments import Segments
 from visadapt.progress import Progress
-from visadapt.systems import System
 
 MAX_EFFECTS = 6  # Effects in a set at most
 
@@ -55,18 +53,10 @@ fewer parameters, since a quick fit of the right set may keep too much process n
 class Search(FittedModels):
     """How sets grow from the source, and which sets near the best are tried."""
 
-    def __init__(
-        self,
-        system: System,
-        rows: Segments,
-        catalogue: Sequence[type[Effect]],
-        source: FitState | None = None,
-        jobs: int = 1,
-        rival: float = -math.inf,
-    ) -> None:
-        super().__init__(system, rows, catalogue, source, jobs, rival)
-        self._exchanged: set[tuple[frozenset[str], frozenset[str]]] = set()
-        """sets of which effects were exchanged, and what was kept of them"""
+    @cached_property
+    def _exchanged(self) -> set[tuple[frozenset[str], frozenset[str]]]:
+        """Sets of which effects were exchanged so far, and what was kept of them."""
+        return set()
 
     def run(self, progress: Progress | None = None) -> None:
         """Grow sets while that raises the posterior odds, then try sets near the best."""
