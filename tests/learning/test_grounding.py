@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from tests.scenes import image_residual_network, observing, small_renderer, state_residual_network
-from visadapt.effects import AngleOffset, ConstantForce, QuadraticDrag, Residual, ViscousFriction
-from visadapt.history import LENGTH
+from visadapt.effects import ActuatorDelay, AngleOffset, ConstantForce, QuadraticDrag, Residual, ViscousFriction
+from visadapt.history import LENGTH, History
 from visadapt.learning.grounding import (
     GroundSettings,
     fit_named,
@@ -28,11 +28,11 @@ NEWTONS = 2.0
 SAMPLES = 10  # of an episode
 
 
-def recorded(seed, count=16, rows=SAMPLES + 1):
-    """Episodes under random actions in a world with a constant force, as states."""
+def recorded(seed, count=16, rows=SAMPLES + 1, effects=None, size=0.2):
+    """Episodes under random actions of that size in a world with a constant force, or other effects, as states."""
     generator = torch.Generator().manual_seed(seed)
-    world = World(CartPole(), [ConstantForce(force=NEWTONS)]).requires_grad_(False)
-    actions = 0.2 * torch.randn(rows, count, 1, generator=generator)
+    world = World(CartPole(), effects or [ConstantForce(force=NEWTONS)]).requires_grad_(False)
+    actions = size * torch.randn(rows, count, 1, generator=generator)
     at = world.start(0.1 * torch.randn(count, 4, generator=generator))
     states = [at.state]
     for action in actions[:-1]:
@@ -151,6 +151,19 @@ class TestOnStates:
         assert found[0][1] == found[1][1]
         second = fit(residual, SOURCE, transitions, settings, torch.Generator().manual_seed(0))
         assert second[0].held_out == pytest.approx(min(loss.held_out for loss in first), rel=1e-3)
+
+    def test_small_commands_show_that_a_motor_is_late(self):
+        """By a period: what the present command does in the source, the last one does."""
+        torch.manual_seed(0)
+        residual = Residual(state_residual_network(with_history=True), torch.ones(4))
+        late = recorded(1, count=20, effects=[ActuatorDelay(delay=0.05)], size=0.05)
+        fit(residual, SOURCE, Transitions.cut(late, "state"), GroundSettings(), torch.Generator().manual_seed(0))
+        rest, command = torch.zeros(1, 4), torch.full((1, 1), 0.1)
+        history = History.start(rest, 1)
+        with torch.no_grad():
+            expected = SOURCE.step(SOURCE.start(rest), command).state
+            now = residual.delta(history.acting(command)) - residual.delta(history.acting(0 * command))
+        np.testing.assert_allclose(now.numpy(), -expected.numpy(), rtol=0.15)
 
 
 class TestOnFrames:

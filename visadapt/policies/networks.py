@@ -221,7 +221,7 @@ class StateResidualNetwork(ResidualNetwork):
         """(inputs,) ACTION_UNIT squared for the actions of a history, else 1.
 
         Near rest the commands are small, so their weights must be large to say that a motor is late or weak. Held back
-        as much as the others, they said it in part after 200 samples, and a policy that was tuned with them fell.
+        as much as the others, they said a quarter of it after 200 samples, and policies that were tuned with them fell.
         """
         every = super().penalties(inputs)
         if self.system is not None:
