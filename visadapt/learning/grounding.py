@@ -29,7 +29,7 @@ class GroundSettings:
 
     ridge: float = 1.0
     """weight of the squared coefficients of a linear head (times the network's `penalties`), where a sample's squared
-    error has weight 1. From few samples of a force that changes, with 0.1 the residual's world is unstable"""
+    error has weight 1. With 0.1 and 50 samples of a force that changes, a cart-pole with the residual is unstable"""
     negligible: float = 0.0
     """least scale of the residual, as a share of the root mean square change of a state in a period"""
     steps: int = 2000  # optimisation steps at most
@@ -125,7 +125,7 @@ def ground(
         seen, target = seen[informed], target[informed]
     train, held_out = split(len(seen), settings.held_out, generator)
     if isinstance(network.head, nn.Linear):
-        penalty = settings.ridge * network.penalties(seen.shape[1]).to(seen)
+        penalty = settings.ridge * network.penalties(seen)
         return _solve(network.head, seen, target, train, held_out, penalty)
     return _descend(network.head, seen, target, train, held_out, settings, generator, progress)
 

@@ -18,7 +18,7 @@ N_KINEMATICS = 2 * LENGTH
 """Width of the encoder's readout: latest position and its LENGTH - 1 changes, of cart and pole."""
 N_DISTURBANCE = 12  # Width of `FlightResidualNetwork.disturbance`
 ACTION_UNIT = 0.1
-"""Commands of a cart-pole near rest, as a share of their range: what `StateResidualNetwork.penalties` calls small."""
+"""Size of a cart-pole's commands near rest, as a share of their range."""
 ACCELERATION_UNIT = 2.0  # m/s2 and rad/s2, unit of the unexplained accelerations that a network reads
 HISTORY_ACCELERATION_UNIT = 0.2
 """m/s2 and rad/s2, their unit in the history that a vehicle's residual reads. The small unit makes these inputs large,
@@ -118,9 +118,9 @@ class ResidualNetwork(nn.Module):
         """(B,) whether the head's inputs (B, inputs) have a complete history; it is fitted to these rows alone."""
         return inputs.new_ones(len(inputs), dtype=torch.bool)
 
-    def penalties(self, inputs: int) -> Tensor:
-        """(inputs,) what ridge regression weighs the square of each input's weight by."""
-        return torch.ones(inputs)
+    def penalties(self, inputs: Tensor) -> Tensor:
+        """(inputs,) what ridge regression multiplies the squared weights of each of the inputs (B, inputs) by."""
+        return torch.ones_like(inputs[0])
 
     def forward(self, history: History) -> Tensor:
         """Corrections (B, n_state) in units of the residual's scale."""
@@ -217,7 +217,7 @@ class StateResidualNetwork(ResidualNetwork):
         states = inputs[:, : LENGTH * self.n_state].unflatten(1, (LENGTH, self.n_state))
         return states.diff(dim=1).any(2).all(1)
 
-    def penalties(self, inputs: int) -> Tensor:
+    def penalties(self, inputs: Tensor) -> Tensor:
         """(inputs,) ACTION_UNIT squared for the actions of a history, else 1.
 
         Near rest the commands are small, so their weights must be large to say that a motor is late or weak. Held back
