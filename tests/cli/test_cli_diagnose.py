@@ -110,6 +110,14 @@ class TestCommand:
         for setting in (str(recording), "CartPole(cart_mass=1.0", "<td>7</td>", f"torch {torch.__version__}"):
             assert setting in text
 
+    def test_equal_diagnoses_write_equal_files(self, recording, stub, tmp_path, monkeypatch):
+        written = []
+        for clock in (iter(range(1000)), iter(range(0, 10**6, 1000))):
+            monkeypatch.setattr("time.perf_counter", lambda clock=clock: float(next(clock)))
+            assert run(recording, "--json", tmp_path / "a.json", "--report", tmp_path / "a.html") == 0
+            written.append([(tmp_path / name).read_bytes() for name in ("a.json", "a.html")])
+        assert written[0] == written[1]
+
     def test_a_plan_where_nothing_is_open(self, recording, stub, tmp_path, capsys):
         path = tmp_path / "plan.csv"
         assert run(recording, "--plan", path) == 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from pathlib import Path
 
 from torch import nn
@@ -30,7 +29,6 @@ from visadapt.world import World
 
 def run(options: argparse.Namespace) -> None:
     """Diagnose, print the verdict, write what was asked for."""
-    began = time.perf_counter()
     system = the_system(options)
     import_effects(options)
     policy = _state_policy(Path(options.policy), system) if options.policy else None
@@ -55,8 +53,7 @@ def run(options: argparse.Namespace) -> None:
         with replacing(options.json) as temporary:
             temporary.write_text(json.dumps(result.to_json(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
     if options.report:
-        settings = _settings(options, system, time.perf_counter() - began)
-        write_report(options.report, result, settings)
+        write_report(options.report, result, _settings(options, system))
     if options.plan:
         _plan(options, result, recording, source, policy)
 
@@ -78,8 +75,8 @@ def _plan(
     print(planned if planned.settles else f"--plan: {planned}; {options.plan} was not written")
 
 
-def _settings(options: argparse.Namespace, system: System, seconds: float) -> dict[str, str]:
-    """What the result depends on, for the report's foot."""
+def _settings(options: argparse.Namespace, system: System) -> dict[str, str]:
+    """What the result depends on, for the report's foot: equal diagnoses give equal pages."""
     settings = {
         "recording": ", ".join(options.recording),
         "system": str(system),
@@ -89,7 +86,6 @@ def _settings(options: argparse.Namespace, system: System, seconds: float) -> di
         "policy from": options.policy or "",
         "renderer from": options.renderer or "",
         "seed": str(options.seed),
-        "time": f"{seconds:.1f} s on {options.jobs} core{'s' if options.jobs > 1 else ''}",
         "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
     }
     return {name: value for name, value in settings.items() if value}
