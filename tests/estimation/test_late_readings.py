@@ -1,5 +1,7 @@
 """What late sensors read: against the motion itself, simulated in steps of 1 ms."""
 
+from functools import cache
+
 import pytest
 import torch
 
@@ -18,11 +20,14 @@ LATE = {MeasurementDelay: [0, 1, 2, 3], PositionDelay: [0, 1], AngleDelay: [2, 3
 FRICTION = 2.0  # N; the cart stops and starts again several times
 
 
-def motion(ticks, effects=()):
-    """States (T, 4) at every tick, and its rows: all read without delay, commands held from each to the next."""
+@cache
+def motion(ticks, *friction):
+    """States (T, 4) at every tick under these kinds of friction, and its rows: all read without delay, commands held
+    from each to the next."""
     generator = torch.Generator().manual_seed(3)
     commands = torch.rand(len(ticks), 1, generator=generator, dtype=torch.float64) - 0.5
     at = torch.tensor([[0.1, 0.4, 0.1, -0.3]], dtype=torch.float64)
+    effects = [kind(force=FRICTION) for kind in friction]
     world, states = World(CartPole(), effects, period=TICK).double().requires_grad_(False), [at]
     for command in commands.repeat_interleave(ticks, 0):
         states.append(world.integrate(torch.zeros(1).double(), states[-1], command[None, None]))
@@ -41,7 +46,7 @@ def at(track, time):
 @pytest.mark.parametrize("friction", [[], [CoulombFriction]])
 @pytest.mark.parametrize("ticks", [STEADY, UNSTEADY], ids=["steady", "unsteady"])
 def test_a_late_sensor_reads_the_motion_as_it_was_also_through_stops(ticks, friction, sensor, delay):
-    track, rows = motion(ticks, [kind(force=FRICTION) for kind in friction])
+    track, rows = motion(ticks, *friction)
     if friction:
         assert int((track[1:, 1] == 0).sum()) > 5
     model = CandidateModel(CartPole(), [*friction, sensor], rows)
@@ -70,7 +75,7 @@ def test_every_reading_is_shown_once_but_for_those_of_before_the_episode():
 
 @pytest.mark.parametrize("delay", [0.0, 0.02, 0.05])
 def test_derivatives_are_those_of_the_motion(delay):
-    track, rows = motion(STEADY, [CoulombFriction(force=FRICTION)])
+    track, rows = motion(STEADY, CoulombFriction)
     model = CandidateModel(CartPole(), [CoulombFriction, AngleDelay], rows)
     theta, state = torch.tensor([FRICTION, delay]).double(), at(track, rows.time)
     found = linearise(model, theta, state)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import io
 import re
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,8 @@ from visadapt.recordings.episode import RecordingError
 
 MOST_NAMES = 40
 """Most names that a message lists."""
+ULOG_HEADER = 3
+"""Bytes of the header of a message of ULog: size and kind."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +46,31 @@ def reader(path: Path) -> Read | None:
     return None
 
 
+class _ULogFile(io.BufferedReader):
+    """A file over which pyulog does not loop for ever: where the last definition is cut short, it reads what is there
+    and goes back by as much as there should be, to where it was before or further."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self._got = self._asked = 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        self._got, self._asked = len(data), size or 0
+        return data
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        if whence == 1 and self._got < self._asked and -offset >= ULOG_HEADER + self._got:
+            raise EOFError("the last message is not whole")
+        return super().seek(offset, whence)
+
+
 def _read_ulog(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
     """The second instance of a topic is NAME_1, and so on."""
-    with redirect_stdout(StringIO()):  # pyulog prints warnings about a log that a crash cut short
-        log = _import(path, "pyulog").ULog(str(path))
+    pyulog = _import(path, "pyulog")
+    # It prints warnings about a log that a crash cut short.
+    with redirect_stdout(io.StringIO()), _ULogFile(path) as file:
+        log = pyulog.ULog(file)
     there = {f"{each.name}_{each.multi_id}" if each.multi_id else each.name: each.data for each in log.data_list}
     topics = {}
     for name, fields in wanted.items():

@@ -160,6 +160,8 @@ def _world(description: Mapping[str, Any], path: Path) -> World:
     """The world that `describe` described; raises CheckpointError where its system or an effect is not known."""
 
     def known(name: str, where: Mapping[str, Any], option: str = "") -> Any:
+        if not isinstance(name, str):
+            raise CheckpointError(f"{path}: the name of a system or an effect is no text but a {type(name).__name__}")
         if name not in where:
             line = f"{path}: needs {name!r}, which is not known here: import the file that defines it{option}"
             raise CheckpointError(line)
