@@ -90,11 +90,14 @@ def moved(frame: Tensor, motions: Sequence[Tensor]) -> Tensor:
     whole = centre.inverse()
     for motion in motions:
         whole = motion @ whole
-    affine = (centre @ whole)[..., :2, :].expand(len(frame), -1, -1)
+    affine = (centre @ whole)[..., :2, :]
+    # Frames that are moved alike are channels of one picture, for which the weights of the pixels are computed once.
+    alike = affine.dim() == 2
+    pictures, affine = (frame[None], affine[None]) if alike else (frame[:, None], affine.expand(len(frame), -1, -1))
     warp = _kornia("geometry.transform").warp_affine
     # Bicubic (Keys 1981), since bilinear interpolation has kinks at whole pixels, where most warps begin.
-    out: Tensor = warp(frame[:, None], affine, (height, width), "bicubic", padding_mode="border", align_corners=True)
-    return out[:, 0]
+    out: Tensor = warp(pictures, affine, (height, width), "bicubic", padding_mode="border", align_corners=True)
+    return out[0] if alike else out[:, 0]
 
 
 def seen_by(

@@ -153,8 +153,9 @@ class _Comparison:
             self.free[k] * (self._shown(scene, values + h) - self._shown(scene, values - h)) / (2 * self.step[k])
             for k, h in enumerate(torch.diag(self.step))
         ]
-        counted = [self._counted(each.to(self.frames), values, smooth) for each in (*by_place, *by_value)]
-        derivatives = torch.stack(counted, 1).flatten(2)
+        pictures = torch.stack([each.to(self.frames) for each in (*by_place, *by_value)], 1)
+        counted = self._counted(pictures.flatten(0, 1), values, smooth)
+        derivatives = counted.unflatten(0, pictures.shape[:2]).flatten(2)
         return derivatives[:, :2] / (2 * DIFFERENCE), derivatives[:, 2:]
 
     def _scene(self, place: Tensor) -> Tensor:

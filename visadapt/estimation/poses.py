@@ -68,6 +68,7 @@ class PoseFinder:
         self.grey = float(self._mean.mean())
         """mean grey level, of [0, 1], of the frames over the grid"""
         self._small = torch.cat([_shrink(part) for part in rendered])
+        self._square = self._small.square().sum(1)
 
     @torch.no_grad()
     def __call__(self, frames: Tensor) -> Poses:
@@ -84,13 +85,14 @@ class PoseFinder:
 
         `change` is made to the rendered frames of the grid, at half the resolution.
         """
-        drawn = self._small
+        drawn, square = self._small, self._square
         if change is not None:
             height, width = (math.ceil(side / 2) for side in self.size)
             drawn = change(drawn.unflatten(1, (height, width))).flatten(1)
+            square = drawn.square().sum(1)
         small = _shrink(frames)
         # |f - t|^2 less |f|^2, which is the same for every t.
-        least, index = (drawn.square().sum(1) - 2 * small @ drawn.T).min(1)
+        least, index = (square - 2 * small @ drawn.T).min(1)
         return self._grid[index], (least + small.square().sum(1)) / small.shape[1]
 
     @torch.no_grad()
