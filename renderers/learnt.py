@@ -73,14 +73,14 @@ class Layer(nn.Module):
         turn = torch.stack((torch.stack((cosine, sine), -1), torch.stack((-sine, cosine), -1)), 1)
         turn = turn / self.extent[:, None]
         shift = -(turn @ hinge[..., None])[..., 0] + (moved - self.centre) / self.extent
-        # One matrix product maps every pixel of a frame to its place in the picture.
-        place = pixels.flatten(0, 1) @ torch.cat((turn, shift[..., None]), -1).transpose(1, 2)
+        # One matrix product maps every pixel of all frames to its place in the picture.
+        place = torch.cat((turn, shift[..., None]), -1).flatten(0, 1) @ pixels.flatten(0, 1).T
         opacity = self.opacity.sigmoid()
         picture = torch.cat((self.shade.sigmoid() * opacity, opacity))
         # Zero padding makes everything outside the window transparent.
         return F.grid_sample(
             picture.expand(len(theta), -1, -1, -1),
-            place.unflatten(1, pixels.shape[:2]),
+            place.view(len(theta), 2, *pixels.shape[:2]).movedim(1, -1),
             align_corners=True,
             padding_mode="zeros",
         )

@@ -164,8 +164,9 @@ def test_a_film_is_decoded_as_it_was_drawn(tmp_path: Path):
     frames = imageio.imread(path, plugin="FFMPEG")
     assert len(frames) == round((0.3 + 1.5) * 25) + 1
     assert done[-1] == (len(frames), len(frames))
+    film = FlightFilm(panels)
     for i in (0, 20, len(frames) - 1):
-        drawn = FlightFilm(panels).still(i * 0.04)
+        drawn = film.still(i * 0.04)
         assert frames[i].shape == drawn.shape
         assert drawn.shape[0] % 2 == drawn.shape[1] % 2 == 0
         assert np.abs(frames[i].astype(float) - drawn).mean() < 2
@@ -175,9 +176,10 @@ def test_a_film_is_decoded_as_it_was_drawn(tmp_path: Path):
 def test_a_still_is_a_picture_and_its_end_stands_still(tmp_path: Path):
     panels = [following(), following((0.0, 0.05, 0.0))]
     FlightFilm(panels).write_still(tmp_path / "still.png", 0.6)
+    film = FlightFilm(panels)
     with Image.open(tmp_path / "still.png") as picture:
-        assert np.array_equal(np.asarray(picture), FlightFilm(panels).still(0.6))
-    assert np.array_equal(FlightFilm(panels).still(1.0), FlightFilm(panels).still(9.0))
+        assert np.array_equal(np.asarray(picture), film.still(0.6))
+    assert np.array_equal(film.still(1.0), film.still(9.0))
 
 
 def test_flights_that_failed_are_marked_as_such_from_then_on():
@@ -189,14 +191,17 @@ def test_flights_that_failed_are_marked_as_such_from_then_on():
     assert lost.failed == pytest.approx(0.6)
     for panel, before, after in ((strays, 0.4, 0.8), (lost, 0.5, 0.7)):
         banner = slice(60, 120), slice(28, 508)
-        assert count(FlightFilm([following(), panel]).still(before)[:, 544:][banner], RED) == 0
-        assert count(FlightFilm([following(), panel]).still(after)[:, 544:][banner], RED) > 2000
-        assert count(FlightFilm([following(), panel]).still(after)[banner], RED) == 0
+        film = FlightFilm([following(), panel])
+        assert count(film.still(before)[:, 544:][banner], RED) == 0
+        still = film.still(after)
+        assert count(still[:, 544:][banner], RED) > 2000
+        assert count(still[banner], RED) == 0
     missed, hit = reaching(1.3), reaching(0.01)
     assert missed.failed == pytest.approx(missed.passed)
     assert hit.failed is None
-    assert count(FlightFilm([missed, hit]).still(4.0)[60:120], RED) == 0
-    after_it = FlightFilm([missed, hit]).still(4.7)[60:120]
+    film = FlightFilm([missed, hit])
+    assert count(film.still(4.0)[60:120], RED) == 0
+    after_it = film.still(4.7)[60:120]
     assert count(after_it[:, :510], RED) > 2000
     assert count(after_it[:, 510:], RED) == 0
 
@@ -205,9 +210,10 @@ def test_a_flight_that_strays_beyond_all_bounds_is_drawn_all_the_same():
     state, panel = beside(), following()
     state[5:, :6] = 1e30
     strayed = flown(state, survived=False, force=np.full((11, 3), 1e30))
+    film, other = FlightFilm([strayed, panel]), FlightFilm([panel, panel])
     for t in (0.45, 0.5, 1.0):
-        assert FlightFilm([strayed, panel]).still(t).shape == FlightFilm([panel, panel]).still(t).shape
-    assert FlightFilm([strayed, panel]).far == FlightFilm([panel]).far
+        assert film.still(t).shape == other.still(t).shape
+    assert film.far == FlightFilm([panel]).far
 
 
 def test_a_flight_of_one_row_is_a_picture():
