@@ -95,11 +95,9 @@ class TestSize:
         rows = 10**6
         table = a_table(rows=1000, period=0.01)
         block = np.column_stack([table[name] for name in HEADER[1:]])
-        line = "\n".join("{},%.9g,%.9g,%.9g,%.9g,%.9g" % tuple(row) for row in block)  # noqa: UP031
-        count = iter(range(rows))
-        body = "\n".join([line] * (rows // 1000)).split("\n")
-        file.write_text(
-            "episode,time,x,x_dot,theta,theta_dot,command\n"
-            + "\n".join(f"{n // 1000},{text.format(n % 1000 / 100)}" for n, text in zip(count, body, strict=True))
-        )
+        lines = [f",{n / 100}," + ",".join(f"{value:.9g}" for value in row) for n, row in enumerate(block)]
+        with file.open("w") as out:
+            out.write("episode,time,x,x_dot,theta,theta_dot,command\n")
+            for episode in range(rows // 1000):
+                out.write("".join(f"{episode}{line}\n" for line in lines))
         assert load(file).samples == rows - 1000

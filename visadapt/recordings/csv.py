@@ -122,13 +122,10 @@ class Table:
     def _parsed(self, lines: Iterator[tuple[int, str]], columns: Sequence[int]) -> Iterator[list[float]]:
         """For each row its number, its line number, and its values in `columns`."""
         pulled: list[int] = []
-        plain = False  # whether the last line has none of what `_number` looks for in each cell
 
         def texts() -> Iterator[str]:
-            nonlocal plain
             for line, text in lines:
                 pulled.append(line)
-                plain = text.isascii() and "_" not in text and "#" not in text
                 yield text
 
         reader = csv.reader(texts(), delimiter=self.separator, strict=True)
@@ -137,33 +134,26 @@ class Table:
             try:
                 cells = next(reader, None)
             except csv.Error as error:
-                where = self._row(number, pulled[0])
+                where = f"{self.path}: row {number} (line {pulled[0]})"
                 raise RecordingError(f"{where} is no row of CSV: {error}; is a quotation mark left open?") from error
             if cells is None:
                 return
-            if len(pulled) > 1 or len(cells) != len(self.header):
-                raise RecordingError(f"{self._row(number, pulled[0])}{self._misshapen(pulled, cells)}")
+            line, *more = pulled
+            where = f"{self.path}: row {number} (line {line})"
+            if more:
+                raise RecordingError(f"{where}: a quotation mark is left open, so that the next lines are part of it")
+            if len(cells) < len(self.header):
+                raise RecordingError(
+                    f"{where} is cut short: {len(cells)} of {len(self.header)} cells; is the file incomplete?"
+                )
+            if len(cells) > len(self.header):
+                raise RecordingError(f"{where} has {len(cells)} cells, the line of names {len(self.header)}")
             try:
-                if plain:
-                    values = [float(cells[column]) for column in columns]
-                else:
-                    values = [_number(cells[column].partition("#")[0]) for column in columns]
+                values = [_number(cells[column].partition("#")[0]) for column in columns]
             except ValueError:
                 column = next(column for column in columns if not _is_number(cells[column]))
-                where = self._row(number, pulled[0])
                 raise RecordingError(f"{where}, column {self.header[column]!r} {_complaint(cells[column])}") from None
-            yield [number, pulled[0], *values]
-
-    def _row(self, number: int, line: int) -> str:
-        return f"{self.path}: row {number} (line {line})"
-
-    def _misshapen(self, lines: Sequence[int], cells: Sequence[str]) -> str:
-        """What is wrong with a row on these lines of the file, or with so many cells."""
-        if len(lines) > 1:
-            return ": a quotation mark is left open, so that the next lines are part of it"
-        if len(cells) < len(self.header):
-            return f" is cut short: {len(cells)} of {len(self.header)} cells; is the file incomplete?"
-        return f" has {len(cells)} cells, the line of names {len(self.header)}"
+            yield [number, line, *values]
 
 
 def _lines(path: Path, progress: Progress | None = None) -> Generator[tuple[int, str], None, None]:
