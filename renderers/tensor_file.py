@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor, uint8
 
 
@@ -24,6 +25,15 @@ def unsealed(entry: str, tensors: Mapping[str, Tensor]) -> str | None:
         return entry
     checksum, _, text = entry.partition(" ")
     return text if checksum == _checksum(text, tensors) else None
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], key: str, text: str) -> None:
+    """Write tensors, with the JSON that says what they are under a key of the header.
+
+    Not by `safetensors.torch.save_file`, which writes a file of another name first: a process that is killed meanwhile
+    leaves it.
+    """
+    path.write_bytes(save(dict(tensors), {key: sealed(text, tensors)}))
 
 
 def read_tensors(path: Path, kind: str, error: type[ValueError]) -> tuple[dict[str, str], dict[str, Tensor]]:

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
 
 from renderers.learnt import LayeredRenderer, MLPRenderer
-from renderers.tensor_file import read_tensors, sealed, unsealed
+from renderers.tensor_file import read_tensors, unsealed, write_tensors
 
 KINDS: dict[str, type[LayeredRenderer] | type[MLPRenderer]] = {"layered": LayeredRenderer, "mlp": MLPRenderer}
 FORMAT_VERSION = 1
@@ -31,7 +30,7 @@ def save_renderer(path: Path, renderer: LayeredRenderer | MLPRenderer, training:
     kind = next(name for name, cls in KINDS.items() if type(renderer) is cls)
     header = {"format": FORMAT_VERSION, "kind": kind, "arguments": renderer.arguments, "training": dict(training)}
     weights = {key: value.detach().contiguous() for key, value in renderer.state_dict().items()}
-    save_file(weights, path, {HEADER_KEY: sealed(json.dumps(header), weights)})
+    write_tensors(path, weights, HEADER_KEY, json.dumps(header))
 
 
 def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRenderer | MLPRenderer:

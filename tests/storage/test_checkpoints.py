@@ -1,4 +1,6 @@
+import os
 import resource
+import signal
 from contextlib import suppress
 
 import pytest
@@ -112,6 +114,23 @@ class TestTrees:
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         assert load_tree(path) == {"a": 1}
+        assert list(tmp_path.iterdir()) == [path]
+
+    def test_what_a_process_leaves_that_is_killed_as_it_writes_is_removed_by_the_next(self, tmp_path):
+        path = tmp_path / "t.safetensors"
+        save_tree(path, {"a": 1})
+        if (child := os.fork()) == 0:
+            try:
+                signal.signal(signal.SIGXFSZ, signal.SIG_DFL)  # a limit on the size of files then kills
+                resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+                resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+                save_tree(path, {"a": torch.zeros(100_000)})
+            finally:
+                os._exit(0)
+        assert os.waitpid(child, 0)[1] == signal.SIGXFSZ
+        assert len(list(tmp_path.iterdir())) == 2
+        assert load_tree(path) == {"a": 1}
+        save_tree(path, {"a": 2})
         assert list(tmp_path.iterdir()) == [path]
 
 

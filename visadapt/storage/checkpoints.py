@@ -12,10 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from renderers.tensor_file import read_tensors, sealed, unsealed
+from renderers.tensor_file import read_tensors, unsealed, write_tensors
 from renderers.weights import HEADER_KEY
 from visadapt.storage.atomic_files import replacing
 
@@ -32,7 +31,7 @@ def save_tree(path: Path, tree: Any) -> None:
     tensors: dict[str, Tensor] = {}
     skeleton = json.dumps(_strip(tree, tensors))
     with replacing(path) as temporary:
-        save_file(tensors, temporary, {TREE_KEY: sealed(skeleton, tensors)})
+        write_tensors(temporary, tensors, TREE_KEY, skeleton)
 
 
 def load_tree(path: Path) -> Any:
