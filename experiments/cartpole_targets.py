@@ -54,6 +54,7 @@ def source(shown: Shown, folder: Path) -> tuple[Setup, Policy]:
         setup = cartpole_frames()
         return setup, setup.load(shipped("cartpole_frames"))
     setup = cartpole_states(with_history=True)
+    torch.set_num_threads(1)  # Rounding, and with it the weights that training gives, depends on the number of threads
     return setup, setup.pretrain(folder / "source.safetensors", seed=0)
 
 

@@ -13,7 +13,7 @@ from tests.scenes import (
 )
 from visadapt.effects import ActuatorDelay, ConstantForce, DynamicsEffect, Residual
 from visadapt.evaluation import score
-from visadapt.history import History
+from visadapt.history import HORIZON, History
 from visadapt.learning.plans import ClosedLoop, imagine
 from visadapt.learning.policy import DivergedError, TuneSettings, initialise_feedforward, tune
 from visadapt.learning.streams import Streams
@@ -258,11 +258,32 @@ class UnevenTrack(DynamicsEffect):
 
 
 class TestClosedLoop:
+    """The policy decides anew at every step that is imagined."""
+
     def test_with_kept_states_it_is_refused(self):
         with pytest.raises(ValueError, match=r"closed_loop decides at every step, .* got streams = 4"):
             TuneSettings(Balance(PAPER_CARTPOLE), 1, streams=4, closed_loop=True)
 
-    """The policy decides anew at every step that is imagined."""
+    def test_streams_go_on_after_the_last_step_as_the_policy_would_have_gone(self):
+        torch.manual_seed(0)
+        policy, world = StatePolicy(4, with_history=True), World(CartPole(), [ConstantForce(force=1.0)])
+        task = Balance(PAPER_CARTPOLE, start_spread=(0.1, 0.1, 0.05, 0.1), kick=(0.0,) * 4, divergence=ANYWHERE)
+        generator = torch.Generator().manual_seed(1)
+        streams = Streams(world, task, None, None, 8, 1000, 0.0)
+        streams.start(1.0, generator)
+        at, history, age = streams.now.at, streams.now.history, streams.age.clone()
+        ClosedLoop(policy, streams, 0.0, generator).loss(0, 1.0)
+        with torch.no_grad():
+            for _ in range(HORIZON):
+                action = policy.act(history)
+                at = world.step(at, action)
+                history = history.acting(action).observing(at.state)
+        young = age + HORIZON < 1000
+        assert young.any()
+        assert torch.equal(streams.age[young], age[young] + HORIZON)
+        torch.testing.assert_close(streams.now.at.state[young], at.state[young])
+        torch.testing.assert_close(streams.now.history.observations[young], history.observations[young])
+        assert not streams.now.history.observations.requires_grad
 
     def test_the_gradient_is_the_change_of_the_loss(self):
         torch.manual_seed(0)

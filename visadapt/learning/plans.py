@@ -57,26 +57,25 @@ class ClosedLoop(Plans):
     """The policy decides anew at every step that is imagined, and the gradient is of the actions that it executes.
 
     Of a plan that is carried out whole, most of the cost is of its later actions where a force acts that cannot be
-    foreseen over half a second, and the first action, the only one executed, is learnt from little of the gradient
-    (Xu et al. 2022, Accelerated policy learning with parallel differentiable simulation, ICLR).
+    foreseen over half a second, and the first action, the only one executed, is learnt from little of the gradient.
+    All steps are the streams' own, which go on after the last one (Xu et al. 2022, Accelerated policy learning with
+    parallel differentiable simulation, ICLR): no step is imagined to be forgotten, and the next gradient is of other
+    states.
     """
 
     def loss(self, iteration: int, progress: float) -> Tensor:
-        streams, now = self.streams, self.streams.now
-        at, history, first = now.at, now.history, now.at
+        streams, stream = self.streams, self.streams.now
         states: list[Tensor] = []
         actions: list[Tensor] = []
-        for k in range(HORIZON):
-            if k > 0:
-                seen, at = look(streams.world, streams.observe, at, self.generator)
-                history = history.acting(actions[-1]).observing(streams.task.show(seen, now.task_state))
-            actions.append(self.policy.act(self.seen(history)))
-            at = streams.world.step(at, actions[-1], history)
+        for _ in range(HORIZON):
+            actions.append(self.policy.act(self.seen(stream.history)))
+            at = streams.world.step(stream.at, actions[-1], stream.history)
             states.append(at.state)
-            if k == 0:
-                first = at
-        loss = streams.task.cost(torch.stack(states, 1), torch.stack(actions, 1), now.at.state, now.task_state).mean()
-        streams.advance(first, actions[0].detach(), progress, self.generator)
+            stream = streams.after(stream, at, actions[-1], self.generator)
+        began = streams.now
+        plan = torch.stack(actions, 1)
+        loss = streams.task.cost(torch.stack(states, 1), plan, began.at.state, began.task_state).mean()
+        streams.go_on(stream, HORIZON, progress, self.generator)
         return loss
 
 

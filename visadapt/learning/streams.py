@@ -101,19 +101,27 @@ class Streams:
 
     @torch.no_grad()
     def advance(self, at: WorldState, action: Tensor, progress: float, generator: torch.Generator) -> None:
-        """Take the step to `at`, whose row the sensors have not read yet, under `action`.
+        """Take the step to `at`, whose row the sensors have not read yet, under `action`; then `go_on`."""
+        self.go_on(self.after(self.now, at, action, generator), 1, progress, generator)
 
-        Streams that have diverged, or have taken `longest` steps, start anew.
-
-        `progress` in [0, 1] drives the curriculum.
-        """
+    def after(self, stream: StreamState, at: WorldState, action: Tensor, generator: torch.Generator) -> StreamState:
+        """The streams after a step from `stream` to `at`, whose row the sensors have not read yet, under `action`."""
         at = replace(at, state=self.task.disturb(at.state, generator))
-        task_state = self.task.advance(self.now.task_state)
+        task_state = self.task.advance(stream.task_state)
         seen, at = look(self.world, self.observe, at, generator)
-        history = self.now.history.acting(action).observing(self.task.show(seen, task_state)).detach()
-        self.now = StreamState(at.detach(), history, task_state)
-        self.age += 1
-        keep = (self.age < self.longest) & ~self.task.diverged(at.state, task_state, progress)
+        history = stream.history.acting(action).observing(self.task.show(seen, task_state))
+        return StreamState(at, history, task_state)
+
+    @torch.no_grad()
+    def go_on(self, stream: StreamState, steps: int, progress: float, generator: torch.Generator) -> None:
+        """Go on from `stream`, so many `steps` later, without gradients.
+
+        Streams that have diverged, or have taken `longest` steps, start anew. `progress` in [0, 1] drives the
+        curriculum.
+        """
+        self.now = stream.detach()
+        self.age += steps
+        keep = (self.age < self.longest) & ~self.task.diverged(stream.at.state, stream.task_state, progress)
         ended = (~keep).nonzero()[:, 0]
         if len(ended):
             self.now = self.now.replaced(ended, self._fresh(ended, progress, generator))
