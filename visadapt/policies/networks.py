@@ -19,6 +19,8 @@ N_KINEMATICS = 2 * LENGTH
 N_DISTURBANCE = 12  # Width of `FlightResidualNetwork.disturbance`
 ACTION_UNIT = 0.1
 """Size of a cart-pole's commands near rest, as a share of their range."""
+FRAMES_ACTION_PENALTY = 0.1
+"""What ridge regression multiplies the squared weights of commands by, for a residual that reads frames."""
 ACCELERATION_UNIT = 2.0  # m/s2 and rad/s2, unit of the unexplained accelerations that a network reads
 HISTORY_ACCELERATION_UNIT = 0.2
 """m/s2 and rad/s2, their unit in the history that a vehicle's residual reads. The small unit makes these inputs large,
@@ -162,6 +164,12 @@ class ImageResidualNetwork(ResidualNetwork):
         kinematics = self.encoder.kinematics(history)
         unexplained = self.unexplained(kinematics * self.scale, history.actions) / ACCELERATION_UNIT
         return torch.cat((kinematics, history.actions.flatten(1), unexplained.flatten(1)), 1)
+
+    def penalties(self, inputs: Tensor) -> Tensor:
+        """(inputs,) FRAMES_ACTION_PENALTY for the actions, which are small near rest; else 1."""
+        every = super().penalties(inputs)
+        every[N_KINEMATICS : N_KINEMATICS + self.encoder.n_action * LENGTH] = FRAMES_ACTION_PENALTY
+        return every
 
     def unexplained(self, kinematics: Tensor, actions: Tensor) -> Tensor:
         """Accelerations of cart and pole minus the system's, (B, LENGTH - 2, 2), at all frames but the first and last.
