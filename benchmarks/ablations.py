@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 import tyro
-from torch import nn
+from torch import Tensor, nn
 
 from experiments.cartpole_targets import TARGETS, Shown, experiment, source, target, unadapted_score
 from experiments.kept_scores import kept_score
@@ -24,7 +24,8 @@ from experiments.parallel import in_processes
 from experiments.result_tables import print_speed, speed_row, write_rows
 from visadapt.effects import Residual
 from visadapt.evaluation import CartPoleScore
-from visadapt.policies import Policy
+from visadapt.history import History
+from visadapt.policies import ImagePolicy, Policy, StatePolicy
 from visadapt.policies.networks import ResidualNetwork, mlp
 from visadapt.setups.base import Setup
 from visadapt.storage.run_folder import open_run
@@ -33,16 +34,49 @@ from visadapt.world import World
 SAMPLES = 200
 ROUND_SAMPLES = 100
 
-Variant = Callable[[Setup], Setup]
+Variant = Callable[[Setup, Policy], Setup]
 
 
-def untuned(setup: Setup) -> Setup:
+class NoGradient(Residual):
+    """A residual past which no gradient flows."""
+
+    def delta(self, history: History) -> Tensor:
+        return super().delta(history).detach()
+
+
+def past_the_residual(setup: Setup, policy: Policy) -> Setup:
+    """The residual acts on what is imagined, but the gradient flows through renderer and physics alone."""
+
+    def residual(policy: Policy, source: World) -> Residual:
+        made = setup.residual(policy, source)
+        return NoGradient(made.network, made.scale)
+
+    return replace(setup, residual=residual)
+
+
+def past_the_renderer(setup: Setup, policy: Policy) -> Setup:
+    """Frames are rendered, but the gradient flows through physics and residual alone."""
+    render = setup.observe
+    assert render is not None
+    return replace(setup, observe=lambda states: render(states).detach())
+
+
+def output_layer_alone(setup: Setup, policy: Policy) -> Setup:
+    """Of the policy, the map from the last hidden layer to the plan alone is tuned."""
+    assert isinstance(policy, (ImagePolicy, StatePolicy))
+    policy.requires_grad_(False)
+    last = policy.out if isinstance(policy, ImagePolicy) else policy.rest[-1]
+    last.requires_grad_(True)
+    return setup
+
+
+def untuned(setup: Setup, policy: Policy) -> Setup:
     """The feed-forward on the residual, in closed form, and no backpropagation."""
     tuning = replace(setup.settings.tuning, iterations=0)
     return replace(setup, settings=replace(setup.settings, tuning=tuning))
 
 
-def held_over_a_plan(setup: Setup) -> Setup:
+def held_over_a_plan(setup: Setup, policy: Policy) -> Setup:
     """The residual's correction is constant over a plan, so that the gradient flows through the physics alone."""
     plans = setup.settings.refinement
     assert plans is not None
@@ -50,7 +84,7 @@ def held_over_a_plan(setup: Setup) -> Setup:
     return replace(setup, settings=replace(setup.settings, tuning=held))
 
 
-def with_an_mlp(setup: Setup) -> Setup:
+def with_an_mlp(setup: Setup, policy: Policy) -> Setup:
     """The paper's head of the residual: two hidden layers of 64, fitted by gradient descent."""
 
     def residual(policy: Policy, source: World) -> Residual:
@@ -67,14 +101,17 @@ def with_an_mlp(setup: Setup) -> Setup:
 
 
 def _with(**changed: object) -> Variant:
-    return lambda setup: replace(setup, settings=replace(setup.settings, **changed))  # type: ignore[arg-type]
+    return lambda setup, policy: replace(setup, settings=replace(setup.settings, **changed))  # type: ignore[arg-type]
 
 
 VARIANTS: dict[str, Variant] = {
-    "as shipped": lambda setup: setup,
+    "as shipped": lambda setup, policy: setup,
     "no tuning": untuned,
     "no feed-forward": _with(feedforward=False),
     "each round tunes on": _with(tunes_on=True),
+    "output layer alone": output_layer_alone,
+    "gradient past the renderer": past_the_renderer,
+    "gradient past the residual": past_the_residual,
     "correction held over a plan": held_over_a_plan,
     "MLP residual": with_an_mlp,
 }
@@ -91,7 +128,7 @@ class Settings:
     targets: tuple[str, ...] = tuple(TARGETS)
     """which of TARGETS"""
     variants: tuple[str, ...] = tuple(VARIANTS)
-    """which of VARIANTS"""
+    """which of VARIANTS; from states there is no renderer"""
     jobs: int = 2
     """adaptations at once, one core each"""
     work: Path = Path("runs/ablations")
@@ -124,7 +161,7 @@ def main(settings: Settings) -> None:
 def _after(settings: Settings, name: str, variant: str, seed: int) -> CartPoleScore:
     torch.set_num_threads(1)
     shipped_setup, policy = source(settings.shown, settings.work)
-    setup, machine = VARIANTS[variant](shipped_setup), target(name, settings.shown)
+    setup, machine = VARIANTS[variant](shipped_setup, policy), target(name, settings.shown)
     folder = settings.work / name / variant / f"seed-{seed}"
     about = {"shown": settings.shown, "seed": seed, "episodes": settings.episodes}
     open_run(folder, {**about, **setup.settings.numbers()})

@@ -38,6 +38,14 @@ def without_history(setup: Setup, policy: Policy) -> Setup:
     return replace(setup, residual=residual_for)
 
 
+def without_disturbance_estimate(setup: Setup, policy: Policy) -> Setup:
+    """The residual reads the history, but the policy reads the residual's correction alone."""
+    assert isinstance(policy, FlightPolicy)
+    for layer in (policy.hearing, policy.answer):  # zero in the source, where there is no estimate
+        layer.requires_grad_(False)
+    return setup
+
+
 def with_output_layers_alone(setup: Setup, policy: Policy) -> Setup:
     """Of the policy, the maps to its commands alone are tuned."""
     assert isinstance(policy, FlightPolicy)
@@ -50,7 +58,8 @@ def with_output_layers_alone(setup: Setup, policy: Policy) -> Setup:
 VARIANTS: dict[str, Callable[[Setup, Policy], Setup]] = {
     "as shipped": lambda setup, policy: setup,
     "no history": without_history,
-    "MLP residual": lambda setup, policy: with_an_mlp(setup),
+    "no disturbance estimate": without_disturbance_estimate,
+    "MLP residual": with_an_mlp,
     "output layers alone": with_output_layers_alone,
 }
 

@@ -12,7 +12,7 @@ from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.setups.policy_file import source_steps
 from visadapt.storage.checkpoints import CheckpointError, load_network, save_network
 from visadapt.systems import FixedWing, Quadrotor
-from visadapt.systems.rigid_body import POSITION
+from visadapt.systems.rigid_body import POSITION, rotation
 from visadapt.targets import FlightTarget, SyntheticTarget, TargetError
 from visadapt.targets.rollout import see_goals
 from visadapt.tasks.follow import Follow
@@ -144,6 +144,37 @@ def test_on_its_reference_at_the_right_speed_a_follower_sees_nothing_left_to_do(
     steps = PERIOD * torch.arange(1, 11)[:, None]
     goal = torch.cat((steps * velocity, velocity.expand(10, 3)), 1).flatten()[None]
     torch.testing.assert_close(FollowPolicy(PERIOD).aim(state, goal), torch.zeros(1, 60))
+
+
+def test_a_follower_answers_alike_whatever_the_heading():
+    policy, seen = stir(made("follow", torch.float64)), shown("follow")
+    policy.residual = a_residual("follow")
+    with torch.no_grad():
+        policy.first.weight[:, -13:] = 0  # the residual's correction, whose axes are the world's
+        policy.feedforward.weight.zero_()
+    past = torch.randn(LENGTH, 1, 73, generator=seeded(2), dtype=torch.float64) * 0.02 + seen
+    past[..., 13:] = seen[:, 13:]
+
+    def turned(rows):
+        half = torch.tensor(0.4, dtype=torch.float64)
+        turn = torch.stack((half.cos(), *torch.zeros(2).double(), half.sin()))[None]
+        matrix = rotation(turn)[0]
+        out = rows.clone()
+        for first in (0, 3, *range(13, 73, 3)):
+            out[..., first : first + 3] = rows[..., first : first + 3] @ matrix.T
+        w, x, y, z = rows[..., 6:10].unbind(-1)
+        c, s = half.cos(), half.sin()
+        out[..., 6:10] = torch.stack((c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w), -1)
+        return out
+
+    def plan(rows):
+        history = History(rows.transpose(0, 1), torch.zeros(len(seen), LENGTH, 4).double())
+        return policy(history)
+
+    torch.testing.assert_close(plan(turned(past)), plan(past))
+    left = turned(past)
+    left[..., 13:] = past[..., 13:]
+    assert (plan(left) - plan(past)).abs().max() > 0.1
 
 
 def test_a_wing_that_flies_at_its_point_or_stands_in_it_sees_finite_numbers():

@@ -13,28 +13,30 @@ from visadapt.policies.base import Policy, ignore_correction
 from visadapt.policies.networks import N_DISTURBANCE, FlightResidualNetwork, mlp
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY, RigidBody, matvec, rotation
 
-FARTHEST, FASTEST = 0.5, 1.0
+FARTHEST, FASTEST = 1.5, 2.5
 """m and m/s, the errors of position and velocity above which `FollowPolicy` reacts no more strongly."""
 
 
 class FlightPolicy(Policy):
     """A policy for a rigid body that is shown its state (13) and, after it, its goal; after A.1.1 and A.1.2.
 
-    Like the paper's it reads velocities in world and body axes, two columns of the rotation matrix, the rates, and what
-    `aim` makes of the goal. A linear path past the hidden layers carries the feedback near the goal.
+    A linear path past the hidden layers carries the feedback near the goal.
+
+    Args:
+        n_goal, n_own: numbers of the goal, and of what `own_inputs` makes of state and goal.
     """
 
     shown = "state and goal"
     goal: ClassVar[str]
     """what the goal's numbers are, in words"""
 
-    def __init__(self, n_goal: int, n_aim: int, arguments: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, n_goal: int, n_own: int, arguments: Mapping[str, Any] | None = None) -> None:
         n_action, width, n_state = 4, 128, len(RigidBody.states)
         super().__init__(n_state, n_action, arguments, (n_state + n_goal,))
-        self.first = nn.Linear(15 + n_aim + self.n_state, width)
+        self.first = nn.Linear(n_own + self.n_state, width)
         self.rest = mlp(width, width, width)
         self.out = nn.Linear(width, HORIZON * n_action)
-        self.straight = nn.Linear(15 + n_aim, HORIZON * n_action, bias=False)
+        self.straight = nn.Linear(n_own, HORIZON * n_action, bias=False)
         # Last, so that the initial weights of the other layers do not depend on these.
         self.hearing = nn.Linear(N_DISTURBANCE, width, bias=False)
         self.answer = nn.Linear(N_DISTURBANCE, HORIZON * n_action, bias=False)
@@ -44,16 +46,14 @@ class FlightPolicy(Policy):
             for layer in (self.straight, self.hearing, self.answer):
                 layer.weight.zero_()
 
-    def aim(self, state: Tensor, goal: Tensor) -> Tensor:
-        """The goal (B, n_goal) relative to a vehicle in a state (B, 13), as inputs (B, n_aim)."""
+    def own_inputs(self, state: Tensor, goal: Tensor) -> Tensor:
+        """What the policy reads of its state (B, 13) and goal (B, n_goal): (B, n_own)."""
         raise NotImplementedError
 
     def embed(self, history: History) -> Tensor:
         shown = history.observations[:, -1]
-        state, goal = shown[:, : self.n_state], shown[:, self.n_state :]
-        velocity, turned = state[:, VELOCITY], rotation(state[:, ATTITUDE])
-        moving = (velocity, matvec(turned.mT, velocity), turned[:, :, :2].flatten(1), state[:, RATES])
-        return torch.cat((*moving, self.aim(state, goal), self.disturbance(history)), 1)
+        own = self.own_inputs(shown[:, : self.n_state], shown[:, self.n_state :])
+        return torch.cat((own, self.disturbance(history)), 1)
 
     def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:
         own, disturbance = inputs[:, :-N_DISTURBANCE], inputs[:, -N_DISTURBANCE:]
@@ -71,13 +71,29 @@ class FlightPolicy(Policy):
 
 
 class FollowPolicy(FlightPolicy):
-    """Follows a reference, whose next HORIZON positions and velocities (6 each), `period` s apart, are its goal."""
+    """Follows a reference, whose next HORIZON positions and velocities (6 each), `period` s apart, are its goal.
+
+    It reads velocity, the vertical, rates, what `aim` makes of the goal and the disturbance estimate, all in body axes.
+    So it answers alike whatever the heading, and under a strong push may yaw, to tilt about two axes at once.
+    """
 
     goal = f"the next {HORIZON} points of the reference, a period apart: x, y, z in m and their rates in m/s"
 
     def __init__(self, period: float) -> None:
-        super().__init__(6 * HORIZON, 6 * HORIZON, {"period": period})
+        super().__init__(6 * HORIZON, 9 + 6 * HORIZON, {"period": period})
         self.period = period
+
+    def own_inputs(self, state: Tensor, goal: Tensor) -> Tensor:
+        turned = rotation(state[:, ATTITUDE])
+        aim = self.aim(state, goal).unflatten(1, (-1, 3))
+        moving = torch.cat((state[:, None, VELOCITY], aim), 1) @ turned
+        return torch.cat((moving.flatten(1), turned[:, 2], state[:, RATES]), 1)
+
+    def disturbance(self, history: History) -> Tensor:
+        turned = rotation(history.observations[:, -1, : self.n_state][:, ATTITUDE])
+        linear, angular, linear_rate, angular_rate = super().disturbance(history).unflatten(1, (4, 3)).unbind(1)
+        linear, linear_rate = (matvec(turned.mT, each) for each in (linear, linear_rate))
+        return torch.cat((linear, angular, linear_rate, angular_rate), 1)
 
     def aim(self, state: Tensor, goal: Tensor) -> Tensor:
         """The reference minus the path at constant present velocity, (B, 6 HORIZON): positions in m, velocities in m/s.
@@ -101,12 +117,21 @@ def _at_most(limit: float, vectors: Tensor) -> Tensor:
 
 
 class ReachPolicy(FlightPolicy):
-    """Flies a fixed wing through a point (3), its goal."""
+    """Flies a fixed wing through a point (3), its goal.
+
+    Like the paper's it reads velocity in world and body axes, two columns of the rotation matrix, the rates, and what
+    `aim` makes of the goal.
+    """
 
     goal = "the point to fly through: x, y, z in m"
 
     def __init__(self) -> None:
-        super().__init__(3, 10)
+        super().__init__(3, 25)
+
+    def own_inputs(self, state: Tensor, goal: Tensor) -> Tensor:
+        velocity, turned = state[:, VELOCITY], rotation(state[:, ATTITUDE])
+        moving = (velocity, matvec(turned.mT, velocity), turned[:, :, :2].flatten(1), state[:, RATES])
+        return torch.cat((*moving, self.aim(state, goal)), 1)
 
     def aim(self, state: Tensor, goal: Tensor) -> Tensor:
         """(B, 10): distance / 50 m, direction to the point in body axes, heading error, and that error / distance.

@@ -44,10 +44,10 @@ def quadrotor(
             f"the references have rows {train.period:g} s apart, the source {source.period:g} s between commands"
         )
     train, test = train.as_many(), None if test is None else test.as_many()
-    task, recover = Follow(train), Follow(train, RecoverCost(), divergence=3.0)
+    task, recover = Follow(train), Follow(train, RecoverCost(), start_spread=(0.3, 0.8), divergence=3.0)
     tuning = _learn(task, 200, 256, 1e-3, curriculum=False)
     if with_history:
-        tuning = _learn(recover, 400, 128, 2e-3, curriculum=False, recorded=RECORDED)
+        tuning = _learn(recover, 400, 128, 5e-3, longest=60, curriculum=False, recorded=RECORDED)
     return Setup(
         source=source or World(Quadrotor(), period=train.period, substeps=2),
         policy=lambda: FollowPolicy(train.period),

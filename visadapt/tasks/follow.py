@@ -96,11 +96,7 @@ class Follow(FlightTask):
         which = torch.randint(len(positions), (batch,), generator=generator).to(positions.device)
         row = torch.randint(self.steps, (batch,), generator=generator).to(which)
         state = self.on(which, row)
-        metres, speed = self.start_spread
-        spread = torch.tensor([metres] * 3 + [speed] * 3)
-        share = curriculum(self.first_divergence, progress)
-        off = share * spread * torch.randn(batch, len(spread), generator=generator)
-        state[:, : len(spread)] += off.to(state)
+        state = state + curriculum(self.first_divergence, progress) * self._spread(state, generator)
         return state, torch.stack((which, row), 1)
 
     def cost(self, states: Tensor, plan: Tensor, now: Tensor, task_state: Tensor) -> Tensor:
@@ -144,11 +140,12 @@ class Follow(FlightTask):
     def augment(
         self, observed: Tensor, state: Tensor, task_state: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Shifted to another reference, with the same errors, at its row with the most similar motion.
+        """Shifted to another reference, at its row with the most similar motion, with the same errors and a spread.
 
         Without forces of the air a motion does not depend on position and velocity: these are shifted by the same in
         all rows. Of `candidates` rows of references drawn at random, the one with the most similar velocity and
-        acceleration is taken, so that drag and tilt change little.
+        acceleration is taken, so that drag and tilt change little. The spread is that of other starts: recorded errors
+        are few, and smaller than those that a gust against a new policy makes.
         """
         own, batch = self.references, len(observed)
         which = torch.randint(len(own.positions), (batch, self.candidates), generator=generator)
@@ -164,6 +161,15 @@ class Follow(FlightTask):
         shift = torch.zeros_like(state)
         for part, values in ((POSITION, own.positions), (VELOCITY, own.velocities)):
             shift[:, part] = values[chosen, until] - values[now[:, 0], now[:, 1]]
+        shift = shift + self._spread(state, generator)
         back = torch.arange(1 - task_state.shape[1], 1)
         there = torch.stack((chosen[:, None].expand(-1, len(back)), until[:, None] + back), -1)
         return observed + shift[:, None], state + shift, there.to(task_state)
+
+    def _spread(self, state: Tensor, generator: torch.Generator) -> Tensor:
+        """Random differences of position and velocity, zeros elsewhere; as large as `state` (B, 13)."""
+        metres, speed = self.start_spread
+        spread = torch.tensor([metres] * 3 + [speed] * 3)
+        off = torch.zeros_like(state)
+        off[:, : len(spread)] = (spread * torch.randn(len(state), len(spread), generator=generator)).to(state)
+        return off
