@@ -85,7 +85,7 @@ def grounding(pixels: Rows) -> Lines:
 
 
 def ablations(rows: Rows) -> Lines:
-    """What each part of an adaptation is worth, one target a line, in m/s."""
+    """What each part of an adaptation is worth, one variant a line, in m/s."""
 
     def cell(row: Row) -> str:
         speed, up, _ = _speed_cells(row)
@@ -106,12 +106,12 @@ def flight_ablations(rows: Rows) -> Lines:
 
 
 def _by_method(rows: Rows, head: str, label: Callable[[Row], str], cell: Callable[[Row], str]) -> Lines:
-    """A line for each experiment with a cell for each method."""
-    methods = list(dict.fromkeys(row["method"] for row in rows))
-    lines = [[head, *methods]]
-    for experiment in dict.fromkeys(row["experiment"] for row in rows):
-        found = {row["method"]: row for row in rows if row["experiment"] == experiment}
-        lines.append([label(found[methods[0]]), *(cell(found[method]) for method in methods)])
+    """A line for each method with a cell for each experiment."""
+    experiments = {row["experiment"]: label(row) for row in rows}
+    lines = [[head, *experiments.values()]]
+    for method in dict.fromkeys(row["method"] for row in rows):
+        found = {row["experiment"]: row for row in rows if row["method"] == method}
+        lines.append([method, *(cell(found[experiment]) for experiment in experiments)])
     return lines
 
 

@@ -49,8 +49,9 @@ def small_quadrotor(rows=21, with_history=False, **training):
 def trained_as(setup, **training):
     """A setup with other TuneSettings, in the source and in each round."""
     own = setup.settings
-    source, tuning = (dataclasses.replace(part, **training) for part in (own.source, own.tuning))
-    return dataclasses.replace(setup, settings=dataclasses.replace(own, source=source, tuning=tuning))
+    parts = {"source": own.source, "tuning": own.tuning, "refinement": own.refinement}
+    changed = {name: dataclasses.replace(part, **training) for name, part in parts.items() if part is not None}
+    return dataclasses.replace(setup, settings=dataclasses.replace(own, **changed))
 
 
 def drag(rate):

@@ -44,15 +44,18 @@ def quadrotor(
             f"the references have rows {train.period:g} s apart, the source {source.period:g} s between commands"
         )
     train, test = train.as_many(), None if test is None else test.as_many()
-    task, recover = Follow(train), Follow(train, RecoverCost(), start_spread=(0.3, 0.8), divergence=3.0)
+    task, far_off = Follow(train), partial(Follow, train, start_spread=(0.3, 0.8), divergence=3.0)
     tuning = _learn(task, 200, 256, 1e-3, curriculum=False)
     if with_history:
-        tuning = _learn(recover, 400, 128, 5e-3, longest=60, curriculum=False, recorded=RECORDED)
+        tuning = _learn(far_off(RecoverCost()), 400, 128, 5e-3, longest=60, curriculum=False, recorded=RECORDED)
     return Setup(
         source=source or World(Quadrotor(), period=train.period, substeps=2),
         policy=lambda: FollowPolicy(train.period),
         residual=partial(residual_for, with_history=with_history),
-        settings=_settings(_learn(task, 4000, 256, 4e-3), tuning),
+        # First to come back from far off, then to keep to the reference.
+        settings=_settings(
+            _learn(far_off(), 4000, 256, 4e-3), tuning, refinement=_learn(task, 1000, 256, 1e-3, curriculum=False)
+        ),
         test=task if test is None else Follow(test),
     )
 
@@ -78,8 +81,14 @@ def fixed_wing(source: World | None = None, with_history: bool = False) -> Setup
     )
 
 
-def _settings(source: TuneSettings, tuning: TuneSettings) -> SetupSettings:
+def _settings(source: TuneSettings, tuning: TuneSettings, refinement: TuneSettings | None = None) -> SetupSettings:
     assert isinstance(tuning.task, FlightTask)
     return SetupSettings(
-        source, tuning, ground=GROUND, longest_episode=tuning.task.steps, feedforward=False, tunes_on=True
+        source,
+        tuning,
+        ground=GROUND,
+        longest_episode=tuning.task.steps,
+        feedforward=False,
+        tunes_on=True,
+        refinement=refinement,
     )
