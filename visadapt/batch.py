@@ -10,6 +10,11 @@ import torch
 from torch import Tensor
 
 
+def placed(values: Tensor, like: Tensor) -> Tensor:
+    """The values on the device of `like` and, where they are of floating point, with its dtype."""
+    return values.to(like) if values.is_floating_point() else values.to(like.device)
+
+
 class Batch:
     """Base of dataclasses whose fields are tensors (B, ...), tuples of these, or batches themselves."""
 
@@ -18,6 +23,10 @@ class Batch:
         values: Any = self
         names = [field.name for field in fields(values)]
         return type(self)(*(_mapped(function, [getattr(one, name) for one in (self, *others)]) for name in names))
+
+    def to(self, like: Tensor) -> Self:
+        """The batch with every tensor `placed` where `like` is."""
+        return self.map(lambda tensor: placed(tensor, like))
 
     def detach(self) -> Self:
         """The same, cut off from the graph."""

@@ -139,7 +139,7 @@ class World(nn.Module):
         rows = [(*acting, *sensing, *seeing)]
         if not any(memory.numel() for memory in rows[0]):
             return tuple(memory[:, None].expand(-1, commands.shape[1] + 1, -1, -1) for memory in rows[0])
-        generator = torch.Generator(first.device).manual_seed(0)  # which readings were lost is not known
+        generator = torch.Generator().manual_seed(0)  # which readings were lost is not known
         system = self.altered(first)
         for t in range(commands.shape[1]):
             _, acting = self._act(commands[:, t, None], acting, system, None if held is None else held[:, t, None])

@@ -269,7 +269,7 @@ class TestClosedLoop:
         policy, world = StatePolicy(4, with_history=True), World(CartPole(), [ConstantForce(force=1.0)])
         task = Balance(PAPER_CARTPOLE, start_spread=(0.1, 0.1, 0.05, 0.1), kick=(0.0,) * 4, divergence=(1e9,) * 4)
         generator = torch.Generator().manual_seed(1)
-        streams = Streams(world, task, None, None, 8, 1000, 0.0)
+        streams = Streams(world, task, None, None, 8, 1000, 0.0, torch.zeros(()))
         streams.start(1.0, generator)
         at, history, age = streams.now.at, streams.now.history, streams.age.clone()
         ClosedLoop(policy, streams, 0.0, generator).loss(0, 1.0)
@@ -293,7 +293,7 @@ class TestClosedLoop:
 
         def loss():
             generator = torch.Generator().manual_seed(1)
-            streams = Streams(world, task, None, None, 8, 100, 0.0)
+            streams = Streams(world, task, None, None, 8, 100, 0.0, torch.zeros(()))
             streams.start(1.0, generator)
             return ClosedLoop(policy, streams, 0.0, generator).loss(0, 1.0)
 

@@ -46,7 +46,7 @@ def episodes_of(world, lengths=(30, 12, 21), seed=0):
 
 
 def streams_of(world, task=WIDE, observe=None, transitions=None, recorded=0.0, count=40):
-    made = Streams(world, task, observe, transitions, count, 1000, recorded)
+    made = Streams(world, task, observe, transitions, count, 1000, recorded, torch.zeros(()))
     made.start(1.0, torch.Generator().manual_seed(1))
     return made
 

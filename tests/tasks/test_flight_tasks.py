@@ -40,7 +40,7 @@ def reaching(**changes):
 
 
 def streams(task, world, batch, longest=1000, seed=0):
-    made = Streams(world, task, identity, None, batch, longest, 0.0)
+    made = Streams(world, task, identity, None, batch, longest, 0.0, torch.zeros(()))
     made.start(0.0, seeded(seed))
     return made
 
@@ -241,7 +241,7 @@ class TestStreams:
         torch.manual_seed(0)
         flown = run(target, FollowPolicy(PERIOD), 2, 12, seeded(4))
         transitions = Transitions.cut([each.episode for each in flown], "state")
-        made = Streams(self.WORLD, task, identity, transitions, 40, 1000, 1.0)
+        made = Streams(self.WORLD, task, identity, transitions, 40, 1000, 1.0, torch.zeros(()))
         made.start(0.0, seeded(5))
         network = FlightResidualNetwork(Quadrotor(), PERIOD, partial(source_steps, self.WORLD))
 
@@ -275,7 +275,7 @@ class TestStreams:
         torch.manual_seed(0)
         flown = run(target, ReachPolicy(), 2, 12, seeded(4))
         transitions = Transitions.cut([each.episode for each in flown], "state")
-        made = Streams(World(FixedWing(), period=0.05), task, identity, transitions, 20, 1000, 1.0)
+        made = Streams(World(FixedWing(), period=0.05), task, identity, transitions, 20, 1000, 1.0, torch.zeros(()))
         made.start(0.0, seeded(5))
         for b in range(20):
             # Both flights begin in the same state: their points tell them apart.

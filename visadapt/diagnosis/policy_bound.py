@@ -63,8 +63,7 @@ def check(policy: StatesToActions, system: System) -> None:
 def actions(policy: StatesToActions, system: System, history: History) -> Tensor:
     """The policy's actions (B, n_action), limited to the system's range, after a history of states; float64."""
     if isinstance(policy, Policy):
-        dtype = next(policy.parameters()).dtype
-        chosen = policy.act(History(history.observations.to(dtype), history.actions.to(dtype)))
+        chosen = policy.act(history.to(next(policy.parameters())))
     else:
         chosen = torch.as_tensor(policy(history.observations[:, -1].to(torch.get_default_dtype())))
     batch, _, n_action = history.actions.shape
@@ -75,7 +74,7 @@ def actions(policy: StatesToActions, system: System, history: History) -> Tensor
             f"for states ({batch}, {history.observations.shape[-1]}) the policy gave {what}; "
             f"actions ({batch}, {n_action}) are right: {ranges}"
         )
-    return system.within_range(chosen.double())
+    return system.within_range(chosen.to(history.actions.device).double())
 
 
 def policy_terms(policy: StatesToActions, system: System, rows: Segments, best: ScoredModel) -> PolicyTerms:

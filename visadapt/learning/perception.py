@@ -86,18 +86,19 @@ def learn_to_see(
     rate, steps = settings.learning_rate, settings.iterations
     training = TrainingState(encoder, optimiser, generator, rate, steps, progress, checkpoint)
     training.resume()
-    unit = scale(settings, period)
+    like = next(encoder.parameters())
+    unit = scale(settings, period).to(like)
     for _ in range(len(training.losses), steps):
         paths = [
-            coordinate.draw(settings.streams, settings.length, period, generator)
+            coordinate.draw(settings.streams, settings.length, period, generator).to(like)
             for coordinate in (settings.cart, settings.pole)
         ]
         with torch.no_grad():
             frames = render(paths[0].flatten(), paths[1].flatten()).unflatten(0, paths[0].shape)
-            frames = frames + settings.pixel_noise * torch.randn(frames.shape, generator=generator)
+            frames = frames + settings.pixel_noise * torch.randn(frames.shape, generator=generator).to(like)
         windows = frames.unfold(1, LENGTH, 1).permute(0, 1, 4, 2, 3).flatten(0, 1)
         truth = torch.cat([kinematics(path.unfold(1, LENGTH, 1).flatten(0, 1)) for path in paths], 1) / unit
-        actions = torch.zeros(len(windows), LENGTH, encoder.n_action)
+        actions = windows.new_zeros(len(windows), LENGTH, encoder.n_action)
         error = encoder.kinematics(History(windows, actions)) - truth
         bends = torch.cat([error[:, 1:LENGTH].diff(dim=1), error[:, LENGTH + 1 :].diff(dim=1)], 1)
         training.descend(error.square().mean() + BEND_WEIGHT * bends.square().mean())

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from visadapt.batch import placed
 from visadapt.history import HORIZON, History
 from visadapt.learning.streams import Streams, StreamState, Visited, look
 from visadapt.learning.transitions import Observe
@@ -50,7 +51,8 @@ class Plans:
 
     def restore(self, tree: dict[str, Any]) -> None:
         """Go on from a `tree`."""
-        self.streams.now, self.streams.age = StreamState.of(tree["now"]), tree["age"]
+        streams = self.streams
+        streams.now, streams.age = StreamState.of(tree["now"]).to(streams.like), placed(tree["age"], streams.like)
 
 
 class ClosedLoop(Plans):
@@ -116,7 +118,7 @@ class KeptPlans(Plans):
 
     def restore(self, tree: dict[str, Any]) -> None:
         super().restore(tree)
-        self.past = Visited.of(tree["past"])
+        self.past = Visited.of(tree["past"]).to(self.streams.like)
 
 
 def imagine(

@@ -69,7 +69,7 @@ def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None
 
     `scale` (n_state,) is the residual's, the unit of the corrections that the policy reads.
     """
-    rest = torch.zeros(1, policy.n_state, dtype=torch.float64, device=scale.device)
+    rest = torch.zeros(1, policy.n_state, dtype=torch.float64)
     still = rest.new_zeros(1, source.substeps, policy.n_action)
     with torch.no_grad():
         step = linearise_step(source, source.values.to(rest), rest[:, 0], rest, still, by_state=False, by_command=True)
@@ -87,7 +87,7 @@ def tune(
     progress: Progress | None = None,
     checkpoint: Path | None = None,
 ) -> list[float]:
-    """Train `policy` in `world`, in place; returns the loss of every iteration.
+    """Train `policy` in `world`, in place, on its device; returns the loss of every iteration.
 
     Args:
         observe: the camera through which the policy sees, differentiable, since a residual may read its frames; None
@@ -106,7 +106,8 @@ def tune(
     steps = settings.iterations
     training = TrainingState(policy, optimiser, generator, settings.learning_rate, steps, progress, checkpoint)
     count = settings.streams or settings.batch
-    streams = Streams(world, settings.task, observe, transitions, count, settings.longest, settings.recorded)
+    like, longest = next(policy.parameters()), settings.longest
+    streams = Streams(world, settings.task, observe, transitions, count, longest, settings.recorded, like)
     given = (policy, streams, settings.observation_noise, generator)
     if settings.closed_loop:
         plans: Plans = ClosedLoop(*given)

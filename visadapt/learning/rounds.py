@@ -163,10 +163,11 @@ class JointLearning:
         world = known.with_effects([*known.effects, self.residual])
         if not folder.residual.exists():
             true = fit_named(known, transitions)
+            placed = true.to(self.residual.scale)
             if not self.grounded:
-                rescale(self.residual, known, true, self.settings.ground.negligible)
+                rescale(self.residual, known, placed, self.settings.ground.negligible)
             progress = self._progress(folder, "ground")
-            losses = ground(self.residual, known, true, self.settings.ground, folder.generator(1), progress)
+            losses = ground(self.residual, known, placed, self.settings.ground, folder.generator(1), progress)
             changed = {} if true is transitions else {"states": true.states, "times": true.times}
             save_tree(folder.residual, {"weights": world.state_dict(), "losses": losses, "windows": changed})
         tree = load_tree(folder.residual)

@@ -8,7 +8,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from visadapt.batch import Batch
+from visadapt.batch import Batch, placed
 from visadapt.history import History
 from visadapt.learning.transitions import Observe, Transitions
 from visadapt.tasks.balance import EPISODE_STEPS
@@ -80,11 +80,15 @@ class Streams:
     count: int
     longest: int  # steps after which a stream starts anew
     recorded: float  # share of the starts that are transitions, with their histories
+    like: Tensor  # whose device and dtype the streams have
 
     def __post_init__(self) -> None:
         self.now: StreamState
         self.age: Tensor
         self._recorded: WorldState | None = None
+        self.task = self.task.to(self.like)
+        if self.transitions is not None:
+            self.transitions = self.transitions.to(self.like)
         with torch.no_grad():
             if self.transitions is None:
                 times, state = an_episode(self.world, self.task)
@@ -96,8 +100,8 @@ class Streams:
     @torch.no_grad()
     def start(self, progress: float, generator: torch.Generator) -> None:
         """Start all streams, at random ages, so that they do not end together."""
-        self.now = self._fresh(torch.arange(self.count), progress, generator)
-        self.age = torch.randint(self.longest, (self.count,), generator=generator)
+        self.now = self._fresh(torch.arange(self.count).to(self.like.device), progress, generator)
+        self.age = torch.randint(self.longest, (self.count,), generator=generator).to(self.like.device)
 
     @torch.no_grad()
     def advance(self, at: WorldState, action: Tensor, progress: float, generator: torch.Generator) -> None:
@@ -130,14 +134,15 @@ class Streams:
     def _fresh(self, ended: Tensor, progress: float, generator: torch.Generator) -> StreamState:
         """New starts for the streams `ended`: drawn for all streams, but only these are rendered."""
         count, transitions = self.count, self.transitions
-        state, task_state = (each[ended] for each in self.task.training_start(count, progress, generator))
+        start = self.task.training_start(count, progress, generator)
+        state, task_state = (placed(each, self.like)[ended] for each in start)
         at = self.world.start(state)
         if self._times is not None:
             # Streams are shorter than episodes: if all began at time 0, none would meet a late gust, or all phases of a
             # slow force. So they begin at the times of recorded samples, or, without a recording, at any time of an
             # episode.
             times = self._times[torch.randint(len(self._times), (count,), generator=generator)]
-            at = replace(at, time=times[ended].to(state))
+            at = replace(at, time=times.to(state)[ended])
         seen, at = look(self.world, self.observe, at, generator)
         history = History.start(self.task.show(seen, task_state), len(self.world.system.actions))
         fresh = StreamState(at, history, task_state)
@@ -148,7 +153,7 @@ class Streams:
         near = (~self.task.diverged(transitions.state, task_states[:, -1], progress)).nonzero()[:, 0]
         if not len(near):
             return fresh
-        from_record = torch.rand(count, generator=generator)[ended] < self.recorded
+        from_record = torch.rand(count, generator=generator).to(state)[ended] < self.recorded
         rows = near[torch.randint(len(near), (count,), generator=generator)][ended]
         past = transitions.history(rows)
         seen, now, where = self.task.augment(past.observations, transitions.state[rows], task_states[rows], generator)
@@ -172,7 +177,8 @@ def look(
 def an_episode(world: World, task: Task) -> tuple[Tensor, Tensor]:
     """Times (T,), in s, of the rows of an episode, and a state (1, n_state) in which one may start."""
     state, _ = task.training_start(1, 0.0, torch.Generator().manual_seed(0))
-    return world.period * torch.arange(task.steps if isinstance(task, FlightTask) else EPISODE_STEPS), state
+    rows = torch.arange(task.steps if isinstance(task, FlightTask) else EPISODE_STEPS)
+    return (world.period * rows).to(state), state
 
 
 def depends_on_time(world: World, time: Tensor, state: Tensor) -> bool:

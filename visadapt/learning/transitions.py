@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torch.nn.utils.rnn import pad_sequence
 
+from visadapt.batch import placed
 from visadapt.history import LENGTH, History
 from visadapt.recordings import Episode
 from visadapt.world import World, WorldState
@@ -65,6 +66,11 @@ class Transitions:
         if first == len(episodes):
             raise ValueError("the recording holds no sample: every episode has a single row")
         return cls([len(each.time) for each in episodes], *(torch.cat(own) for own in zip(*parts, strict=True)))
+
+    def to(self, like: Tensor) -> Transitions:
+        """The same on the device of `like`; what is of floating point gets its dtype."""
+        tensors = (self.observations, self.actions, self.states, self.times, self.task_states, self.rows)
+        return Transitions(self.lengths, *(placed(values, like) for values in tensors))
 
     def __len__(self) -> int:
         return len(self.rows)

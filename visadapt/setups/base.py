@@ -141,7 +141,7 @@ class Setup:
         self.check_policy(policy)
         self.check_target(target)
         torch.manual_seed(seed)
-        residual = self.residual(policy, self.source)
+        residual = self.residual(policy, self.source).to(next(policy.parameters()))
         args = (policy, residual, self.source, target, self.settings, folder, budget, round_samples, seed)
         explain = explained(self.source, self.renderer, report) if diagnose else None
         adapted = adapt(*args, self.observe, self.label, report, explorer, explain)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import asdict, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import torch
@@ -140,9 +141,19 @@ def cartpole_frames(
     settings = settings or _narrowed(from_frames(source), seen)
     perception = settings.perception or PerceptionSettings()
 
-    def observe(state: Tensor) -> Tensor:
-        frame: Tensor = seen(state[:, 0], state[:, 2])
+    @cache
+    def copied(device: torch.device, dtype: torch.dtype) -> LayeredRenderer:
+        # The renderer stays where it is: the tracker reads frames of the target with it.
+        return copy.deepcopy(seen).to(device, dtype)
+
+    def render(x: Tensor, theta: Tensor) -> Tensor:
+        own = seen.background
+        here = (x.device, x.dtype) == (own.device, own.dtype)
+        frame: Tensor = (seen if here else copied(x.device, x.dtype))(x, theta)
         return frame
+
+    def observe(state: Tensor) -> Tensor:
+        return render(state[:, 0], state[:, 2])
 
     def label(episodes: list[Episode]) -> list[Episode]:
         """The same episodes with states estimated from their frames; those of 1 or 2 rows are left out."""
@@ -154,7 +165,7 @@ def cartpole_frames(
         eyes = policy.perception.requires_grad_(True)
         args = (
             eyes,
-            seen,
+            render,
             source.period,
             perception,
             torch.Generator().manual_seed(seed),

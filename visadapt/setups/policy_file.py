@@ -97,7 +97,7 @@ def _restored(
 ) -> Policy:
     if (grounded_in := tree["settings"].get("grounded_in")) is not None:
         policy.grounded_in = grounded_in
-        policy.residual = residual(policy, _world(grounded_in, path))
+        policy.residual = residual(policy, _world(grounded_in, path)).to(next(policy.parameters()))
     load_weights(policy, tree["weights"], path)
     return policy.eval()
 
@@ -195,7 +195,7 @@ def residual_for(
         eyes = policy.perception
         unit = scale(perception or PerceptionSettings(), period)
         network = ImageResidualNetwork(eyes.background, float(eyes.contrast), system, period, unit)
-        network.encoder.load_state_dict(eyes.state_dict())
+        network.to(eyes.background).encoder.load_state_dict(eyes.state_dict())
     elif isinstance(policy, StatePolicy):
         physics = system if policy.with_history else None
         network = StateResidualNetwork(policy.n_state, policy.n_action, physics, period)

@@ -151,7 +151,8 @@ def adapt(
 
     Without a target the policy is tuned in `source` with the effects that it has: those of a diagnosis, say. With one,
     the policy is run there for `samples` counted steps, round by round; a residual learns what `source` leaves out, the
-    parameters of its effects are fitted, and the policy is tuned in the result.
+    parameters of its effects are fitted, and the policy is tuned in the result. Tuning happens on the device of the
+    policy's parameters; the target is given, and gives, tensors on the CPU.
 
     Args:
         samples: steps of the target in all; every one is counted.

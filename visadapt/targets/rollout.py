@@ -91,14 +91,15 @@ def run(
     see = see or SHOWN[policy.shown]
     observation = target.reset(batch, generator)
     _check_finite(target, observation, torch.ones_like(observation.alive), "the first state")
-    history = History.start(see(observation), target.n_action)
+    like = next(policy.parameters(), observation.state)
+    history = History.start(see(observation).to(like), target.n_action)
     rows: list[tuple[Observation, Tensor]] = []
     length = torch.zeros(batch, dtype=torch.long)
     running = observation.alive.clone()
     for _ in range(steps):
         if not bool(running.any()):
             break
-        action = policy.act(history)
+        action = policy.act(history).to(observation.state)
         if exploration > 0:
             action = (action + exploration * torch.randn(action.shape, generator=generator).to(action)).clamp(-1, 1)
         if added is not None:
@@ -110,7 +111,7 @@ def run(
             _check_finite(target, observation, running, f"the state after step {len(rows)}")
         length += running & finite
         running &= observation.alive & finite
-        history = history.acting(action).observing(see(observation))
+        history = history.acting(action.to(like)).observing(see(observation).to(like))
     rows.append((observation, torch.zeros(batch, target.n_action)))
     return [_cut(rows, b, int(length[b]), bool(running[b]), target.period) for b in range(batch)]
 

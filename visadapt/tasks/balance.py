@@ -128,7 +128,7 @@ class Balance(Task):
         return self.plan_cost(states, plan, now)
 
     def diverged(self, state: Tensor, task_state: Tensor, progress: float) -> Tensor:
-        return ~(state.abs() <= self._limit(progress)).all(1)  # also where a state is not a number
+        return ~(state.abs() <= self._limit(progress).to(state)).all(1)  # also where a state is not a number
 
     def disturb(self, state: Tensor, generator: torch.Generator) -> Tensor:
         kicked = torch.rand(len(state), 1, generator=generator) < 0.05

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -22,6 +23,10 @@ class Task(ABC):
     >>> isinstance(task, va.Task), state.shape, task_state.shape
     (True, torch.Size([3, 4]), torch.Size([3, 0]))
     """
+
+    def to(self, like: Tensor) -> Self:
+        """The same task; tensors that it holds get the device and dtype of `like`."""
+        return self
 
     @abstractmethod
     def training_start(self, batch: int, progress: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:

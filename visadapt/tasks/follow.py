@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -73,6 +73,9 @@ class Follow(FlightTask):
     first_divergence: float = 0.05
     """share of `divergence` that the curriculum begins with; it reaches 1 at half of the iterations"""
     candidates: int = 64  # rows of references drawn at random, of which `augment` takes the most similar one
+
+    def to(self, like: Tensor) -> Follow:
+        return replace(self, references=self.references.to(like))
 
     @property
     def period(self) -> float:
@@ -148,8 +151,9 @@ class Follow(FlightTask):
         are few, and smaller than those that a gust against a new policy makes.
         """
         own, batch = self.references, len(observed)
-        which = torch.randint(len(own.positions), (batch, self.candidates), generator=generator)
-        row = torch.randint(task_state.shape[1] - 1, self.steps, (batch, self.candidates), generator=generator)
+        draws, device = (batch, self.candidates), own.positions.device
+        which = torch.randint(len(own.positions), draws, generator=generator).to(device)
+        row = torch.randint(task_state.shape[1] - 1, self.steps, draws, generator=generator).to(device)
 
         def motion(which: Tensor, row: Tensor) -> Tensor:
             return torch.cat((own.velocities[which, row], own.accelerations[which, row]), -1)
@@ -162,7 +166,7 @@ class Follow(FlightTask):
         for part, values in ((POSITION, own.positions), (VELOCITY, own.velocities)):
             shift[:, part] = values[chosen, until] - values[now[:, 0], now[:, 1]]
         shift = shift + self._spread(state, generator)
-        back = torch.arange(1 - task_state.shape[1], 1)
+        back = torch.arange(1 - task_state.shape[1], 1).to(row)
         there = torch.stack((chosen[:, None].expand(-1, len(back)), until[:, None] + back), -1)
         return observed + shift[:, None], state + shift, there.to(task_state)
 

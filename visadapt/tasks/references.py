@@ -50,6 +50,11 @@ class Reference:
         positions, velocities, accelerations, jerks = motion
         return cls(positions, velocities, accelerations, jerks, period)
 
+    def to(self, like: Tensor) -> Self:
+        """The same with the device and dtype of `like`."""
+        motion = torch.stack((self.positions, self.velocities, self.accelerations, self.jerks))
+        return type(self).of(motion.to(like), self.period)
+
     def as_many(self) -> Self:
         """With a leading axis that numbers references, (1, T, 3), where this is a single one; else itself."""
         motion = torch.stack((self.positions, self.velocities, self.accelerations, self.jerks))
