@@ -1,0 +1,187 @@
+"""Learning happens on the device and in the dtype of the policy's parameters; targets and files stay on the CPU.
+
+A second device is pretended by `tests.second_device`. Products of two dtypes raise as those of two devices do.
+"""
+
+import contextlib
+import dataclasses
+
+import pytest
+import torch
+
+import visadapt as va
+from renderers import DrawnCartPole
+from tests.flying import small_quadrotor
+from tests.second_device import DEVICE, second_device
+from visadapt.diagnosis.policy_bound import actions
+from visadapt.history import History
+from visadapt.learning import training_state
+from visadapt.learning.perception import PerceptionSettings
+from visadapt.setups.cartpole import cartpole_frames, cartpole_states, from_frames
+from visadapt.setups.flight import fixed_wing
+from visadapt.targets import synthetic
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(autouse=True)
+def coarse_targets(monkeypatch):
+    """Simulated in few steps, for the time they take."""
+    monkeypatch.setattr(synthetic, "SMOOTH_STEP", 0.05)
+
+
+def frames():
+    few = dataclasses.replace(from_frames(va.World(va.CartPole())), perception=PerceptionSettings(2, streams=2))
+    return cartpole_frames(settings=few)
+
+
+SETUPS = {
+    "cartpole_states": cartpole_states,
+    "cartpole_frames": frames,
+    "quadrotor": lambda: small_quadrotor(with_history=True),
+    "fixed_wing": lambda: fixed_wing(with_history=True),
+}
+
+
+def short(name):
+    """A setup with few iterations of few plans."""
+    setup = SETUPS[name]()
+
+    def fewer(tuning):
+        few = tuning.streams and 4
+        return dataclasses.replace(tuning, iterations=2, batch=4, streams=few)
+
+    own = setup.settings.with_tuning(fewer)
+    own = dataclasses.replace(
+        own,
+        source=fewer(own.source),
+        refinement=own.refinement and fewer(own.refinement),
+        ground=dataclasses.replace(own.ground, steps=5),
+    )
+    return dataclasses.replace(setup, settings=own)
+
+
+def target(setup):
+    if setup.test is not None:
+        return va.FlightTarget(setup.test, setup.source.system)
+    return va.SyntheticTarget(va.constant_force(2.0), DrawnCartPole() if setup.renderer else None)
+
+
+def shipped(setup, name, like):
+    """The policy that the library ships for the setup, with the device and dtype of `like`."""
+    return setup.load(va.shipped(name)).to(like)
+
+
+def weights(policy):
+    return {key: value.detach().cpu() for key, value in policy.state_dict().items()}
+
+
+def learnt(name, like, folder):
+    """What tuning, adaptation and scores leave: losses, weights, and the score."""
+    setup = short(name)
+    policy = shipped(setup, name, like)
+    losses = setup.tune(policy, 1)
+    run = setup.adapt(policy, target(setup), folder, 4, 4, 1)
+    losses += [loss for each in run.rounds for loss in each.policy]
+    assert {parameter.dtype for parameter in policy.parameters()} == {like.dtype}
+    assert {parameter.device for parameter in policy.parameters()} == {like.device}
+    return losses, weights(policy), va.score(policy, target(setup), episodes=2, steps=2)
+
+
+@pytest.mark.parametrize("name", SETUPS)
+def test_a_policy_in_double_precision_learns_the_same_up_to_rounding(name, tmp_path):
+    single, _, _ = learnt(name, torch.zeros(()), tmp_path / "single")
+    double, found, _ = learnt(name, torch.zeros((), dtype=torch.float64), tmp_path / "double")
+    assert double == pytest.approx(single, rel=0.01)
+    assert all(value.isfinite().all() for value in found.values())
+
+
+def test_the_second_device_refuses_tensors_of_the_first():
+    with second_device():
+        remote, here = torch.ones(2, device=DEVICE), torch.ones(2)
+        assert (remote * torch.tensor(3.0)).cpu().tolist() == [3.0, 3.0]
+        assert remote[torch.tensor([1])].cpu().tolist() == [1.0]
+        for mix in (lambda: remote + here, lambda: torch.cat((remote, here)), lambda: here[remote.long()]):
+            with pytest.raises(RuntimeError, match="tensors on two devices"):
+                mix()
+
+
+@pytest.mark.parametrize("name", SETUPS)
+def test_a_policy_on_another_device_learns_the_same_there(name, tmp_path):
+    here = learnt(name, torch.zeros(()), tmp_path / "here")
+    with second_device():
+        there = learnt(name, torch.zeros((), device=DEVICE), tmp_path / "there")
+    assert there[0] == here[0]
+    assert there[1].keys() == here[1].keys()
+    assert all(torch.equal(there[1][key], value) for key, value in here[1].items())
+    assert there[2] == here[2]
+
+
+@pytest.mark.parametrize("name", SETUPS)
+def test_a_policy_that_is_made_on_another_device_is_trained_and_loaded_there(name, tmp_path):
+    setup = short(name)
+    here = weights(setup.pretrain(tmp_path / "here.safetensors", 1))
+    with second_device():
+        there = dataclasses.replace(setup, policy=lambda: setup.policy().to(DEVICE))
+        there.pretrain(tmp_path / "there.safetensors", 1)
+        loaded = there.load(tmp_path / "there.safetensors")
+        assert next(loaded.parameters()).device == DEVICE
+        assert all(torch.equal(value, here[key]) for key, value in weights(loaded).items())
+    back = weights(setup.load(tmp_path / "there.safetensors"))
+    assert all(torch.equal(value, here[key]) for key, value in back.items())
+
+
+@pytest.mark.parametrize(("name", "began", "goes_on"), [("quadrotor", CPU, DEVICE), ("cartpole_frames", DEVICE, CPU)])
+def test_a_run_that_was_interrupted_goes_on_on_another_device(name, began, goes_on, tmp_path, monkeypatch):
+    monkeypatch.setattr(training_state, "CHECKPOINT_ITERATIONS", 1)
+    setup = short(name)
+    own = setup.settings
+    setup = dataclasses.replace(setup, settings=dataclasses.replace(own, tuning=own.named or own.tuning))
+
+    def interrupt(stage, done, of, loss):
+        if stage == "round 1/1: tune" and done == 2:
+            raise KeyboardInterrupt
+
+    def adapted(device, folder, report=None):
+        policy = shipped(setup, name, torch.zeros((), device=device))
+        setup.adapt(policy, target(setup), folder, 3, 3, 1, report)
+        return weights(policy)
+
+    whole = adapted(CPU, tmp_path / "whole")
+    with second_device():
+        with contextlib.suppress(KeyboardInterrupt):
+            adapted(began, tmp_path / "cut", interrupt)
+        assert list((tmp_path / "cut").rglob("*.partial.safetensors"))
+        found = adapted(goes_on, tmp_path / "cut")
+    assert all(torch.equal(found[key], value) for key, value in whole.items())
+
+
+def test_effects_act_on_another_device():
+    effects = (
+        va.effects.PeriodicForce(amplitude=1.0, frequency=0.3, phase=0.0, offset=0.0),
+        va.effects.ActuatorDelay(delay=0.03),
+        va.effects.Dropout(rate=0.1),
+    )
+    source = va.World(va.CartPole(), effects)
+    policy = va.load_policy(va.shipped("cartpole_states"))
+    here = weights(va.adapt(policy, source, iterations=2))
+    with second_device():
+        there = weights(va.adapt(policy.to(DEVICE), source, iterations=2))
+    assert all(torch.equal(there[key], value) for key, value in here.items())
+
+
+def test_an_adaptation_with_a_diagnosis_takes_a_policy_in_double_precision(only_effects):
+    only_effects("viscous_friction", "actuator_gain")
+    policy = va.load_policy(va.shipped("cartpole_states")).double()
+    rubs = va.SyntheticTarget(lambda batch, generator: [va.effects.ViscousFriction(coefficient=0.8)])
+    run = va.adapt(policy, va.World(va.CartPole()), rubs, 40, round_samples=40, iterations=1, diagnose=True)
+    assert run.rounds[0].explanation.verdict == "identified"
+    assert next(run.policy.parameters()).dtype == torch.float64
+
+
+def test_an_experiment_takes_the_actions_of_a_policy_on_another_device():
+    policy = va.load_policy(va.shipped("cartpole_states"))
+    history = History.start(torch.ones(2, 4, dtype=torch.float64), 1)
+    here = actions(policy, va.CartPole(), history)
+    with second_device():
+        assert torch.equal(actions(policy.to(DEVICE), va.CartPole(), history), here)
