@@ -234,9 +234,10 @@ class TestStreams:
         assert torch.equal(made.now.task_state[[0, 3, 4]], task_state[[0, 3, 4]])
         assert torch.equal(made.now.history.observations[:, -1, 13:], made.now.task_state)
 
-    def test_recorded_starts_are_as_far_off_another_reference_with_the_past_that_they_had(self):
+    @pytest.mark.parametrize("spread", [(0.0, 0.0), (0.3, 0.8)])
+    def test_recorded_starts_are_as_far_off_another_reference_but_for_the_spread_with_the_past_they_had(self, spread):
         """What the source leaves unexplained stays as it was recorded: without air a vehicle flies alike anywhere."""
-        task = following(first_divergence=1.0)
+        task = following(first_divergence=1.0, start_spread=spread)
         target = FlightTarget(task, Quadrotor(), push(2.0))
         torch.manual_seed(0)
         flown = run(target, FollowPolicy(PERIOD), 2, 12, seeded(4))
@@ -251,7 +252,7 @@ class TestStreams:
         def off(state, task_state):
             return state[..., : VELOCITY.stop] - task.on(*task_state.long().unbind(-1))[..., : VELOCITY.stop]
 
-        now, found = made.now, set()
+        now, found, further = made.now, set(), []
         every = transitions.history(torch.arange(len(transitions)))
         for b in range(40):
             alike = (every.actions - now.history.actions[b]).abs().amax((1, 2)) == 0
@@ -259,11 +260,12 @@ class TestStreams:
             row = int(alike.nonzero()[0])
             found.add(row)
             here, there = off(now.at.state[b : b + 1], now.task_state[b : b + 1]), transitions.state[row : row + 1]
-            torch.testing.assert_close(
-                here, off(there, transitions.task_states[transitions.rows[row, -1:]]), rtol=0, atol=1e-5
-            )
+            further.append(here - off(there, transitions.task_states[transitions.rows[row, -1:]]))
             past = unexplained(transitions.history(torch.tensor([row])))
             torch.testing.assert_close(unexplained(now.history[b : b + 1]), past, rtol=0, atol=2e-3)
+        metres, speed = torch.cat(further).square().mean(0).sqrt().split(3)
+        torch.testing.assert_close(metres, torch.full((3,), spread[0]), rtol=0.3, atol=1e-5)
+        torch.testing.assert_close(speed, torch.full((3,), spread[1]), rtol=0.3, atol=1e-5)
         assert len(found) > 12
         assert set(now.task_state[:, 0].tolist()) - set(target.first[:, 0].tolist())
         assert torch.equal(now.history.observations[:, -1, :13], now.at.state)
