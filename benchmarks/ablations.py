@@ -62,7 +62,7 @@ def past_the_renderer(setup: Setup, policy: Policy) -> Setup:
 
 
 def output_layer_alone(setup: Setup, policy: Policy) -> Setup:
-    """Of the policy, the map from the last hidden layer to the plan alone is tuned."""
+    """Of the policy, the maps to the plan alone are tuned: that of the last hidden layer, and the feed-forward."""
     assert isinstance(policy, (ImagePolicy, StatePolicy))
     policy.requires_grad_(False)
     last = policy.out if isinstance(policy, ImagePolicy) else policy.rest[-1]

@@ -263,7 +263,9 @@ class TestStreams:
             further.append(here - off(there, transitions.task_states[transitions.rows[row, -1:]]))
             past = unexplained(transitions.history(torch.tensor([row])))
             torch.testing.assert_close(unexplained(now.history[b : b + 1]), past, rtol=0, atol=2e-3)
-        metres, speed = torch.cat(further).square().mean(0).sqrt().split(3)
+        added = torch.cat(further)
+        assert (added.abs() <= 1e-5 + 5 * torch.tensor(spread).repeat_interleave(3)).all()
+        metres, speed = added.square().mean(0).sqrt().split(3)
         torch.testing.assert_close(metres, torch.full((3,), spread[0]), rtol=0.3, atol=1e-5)
         torch.testing.assert_close(speed, torch.full((3,), spread[1]), rtol=0.3, atol=1e-5)
         assert len(found) > 12

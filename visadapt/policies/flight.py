@@ -46,14 +46,20 @@ class FlightPolicy(Policy):
             for layer in (self.straight, self.hearing, self.answer):
                 layer.weight.zero_()
 
-    def own_inputs(self, state: Tensor, goal: Tensor) -> Tensor:
-        """What the policy reads of its state (B, 13) and goal (B, n_goal): (B, n_own)."""
+    def own_inputs(self, state: Tensor, goal: Tensor, axes: Tensor) -> Tensor:
+        """What the policy reads of its state (B, 13) and goal (B, n_goal): (B, n_own); `axes` (B, 3, 3), the body's."""
         raise NotImplementedError
+
+    def disturbance_inputs(self, disturbance: Tensor, axes: Tensor) -> Tensor:
+        """What it reads of the disturbance estimate (B, N_DISTURBANCE), as many numbers."""
+        return disturbance
 
     def embed(self, history: History) -> Tensor:
         shown = history.observations[:, -1]
-        own = self.own_inputs(shown[:, : self.n_state], shown[:, self.n_state :])
-        return torch.cat((own, self.disturbance(history)), 1)
+        state, goal = shown[:, : self.n_state], shown[:, self.n_state :]
+        axes = rotation(state[:, ATTITUDE])
+        disturbance = self.disturbance_inputs(self.disturbance(history), axes)
+        return torch.cat((self.own_inputs(state, goal, axes), disturbance), 1)
 
     def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:
         own, disturbance = inputs[:, :-N_DISTURBANCE], inputs[:, -N_DISTURBANCE:]
@@ -73,8 +79,9 @@ class FlightPolicy(Policy):
 class FollowPolicy(FlightPolicy):
     """Follows a reference, whose next HORIZON positions and velocities (6 each), `period` s apart, are its goal.
 
-    It reads velocity, the vertical, rates, what `aim` makes of the goal and the disturbance estimate, all in body axes.
-    So it answers alike whatever the heading, and under a strong push may yaw, to tilt about two axes at once.
+    It reads velocity, the vertical, rates, what `aim` makes of the goal and the disturbance estimate, all in body axes:
+    but for the residual's correction, which is in world axes, it answers alike whatever the heading, and under a strong
+    push may yaw, to tilt about two axes at once.
     """
 
     goal = f"the next {HORIZON} points of the reference, a period apart: x, y, z in m and their rates in m/s"
@@ -83,16 +90,14 @@ class FollowPolicy(FlightPolicy):
         super().__init__(6 * HORIZON, 9 + 6 * HORIZON, {"period": period})
         self.period = period
 
-    def own_inputs(self, state: Tensor, goal: Tensor) -> Tensor:
-        turned = rotation(state[:, ATTITUDE])
+    def own_inputs(self, state: Tensor, goal: Tensor, axes: Tensor) -> Tensor:
         aim = self.aim(state, goal).unflatten(1, (-1, 3))
-        moving = torch.cat((state[:, None, VELOCITY], aim), 1) @ turned
-        return torch.cat((moving.flatten(1), turned[:, 2], state[:, RATES]), 1)
+        moving = torch.cat((state[:, None, VELOCITY], aim), 1) @ axes
+        return torch.cat((moving.flatten(1), axes[:, 2], state[:, RATES]), 1)
 
-    def disturbance(self, history: History) -> Tensor:
-        turned = rotation(history.observations[:, -1, : self.n_state][:, ATTITUDE])
-        linear, angular, linear_rate, angular_rate = super().disturbance(history).unflatten(1, (4, 3)).unbind(1)
-        linear, linear_rate = (matvec(turned.mT, each) for each in (linear, linear_rate))
+    def disturbance_inputs(self, disturbance: Tensor, axes: Tensor) -> Tensor:
+        linear, angular, linear_rate, angular_rate = disturbance.unflatten(1, (4, 3)).unbind(1)
+        linear, linear_rate = (matvec(axes.mT, each) for each in (linear, linear_rate))
         return torch.cat((linear, angular, linear_rate, angular_rate), 1)
 
     def aim(self, state: Tensor, goal: Tensor) -> Tensor:
@@ -128,9 +133,9 @@ class ReachPolicy(FlightPolicy):
     def __init__(self) -> None:
         super().__init__(3, 25)
 
-    def own_inputs(self, state: Tensor, goal: Tensor) -> Tensor:
-        velocity, turned = state[:, VELOCITY], rotation(state[:, ATTITUDE])
-        moving = (velocity, matvec(turned.mT, velocity), turned[:, :, :2].flatten(1), state[:, RATES])
+    def own_inputs(self, state: Tensor, goal: Tensor, axes: Tensor) -> Tensor:
+        velocity = state[:, VELOCITY]
+        moving = (velocity, matvec(axes.mT, velocity), axes[:, :, :2].flatten(1), state[:, RATES])
         return torch.cat((*moving, self.aim(state, goal)), 1)
 
     def aim(self, state: Tensor, goal: Tensor) -> Tensor:
