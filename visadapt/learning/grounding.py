@@ -25,11 +25,13 @@ from visadapt.world import World
 
 @dataclass(frozen=True)
 class GroundSettings:
-    """How a residual is fitted. A linear head uses `ridge`, `negligible` and, for the losses it reports, `held_out`."""
+    """How a residual is fitted. A linear head uses `ridge`, `larger`, `negligible` and, for its losses, `held_out`."""
 
     ridge: float = 1.0
     """weight of the squared coefficients of a linear head (times the network's `penalties`), where a sample's squared
-    error has weight 1. With 0.1 and 50 samples of a force that changes, a cart-pole with the residual is unstable"""
+    error has weight 1"""
+    larger: tuple[float, ...] = ()
+    """values of `ridge` to try in turn where the world with the residual is unstable (`learning.stability`)"""
     negligible: float = 0.0
     """least scale of the residual, as a share of the root mean square change of a state in a period"""
     steps: int = 2000  # optimisation steps at most
@@ -128,6 +130,12 @@ def ground(
         penalty = settings.ridge * network.penalties(seen)
         return _solve(network.head, seen, target, train, held_out, penalty)
     return _descend(network.head, seen, target, train, held_out, settings, generator, progress)
+
+
+def attempts(residual: Residual, settings: GroundSettings) -> list[GroundSettings]:
+    """The settings to fit with in turn until the world is stable: with each larger ridge, where the head is linear."""
+    linear = isinstance(getattr(residual.network, "head", None), nn.Linear)
+    return [settings, *(replace(settings, ridge=ridge) for ridge in settings.larger if linear)]
 
 
 @torch.no_grad()

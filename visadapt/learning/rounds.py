@@ -16,10 +16,11 @@ from torch import Tensor
 
 from visadapt.effects import Residual
 from visadapt.learning.explanation import NOT_DIAGNOSED, Explain, Explanation
-from visadapt.learning.grounding import GroundLoss, fit_named, ground, rescale
+from visadapt.learning.grounding import GroundLoss, attempts, fit_named, ground, rescale
 from visadapt.learning.ledger import Ledger
 from visadapt.learning.policy import initialise_feedforward, tune
 from visadapt.learning.setup_settings import SetupSettings
+from visadapt.learning.stability import stable
 from visadapt.learning.transitions import Observe, Transitions
 from visadapt.policies import Policy
 from visadapt.progress import Progress, Report, staged
@@ -118,6 +119,11 @@ class JointLearning:
         return self.source.with_effects([*self.source.effects, *self.found.effects])
 
     @property
+    def _learnt(self) -> World:
+        """The known world with the residual."""
+        return self.known.with_effects([*self.known.effects, self.residual])
+
+    @property
     def episodes(self) -> list[Episode]:
         """The episodes of the target, with states as far as grounding needed them."""
         return [*self.labelled, *self.waiting]
@@ -159,15 +165,13 @@ class JointLearning:
     def _ground(self, folder: RoundFolder) -> tuple[list[GroundLoss], Transitions]:
         """Fit the named effects and the residual to all samples; the residual's losses, and the transitions with the
         states and times that `fit_named` gives them."""
-        transitions, known = self._transitions(), self.known
-        world = known.with_effects([*known.effects, self.residual])
+        transitions, known, world = self._transitions(), self.known, self._learnt
         if not folder.residual.exists():
             true = fit_named(known, transitions)
             placed = true.to(self.residual.scale)
             if not self.grounded:
                 rescale(self.residual, known, placed, self.settings.ground.negligible)
-            progress = self._progress(folder, "ground")
-            losses = ground(self.residual, known, placed, self.settings.ground, folder.generator(1), progress)
+            losses = self._fit_until_stable(folder, placed)
             changed = {} if true is transitions else {"states": true.states, "times": true.times}
             save_tree(folder.residual, {"weights": world.state_dict(), "losses": losses, "windows": changed})
         tree = load_tree(folder.residual)
@@ -176,16 +180,31 @@ class JointLearning:
             transitions = replace(transitions, **tree["windows"])
             return [GroundLoss(*each) for each in tree["losses"]], transitions
 
-    def _tune_with_residual(self, folder: RoundFolder, transitions: Transitions) -> list[float]:
-        """Tune the policy in the source with the named effects and the residual; the loss of every iteration."""
+    def _fit_until_stable(self, folder: RoundFolder, transitions: Transitions) -> list[GroundLoss]:
+        """Fit the residual, again with the next larger ridge where the policy is unstable in the world with it."""
+        known, world = self.known, self._learnt
+        self._begin_tuning()
+        left = attempts(self.residual, self.settings.ground)
+        while True:
+            about = left.pop(0), folder.generator(1), self._progress(folder, "ground")
+            losses = ground(self.residual, known, transitions, *about)
+            imagined = self.settings.tuning, folder.generator(3), transitions
+            if not left or stable(self.policy, world, self.observe, *imagined):
+                return losses
+
+    def _begin_tuning(self) -> None:
+        """Give the policy the weights that tuning with the residual begins with."""
         if not self.grounded and self.settings.feedforward:
             initialise_feedforward(self.policy, self.source, self.residual.scale)
             self.first["feedforward.weight"] = self.policy.feedforward.weight.detach().clone()
-        self.grounded = True
         if not self.settings.tunes_on:
             self._start_anew()
-        known = self.known
-        world = known.with_effects([*known.effects, self.residual])
+
+    def _tune_with_residual(self, folder: RoundFolder, transitions: Transitions) -> list[float]:
+        """Tune the policy in the source with the named effects and the residual; the loss of every iteration."""
+        self._begin_tuning()
+        self.grounded = True
+        world = self._learnt
 
         def tuned(partial: Path) -> list[float]:
             about = self.settings.tuning, folder.generator(2), transitions, self._progress(folder, "tune"), partial
