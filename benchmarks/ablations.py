@@ -22,12 +22,14 @@ from experiments.cartpole_targets import TARGETS, Shown, experiment, source, tar
 from experiments.kept_scores import kept_score
 from experiments.parallel import in_processes
 from experiments.result_tables import print_speed, speed_row, write_rows
+from renderers import load_renderer
 from visadapt.effects import Residual
 from visadapt.evaluation import CartPoleScore
 from visadapt.history import History
 from visadapt.policies import ImagePolicy, Policy, StatePolicy
-from visadapt.policies.networks import ResidualNetwork, mlp
+from visadapt.policies.networks import ImageResidualNetwork, ResidualNetwork, StateResidualNetwork, mlp
 from visadapt.setups.base import Setup
+from visadapt.setups.policy_file import residual_for
 from visadapt.storage.run_folder import open_run
 from visadapt.world import World
 
@@ -100,6 +102,31 @@ def with_an_mlp(setup: Setup, policy: Policy) -> Setup:
     return replace(setup, residual=residual)
 
 
+def without_history(setup: Setup, policy: Policy) -> Setup:
+    """The residual reads the last state and action alone; the policy still reads 5 of each."""
+    return replace(setup, residual=residual_for)
+
+
+def without_unexplained_accelerations(setup: Setup, policy: Policy) -> Setup:
+    """The residual reads the observed motion and the commands, but not the accelerations that the source leaves."""
+
+    def residual(policy: Policy, source: World) -> Residual:
+        made = setup.residual(policy, source)
+        network = made.network
+        assert isinstance(network, (ImageResidualNetwork, StateResidualNetwork))
+        all_of_them = network.unexplained
+        network.unexplained = lambda *given: torch.zeros_like(all_of_them(*given))  # type: ignore[method-assign]
+        return made
+
+    return replace(setup, residual=residual)
+
+
+def with_an_mlp_renderer(setup: Setup, policy: Policy) -> Setup:
+    """Streams are seen through the paper's renderer, four layers of neurons; the tracker keeps ours."""
+    renderer = load_renderer(Path("assets/renderer_mlp.safetensors")).requires_grad_(False)
+    return replace(setup, observe=lambda states: renderer(states[:, 0], states[:, 2]))
+
+
 def _with(**changed: object) -> Variant:
     return lambda setup, policy: replace(setup, settings=replace(setup.settings, **changed))  # type: ignore[arg-type]
 
@@ -113,7 +140,10 @@ VARIANTS: dict[str, Variant] = {
     "gradient past the renderer": past_the_renderer,
     "gradient past the residual": past_the_residual,
     "correction held over a plan": held_over_a_plan,
+    "no history": without_history,
+    "no unexplained accelerations": without_unexplained_accelerations,
     "MLP residual": with_an_mlp,
+    "MLP renderer": with_an_mlp_renderer,
 }
 
 
@@ -128,7 +158,7 @@ class Settings:
     targets: tuple[str, ...] = tuple(TARGETS)
     """which of TARGETS"""
     variants: tuple[str, ...] = tuple(VARIANTS)
-    """which of VARIANTS; from states there is no renderer"""
+    """which of VARIANTS; from states there is no renderer, from frames always a history"""
     jobs: int = 2
     """adaptations at once, one core each"""
     work: Path = Path("runs/ablations")
