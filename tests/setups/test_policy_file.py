@@ -36,6 +36,20 @@ def test_a_flights_residual_comes_back_with_the_history_that_it_reads(tmp_path, 
     assert torch.equal(read.act(history), policy.act(history))
 
 
+@pytest.mark.parametrize("kind", ["cartpole_frames", "quadrotor"])
+def test_a_policy_in_double_precision_comes_back_in_it(tmp_path, kind):
+    policy, path = va.load_policy(va.shipped(kind)).double(), tmp_path / "policy.safetensors"
+    world = va.load_source(va.shipped(kind))
+    policy.residual, policy.grounded_in = stir(residual_for(policy, world)).double(), describe(world)
+    save_policy(path, policy)
+    read = load_policy(path)
+    assert {each.dtype for each in read.state_dict().values() if each.is_floating_point()} == {torch.float64}
+    history = History(
+        torch.rand(2, LENGTH, *policy.observation_shape).double(), torch.zeros(2, LENGTH, policy.n_action).double()
+    )
+    assert torch.equal(read.act(history), policy.act(history))
+
+
 class OwnPolicy(StatePolicy):
     pass
 

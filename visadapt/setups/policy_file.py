@@ -68,7 +68,7 @@ def load_policy(path: str | Path) -> Policy:
         made, weights = tree["settings"], tree["weights"]
         kind, arguments = KINDS[tree["class"]], made["arguments"]
         with torch.device("meta"):  # without memory: a damaged file may ask for more than there is
-            sizes = kind(**arguments).state_dict()
+            sizes = kind(**arguments).to(_dtype(weights)).state_dict()
         check_sizes(sizes, {key: value for key, value in weights.items() if not key.startswith("residual.")}, path)
         policy = kind(**arguments)
         residual: Callable[[Policy, World], Residual]
@@ -95,11 +95,17 @@ def load_into(path: Path, policy: Policy, residual: Callable[[Policy, World], Re
 def _restored(
     policy: Policy, tree: Mapping[str, Any], path: Path, residual: Callable[[Policy, World], Residual]
 ) -> Policy:
+    policy.to(_dtype(tree["weights"]))
     if (grounded_in := tree["settings"].get("grounded_in")) is not None:
         policy.grounded_in = grounded_in
         policy.residual = residual(policy, _world(grounded_in, path)).to(next(policy.parameters()))
     load_weights(policy, tree["weights"], path)
     return policy.eval()
+
+
+def _dtype(weights: Mapping[str, Tensor]) -> torch.dtype:
+    """That of the first of the weights, which a policy has in common."""
+    return next((weight.dtype for weight in weights.values() if weight.is_floating_point()), torch.float32)
 
 
 def _residual_of_width(head: Tensor | None, policy: Policy, source: World) -> Residual:
