@@ -29,7 +29,6 @@ from visadapt.history import History
 from visadapt.policies import ImagePolicy, Policy, StatePolicy
 from visadapt.policies.networks import ImageResidualNetwork, ResidualNetwork, StateResidualNetwork, mlp
 from visadapt.setups.base import Setup
-from visadapt.setups.policy_file import residual_for
 from visadapt.storage.run_folder import open_run
 from visadapt.world import World
 
@@ -103,8 +102,12 @@ def with_an_mlp(setup: Setup, policy: Policy) -> Setup:
 
 
 def without_history(setup: Setup, policy: Policy) -> Setup:
-    """The residual reads the last state and action alone; the policy still reads 5 of each."""
-    return replace(setup, residual=residual_for)
+    """The paper's residual of one state and action, without a history; the policy still reads 5 of each."""
+
+    def residual(policy: Policy, source: World) -> Residual:
+        return Residual(StateResidualNetwork(policy.n_state, policy.n_action), torch.ones(policy.n_state))
+
+    return replace(setup, residual=residual)
 
 
 def without_unexplained_accelerations(setup: Setup, policy: Policy) -> Setup:
