@@ -48,7 +48,7 @@ def streams(task, world, batch, longest=1000, seed=0):
 class TestFollowCost:
     """On straight references, on which rates are zero."""
 
-    task = Follow(straight(rows=ROWS), FollowCost(position=2.0, velocity=3.0, rates=5.0, action=7.0))
+    task = Follow(straight(rows=ROWS), FollowCost(position=2.0, velocity=3.0, turning=5.0, action=7.0))
     task_state = torch.tensor([[0, 4], [1, 11]])
 
     def on_it(self):
@@ -75,6 +75,17 @@ class TestFollowCost:
         states[1, :, part] += torch.tensor([0.0, 0.2, 0.0])
         wanted = weight * torch.tensor([0.25 + 1.0, HORIZON * 0.04])
         torch.testing.assert_close(self.cost(states), wanted, rtol=1e-4, atol=1e-6)
+
+    def test_on_a_curved_reference_what_it_turns_by_costs_nothing_and_what_is_missing_of_it_counts(self):
+        task = following(plan_cost=self.task.plan_cost)
+        which, rows = torch.tensor([[0], [4]]), torch.tensor([[3], [7]]) + torch.arange(HORIZON + 1)
+        states, plan = task.on(which.expand_as(rows), rows), torch.zeros(2, HORIZON, 4)
+        about = states[:, 0], torch.cat((which, rows[:, :1]), 1)
+        torch.testing.assert_close(task.cost(states[:, 1:], plan, *about), torch.zeros(2), rtol=0, atol=1e-7)
+        rates = states[:, 1:, RATES].clone()
+        assert (rates.abs().amax((1, 2)) > 0.05).all()
+        states[:, :, RATES] = 0.0
+        torch.testing.assert_close(task.cost(states[:, 1:], plan, *about), 5.0 * rates.square().sum((1, 2)))
 
     def test_attitude_is_free(self):
         _, states = self.on_it()

@@ -52,9 +52,9 @@ def quadrotor(
         source=source or World(Quadrotor(), period=train.period, substeps=2),
         policy=lambda: FollowPolicy(train.period),
         residual=partial(residual_for, with_history=with_history),
-        # First to come back from far off, then to keep to the reference.
+        # First to keep to the reference, then to come back from far off.
         settings=_settings(
-            _learn(far_off(), 4000, 256, 4e-3), tuning, refinement=_learn(task, 1000, 256, 1e-3, curriculum=False)
+            _learn(task, 4000, 256, 4e-3), tuning, refinement=_learn(far_off(), 2000, 256, 1e-3, curriculum=False)
         ),
         test=task if test is None else Follow(test),
     )

@@ -8,34 +8,46 @@ import torch
 from torch import Tensor
 
 from visadapt.history import HORIZON
-from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
+from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY, matvec, rotation
 from visadapt.tasks.base import FlightTask, curriculum
 from visadapt.tasks.differential_flatness import demanded
 from visadapt.tasks.references import Reference
 
 
+def turning(states: Tensor) -> Tensor:
+    """The angular velocity (B, K, 3) in world axes, rad/s, of states (B, K, 13)."""
+    turned = rotation(states[..., ATTITUDE].flatten(0, 1)).unflatten(0, states.shape[:2])
+    return matvec(turned, states[..., RATES])
+
+
 @dataclass(frozen=True)
 class FollowCost:
-    """Weights of squared distances from the reference and of effort, A.1.1 of the paper.
+    """Weights of squared distances from the reference and of effort, after A.1.1 of the paper.
 
-    C = sum_k position |x - x_nu|^2 + velocity |v - v_nu|^2 + rates |omega|^2 + action |a|^2
+    C = sum_k position |x - x_nu|^2 + velocity |v - v_nu|^2 + turning |omega - omega_nu|^2 + action |a|^2
 
-    The paper holds thrust and rates near the middle of their range with weights of 5 and 0.1 on commands in [0, 1];
-    what pulls the thrust towards hovering also pulls the vehicle off its reference, so `action` is small.
+    omega is the angular velocity in world axes, rad/s. The paper weighs omega itself, by 0.1, and holds thrust and rates
+    near the middle of their range, by 5 and 0.1 on commands in [0, 1]. What pulls the thrust towards hovering, or omega
+    towards zero, also pulls the vehicle off its reference. With little weight on either, a policy that never meets a
+    lag may answer small errors with nearly all of its body rates, and swings up where the motors lag; with the weight on
+    the difference it keeps to both.
     """
 
     position: float = 10.0
     velocity: float = 1.0
-    rates: float = 0.1
+    turning: float = 1.0
     action: float = 0.01
 
     def __call__(self, states: Tensor, plan: Tensor, reference: Tensor) -> Tensor:
-        """Cost (B,) of states (B, K, 13) and actions (B, K, n_action); `reference` (B, K, 6): positions, velocities."""
-        away = states[..., : VELOCITY.stop] - reference
+        """Cost (B,) of states (B, K, 13) and actions (B, K, n_action).
+
+        `reference` (B, K, 9): positions, velocities and angular velocities in world axes.
+        """
+        away = torch.cat((states[..., : VELOCITY.stop], turning(states)), -1) - reference
         return (
             self.position * away[..., POSITION].square().sum((1, 2))
             + self.velocity * away[..., VELOCITY].square().sum((1, 2))
-            + self.rates * states[..., RATES].square().sum((1, 2))
+            + self.turning * away[..., VELOCITY.stop :].square().sum((1, 2))
             + self.action * plan.square().sum((1, 2))
         )
 
@@ -56,7 +68,7 @@ class RecoverCost(FollowCost):
     floor: float = 0.01  # keeps the root differentiable at zero; about the cost of a plan with 1 cm of error all along
 
     def __call__(self, states: Tensor, plan: Tensor, reference: Tensor) -> Tensor:
-        away = (states[..., : VELOCITY.stop] - reference)[:, -1]
+        away = states[:, -1, : VELOCITY.stop] - reference[:, -1, : VELOCITY.stop]
         later = away[:, POSITION] + self.beyond * away[:, VELOCITY]
         return (super().__call__(states, plan, reference) + self.final * later.square().sum(1) + self.floor).sqrt()
 
@@ -103,7 +115,7 @@ class Follow(FlightTask):
         return state, torch.stack((which, row), 1)
 
     def cost(self, states: Tensor, plan: Tensor, now: Tensor, task_state: Tensor) -> Tensor:
-        return self.plan_cost(states, plan, self.ahead(task_state))
+        return self.plan_cost(states, plan, torch.cat((self.ahead(task_state), self._turning_ahead(task_state)), -1))
 
     def diverged(self, state: Tensor, task_state: Tensor, progress: float) -> Tensor:
         limit = self.divergence * curriculum(self.first_divergence, progress)
@@ -133,12 +145,23 @@ class Follow(FlightTask):
 
     def ahead(self, task_state: Tensor) -> Tensor:
         """Positions and velocities (B, HORIZON, 6) of the next rows; at its end a reference goes straight on."""
-        which = task_state[:, :1]
-        rows = task_state[:, 1:] + torch.arange(1, HORIZON + 1).to(task_state)
+        which, rows = self._rows_ahead(task_state)
         beyond = (rows - self.steps).clamp(min=0)[..., None] * self.period
         rows = rows.clamp(max=self.steps)
         velocity = self.references.velocities[which, rows]
         return torch.cat((self.references.positions[which, rows] + beyond * velocity, velocity), -1)
+
+    def _turning_ahead(self, task_state: Tensor) -> Tensor:
+        """Angular velocities (B, HORIZON, 3), in world axes, of the next rows; zero beyond the end of a reference."""
+        which, rows = self._rows_ahead(task_state)
+        here, end = rows.clamp(max=self.steps), rows[..., None] > self.steps
+        asked = demanded(self.references.accelerations[which, here], self.references.jerks[which, here])
+        turned = rotation(asked.attitude.flatten(0, 1)).unflatten(0, rows.shape)
+        return matvec(turned, asked.rates).masked_fill(end, 0.0)
+
+    def _rows_ahead(self, task_state: Tensor) -> tuple[Tensor, Tensor]:
+        """References (B, 1) and the next rows (B, HORIZON) of each, of which some may be beyond its end."""
+        return task_state[:, :1], task_state[:, 1:] + torch.arange(1, HORIZON + 1).to(task_state)
 
     def augment(
         self, observed: Tensor, state: Tensor, task_state: Tensor, generator: torch.Generator
