@@ -26,11 +26,11 @@ class FollowCost:
 
     C = sum_k position |x - x_nu|^2 + velocity |v - v_nu|^2 + turning |omega - omega_nu|^2 + action |a|^2
 
-    omega is the angular velocity in world axes, rad/s. The paper weighs omega itself, by 0.1, and holds thrust and rates
-    near the middle of their range, by 5 and 0.1 on commands in [0, 1]. What pulls the thrust towards hovering, or omega
-    towards zero, also pulls the vehicle off its reference. With little weight on either, a policy that never meets a
-    lag may answer small errors with nearly all of its body rates, and swings up where the motors lag; with the weight on
-    the difference it keeps to both.
+    omega is the angular velocity in world axes, rad/s. The paper weighs omega itself, by 0.1, and holds thrust and
+    rates near the middle of their range, by 5 and 0.1 on commands in [0, 1]. What pulls the thrust towards hovering, or
+    omega towards zero, also pulls the vehicle off its reference. With little weight on either, a policy that never
+    meets a lag may answer small errors with nearly all of its body rates, and swings up where the motors lag; with the
+    weight on the difference it keeps to both.
     """
 
     position: float = 10.0
