@@ -68,7 +68,7 @@ def test_thrown_far_off_its_reference_the_quadrotor_comes_back(whole):
 
 def test_where_motors_lag_and_the_rate_loop_is_slow_the_quadrotor_still_flies(whole):
     """One that answers small errors strongly swings up: on rotorpy's Crazyflie without air it then lost 4 of 5."""
-    slow = quadrotor(*whole, World(SOURCE, period=whole[0].period, substeps=2))
+    slow = quadrotor(whole[0], whole[1], World(SOURCE, period=whole[0].period, substeps=2))
     lagging = flight_target(slow, lambda batch, generator: (MotorLag(time_constant=0.05),))
     found = score(slow.load(shipped("quadrotor")), lagging, 20, 0)
     assert found.failed == 0
