@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -50,6 +50,8 @@ class CameraEffect(Effect):
     """
 
     stage = Stage.CAMERA
+    in_one_frame: ClassVar[bool] = True
+    """whether a single frame shows it, so that a diagnosis looks for it in pixels; False: only motion does"""
 
     def memory(self, state: Tensor, period: float) -> Tensor:
         """The effect's memory (B, any, any) before the first frame of an episode that begins in `state`."""
@@ -245,6 +247,7 @@ class FrameDrop(Lossy, CameraEffect):
     systems = (CartPole,)
     equation = "frame_k = frame_(k-1) with probability rate"
     no_gradient = "whether a frame is lost is a random yes or no"
+    in_one_frame = False
 
     def apply_to(self, frame: Tensor, memory: Tensor, generator: torch.Generator | None) -> Reading:
         lost = self.lost(frame, generator)

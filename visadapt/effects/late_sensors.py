@@ -84,6 +84,7 @@ class CameraDelay(Late, CameraEffect):
     name = "camera_delay"
     systems = (CartPole,)
     equation = "frame(t) = picture of state(max(t - delay, 0))"
+    in_one_frame = False
     table = (Parameter("delay", "s", 0.0, 0.2, 0.0),)
     indistinguishable_from = ("actuator_delay", "measurement_delay")
     late: ClassVar[list[int]] = list(range(len(CartPole.states)))

@@ -13,14 +13,14 @@ from torch import Tensor, nn
 
 from visadapt.diagnosis.result import Cause, Estimate
 from visadapt.diagnosis.search.causes import Z_90
-from visadapt.effects import Blur, Brightness, CameraEffect, CameraRotation, CameraShift, CameraZoom, Gamma, Occlusion
+from visadapt.effects import EFFECTS, Blur, Brightness, CameraEffect, CameraShift, Gamma, Occlusion
 from visadapt.effects.camera import moved
 from visadapt.estimation.camera_fit import Camera, CameraFit, fit_camera, made, through
 from visadapt.estimation.poses import PoseFinder
 from visadapt.estimation.structure import MAX_FRAME_RATIO, evenly_spaced, white_noise
 from visadapt.progress import Progress
 
-SEARCHED: Camera = (CameraRotation, CameraZoom, CameraShift, Occlusion, Blur, Gamma, Brightness)
+SEARCHED: Camera = tuple(kind for kind in EFFECTS.values() if issubclass(kind, CameraEffect) and kind.in_one_frame)
 
 FRAMES, FRAMES_AT_FIRST = 16, 6
 """Frames, spread over the recording, to which a camera is fitted, and for which its first values are looked for."""
