@@ -12,7 +12,7 @@ from visadapt.recordings import RecordingError
 from visadapt.systems import Quadrotor
 from visadapt.systems.rigid_body import rotation
 from visadapt.tasks.differential_flatness import commands, demanded
-from visadapt.tasks.references import LOOP_RADIUS, Reference, cubic, power_loop, read_reference, smallest_loop
+from visadapt.tasks.references import LOOP_RADIUS, cubic, power_loop, read_reference, smallest_loop
 from visadapt.world import World
 
 SMALL = Settings(train=60, test=20)
@@ -56,9 +56,7 @@ def test_what_a_reference_asks_for_flies_it_in_the_simulator(fine):
 
 @pytest.mark.parametrize("speed", [2.6, 5.0])
 def test_what_a_power_loop_asks_for_flies_it_in_the_simulator(speed):
-    loop = power_loop(speed, period=0.005)
-    loop = Reference.of(torch.stack([loop.positions, loop.velocities, loop.accelerations, loop.jerks])[:, None], 0.005)
-    assert fly_blind(loop).max() < 0.02
+    assert fly_blind(power_loop(speed, period=0.005).as_many()).max() < 0.02
 
 
 def test_the_demand_of_a_motion_is_the_thrust_that_makes_it_with_yaw_zero():
@@ -122,8 +120,7 @@ def test_the_references_use_what_is_allowed(drawn):
 
 
 def test_derivatives_are_those_of_the_positions(fine):
-    rows = [fine.positions, fine.velocities, fine.accelerations, fine.jerks]
-    for value, slope in pairwise(rows):
+    for value, slope in pairwise(fine.motion):
         seen = torch.gradient(value.double(), spacing=fine.period, dim=1)[0]
         # float32 rounds metres to 1e-6, over 4 ms.
         torch.testing.assert_close(seen[:, 1:-1], slope[:, 1:-1].double(), rtol=1e-3, atol=5e-3)

@@ -50,15 +50,18 @@ class Reference:
         positions, velocities, accelerations, jerks = motion
         return cls(positions, velocities, accelerations, jerks, period)
 
+    @property
+    def motion(self) -> Tensor:
+        """Positions, velocities, accelerations and jerks, one after the other, as `of` takes them: (4, ..., T, 3)."""
+        return torch.stack((self.positions, self.velocities, self.accelerations, self.jerks))
+
     def to(self, like: Tensor) -> Self:
         """The same with the device and dtype of `like`."""
-        motion = torch.stack((self.positions, self.velocities, self.accelerations, self.jerks))
-        return type(self).of(motion.to(like), self.period)
+        return type(self).of(self.motion.to(like), self.period)
 
     def as_many(self) -> Self:
         """With a leading axis that numbers references, (1, T, 3), where this is a single one; else itself."""
-        motion = torch.stack((self.positions, self.velocities, self.accelerations, self.jerks))
-        return self if motion.dim() > 3 else type(self).of(motion[:, None], self.period)
+        return self if self.positions.dim() > 2 else type(self).of(self.motion[:, None], self.period)
 
 
 def power_loop(speed: float, radius: float = LOOP_RADIUS, period: float = 0.1) -> Reference:
