@@ -182,7 +182,7 @@ def test_a_wing_that_flies_at_its_point_or_stands_in_it_sees_finite_numbers():
     state[:, 6] = 1.0
     state[0, 3] = 12.0
     goal = torch.tensor([[25.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    aim = ReachPolicy().aim(state, goal)
+    aim = ReachPolicy().aim(state, goal, rotation(state[:, 6:10]))
     torch.testing.assert_close(aim[0], torch.tensor([0.5, 1.0, *[0.0] * 8]))
     assert aim[1].isfinite().all()
 

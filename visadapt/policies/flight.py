@@ -136,15 +136,16 @@ class ReachPolicy(FlightPolicy):
     def own_inputs(self, state: Tensor, goal: Tensor, axes: Tensor) -> Tensor:
         velocity = state[:, VELOCITY]
         moving = (velocity, matvec(axes.mT, velocity), axes[:, :, :2].flatten(1), state[:, RATES])
-        return torch.cat((*moving, self.aim(state, goal)), 1)
+        return torch.cat((*moving, self.aim(state, goal, axes)), 1)
 
-    def aim(self, state: Tensor, goal: Tensor) -> Tensor:
+    def aim(self, state: Tensor, goal: Tensor, axes: Tensor) -> Tensor:
         """(B, 10): distance / 50 m, direction to the point in body axes, heading error, and that error / distance.
 
-        The heading error is 10 times the direction to the point minus that of the velocity, in world axes.
+        The heading error is 10 times the direction to the point minus that of the velocity, in world axes; `axes`
+        (B, 3, 3) are the body's, the rotation matrix of the attitude.
         """
         to, velocity = goal - state[:, POSITION], state[:, VELOCITY]
         distance = to.norm(dim=1, keepdim=True).clamp_min(1.0)
         way, path = to / distance, velocity / velocity.norm(dim=1, keepdim=True).clamp_min(1.0)
         aside = 10 * (way - path)
-        return torch.cat((distance / 50, matvec(rotation(state[:, ATTITUDE]).mT, way), aside, aside / distance), 1)
+        return torch.cat((distance / 50, matvec(axes.mT, way), aside, aside / distance), 1)
