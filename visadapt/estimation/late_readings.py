@@ -62,13 +62,19 @@ def _later(world: World, state: Tensor, following: Following, ahead: Tensor) -> 
 def rows_later(rows: Segments, delays: Delays, columns: Sequence[int]) -> list[int]:
     """By how many rows the readings of these states come after the row whose state they show: the least after which,
     everywhere in the episodes, more time than the delay has passed."""
-    out = dict.fromkeys(columns, 0)
-    for column in delays.keys() & out.keys():
-        clock, count = _clock(rows), 1 + int(delays[column] / rows.period)
-        while count < clock.shape[1] - 1 and float((clock[:, count:] - clock[:, :-count]).min()) <= delays[column]:
-            count += 1
-        out[column] = count
-    return list(out.values())
+    if not delays:
+        return [0] * len(columns)
+    clock = _clock(rows)
+    return [_rows_in(delays[column], clock, rows.period) if column in delays else 0 for column in columns]
+
+
+def _rows_in(delay: float, clock: Tensor, period: float) -> int:
+    """The least number of rows, at least one, after which everywhere on the `clock` (E, L + 1) more than `delay` s have
+    passed."""
+    count = 1 + int(delay / period)
+    while count < clock.shape[1] - 1 and float((clock[:, count:] - clock[:, :-count]).min()) <= delay:
+        count += 1
+    return count
 
 
 def following(rows: Segments, delays: Delays, acting: Tensor, states: int, chosen: slice) -> Following:
@@ -82,7 +88,7 @@ def following(rows: Segments, delays: Delays, acting: Tensor, states: int, chose
     read = torch.zeros(*index.shape, states, dtype=torch.float64)
     farthest = read[..., 0]
     for column, delay in delays.items():
-        read[..., column] = passed(*rows_later(rows, delays, [column]))
+        read[..., column] = passed(_rows_in(delay, clock, rows.period))
         farthest = torch.maximum(farthest, read[..., column] - delay)
     count = 1
     while count < clock.shape[1] and bool((passed(count) < farthest - ROUNDING_ERROR).any()):
