@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
-from functools import cached_property
 from itertools import combinations
 
 from visadapt.diagnosis.search.fitted_models import FittedModels, ScoredModel, key_of, less
@@ -50,17 +50,16 @@ POLISH_MODELS = 8
 fewer parameters, since a quick fit of the right set may keep too much process noise; and the most of them."""
 
 
+Exchanges = set[tuple[frozenset[str], frozenset[str]]]
+"""Sets of which effects were exchanged so far, by the names of their effects, each with those that were kept."""
+
+
 class Search(FittedModels):
     """How sets grow from the source, and which sets near the best are tried."""
 
-    @cached_property
-    def _exchanged(self) -> set[tuple[frozenset[str], frozenset[str]]]:
-        """Sets of which effects were exchanged so far, and what was kept of them."""
-        return set()
-
     def run(self, progress: Progress | None = None) -> None:
         """Grow sets while that raises the posterior odds, then try sets near the best."""
-        beam = [self.source]
+        beam, exchanged = [self.source], Exchanges()
         for size in range(MAX_EFFECTS):
             if progress is not None:
                 progress(size, MAX_EFFECTS, -self.best.log_odds)
@@ -71,14 +70,14 @@ class Search(FittedModels):
             beam = sorted(children, key=lambda f: -f.log_odds)[: self.profile.beam_width]
             if beam[0].log_odds < before.log_odds:
                 break
-        self._settle()
-        if self._improve_while_unexplained() > WIDEN_ABOVE:
+        self._settle(exchanged)
+        if self._improve_while_unexplained(exchanged) > WIDEN_ABOVE:
             # Perhaps by two effects that only together beat single effects which fit fairly.
             for size in (1, 2):
                 bases = [f for f in self.ranked if len(f.effects) == size and f.log_odds > -math.inf]
                 self.extend(bases[:WIDEN_MODELS])
             self._with_late_sensors()
-            self._settle()
+            self._settle(exchanged)
             self._phases_of_episodes()
         if progress is not None:
             progress(MAX_EFFECTS, MAX_EFFECTS, -self.best.log_odds)
@@ -100,7 +99,7 @@ class Search(FittedModels):
         """Fit the first few sets, which promise most, then the others, which stop early where they fall far behind."""
         return self.fit(starts[:LEADERS], QUICK) + self.fit(starts[LEADERS:], QUICK)
 
-    def _improve_while_unexplained(self) -> float:
+    def _improve_while_unexplained(self, exchanged: Exchanges) -> float:
         """Refit the best set without process noise, prune and settle, until it stays the best; return the log
         likelihood that process noise then adds to it."""
         before, left = None, 0.0
@@ -109,7 +108,7 @@ class Search(FittedModels):
             (left,) = self.refit_without_process_noise([before])
             if self.best is not before:
                 self._prune()
-                self._settle()
+                self._settle(exchanged)
         return left
 
     def _prune(self) -> None:
@@ -137,11 +136,12 @@ class Search(FittedModels):
         ]
         self.fit([(each.effects, each.fits) for each in self.fit(starts, QUICK, process_noise=False)], QUICK)
 
-    def _settle(self) -> None:
-        """Exchange, remove and fit carefully until the best set stays the best."""
+    def _settle(self, exchanged: Exchanges) -> None:
+        """Exchange, remove and fit carefully until the best set stays the best; no exchange is made again, and those
+        that are made are added to `exchanged`."""
         for _ in range(3):
             before = self.best
-            self._fit_neighbours(before)
+            self._fit_neighbours(before, exchanged)
             self._polish()
             if self.best.names == before.names:
                 return
@@ -151,20 +151,15 @@ class Search(FittedModels):
         catalogue = tuple(with_episode_phases(effect, len(self.rows.command)) for effect in self.catalogue)
         if catalogue == self.catalogue or self.refit_without_process_noise([self.best])[0] <= WIDEN_ABOVE:
             return
-        rival, fitted, in_step = self.best, self.fitted, self.catalogue
         periodic = {effect.name for effect in catalogue if has_episode_phases(effect)}
-        self._use({names: each for names, each in fitted.items() if not names & periodic}, catalogue)
-        self.extend(list({each.names: each for each in (self.source, self.best)}.values()))
-        if any(has_episode_phases(effect) for effect in self.best.effects):
-            self._settle()
-        if self.best.log_odds <= rival.log_odds:
-            self._use(fitted, in_step)
-
-    def _use(self, fitted: dict[frozenset[str], ScoredModel], catalogue: Effects) -> None:
-        """Go on with these fitted sets and this catalogue."""
-        self.fitted, self.catalogue = fitted, catalogue
-        self._screened.clear()
-        self._exchanged.clear()
+        other = copy(self)
+        other.catalogue, other._screened = catalogue, {}
+        other.fitted = {names: each for names, each in self.fitted.items() if not names & periodic}
+        other.extend(list({each.names: each for each in (other.source, other.best)}.values()))
+        if any(has_episode_phases(effect) for effect in other.best.effects):
+            other._settle(Exchanges())
+        if other.best.log_odds > self.best.log_odds:
+            self.fitted, self.catalogue, self._screened = other.fitted, other.catalogue, other._screened
 
     def extend(self, bases: Sequence[ScoredModel], most: int = MAX_CANDIDATES) -> list[ScoredModel]:
         """Every base with one more effect, fitted unless it was, for the `most` best candidates of its screening."""
@@ -196,17 +191,18 @@ class Search(FittedModels):
 
         return [one for one in screened if one.gain >= required(one)]
 
-    def _fit_neighbours(self, centre: ScoredModel) -> None:
-        """Fit the sets with one effect removed, with one exchanged for another, and with two exchanged for one."""
+    def _fit_neighbours(self, centre: ScoredModel, exchanged: Exchanges) -> None:
+        """Fit the sets with one effect removed, with one exchanged for another, and with two exchanged for one, but
+        for exchanges made before."""
         # Also sets that were fitted before: from the larger set's parameters a fit may reach a better optimum.
         self.fit([less(centre, [removed]) for removed in centre.effects], QUICK)
         exchanges = []
         for removed in (*combinations(centre.effects, 1), *combinations(centre.effects, 2)):
             # Along the states of the whole set a removed effect shows as a disturbance, without a fit of the rest.
             kept, fits = less(centre, removed)
-            if (exchange := (key_of(centre.effects), key_of(kept))) in self._exchanged:
+            if (exchange := (key_of(centre.effects), key_of(kept))) in exchanged:
                 continue
-            self._exchanged.add(exchange)
+            exchanged.add(exchange)
             rest = [e for e in self.catalogue if e not in centre.effects]
             screened = screen(self.system, kept, fits, self.rows, rest, self.jobs)
             for candidate in self._promising(screened)[:MAX_EXCHANGES]:
