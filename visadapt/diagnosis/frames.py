@@ -274,13 +274,13 @@ def _parts(
     recording: Recording, seen: Sequence[_Seen], clear: Sequence[NDArray[np.bool_]]
 ) -> Iterator[tuple[Episode, NDArray[np.bool_], str, NDArray[np.uint8]]]:
     """The stretches of the episodes without long misses: poses, which rows are usable, source, and frames."""
-    for episode, own, used, source in zip(recording.episodes, seen, clear, recording.sources, strict=True):
+    for episode, poses, used, source in zip(recording.episodes, seen, clear, recording.sources, strict=True):
         assert episode.frame is not None
         for first, last in _stretches(used, recording.period):
             rows = slice(first, last)
             time, action = episode.time[rows], episode.action[rows]
-            part = replace(episode, time=time, action=action, state=own.place[rows], frame=None)
-            yield part, (used & own.usual)[rows], source, episode.frame[rows]
+            part = replace(episode, time=time, action=action, state=poses.place[rows], frame=None)
+            yield part, (used & poses.usual)[rows], source, episode.frame[rows]
 
 
 def _misses(recording: Recording, clear: Sequence[NDArray[np.bool_]]) -> Iterator[str]:

@@ -267,12 +267,12 @@ def _excitations(system: System, period: float, samples: int, generator: torch.G
     for k, action in enumerate(system.actions):
         where = f" on {action.name}" if len(system.actions) > 1 else ""
         phases = {f: 2 * math.pi * f * time for f in FREQUENCIES if f * period < 0.25}
-        own = {
+        signals = {
             f"a square wave of {f:g} Hz{where}": torch.where(phase.sin() >= 0, 1.0, -1.0) for f, phase in phases.items()
         }
-        own |= {f"a sine of {f:g} Hz{where}": phase.sin() for f, phase in phases.items()}
-        own[f"white noise{where}"] = torch.randn(samples, generator=generator, dtype=torch.float64)
-        for name, values in own.items():
+        signals |= {f"a sine of {f:g} Hz{where}": phase.sin() for f, phase in phases.items()}
+        signals[f"white noise{where}"] = torch.randn(samples, generator=generator, dtype=torch.float64)
+        for name, values in signals.items():
             shape = torch.zeros(samples, len(system.actions), dtype=torch.float64)
             shape[:, k] = values * (action.high - action.low) / 2
             names.append(name)
@@ -335,7 +335,7 @@ def _lead(truth: Sequence[Effect], other: Sequence[Effect], recording: Recording
     prepared = prepare(recording, system)
     models = FittedModels(system, prepared.rows, catalogue, prepared.source)
     # In one batch: of two fits in turn, the second would stop where it falls far behind on its way.
-    starts = [(own, _start(models.source.fits, effects)) for own, effects in zip(sets, (truth, other), strict=True)]
+    starts = [(kinds, _start(models.source.fits, effects)) for kinds, effects in zip(sets, (truth, other), strict=True)]
     first, second = models.fit(starts, QUICK)
     if first.log_odds == -math.inf:
         return -math.inf  # nothing is learnt about the truth

@@ -222,14 +222,14 @@ def _normal(by_place: Tensor, by_value: Tensor, error: Tensor) -> tuple[Tensor, 
     )
 
 
-def _solved(own: Tensor, both: Tensor, whole: Tensor, g: Tensor, b: Tensor, damping: float) -> tuple[Tensor, Tensor]:
-    """Steps (P,) of the values and (N, 2) of the places."""
-    own = own + torch.diag_embed(own.diagonal(dim1=1, dim2=2) * damping + 1e-9)
+def _solved(places: Tensor, both: Tensor, whole: Tensor, g: Tensor, b: Tensor, damping: float) -> tuple[Tensor, Tensor]:
+    """Steps (P,) of the values and (N, 2) of the places, from the blocks and right sides that `_normal` gives."""
+    places = places + torch.diag_embed(places.diagonal(dim1=1, dim2=2) * damping + 1e-9)
     whole = whole + torch.diag(whole.diagonal() * damping + 1e-9)
-    gain = torch.linalg.solve(own, both.mT).mT  # (N, P, 2)
+    gain = torch.linalg.solve(places, both.mT).mT  # (N, P, 2)
     reduced = whole - (gain @ both.mT).sum(0)
     change = torch.linalg.solve(reduced, b - (gain @ g[..., None])[..., 0].sum(0))
-    moves = torch.linalg.solve(own, (g - (change @ both))[..., None])[..., 0]
+    moves = torch.linalg.solve(places, (g - (change @ both))[..., None])[..., 0]
     return change, moves
 
 
@@ -238,9 +238,9 @@ def _covariance(by_place: Tensor, by_value: Tensor, error: Tensor, noise: float,
     the rest of the residual, which is alike in many pixels and frames and so counts as few errors."""
     if not len(wide):
         return wide.new_zeros(0, 0)
-    own = (by_place @ by_place.mT).double()
-    own = own + 1e-9 * torch.eye(2).to(own)
-    gain = torch.linalg.solve(own, (by_place @ by_value.mT).double()).mT  # (N, P, 2)
+    places = (by_place @ by_place.mT).double()
+    places = places + 1e-9 * torch.eye(2).to(places)
+    gain = torch.linalg.solve(places, (by_place @ by_value.mT).double()).mT  # (N, P, 2)
     clear = by_value - gain.to(by_place) @ by_place  # less what the places take up
     white = max(noise**2, 1e-12)
     left = white_noise(error) ** 2  # of the noise, where frames are smoothed

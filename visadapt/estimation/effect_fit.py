@@ -95,9 +95,9 @@ def fit_effects(
     covariance = torch.linalg.inv(posterior(fitted, found)[1]) if fitted else torch.zeros(0, 0)
     states = _by_episode(rows, found.state[0], measured)
     values, spreads = {}, {}
-    for kind, own in columns.items():
+    for kind, span in columns.items():
         plain = in_step(kind)
-        stated = slice(own.start, own.start + len(plain.table))
+        stated = slice(span.start, span.start + len(plain.table))
         values[plain] = _within_a_turn(plain, found.theta[0, stated])
         spreads[plain] = covariance[stated, stated]
     if Dropout in kinds:

@@ -58,9 +58,9 @@ def phase_columns(effects: Sequence[type[Effect]], episodes: int) -> Tensor | No
     out = torch.arange(len(roles)).repeat(episodes, 1)
     first = 0
     for effect in effects:
-        own = range(first, first + len(effect.table))
-        first = own.stop
+        columns = range(first, first + len(effect.table))
+        first = columns.stop
         if has_episode_phases(effect):
-            phase = next(k for k in own if roles[k] is Role.PHASE)
-            out[1:, phase] = torch.tensor([k for k in own if roles[k] is Role.EPISODE_PHASE])
+            phase = next(k for k in columns if roles[k] is Role.PHASE)
+            out[1:, phase] = torch.tensor([k for k in columns if roles[k] is Role.EPISODE_PHASE])
     return out

@@ -207,8 +207,8 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState) -> Derivativ
     at_once = max(1, ROWS_AT_ONCE // fits.state.shape[2])
     parts = []
     for first in range(0, count * windows, at_once):
-        own = slice(first, first + at_once)
-        parts.append(_of_systems(problem[own], process[own], noise[own], used[own], counted[own], drawn[own], members))
+        at = slice(first, first + at_once)
+        parts.append(_of_systems(problem[at], process[at], noise[at], used[at], counted[at], drawn[at], members))
     return Derivatives(*(torch.cat(each).unflatten(0, (count, windows)) for each in zip(*parts, strict=True)))
 
 

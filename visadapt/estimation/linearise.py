@@ -76,7 +76,7 @@ def integrate(
     """`World.integrate` with parameters `values` (N, P) of the effects, a row for each of N states."""
     given = [values, time, state, commands] + ([] if duration is None else [duration])
     parts = zip(*(x.split(ROWS_AT_ONCE) for x in given), strict=True)
-    return torch.cat([world.with_values(own).integrate(*rest) for own, *rest in parts])
+    return torch.cat([world.with_values(parameters).integrate(*rest) for parameters, *rest in parts])
 
 
 def linearise_step(

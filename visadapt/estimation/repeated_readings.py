@@ -148,7 +148,7 @@ def zone(repeated: Tensor, angle: Tensor, deviation: float) -> tuple[Tensor, Ten
     low = torch.linspace(float(first) - 3 * deviation, middle, ZONE_EDGE_POINTS, dtype=angle.dtype)
     high = torch.linspace(middle, float(last) + 3 * deviation, ZONE_EDGE_POINTS, dtype=angle.dtype)
     edges, spread = _zone_on((low, high), repeated, angle, deviation)
-    wide = [torch.maximum(2 * grid.diff()[0], 4 * own) for grid, own in zip((low, high), spread, strict=True)]
+    wide = [torch.maximum(2 * grid.diff()[0], 4 * error) for grid, error in zip((low, high), spread, strict=True)]
     finer = [
         edge + width * torch.linspace(-1, 1, ZONE_EDGE_POINTS).to(edge) for edge, width in zip(edges, wide, strict=True)
     ]

@@ -106,8 +106,8 @@ def _with_episode_phases(sensitivity: Sensitivity, effect: type[Effect]) -> Cand
     found = []
     longest = sizes.argsort(descending=True, stable=True)[: min(EPISODES_SCREENED, int((sizes > 0).sum()))]
     for episode in longest.tolist():
-        own = (rows.episode == episode).nonzero()[:, 0]
-        alone = screen(sensitivity.system, sensitivity.effects, fits.on(own), rows.select(own), [plain])
+        windows = (rows.episode == episode).nonzero()[:, 0]
+        alone = screen(sensitivity.system, sensitivity.effects, fits.on(windows), rows.select(windows), [plain])
         found += [_best_phases(sensitivity, effect, one.values) for one in alone]
     return max(found, key=lambda one: one.gain, default=None)
 

@@ -104,14 +104,14 @@ class Sensitivity:
         """
         rows, fits = self.rows, self.fits
         model = CandidateModel(self.system, [*self.effects, effect], rows, COARSEST)
-        count_own = tried.shape[1]
+        count = tried.shape[1]
         neutral = torch.tensor([0.0 if p.neutral is None else p.neutral for p in effect.table], dtype=torch.float64)
         tried = torch.cat((neutral[None], tried))
         theta = torch.cat((fits.theta[0].expand(len(tried), -1), tried), 1)
         # Row 0 is the model without the effect: strengths at neutral; shapes do not matter there.
         for j, parameter in enumerate(effect.table):
             if parameter.neutral is None:
-                theta[0, j - count_own] = tried[1, j]
+                theta[0, j - count] = tried[1, j]
         if issubclass(effect, SensingEffect):
             read = self._read(model, theta)
             reading = (read[:1] - read[1:]).movedim(0, -1).nan_to_num()
@@ -132,8 +132,8 @@ class Sensitivity:
     def _read(self, model: CandidateModel, theta: Tensor) -> Tensor:
         """(M, W, T, m) the readings with parameters (M, P), each in the row in which the innovations have the reading;
         NaN where they have none."""
-        own, state = self.innovations.model, self.fits.state[0]
-        rows_later, used = own.rows_later(self.fits.theta[0]), own.shown(self.fits.theta[0])[1]
+        fitted, state = self.innovations.model, self.fits.state[0]
+        rows_later, used = fitted.rows_later(self.fits.theta[0]), fitted.shown(self.fits.theta[0])[1]
         out = torch.full((len(theta), *used.shape), torch.nan, dtype=torch.float64)
         alike: dict[tuple[int, ...], list[int]] = {}
         for k, one in enumerate(theta):

@@ -56,7 +56,9 @@ def alternatives(
             new = [e for e in rival.model.effects if e not in comparison.best.effects]
             likeliest |= {e: rival for e in new if e not in likeliest}
         pairs = likeliest.items()
-        out.append([Alternative(one, model, own) for own, model in pairs for one in _same(own, effects, system)])
+        out.append(
+            [Alternative(one, model, fitted) for fitted, model in pairs for one in _same(fitted, effects, system)]
+        )
     return out
 
 
@@ -151,19 +153,19 @@ def _averaged(
     Volinsky 1999, Bayesian model averaging, Statistical Science 14(4)). No verdict rests on slight causes, so the
     intervals also hold the estimates `without_slight` ones, which often only mend what no effect describes exactly.
     """
-    own = fitted[one.compared.model.names][one.canonical][0]
+    likeliest = fitted[one.compared.model.names][one.canonical][0]
     having = [c for c in comparison.models if one.canonical in c.model.effects and c.model.names in fitted]
     known = [fitted[compared.model.names][one.canonical] for compared in having]
     values, spreads = (torch.stack(each) for each in zip(*known, strict=True))
     phases = torch.tensor([2 * math.pi * p.is_phase for p in one.canonical.table], dtype=values.dtype)
-    values = values - phases * ((values - own) / (2 * math.pi)).round()
+    values = values - phases * ((values - likeliest) / (2 * math.pi)).round()
     weights = torch.tensor([compared.probability for compared in having], dtype=values.dtype)
     low, high = (_quantile(values, spreads, weights, level) for level in (0.05, 0.95))
     if one.canonical in without_slight:
         alone = without_slight[one.canonical][0]
-        alone = alone - phases * ((alone - own) / (2 * math.pi)).round()
+        alone = alone - phases * ((alone - likeliest) / (2 * math.pi)).round()
         low, high = torch.minimum(low, alone), torch.maximum(high, alone)
-    return _estimates(search, one.compared.model, one.canonical, own, low, high)
+    return _estimates(search, one.compared.model, one.canonical, likeliest, low, high)
 
 
 def _quantile(values: Tensor, spreads: Tensor, weights: Tensor, level: float) -> Tensor:

@@ -39,23 +39,24 @@ def left_over(seen: nn.Module, camera: Sequence[CameraEffect], frames: Tensor, p
     x, theta = place[rows].float().T
     drawn = seen(x, theta)
     residual = (frames[rows].float() / 255 - drawn) * within_frame(camera, drawn)
-    own = residual.square().mean((1, 2))
-    return structure(residual[own <= torch.maximum(MAX_FRAME_RATIO * own.median(), own.quantile(1 - MAX_LEFT_OUT))])
+    power = residual.square().mean((1, 2))
+    most = torch.maximum(MAX_FRAME_RATIO * power.median(), power.quantile(1 - MAX_LEFT_OUT))
+    return structure(residual[power <= most])
 
 
 def usual(renderer: nn.Module, camera: Sequence[CameraEffect], place: Tensor) -> float:
     """What is left where nothing is unexplained, root mean square of [0, 1]: the renderer's own errors and, where the
     camera is moved, the loss in frames drawn at places (N, 2) by moving them half a pixel and back."""
     known = getattr(renderer, "error", None)
-    own = USUAL if known is None else float(known)
+    error = USUAL if known is None else float(known)
     drawn = renderer(*place.float().T)
     if all(effect.motion(drawn) is None for effect in camera):
-        return own
+        return error
     half = CameraShift(dx=0.5, dy=0.5).motion(drawn)
     assert half is not None
     inside = (..., slice(1, -1), slice(1, -1))
     lost = size_of(structure((moved(moved(drawn, [half]), [half.inverse()]) - drawn)[inside]))
-    return math.hypot(own, lost)
+    return math.hypot(error, lost)
 
 
 def judged(left: Tensor, expected: float) -> Pixels:

@@ -237,10 +237,13 @@ class _Fit:
         lengths = [len(track.time) for track in self.tracks]
         for j in range(len(self.innovation)):
             left = [each[:, j] for each in self.left]
-            own = [each[..., j] for each in taken]
+            absorbed = [each[..., j] for each in taken]
             most = MAX_POWER * torch.cat(left).square().median()
             power = torch.cat(
-                [_local_mean(e.square().clamp(max=most) + v.square().sum(0)) for e, v in zip(left, own, strict=True)]
+                [
+                    _local_mean(e.square().clamp(max=most) + v.square().sum(0))
+                    for e, v in zip(left, absorbed, strict=True)
+                ]
             )
             deviation = (0.5 * _log_power(basis, power)).exp()
             at_rest = torch.cat([track.at_rest[:, j] for track in self.tracks])
@@ -251,7 +254,7 @@ class _Fit:
             for part, each in enumerate(deviations):
                 self.spread[part] = self.spread[part].clone()
                 self.spread[part][:, j] = each
-                white, more = (left[part] / each).clamp(-3, 3), own[part] / each
+                white, more = (left[part] / each).clamp(-3, 3), absorbed[part] / each
                 for lag in range(LAGS + 1):
                     end = len(each) - lag
                     moments[lag] += white[lag:] @ white[:end] + (more[:, lag:] * more[:, :end]).sum()
@@ -295,13 +298,13 @@ class _Fit:
         """The bumps with their heights as fitted together."""
         out = []
         for part in range(len(self.tracks)):
-            own = [one for one in self.bumps if one.part == part]
-            if not own:
+            bumps = [one for one in self.bumps if one.part == part]
+            if not bumps:
                 continue
             unit = BUMP_PRIOR * float(self.size)
             deviation = unit * torch.cholesky_inverse(self.roots[part]).diagonal().sqrt()
             heights = unit * self.weights[part]
-            for k, one in enumerate(own, len(heights) - len(own)):
+            for k, one in enumerate(bumps, len(heights) - len(bumps)):
                 out.append(replace(one, height=float(heights[k]), deviation=float(deviation[k])))
         return out
 

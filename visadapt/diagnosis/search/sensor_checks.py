@@ -44,19 +44,19 @@ def opposite_signs(
     if not profile.sign_conventions or float(source.log_process.max()) < SUSPICIOUS_LOG_PROCESS:
         return None
     required = MIN_GAIN_PER_READING * float(rows.used.sum())
-    own = Search(system, rows, catalogue, fitted)
+    as_given = Search(system, rows, catalogue, fitted)
     conventions = [to_source(rows, convention) for convention in profile.sign_conventions]
-    others = [Search(system, each, catalogue, rival=_likelihood(own)) for each in conventions]
+    others = [Search(system, each, catalogue, rival=_likelihood(as_given)) for each in conventions]
     best = max(range(len(others)), key=lambda k: _likelihood(others[k]))
     other = others[best]
-    if _ahead(other, own) <= required:
+    if _ahead(other, as_given) <= required:
         return None
     for added in range(MOST_EFFECTS_WITH_SIGNS):
-        if added >= EFFECTS_WITH_SIGNS and not 0 < _ahead(other, own) <= required:
+        if added >= EFFECTS_WITH_SIGNS and not 0 < _ahead(other, as_given) <= required:
             break
-        for search in (own, other):
+        for search in (as_given, other):
             search.extend([search.best], LEADS_WITH_SIGNS)
-    return profile.sign_conventions[best] if _ahead(other, own) > required else None
+    return profile.sign_conventions[best] if _ahead(other, as_given) > required else None
 
 
 def _ahead(one: Search, other: Search) -> float:

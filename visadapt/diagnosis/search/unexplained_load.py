@@ -188,11 +188,11 @@ class _Motion:
         at = WorldState(self.time, state, ())
         return self.world.system_at(at).accelerations(state, acting, self.world.load(at))
 
-    def gain(self, own: System | None = None) -> tuple[Tensor, Tensor]:
-        """(T, J) accelerations of the joints by the world, or by the bare system `own`, and (T, J, J) their change per
+    def gain(self, bare: System | None = None) -> tuple[Tensor, Tensor]:
+        """(T, J) accelerations of the joints by the world, or by the system `bare`, and (T, J, J) their change per
         unit of each load."""
         at = WorldState(self.time, self.state, ())
-        system, load = self.world.system_at(at) if own is None else own, self.world.load(at)
+        system, load = self.world.system_at(at) if bare is None else bare, self.world.load(at)
         return system.response_to_loads(self.state, self.acting, load)
 
     def loads(self, rate: Callable[[Tensor], Tensor], commanded: Tensor) -> _Loads:
@@ -234,10 +234,10 @@ class _Motion:
                 first = rate(error)
                 change = -slopes[0] * error[:, None] - slopes[1] * first[:, None] + rate(first)[:, None] * joints[j]
                 columns.append(load(change))
-        own: Any = system
-        plain = self.gain(own)
+        bare: Any = system
+        plain = self.gain(bare)
         for name in scalable(system):
-            scaled = self.gain(replace(own, **{name: getattr(own, name) * math.exp(DIFFERENCE)}))
+            scaled = self.gain(replace(bare, **{name: getattr(bare, name) * math.exp(DIFFERENCE)}))
             loads = [torch.linalg.solve(g, (self.measured - f)[..., None])[..., 0] for f, g in (plain, scaled)]
             reactions[len(columns)] = (joints - torch.linalg.solve(scaled[1], plain[1])) / DIFFERENCE
             columns.append((loads[0] - loads[1]) / DIFFERENCE)
