@@ -47,7 +47,7 @@ are off by 0.14 mm and 0.23 mrad (root mean square), with scales off by up to 0.
 MISFIT = "root mean square of frames less those drawn by the renderer, in grey levels of 255"
 
 UNSEEN = (Dropout, FrozenZone, MeasurementDelay, PositionDelay, AngleDelay)
-"""Faults of sensors that a camera cannot have: it shows cart and pole in one frame. A late camera is a camera's."""
+"""Faults of sensors that no camera has, which shows cart and pole in one frame: if these are late, the camera is."""
 
 MIN_MOTION_ERROR = 1.0
 """Error of the source's predictions, over the noise of positions, from which motion shows a gap. Below, it may be the
@@ -61,7 +61,7 @@ LEAST_EXPLAINED = 0.2
 """Share of the frames that the renderer must explain; below, it is taken to be of another scene."""
 
 LONGEST_MISS = 0.5
-"""s without a usable frame after which an episode is split: upright, errors grow by e in about 0.25 s."""
+"""s without a usable frame after which an episode is split: upright, errors grow by a factor e in about 0.25 s."""
 
 FEWEST_POSES = 5  # Usable frames of a part of an episode; parts with fewer are left out
 

@@ -190,7 +190,7 @@ class _Trials:
         return cls(recording, system, measured, noise, names, added, [shown for shown, _ in runs], largest)
 
     def row(self, excitation: int) -> int:
-        """Where `added` and what is shown have an excitation in its largest admissible size."""
+        """The row of `added`, and of what is shown, with an excitation in its largest admissible size."""
         return int(self.largest[excitation]) * len(self.names) + excitation
 
     def worth(self, sets: Sequence[Sequence[Effect]], progress: Progress | None) -> Tensor:
@@ -318,7 +318,8 @@ def _simulate(
 def _recording(
     like: Recording, system: System, measured: tuple[int, ...], states: Tensor, commands: Tensor, noise: Tensor
 ) -> Recording:
-    """One simulated experiment, with these columns of the state, which are known to `noise` (n,)."""
+    """One simulated experiment of states (T, n) and commands (T, n_action): the `measured` columns of the state, whose
+    readings have the standard deviations `noise` (n,)."""
     columns = list(measured)
     time = like.period * np.arange(len(states))
     episode = Episode(time, commands.numpy(), states[:, columns].numpy())

@@ -168,7 +168,7 @@ def _within_a_turn(effect: type[Effect], values: Tensor) -> Tensor:
 
 
 def _shifts(effects: Effects, columns: Mapping[type[Effect], slice], theta: Tensor, episodes: int) -> Tensor:
-    """By how many s the episodes' phases (E,) differ; zeros unless one effect alone depends on time."""
+    """(E,) s by which each episode's phase is ahead of the first's; zeros unless one effect alone depends on time."""
     timed = [effect for effect in effects if any(p.is_phase or (p.is_edge and p.unit == "s") for p in effect.table)]
     if len(timed) != 1 or not has_episode_phases(timed[0]):
         return theta.new_zeros(episodes)

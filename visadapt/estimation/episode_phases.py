@@ -50,8 +50,8 @@ def has_episode_phases(effect: type[Effect]) -> bool:
 
 
 def phase_columns(effects: Sequence[type[Effect]], episodes: int) -> Tensor | None:
-    """(E, P) the column of the parameters from which each parameter of an episode is read; None where all episodes read
-    their own."""
+    """(E, P) the column of the parameters from which each parameter of an episode is read; None where no effect
+    has a phase for each episode, and all episodes read the same columns."""
     if not any(has_episode_phases(effect) for effect in effects):
         return None
     roles = [p.role for effect in effects for p in effect.table]

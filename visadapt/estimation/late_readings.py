@@ -1,4 +1,4 @@
-"""Readings of late sensors, each taken as one of the last row before the instant that it shows.
+"""Readings of late sensors, each taken as a reading of the last row before the instant that it shows.
 
 A reading of row t that is `delay` s late shows the state at that time less the delay: the state of an earlier row,
 moved on by a period or less. The filter takes it at that row, as it may take readings in any order. So no motion is
@@ -60,8 +60,8 @@ def _later(world: World, state: Tensor, following: Following, ahead: Tensor) -> 
 
 
 def rows_later(rows: Segments, delays: Delays, columns: Sequence[int]) -> list[int]:
-    """By how many rows the readings of these states come after the row whose state they show: the least after which,
-    everywhere in the episodes, more time than the delay has passed."""
+    """By how many rows the readings of these columns of the state come after the row whose state they show: the least
+    number of rows in which, everywhere in the episodes, more time than the delay passes; 0 for one that is not late."""
     if not delays:
         return [0] * len(columns)
     clock = _clock(rows)
@@ -69,8 +69,7 @@ def rows_later(rows: Segments, delays: Delays, columns: Sequence[int]) -> list[i
 
 
 def _rows_in(delay: float, clock: Tensor, period: float) -> int:
-    """The least number of rows, at least one, after which everywhere on the `clock` (E, L + 1) more than `delay` s have
-    passed."""
+    """The least number of rows, at least 1, in which more than `delay` s pass everywhere on the `clock` (E, L + 1)."""
     count = 1 + int(delay / period)
     while count < clock.shape[1] - 1 and float((clock[:, count:] - clock[:, :-count]).min()) <= delay:
         count += 1

@@ -142,9 +142,10 @@ def variances(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[T
 
 
 def noise_members(model: CandidateModel) -> tuple[Tensor, Tensor]:
-    """(G + S, n) and (G + S, m) 1 where the noise of a state or a channel has the row's free variance.
+    """Which noises share a free variance: (G + S, n) for the states and (G + S, m) for the channels, 1 where the noise
+    has the variance of that row.
 
-    There is one of each of G groups of driven velocities, and one of each of S kinds of sensors.
+    There is one variance for each of G groups of driven velocities, and one for each of S kinds of sensors.
     """
     channels = model.rows.channels
     driven = [[float(k in group) for k in range(len(model.system.states))] for group in model.profile.driven]

@@ -157,7 +157,7 @@ def _tangent(
 ) -> Tangent:
     """Evaluate the base point, and with each state, parameter of `columns` and command moved, as one batch.
 
-    The other parameters change nothing.
+    The other parameters change nothing; `commands` is `width`, the number of commands, or 0 without their derivatives.
     """
     (count, n), parameters = state.shape, len(columns)
     states = n if by_state else 0

@@ -42,7 +42,7 @@ class RepeatedReadings:
     used: list[Tensor]  # (T, m) 1 where a reading is a measurement
     lost: list[Tensor]  # (T,) whether the whole row is repeated
     frozen: list[Tensor]  # (T,) whether the angle is repeated and the rest of the row is not
-    silent: list[Tensor]  # (T,) whether a row does not show where the angle sensor stands still
+    silent: list[Tensor]  # (T,) whether a row tells nothing of the angles at which the sensor stands still
 
 
 def find_repeats(

@@ -36,15 +36,15 @@ from visadapt.processes import shared_out
 from visadapt.systems import System
 
 EPISODES_SCREENED = 3
-"""Episodes, the longest first, from each of which alone an effect is screened that has a phase for each episode."""
+"""An effect with a phase for each episode is screened on the EPISODES_SCREENED longest episodes, one at a time."""
 
 STEPPED_POINTS = 2
-"""Points of a grid, and small ones among them, that are tried where a Gauss-Newton step leads from them: a step from
-afar may promise too much."""
+"""A Gauss-Newton step is tried from the STEPPED_POINTS best points of a grid, and from as many of its small ones, since
+a step from afar may promise too much."""
 
 NEARLY = 0.9
-"""Share of the largest gain from which on a smaller effect is proposed: the response is linear, so that a motor that
-does nothing may seem as good as a little backlash."""
+"""A smaller effect is proposed where it gains this share of the largest gain: the response is linear, so that a motor
+that does nothing may seem as good as a little backlash."""
 
 MAX_STEPS = 6
 MIN_STEP_GAIN = 0.1
@@ -137,8 +137,8 @@ def _window_stride(most: float, rows: Segments, points: int) -> int:
 
 
 def _promising(sensitivity: Sensitivity, effect: type[Effect], points: Tensor, columns: list[int]) -> Tensor:
-    """Points to which one Gauss-Newton step of `columns` leads from those of points (G, P) that promise most, the
-    best first, also from the best of the small ones; then that of `points` which is best without a step."""
+    """Points (K, P) to which one Gauss-Newton step of `columns` leads from those of points (G, P) that promise most,
+    the best first, then from the best small ones and from the best without a step; last, that one itself."""
     change, slopes = sensitivity.around(effect, points, columns)
     left, slopes = sensitivity.innovations.error[:, None] + change, slopes.movedim(1, 0)
     normal = slopes.mT @ slopes

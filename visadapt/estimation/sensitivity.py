@@ -43,7 +43,8 @@ class Innovations:
 
 
 PROBE_SHARE = 0.02
-"""Share of the range, from neutral, at which a parameter is probed that the effect is proportional to."""
+"""A parameter to which the effect is proportional is probed at this share of the way from neutral to an end of its
+range."""
 
 DIFFERENCE_SHARE = 1e-4  # Share of its range by which a parameter is moved to take a finite difference
 

@@ -47,8 +47,8 @@ class Alternative:
 def alternatives(
     comparison: ModelComparison, effects: Sequence[type[Effect]], system: System
 ) -> list[list[Alternative]]:
-    """For each effect of the best set, those that fit as well in its place, the best first, each with its twins; of
-    `effects` alone, and twins in their order."""
+    """For each effect of the best set, those of `effects` that fit as well in its place, the best first, each among its
+    twins, which are in the order of `effects`."""
     out = []
     for effect, rivals in comparison.alternatives.items():
         likeliest = {effect: comparison.models[0]}
@@ -151,7 +151,8 @@ def _averaged(
 
     Which other effects act is uncertain too, and changes what is left for this one (Hoeting, Madigan, Raftery and
     Volinsky 1999, Bayesian model averaging, Statistical Science 14(4)). No verdict rests on slight causes, so the
-    intervals also hold the estimates `without_slight` ones, which often only mend what no effect describes exactly.
+    intervals also hold the estimates `without_slight` causes, which often only make up for what no effect describes
+    exactly.
     """
     likeliest = fitted[one.compared.model.names][one.canonical][0]
     having = [c for c in comparison.models if one.canonical in c.model.effects and c.model.names in fitted]

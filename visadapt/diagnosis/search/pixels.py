@@ -26,7 +26,7 @@ USUAL = 1 / 255
 FACTOR = 1.7  # Ratio of a film's structure to the usual one, above which frames are unexplained
 
 STANDS_OUT = 4.0  # Structure of a pixel over the mean, above which it belongs to a box
-MOST_BOXES, LEAST_SHARE = 5, 0.05
+MOST_BOXES, LEAST_SHARE = 5, 0.05  # Boxes at most, and the least share of a film's structure that one holds
 
 
 def left_over(seen: nn.Module, camera: Sequence[CameraEffect], frames: Tensor, place: Tensor) -> Tensor:
@@ -45,8 +45,8 @@ def left_over(seen: nn.Module, camera: Sequence[CameraEffect], frames: Tensor, p
 
 
 def usual(renderer: nn.Module, camera: Sequence[CameraEffect], place: Tensor) -> float:
-    """What is left where nothing is unexplained, root mean square of [0, 1]: the renderer's own errors and, where the
-    camera is moved, the loss in frames drawn at places (N, 2) by moving them half a pixel and back."""
+    """What is left where nothing is unexplained, root mean square, where white is 1: the renderer's own errors and,
+    where the camera is moved, what frames drawn at places (N, 2) lose when they are moved half a pixel and back."""
     known = getattr(renderer, "error", None)
     error = USUAL if known is None else float(known)
     drawn = renderer(*place.float().T)

@@ -134,8 +134,8 @@ class _Fit:
         self.bumps: list[_Bump] = []
         joints = tracks[0].load.shape[1]
         self.size = torch.cat([track.load for track in tracks]).square().mean().sqrt() + 1e-300
-        # All of the load, so that columns follow the world's motion: along the measured one, a factor common to all of
-        # them would explain a push away.
+        # At first all of the load, so that `_design` takes the columns along the world's motion: along the measured
+        # motion, one factor common to all columns would explain a push away.
         self.left = [track.load.clone() for track in tracks]
         self.weights = [torch.zeros(0, dtype=torch.float64) for _ in tracks]
         self.roots = [torch.zeros(0, 0, dtype=torch.float64) for _ in tracks]
@@ -188,7 +188,8 @@ class _Fit:
         self._weigh(robust=True)
 
     def _weigh(self, robust: bool) -> None:
-        """The weights of columns and bumps, given the errors: those of each part around those of all."""
+        """Fit the weights of columns and bumps, given the size of the errors: a part's weights have a prior about those
+        common to all parts."""
         count = len(self.tracks[0].columns)
         identity = torch.eye(count, dtype=torch.float64)
         several = len(self.tracks) > 1

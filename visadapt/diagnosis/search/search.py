@@ -25,7 +25,7 @@ from visadapt.progress import Progress
 MAX_EFFECTS = 6  # Effects in a set at most
 
 MAX_CANDIDATES, MAX_EXCHANGES = 8, 5
-"""Effects that are fitted in addition to each set when sets grow, and when effects are exchanged."""
+"""Most effects that are tried with a set: when sets grow, and in the place of those that are exchanged."""
 
 LEADERS = 4  # Sets that are fitted before the others, where some fall far behind
 
@@ -37,17 +37,17 @@ exchange: room for what the new effect does not yet explain, and little to shed 
 
 WIDEN_ABOVE = 5.0
 WIDEN_MODELS = 6
-"""Log likelihood that process noise adds to the best set, above which the search is widened, and to how many of the
-best sets of one and of two effects."""
+"""Where process noise adds more than WIDEN_ABOVE to the best set's log likelihood, the search is widened: the
+WIDEN_MODELS best sets of one and of two effects get a further effect."""
 
 LATE_SHARE, LATE_BASES = 0.3, 3
-"""Late sensors are fitted even where the screening proposes none: from LATE_SHARE of the longest delay, added to the
-source, the best set and the LATE_BASES best single effects."""
+"""Late sensors are fitted even where the screening proposes none: added to the source, to the best set and to the
+LATE_BASES best single effects, with a delay that starts at LATE_SHARE of the longest."""
 
 POLISH_WITHIN, POLISH_SIMPLER_WITHIN = 8.0, 60.0
 POLISH_MODELS = 8
-"""Distance from the best, in log posterior odds, within which sets are fitted carefully, the larger one for sets with
-fewer parameters, since a quick fit of the right set may keep too much process noise; and the most of them."""
+"""Log posterior odds behind the best set up to which sets are fitted carefully, POLISH_MODELS at most. Sets with fewer
+parameters than the best may be farther behind, since a quick fit of the right set may keep too much process noise."""
 
 
 Exchanges = set[tuple[frozenset[str], frozenset[str]]]
@@ -113,7 +113,7 @@ class Search(FittedModels):
 
     def _prune(self) -> None:
         """Remove effects of the best set one by one while that raises the odds, in fits without process noise: with it,
-        a fit may return to where noise explained what they did."""
+        a fit may go back to where noise explains what these effects do."""
         before = None
         while self.best is not before:
             before = self.best
@@ -122,8 +122,8 @@ class Search(FittedModels):
     def _with_late_sensors(self) -> None:
         """The source, the best set and the best single effects with each late sensor in addition.
 
-        The screening does not see a sensor that is far too late: with states that follow its readings, a little of the
-        delay helps little, and where a joint stops, it goes on stopping when the late readings say.
+        The screening, which is linear in the delay, does not see a sensor that is far too late. It keeps to states that
+        follow the late readings: there a little delay gains little, and a joint stops when its late readings do.
         """
         late = [e for e in self.catalogue if issubclass(e, LateSensors)]
         alone = [each for each in self.ranked if len(each.effects) == 1]

@@ -27,9 +27,9 @@ MIN_GAIN_PER_READING = 0.1
 """Log likelihood per reading that another convention must gain to be taken for that of the recording."""
 
 EFFECTS_WITH_SIGNS, MOST_EFFECTS_WITH_SIGNS, LEADS_WITH_SIGNS = 2, 6, 3
-"""Effects that are added one by one to the source in either convention before that is decided, since a large effect can
-look like a wrong sign; how many are added at most while another convention is ahead, but not clearly; and how many are
-tried for each."""
+"""Before a convention is decided on, EFFECTS_WITH_SIGNS effects are added one by one to the source in either, since a
+large effect can look like a wrong sign; while another convention is ahead, but not clearly, up to
+MOST_EFFECTS_WITH_SIGNS. LEADS_WITH_SIGNS effects are tried for each."""
 
 
 def opposite_signs(

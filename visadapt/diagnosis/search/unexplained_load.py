@@ -1,10 +1,10 @@
 """The load that a motion takes beyond what a world explains, over whole episodes, and what else may explain it.
 
-Readings of positions are smoothed and differentiated twice; the accelerations less those of the world, over their gain
-by the loads, are the load in question (inverse dynamics; Khalil and Dombre 2002, chapter 12). It is linear in what a
-world may have wrong: friction, the commands' gain and delay, the parameters, the zero of a sensor, a compliant drive.
-Those columns are taken along the world's own accelerations, not the measured ones: then no factor common to all of
-them explains anything.
+Readings of positions are smoothed and differentiated twice; the accelerations less those of the world, over their
+change per unit of load, are the load in question (inverse dynamics; Khalil and Dombre 2002, chapter 12). It is linear
+in what a world may have wrong: friction, the commands' gain and delay, the parameters, the zero of a sensor, a
+compliant drive. The columns, one for each of these, are taken along the accelerations of the world, not the measured
+ones: then no factor common to all of them explains anything.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class LoadTrack:
     load: Tensor  # (N, J)
     columns: Tensor  # (K, N, J) loads that state and command may explain, of unit root mean square over the recording
     reaction: Tensor
-    """(K, N, J, J) change of the columns per unit of load that nothing explains: they follow the motion modelled"""
+    """(K, N, J, J) change of the columns, which follow the modelled motion, per unit of load that nothing explains"""
     dry: tuple[int, ...]  # the column of each joint's dry friction
     at_rest: Tensor  # (N, J) from 0 to 1: whether a joint is so slow that it may stick
     activity: Tensor  # (N, F) logs of speeds, accelerations and changes of commands, with which errors grow
@@ -271,7 +271,7 @@ def _moved(state: Tensor, column: int) -> Tensor:
 def _smoothed(values: Tensor, deviation: float, edge: int = 0, stride: int = 1) -> Tensor:
     """Values (T, M) smoothed by a Gaussian of this deviation in rows; beyond the ends, point-reflected.
 
-    Of the rows, every `stride`-th from `edge` on, up to as far from the end.
+    Every `stride`-th row is given, without the first and the last `edge` rows.
     """
     reach = math.ceil(GAUSSIAN_REACH * deviation)
     lags = torch.arange(-reach, reach + 1, dtype=values.dtype)
