@@ -60,9 +60,11 @@ class RecoverCost(FollowCost):
 
     A plan that ends on the reference but not with its velocity flies through it and out again, further each time: what
     counts is where the vehicle would be `beyond` s later. The root changes no best plan, but gives the many streams
-    near their references as much weight as the few that are far off.
+    near their references as much weight as the few that are far off. Turning costs little, since who is pushed has to
+    turn fast.
     """
 
+    turning: float = 0.1
     final: float = 10.0
     beyond: float = 1.0  # s
     floor: float = 0.01  # keeps the root differentiable at zero; about the cost of a plan with 1 cm of error all along
