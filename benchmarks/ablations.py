@@ -45,14 +45,14 @@ class NoGradient(Residual):
         return super().delta(history).detach()
 
 
+def _changed(setup: Setup, change: Callable[[Residual], Residual]) -> Setup:
+    """The setup with each new residual changed."""
+    return replace(setup, residual=lambda policy, source: change(setup.residual(policy, source)))
+
+
 def past_the_residual(setup: Setup, policy: Policy) -> Setup:
     """The residual acts on what is imagined, but the gradient flows through renderer and physics alone."""
-
-    def residual(policy: Policy, source: World) -> Residual:
-        made = setup.residual(policy, source)
-        return NoGradient(made.network, made.scale)
-
-    return replace(setup, residual=residual)
+    return _changed(setup, lambda made: NoGradient(made.network, made.scale))
 
 
 def past_the_renderer(setup: Setup, policy: Policy) -> Setup:
@@ -88,8 +88,7 @@ def held_over_a_plan(setup: Setup, policy: Policy) -> Setup:
 def with_an_mlp(setup: Setup, policy: Policy) -> Setup:
     """The paper's head of the residual: two hidden layers of 64, fitted by gradient descent."""
 
-    def residual(policy: Policy, source: World) -> Residual:
-        made = setup.residual(policy, source)
+    def change(made: Residual) -> Residual:
         network = made.network
         assert isinstance(network, ResidualNetwork)
         assert isinstance(network.head, nn.Linear)
@@ -98,7 +97,7 @@ def with_an_mlp(setup: Setup, policy: Policy) -> Setup:
             nn.init.zeros_(weight)
         return made
 
-    return replace(setup, residual=residual)
+    return _changed(setup, change)
 
 
 def without_history(setup: Setup, policy: Policy) -> Setup:
@@ -113,15 +112,14 @@ def without_history(setup: Setup, policy: Policy) -> Setup:
 def without_unexplained_accelerations(setup: Setup, policy: Policy) -> Setup:
     """The residual reads the observed motion and the commands, but not the accelerations that the source leaves."""
 
-    def residual(policy: Policy, source: World) -> Residual:
-        made = setup.residual(policy, source)
+    def change(made: Residual) -> Residual:
         network = made.network
         assert isinstance(network, (ImageResidualNetwork, StateResidualNetwork))
         all_of_them = network.unexplained
         network.unexplained = lambda *given: torch.zeros_like(all_of_them(*given))  # type: ignore[method-assign]
         return made
 
-    return replace(setup, residual=residual)
+    return _changed(setup, change)
 
 
 def with_an_mlp_renderer(setup: Setup, policy: Policy) -> Setup:

@@ -77,6 +77,26 @@ def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None
         policy.feedforward.weight.copy_(undo.repeat(HORIZON, 1))
 
 
+def plans_of(
+    policy: Policy,
+    world: World,
+    observe: Observe | None,
+    settings: TuneSettings,
+    generator: torch.Generator,
+    transitions: Transitions | None,
+) -> Plans:
+    """Plans as `tune` makes them, with its arguments; their streams are not started yet."""
+    count = settings.streams or settings.batch
+    like, longest = next(policy.parameters()), settings.longest
+    streams = Streams(world, settings.task, observe, transitions, count, longest, settings.recorded, like)
+    given = (policy, streams, settings.observation_noise, generator)
+    if settings.closed_loop:
+        return ClosedLoop(*given)
+    if settings.streams is None:
+        return Plans(*given)
+    return KeptPlans(*given, settings.batch, settings.every)
+
+
 def tune(
     policy: Policy,
     world: World,
@@ -105,21 +125,12 @@ def tune(
     optimiser = torch.optim.Adam(policy.parameters())
     steps = settings.iterations
     training = TrainingState(policy, optimiser, generator, settings.learning_rate, steps, progress, checkpoint)
-    count = settings.streams or settings.batch
-    like, longest = next(policy.parameters()), settings.longest
-    streams = Streams(world, settings.task, observe, transitions, count, longest, settings.recorded, like)
-    given = (policy, streams, settings.observation_noise, generator)
-    if settings.closed_loop:
-        plans: Plans = ClosedLoop(*given)
-    elif settings.streams is None:
-        plans = Plans(*given)
-    else:
-        plans = KeptPlans(*given, settings.batch, settings.every)
+    plans = plans_of(policy, world, observe, settings, generator, transitions)
     kept = training.resume()
     if kept is not None:
         plans.restore(kept)
     else:
-        streams.start(0.0 if settings.curriculum else 1.0, generator)
+        plans.streams.start(0.0 if settings.curriculum else 1.0, generator)
     policy.train()
     for iteration in range(len(training.losses), steps):
         loss = plans.loss(iteration, iteration / steps if settings.curriculum else 1.0)

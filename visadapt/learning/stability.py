@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import torch
 
-from visadapt.learning.plans import ClosedLoop
-from visadapt.learning.policy import TuneSettings
-from visadapt.learning.streams import Streams
+from visadapt.learning.policy import TuneSettings, plans_of
 from visadapt.learning.transitions import Observe, Transitions
 from visadapt.policies import Policy
 from visadapt.world import World
@@ -37,12 +35,8 @@ def stable(
 
     The arguments are those of `learning.policy.tune`.
     """
-    like = next(policy.parameters())
-    streams = Streams(
-        world, settings.task, observe, transitions, settings.batch, settings.longest, settings.recorded, like
-    )
-    streams.start(1.0, generator)
-    plans = ClosedLoop(policy, streams, settings.observation_noise, generator)
+    plans = plans_of(policy, world, observe, settings, generator, transitions)
+    plans.streams.start(1.0, generator)
     first = float(plans.loss(0, 1.0))
     # A cost that is not a number is not within the bound either.
     return first < float("inf") and all(float(plans.loss(number, 1.0)) <= GROWTH * first for number in range(1, PLANS))

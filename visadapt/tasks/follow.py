@@ -139,7 +139,7 @@ class Follow(FlightTask):
         return (state[:, POSITION] - self.references.positions[task_state[:, 0], rows]).norm(dim=-1)
 
     def on(self, which: Tensor, row: Tensor) -> Tensor:
-        """The quadrotor's states (B, 13) on the references `which` (B,) at rows (B,)."""
+        """The quadrotor's states (..., 13) on the references `which` (...,) at rows (...,)."""
         own = self.references
         every = (own.positions, own.velocities, own.accelerations, own.jerks)
         position, velocity, acceleration, jerk = (values[which, row] for values in every)
@@ -156,10 +156,7 @@ class Follow(FlightTask):
     def _turning_ahead(self, task_state: Tensor) -> Tensor:
         """Angular velocities (B, HORIZON, 3), in world axes, of the next rows; zero beyond the end of a reference."""
         which, rows = self._rows_ahead(task_state)
-        here, end = rows.clamp(max=self.steps), rows[..., None] > self.steps
-        asked = demanded(self.references.accelerations[which, here], self.references.jerks[which, here])
-        turned = rotation(asked.attitude.flatten(0, 1)).unflatten(0, rows.shape)
-        return matvec(turned, asked.rates).masked_fill(end, 0.0)
+        return turning(self.on(which, rows.clamp(max=self.steps))).masked_fill(rows[..., None] > self.steps, 0.0)
 
     def _rows_ahead(self, task_state: Tensor) -> tuple[Tensor, Tensor]:
         """References (B, 1) and the next rows (B, HORIZON) of each, of which some may be beyond its end."""
