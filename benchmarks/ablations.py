@@ -1,11 +1,12 @@
-"""What each part of an adaptation is worth, on six targets, at 200 counted samples.
+"""What each part of an adaptation is worth, on six targets, at 200 counted samples, and what knowing the effect is.
 
     python -m benchmarks.ablations
     python -m benchmarks.ablations --shown states --out results/ablations_states.csv
 
 Each seed adapts the source policy anew, as shipped and with a part left out, and is scored on episodes whose starts
 no training saw. No score chooses anything. From frames the source policy is the shipped one; from states, where the
-networks see 5 states and actions, it is trained first. Interrupt it anywhere; started again, it goes on.
+networks see 5 states and actions, it is trained first. "true effect" has what is hidden in the simulator, and takes no
+samples: the source policy is tuned there, or a new one trained. Interrupt it anywhere; started again, it goes on.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from visadapt.policies import ImagePolicy, Policy, StatePolicy
 from visadapt.policies.networks import ImageResidualNetwork, ResidualNetwork, StateResidualNetwork, mlp
 from visadapt.setups.base import Setup
 from visadapt.storage.run_folder import open_run
+from visadapt.targets import SyntheticTarget
 from visadapt.world import World
 
 SAMPLES = 200
@@ -148,6 +150,33 @@ VARIANTS: dict[str, Variant] = {
 }
 
 
+def tuned_with_the_truth(setup: Setup, policy: Policy, folder: Path, seed: int) -> Policy:
+    """The policy tuned in the true physics."""
+    setup.tune(policy, seed)
+    return policy
+
+
+def trained_with_the_truth(setup: Setup, policy: Policy, folder: Path, seed: int) -> Policy:
+    """A new policy, trained in the true physics."""
+    return setup.pretrain(folder / "policy.safetensors", seed)
+
+
+KNOWING: dict[str, Callable[[Setup, Policy, Path, int], Policy]] = {
+    "true effect, tuned": tuned_with_the_truth,
+    "true effect, trained anew": trained_with_the_truth,
+}
+"""By name, how a policy is made by who has the target's effects in the simulator, without samples."""
+
+
+def _in_the_true_physics(setup: Setup, machine: SyntheticTarget, seed: int) -> Setup:
+    """The setup whose source is the target's system with its effects.
+
+    A force that changes has one phase, but streams begin at any time of an episode.
+    """
+    effects = machine.draw_effects(1, torch.Generator().manual_seed(seed))
+    return replace(setup, source=World(machine.system, effects, machine.period))
+
+
 @dataclass(frozen=True)
 class Settings:
     """What is run, and where."""
@@ -158,8 +187,8 @@ class Settings:
     episodes: int = 60
     targets: tuple[str, ...] = tuple(TARGETS)
     """which of TARGETS"""
-    variants: tuple[str, ...] = tuple(VARIANTS)
-    """which of VARIANTS; from states there is no renderer, from frames always a history"""
+    variants: tuple[str, ...] = (*VARIANTS, *KNOWING)
+    """which of VARIANTS and KNOWING; from states there is no renderer, from frames always a history"""
     jobs: int = 2
     """adaptations at once, one core each"""
     work: Path = Path("runs/ablations")
@@ -183,7 +212,8 @@ def main(settings: Settings) -> None:
         rows.append(speed_row(experiment(name, settings.shown), "unadapted", "target", 0, [unadapted[(name,)]]))
         for variant in settings.variants:
             scores = [found[name, variant, seed] for seed in range(settings.seeds)]
-            rows.append(speed_row(experiment(name, settings.shown), variant, "adapted", SAMPLES, scores))
+            samples = 0 if variant in KNOWING else SAMPLES
+            rows.append(speed_row(experiment(name, settings.shown), variant, "adapted", samples, scores))
     write_rows(settings.out, rows)
     for row in rows:
         print_speed(row)
@@ -191,12 +221,15 @@ def main(settings: Settings) -> None:
 
 def _after(settings: Settings, name: str, variant: str, seed: int) -> CartPoleScore:
     torch.set_num_threads(1)
-    shipped_setup, policy = source(settings.shown, settings.work)
-    setup, machine = VARIANTS[variant](shipped_setup, policy), target(name, settings.shown)
-    folder = settings.work / name / variant / f"seed-{seed}"
+    setup, policy = source(settings.shown, settings.work)
+    machine, folder = target(name, settings.shown), settings.work / name / variant / f"seed-{seed}"
+    setup = _in_the_true_physics(setup, machine, seed) if variant in KNOWING else VARIANTS[variant](setup, policy)
     about = {"shown": settings.shown, "seed": seed, "episodes": settings.episodes}
     open_run(folder, {**about, **setup.settings.numbers()})
-    setup.adapt(policy, machine, folder, SAMPLES, ROUND_SAMPLES, seed)
+    if variant in KNOWING:
+        policy = KNOWING[variant](setup, policy, folder, seed)
+    else:
+        setup.adapt(policy, machine, folder, SAMPLES, ROUND_SAMPLES, seed)
     return kept_score(folder / "score.json", policy, machine, settings.episodes)
 
 
