@@ -53,7 +53,7 @@ def test_the_report_is_written_from_the_result_and_imported_by_the_command_alone
     report = "visadapt.diagnosis.report"
     for path in (diagnosis / "report").rglob("*.py"):
         of_diagnosis = {name.split(".")[2] for name in modules(path) if name.startswith("visadapt.diagnosis.")}
-        assert of_diagnosis <= {"report", "result", "words"}, path
+        assert of_diagnosis <= {"explanations", "report", "result", "words"}, path
     users = {
         path for path in (ROOT / "visadapt").rglob("*.py") if any(name.startswith(report) for name in modules(path))
     }

@@ -1,7 +1,6 @@
 """The planned experiment: it tells apart what a recording left open, keeps to the ranges, and says where none does."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,16 +47,6 @@ def ambiguous(*causes):
     )
     gap = Gap("error", before=1.5, after=1.0, floor=1.0, black_box=1.0, closed=1.0)
     return va.Diagnosis("cartpole", RecordingSummary(1, 60, 0.05), "ambiguous", Where({}, {}), found, (), gap, "")
-
-
-def test_one_effect_is_exchanged_for_two_that_act_together():
-    either, both = "quadratic_drag", ("viscous_friction", "coulomb_friction")
-    found = ambiguous((either, "coefficient", 0.1), (both[0], "coefficient", 0.2), (both[1], "force", 0.1))
-    alike = {either: both} | dict.fromkeys(both, (either,))
-    causes = tuple(replace(cause, indistinguishable_from=alike[cause.effect]) for cause in found.causes)
-    for ordered in (causes, (causes[1], causes[0], causes[2])):  # the first is the likeliest
-        sets = planning.explanations(replace(found, causes=ordered))
-        assert {frozenset(effect.name for effect in each) for each in sets} == {frozenset({either}), frozenset(both)}
 
 
 def test_it_tells_drag_from_friction_where_the_recording_did_not(policy):

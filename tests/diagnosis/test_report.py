@@ -266,6 +266,18 @@ class TestWords:
         text = sentence(a_diagnosis("ambiguous", causes=(one, two, three)))
         assert re.match(r"Either actuator gain \(.*\), or friction patch \(.*\) and cart mass \(.*\) closes 96 %", text)
 
+    def test_one_that_stands_for_two_of_which_one_may_be_another(self):
+        alike = {
+            "quadratic_drag": ("viscous_friction", "coulomb_friction", "spring"),
+            "viscous_friction": ("quadratic_drag", "spring"),
+            "coulomb_friction": ("quadratic_drag",),
+            "spring": ("quadratic_drag", "viscous_friction"),
+        }
+        causes = tuple(Cause(name, {}, 0.5, 0.9, indistinguishable_from=others) for name, others in alike.items())
+        text = sentence(a_diagnosis("ambiguous", causes=causes))
+        either = "Either quadratic drag, or viscous friction and coulomb friction, or spring and coulomb friction"
+        assert text.startswith(f"{either} closes")
+
     @pytest.mark.parametrize(
         ("value", "text"),
         [(0, "0"), (0.0123456, "0.0123"), (1234.5, "1234"), (2.5e-7, "2.50e-07"), (math.nan, "unknown")],

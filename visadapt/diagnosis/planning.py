@@ -23,8 +23,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from visadapt.diagnosis.explanations import explanations
 from visadapt.diagnosis.policy_bound import StatesToActions, actions
-from visadapt.diagnosis.result import AMBIGUOUS, Diagnosis
+from visadapt.diagnosis.result import AMBIGUOUS, Diagnosis, named_effects
 from visadapt.diagnosis.search.fitted_models import FittedModels
 from visadapt.diagnosis.search.preparation import limited, prepare
 from visadapt.effects import EFFECTS, Effect
@@ -133,7 +134,7 @@ def plan(
         raise ValueError(f"only an ambiguous diagnosis needs an experiment; the verdict is {found.verdict}")
     if not recording.measured:
         raise ValueError("a plan needs a recording of states, not of frames")
-    sets = explanations(found)
+    sets = _explained(found)
     trials = _Trials.of(sets, recording, source.system, policy, samples, torch.Generator().manual_seed(seed))
     worth = trials.worth(sets, progress)
     best = int(worth.nan_to_num(-math.inf).argmax())
@@ -216,26 +217,14 @@ def _highest(values: Tensor) -> float:
     return float(known.max()) if len(known) else math.nan
 
 
-def explanations(found: Diagnosis) -> list[list[Effect]]:
-    """The effects of an ambiguous diagnosis, then these with some exchanged for others that fit equally well."""
-    values = {cause.effect: {name: one.value for name, one in cause.parameters.items()} for cause in found.causes}
-    alternatives = {cause.effect: cause.indistinguishable_from for cause in found.causes}
+def _explained(found: Diagnosis) -> list[list[Effect]]:
+    """The explanations of an ambiguous diagnosis, as effects at their found values."""
     # Repeated readings are found in the readings themselves: no experiment tells more, and no model has them.
-    first = [effect for effect in found.effects() if not effect.repeats_readings]
-    exchanged: dict[frozenset[str], list[Effect]] = {}
-    for effect in first:
-        rivals = [name for name in alternatives[effect.name] if name in values]
-        for rival in rivals:
-            # With those of the others that act together with it.
-            names = [rival]
-            for name in rivals:
-                if all(name != one and name not in alternatives[one] for one in names):
-                    names.append(name)
-            kept = [each for each in first if rival not in alternatives[each.name]]
-            exchanged.setdefault(frozenset(names), [*kept, *(EFFECTS[name](**values[name]) for name in names)])
-    if not exchanged:
+    causes = [cause for cause in found.causes if not EFFECTS[cause.effect].repeats_readings]
+    sets = explanations(causes)
+    if len(sets) < 2:
         raise ValueError("the diagnosis gives no values of the effects that it cannot tell apart: there is no plan")
-    return [first, *exchanged.values()]
+    return [named_effects(found.verdict, each) for each in sets]
 
 
 def _start(source: FitState, effects: Sequence[Effect]) -> FitState:

@@ -117,6 +117,15 @@ def without_slight(causes: Iterable[Cause]) -> list[Cause]:
     return [cause for cause in causes if not cause.slight]
 
 
+def first_explanation(causes: Iterable[Cause]) -> list[Cause]:
+    """The causes without those that an earlier one cannot be told from."""
+    taken: list[Cause] = []
+    for cause in causes:
+        if not any(cause.effect in (one.effect, *one.indistinguishable_from) for one in taken):
+            taken.append(cause)
+    return taken
+
+
 @dataclass(frozen=True)
 class Ranked:
     """One set of effects that was compared; the empty set is the source."""
@@ -301,10 +310,7 @@ def named_effects(verdict: str, causes: Sequence[Cause]) -> list[Effect]:
             f"the verdict is {verdict}: the diagnosis named no cause to put into a world; "
             + ("the source explains the recording as it is" if verdict == NO_GAP else "adapt with a residual")
         )
-    taken: list[Cause] = []
-    for cause in causes:
-        if not any(cause.effect in (one.effect, *one.indistinguishable_from) for one in taken):
-            taken.append(cause)
+    taken = first_explanation(causes)
     for cause in taken:
         for name, estimate in cause.parameters.items():
             if not math.isfinite(estimate.value):

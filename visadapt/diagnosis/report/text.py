@@ -8,6 +8,7 @@ from typing import Any
 
 import jinja2
 
+from visadapt.diagnosis.explanations import explanations
 from visadapt.diagnosis.result import (
     AMBIGUOUS,
     IDENTIFIED,
@@ -64,7 +65,8 @@ def sentence(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == IDENTIFIED:
         return f"{_capitalised(listed([_described(cause) for cause in carrying]))} {_closes(diagnosis)}."
     if diagnosis.verdict == AMBIGUOUS:
-        whole = listed([_either(group) for group in _alternatives(carrying)])
+        sets = explanations(carrying)
+        whole = listed([_either(group, sets) for group in _alternatives(carrying)])
         return f"{_capitalised(whole)} {_closes(diagnosis)}; this recording cannot tell which."
     return _unexplained(diagnosis)
 
@@ -79,23 +81,16 @@ def _alternatives(causes: Sequence[Cause]) -> list[list[Cause]]:
     return sorted(groups, key=len)
 
 
-def _either(group: Sequence[Cause]) -> str:
+def _either(group: Sequence[Cause], sets: Sequence[Sequence[Cause]]) -> str:
     """A group of alternatives: "either a or b"; where one of them stands for two, "either a, or b and c"."""
-    relatives: dict[frozenset[str], list[Cause]] = {}
-    for cause in group:
-        relatives.setdefault(frozenset((cause.effect, *cause.indistinguishable_from)), []).append(cause)
-    # Causes of the same relatives are alternatives; of the others, those that are no alternatives act together.
-    options: list[list[list[Cause]]] = []
-    for alike in relatives.values():
-        rivals = {name for cause in alike for name in cause.indistinguishable_from}
-        for option in options:
-            if not any(cause.effect in rivals for taken in option for cause in taken):
-                option.append(alike)
-                break
-        else:
-            options.append([alike])
-    texts = [listed([listed([_described(one) for one in alike], "or") for alike in option]) for option in options]
-    return ("either " if len(group) > 1 else "") + ", or ".join(texts)
+    options: list[list[Cause]] = []
+    for each in sets:
+        option = [cause for cause in each if cause in group]
+        if option not in options:
+            options.append(option)
+    texts = [listed([_described(cause) for cause in option]) for option in options]
+    either = "either " if len(options) > 1 else ""
+    return either + (", or ".join(texts) if len(group) > len(options) else listed(texts, "or"))
 
 
 def box(one: Box) -> str:
