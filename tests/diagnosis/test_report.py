@@ -139,6 +139,7 @@ def a_diagnosis(verdict, **changes):
         },
         "unexplained": {
             "causes": (),
+            "partial": (MASS,),
             "ranking": (Ranked(("coulomb_friction",), 0.6, 0.38), Ranked((), 0.0, 0.0)),
             "gap": Gap(MEASURE, 6.4, 4.5, 1.02, 1.5, 0.35),
             "next_experiment": "Drive slowly over x from 0.1 to 0.4 m in both directions.",
@@ -354,6 +355,15 @@ class TestPage:
         for piece in (sentence(diagnosis), diagnosis.next_experiment, *diagnosis.warnings, *SETTINGS.values()):
             assert piece in text
         assert "nan" not in re.sub(r"<svg.*?</svg>", "", page_of(verdict), flags=re.DOTALL).split()
+
+    def test_what_explains_a_part_of_it_is_shown_and_is_no_cause(self):
+        diagnosis = a_diagnosis("unexplained")
+        ((name, one),) = MASS.parameters.items()
+        text = " ".join(Page(page_of("unexplained")).words)
+        assert "What explains a part of it" in text
+        assert f"{name} {estimate(one)} {interval(one)}" in text
+        assert f"Partly     cart_mass: probability {MASS.probability:.2f}" in as_text(diagnosis)
+        assert "partial" not in diagnosis.to_json()
 
     def test_a_film_is_scrubbed_in_the_page_itself(self):
         rng = np.random.default_rng(0)

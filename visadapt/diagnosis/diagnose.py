@@ -16,6 +16,7 @@ from visadapt.diagnosis.measured_gap import MeasuredGap, measure
 from visadapt.diagnosis.result import (
     AMBIGUOUS,
     IDENTIFIED,
+    UNEXPLAINED,
     Cause,
     Diagnosis,
     RecordingSummary,
@@ -125,7 +126,7 @@ def diagnose(
     groups, rows = explored.groups, prepared.rows
     repeats = [cause for cause, _ in explored.repeats]
     measured = measure(search, comparison, groups, errors_with_repeats(prepared, search) if repeats else None, jobs)
-    verdict, found = _judge(explored, measured)
+    verdict, found, partial = _judge(explored, measured)
     before, after = disturbances(search, comparison)
     regions = _regions(found, before if found else after, explored.effects, profile.region_variables, seed)
     found_before = [(EFFECTS[cause.effect].stage, cost) for cause, cost in explored.repeats]
@@ -151,6 +152,7 @@ def diagnose(
             film=film_frames(film, rows, measured.corrected) if film else None,
         ),
         policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, comparison.best),
+        partial=partial,
     )
     return found_in_motion if film is None else with_camera(found_in_motion, film, system)
 
@@ -197,14 +199,15 @@ def _explore(
     return _Explored(named, prepared, search, comparison, alternatives(comparison, named, system), repeats)
 
 
-def _judge(explored: _Explored, measured: MeasuredGap) -> tuple[str, tuple[Cause, ...]]:
-    """The verdict, and the causes that go with it."""
+def _judge(explored: _Explored, measured: MeasuredGap) -> tuple[str, tuple[Cause, ...], tuple[Cause, ...]]:
+    """The verdict, the causes that go with it, and what explains a part of a gap that is unexplained."""
     comparison, groups = explored.comparison, explored.groups
     repeats = [cause for cause, _ in explored.repeats]
     explaining = (*repeats, *causes(explored.search, comparison, groups, measured.closed))
     unexplained, coarse = comparison.unexplained(measured.improvable), bool(explored.prepared.coarse)
     verdict = verdict_of(comparison, measured.gap, unexplained, measured.improvable, explaining, bool(repeats), coarse)
-    return verdict, explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
+    found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
+    return verdict, found, explaining if verdict == UNEXPLAINED else ()
 
 
 def _warnings(

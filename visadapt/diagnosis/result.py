@@ -24,7 +24,7 @@ SCHEMA_VERSION = 2  # Version of `schema.json`
 
 KEYS = {"start": "from", "end": "to"}
 """JSON keys of fields that have another name there."""
-NOT_IN_JSON = ("figures", "policy")
+NOT_IN_JSON = ("figures", "policy", "partial")
 """Fields that the report alone shows."""
 SHARES = ("probability", "share", "p_value", "stages", "states")
 """Fields of numbers from 0 to 1: they are rounded to 12 digits, so that no rounding error exceeds 1."""
@@ -263,6 +263,9 @@ class Diagnosis:
     warnings: tuple[str, ...] = ()  # of loading the recording, and of the diagnosis
     figures: FigureData = FigureData()
     policy: PolicyTerms | None = None  # terms of Theorem 1, where a policy was given
+    partial: tuple[Cause, ...] = ()
+    """where the verdict is unexplained, the effects of the most probable set, which explain a part of the gap: what
+    else acts may have moved their values"""
 
     def __post_init__(self) -> None:
         if self.verdict not in VERDICTS:
