@@ -18,8 +18,9 @@ SOURCE = va.World(va.CartPole())
 
 @pytest.fixture(autouse=True)
 def few_excitations(monkeypatch):
-    """Two frequencies of six, for the time it takes."""
+    """Two frequencies of six and three sizes of five, for the time they take."""
     monkeypatch.setattr(planning, "FREQUENCIES", (0.2, 0.8))
+    monkeypatch.setattr(planning, "SIZES", (0.1, 0.4, 0.8))
 
 
 @pytest.fixture(scope="module")

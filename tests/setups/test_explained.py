@@ -30,8 +30,10 @@ def rivals(folder):
 
 
 def test_what_two_causes_explain_is_settled_by_an_experiment_in_the_next_round(tmp_path, monkeypatch, only_effects):
-    only_effects("viscous_friction", "stribeck_friction", "coulomb_friction", "pole_damping", "actuator_gain")
-    monkeypatch.setattr(planning, "FREQUENCIES", (0.8,))  # one of six, for the time it takes
+    only_effects("viscous_friction", "stribeck_friction", "coulomb_friction", "actuator_gain")
+    # One of six and two of five, for the time they take.
+    monkeypatch.setattr(planning, "FREQUENCIES", (0.8,))
+    monkeypatch.setattr(planning, "SIZES", (0.2, 0.4))
     effects = [va.effects.ViscousFriction(coefficient=0.8), ReadingNoise()]
     target = va.SyntheticTarget(lambda batch, generator: effects)
     policy, source = va.load_policy(va.shipped("cartpole_states")), va.World(va.CartPole())
