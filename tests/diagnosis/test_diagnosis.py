@@ -231,7 +231,7 @@ def test_a_late_sensor_is_named_with_its_delay(only_effects):
 
 @pytest.mark.parametrize("others", [[], [CoulombFriction(force=1.5)]])
 def test_a_sensor_later_than_a_row_is_found_also_where_the_joint_stops(only_effects, others):
-    only_effects("coulomb_friction", "position_delay", "angle_delay", "actuator_gain")
+    only_effects("coulomb_friction", "position_delay", "angle_delay")
     noise = (2e-4, 0.005, 5e-4, 0.005)
     recording = record([*others, PositionDelay(delay=0.08)], measured=("x", "x_dot", "theta", "theta_dot"), noise=noise)
     result = diagnose(recording, SOURCE)
