@@ -41,7 +41,7 @@ def only_cameras(monkeypatch):
     return lambda *kinds: monkeypatch.setattr(camera, "SEARCHED", kinds)
 
 
-def film(path, effects=(), seen=lambda frames: frames, episodes=3, rows=60, seed=2):
+def film(path, effects=(), seen=lambda frames: frames, episodes=3, rows=40, seed=2):
     """A film of the drawn cart-pole, kept upright with some noise in the command; two grey levels of noise."""
     target = va.SyntheticTarget(lambda batch, generator: effects, camera=DrawnCartPole())
     policy = va.load_policy(va.shipped("cartpole_frames"))
@@ -89,15 +89,17 @@ def diagnosed(path, **options):
 
 
 class TestMotion:
-    def test_friction_is_found_in_a_film(self, tmp_path, only_effects):
+    def test_friction_is_found_in_a_film(self, tmp_path, only_effects, only_cameras):
         only_effects(*MOTION)
+        only_cameras(Brightness, CameraRotation)
         found = diagnosed(film(tmp_path / "run.h5", [ViscousFriction(coefficient=3.0)]))
         assert found.verdict == "identified"
         assert [cause.effect for cause in found.causes] == ["viscous_friction"]
         assert found.causes[0].parameters["coefficient"].value == pytest.approx(3.0, rel=0.02)
 
-    def test_frames_that_are_not_explained_are_left_out_with_a_warning(self, still, only_effects):
+    def test_frames_that_are_not_explained_are_left_out_with_a_warning(self, still, only_effects, only_cameras):
         only_effects(*MOTION)
+        only_cameras(Brightness, CameraRotation)
 
         def flash(frame):
             frame[[7, 8, 20]] = 0
@@ -169,7 +171,7 @@ class TestCamera:
 
     def test_lost_frames(self, tmp_path, only_effects):
         only_effects(*MOTION)
-        path = rewritten(film(tmp_path / "run.h5", episodes=1), frame=repeat_every_fifth)
+        path = rewritten(film(tmp_path / "run.h5", episodes=1, rows=60), frame=repeat_every_fifth)
         (cause,) = diagnosed(path).causes
         assert cause.effect == "frame_drop"
         assert values(cause)["rate"] == pytest.approx(0.2, abs=0.03)
@@ -205,8 +207,9 @@ class TestPixels:
         assert (box.left, box.top, box.right, box.bottom) == pytest.approx((80, 5, 110, 15), abs=2)
         assert box.share > 0.9
 
-    def test_a_film_of_states_is_beside_its_predictions(self, still, only_effects):
+    def test_a_film_of_states_is_beside_its_predictions(self, still, only_effects, only_cameras):
         only_effects(*MOTION)
+        only_cameras(Brightness, CameraRotation)
         found = diagnosed(still)
         assert found.where.pixels.boxes == ()
         frames = found.figures.film

@@ -27,7 +27,7 @@ PAIRS = [
 
 SMOOTH = [(name, system) for name, system in PAIRS if not EFFECTS[name].no_gradient]
 
-PERIOD, STEPS = 0.05, 3
+PERIOD, STEPS = 0.05, 2
 CART_POLE = CartPole()
 
 STRONG = {
