@@ -178,7 +178,7 @@ def test_a_heavier_cart_is_not_a_weaker_motor_with_a_lighter_pole(only_effects):
 
 
 def test_two_large_effects_are_both_named(only_effects):
-    only_effects("coulomb_friction", "stribeck_friction", "actuator_gain", "cart_mass", "pole_mass")
+    only_effects("coulomb_friction", "stribeck_friction", "actuator_gain", "cart_mass")
     effects = [CoulombFriction(force=3.0), ActuatorGain(scale=0.7)]
     result = diagnose(record(effects, measured=("x", "x_dot", "theta", "theta_dot")), SOURCE)
     carrying = {cause.effect: cause for cause in result.causes if not cause.slight}

@@ -31,7 +31,7 @@ def rivals(folder):
 
 
 def test_what_two_causes_explain_is_settled_by_an_experiment_in_the_next_round(tmp_path, monkeypatch, only_effects):
-    only_effects("viscous_friction", "stribeck_friction", "coulomb_friction", "actuator_gain")
+    only_effects("viscous_friction", "stribeck_friction", "actuator_gain")
     # One excitation of 30, and coarser steps of the target, for the time they take.
     monkeypatch.setattr(planning, "FREQUENCIES", (0.8,))
     monkeypatch.setattr(planning, "SIZES", (0.4,))
