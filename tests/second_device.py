@@ -7,6 +7,7 @@ the other, or is copied from or to it.
 
 import warnings
 from contextlib import contextmanager
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -97,5 +98,15 @@ def operate(function, args, kwargs):
     out = function(*own, **options)
     if not remote:
         return out
-    wrapped = tree_map(lambda each: Remote(each) if isinstance(each, Tensor) else each, out)
-    return return_and_correct_aliasing(function, args, kwargs, wrapped)
+    wrapped = Remote(out) if isinstance(out, Tensor) else tree_map(_remote, out)
+    return return_and_correct_aliasing(function, args, kwargs, wrapped) if _aliases(function) else wrapped
+
+
+def _remote(each):
+    return Remote(each) if isinstance(each, Tensor) else each
+
+
+@cache
+def _aliases(function):
+    """Whether what it returns is, or shares its memory with, what it is given."""
+    return any(returned.alias_info is not None for returned in function._schema.returns)

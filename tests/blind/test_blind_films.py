@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import visadapt as va
+from datasets.blind import films
 from datasets.blind.camera_faults import CAMERA, FOREIGN_IN_FILMS, NOISE, clean, with_losses
 from datasets.blind.films import IN_MOTION, MIX, Settings, calibration_path, main
 from datasets.blind.scene import LOOKS
@@ -68,7 +69,9 @@ def test_a_lost_frame_shows_the_last_one_again():
     assert set(shown) == set(shown[np.flatnonzero(steps) + 1]) | {0}
 
 
-def test_the_key_is_sealed_and_kept_out_of_the_folder(tmp_path, capsys):
+def test_the_key_is_sealed_and_kept_out_of_the_folder(tmp_path, capsys, monkeypatch):
+    for name, few in (("ROWS", 160), ("CALIBRATION_FRAMES", 50)):
+        monkeypatch.setattr(films, name, few)
     out = tmp_path / "films"
     main(Settings(out, "plain", count=2, seed=4))
     key = (tmp_path / "films.key.json").read_bytes()

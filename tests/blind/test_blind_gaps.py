@@ -55,8 +55,7 @@ def drafts():
     return {kind: make(Settings(Path("unused"), kind, count, seed=3)) for kind, count in COUNTS.items()}
 
 
-@pytest.fixture
-def bare(drafts):
+def cut(drafts):
     """A recording's case without its effects, cut to 2 s."""
     case = drafts["hard"][0].case
     rows = 40
@@ -65,6 +64,17 @@ def bare(drafts):
         driver.gain, None, driver.start, driver.excitation[:rows], driver.reference[:rows], driver.description
     )
     return Case(driver, {}, case.noise[:rows], case.loss_draws[:rows])
+
+
+@pytest.fixture
+def bare(drafts):
+    return cut(drafts)
+
+
+@pytest.fixture(scope="module")
+def quiet(drafts):
+    """The run of the case without effects."""
+    return simulate([cut(drafts)], 10)[0]
 
 
 def law(effects):
@@ -216,9 +226,8 @@ def test_kinds_are_named_once_and_shared_by_no_side():
 
 
 @pytest.mark.parametrize("kind", [k.name for k in NAMED + REST + LATER + FOREIGN])
-def test_every_kind_acts(bare, kind):
+def test_every_kind_acts(bare, quiet, kind):
     rng = np.random.default_rng(0)
-    quiet = simulate([bare], 10)[0]
     effect = KINDS[kind]
     bare.effects = {kind: effect.build(effect.high, effect.draw(rng, 2.0))}
     run = simulate([bare], 10)[0]

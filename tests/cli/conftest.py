@@ -21,7 +21,7 @@ def trained(tmp_path_factory):
     """A renderer, and policies on states and on frames, of hardly any training."""
     folder = tmp_path_factory.mktemp("trained")
     frames, renderer = write_frames(folder / "frames.h5"), folder / "renderer.safetensors"
-    assert run("renderer", frames, *GUESS, "--iterations", 300, "--out", renderer) == 0
+    assert run("renderer", frames, *GUESS, "--iterations", 150, "--out", renderer) == 0
     cartpole = ("train", "--system", "cartpole", "--iterations", 3)
     assert run(*cartpole, "--out", folder / "states.safetensors") == 0
     seeing = ("--renderer", renderer, "--seeing", 3)

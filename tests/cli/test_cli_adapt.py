@@ -6,6 +6,8 @@ import torch
 import visadapt as va
 from tests.cli.commands import refused, run, write_frames
 from visadapt import progress
+from visadapt.diagnosis import planning
+from visadapt.diagnosis.search import camera
 
 SHIPPED = va.shipped("cartpole_states")
 SMALL = ("--samples", 40, "--round", 20, "--iterations", 2, "--out", "run")
@@ -58,7 +60,11 @@ def test_effects_of_a_diagnosis_are_fitted_to_the_target(here, trained, diagnosi
     assert float(force.get_parameter("force").detach()) == pytest.approx(1.0, abs=0.2)
 
 
-def test_the_causes_of_the_gap_are_named_and_put_into_the_simulator(here, capsys):
+def test_the_causes_of_the_gap_are_named_and_put_into_the_simulator(here, capsys, only_effects, monkeypatch):
+    only_effects("constant_force", "actuator_bias", "actuator_gain", "viscous_friction", "spring", "angle_offset")
+    # One excitation for the next round of 30, for the time it takes.
+    monkeypatch.setattr(planning, "FREQUENCIES", (0.8,))
+    monkeypatch.setattr(planning, "SIZES", (0.2,))
     policy = ("--policy", SHIPPED, "--target", "rig:states", "--diagnose")
     assert run("adapt", *policy, *SMALL) == 0
     # A bias of the command is the same as the target's force of 1 N.
@@ -72,8 +78,10 @@ def test_the_causes_of_the_gap_are_named_and_put_into_the_simulator(here, capsys
     assert "starts from the bare system" in refused(capsys, *again, *SMALL[:-1], "other")
 
 
-def test_from_frames_the_camera_is_named_beside_what_moves(here, capsys, only_effects):
+def test_from_frames_the_camera_is_named_beside_what_moves(here, capsys, only_effects, monkeypatch):
     only_effects("actuator_gain", "cart_mass", "viscous_friction", "actuator_lag", "angle_offset")
+    monkeypatch.setattr(camera, "FRAMES", 8)
+    monkeypatch.setattr(camera, "SEARCHED", (va.effects.Blur, va.effects.Brightness, va.effects.CameraRotation))
     (here / "filmed.py").write_text(
         "import visadapt as va\nfrom renderers import DrawnCartPole\n\n\ndef target():\n"
         "    faults = [va.effects.CameraRotation(angle=0.06), va.effects.ActuatorGain(scale=0.6)]\n"

@@ -17,6 +17,7 @@ from visadapt.effects import (
     CartMass,
     ConstantForce,
     CoulombFriction,
+    Dropout,
     DynamicsEffect,
     FrictionPatch,
     Gust,
@@ -26,6 +27,7 @@ from visadapt.effects import (
     PoleFriction,
     PoleMass,
     PositionDelay,
+    Spring,
     ViscousFriction,
 )
 from visadapt.effects.forces import CartForce
@@ -111,12 +113,22 @@ def test_on_a_heavy_machine_effects_are_found_beyond_the_ranges_of_a_light_one()
     assert found["pole_damping"].value == pytest.approx(0.5, rel=0.2)
 
 
+RIVALS = {
+    "viscous_friction": None,
+    "angle_offset": ("position_offset", "constant_force", "actuator_bias", "track_tilt", "pole_spring", "angle_delay"),
+    "actuator_backlash": ("actuator_deadzone", "actuator_lag", "actuator_delay", "actuator_gain", "coulomb_friction"),
+}
+"""Those that each is most easily taken for; for one, the whole catalogue."""
+
+
 @pytest.mark.parametrize(
     "effect",
     [ViscousFriction(coefficient=0.8), AngleOffset(offset=0.02), ActuatorBacklash(width=0.05)],
     ids=lambda effect: effect.name,
 )
-def test_one_effect_is_named_with_its_size(effect):
+def test_one_effect_is_named_with_its_size(effect, only_effects):
+    if (rivals := RIVALS[effect.name]) is not None:
+        only_effects(effect.name, *rivals)
     result = diagnose(record([effect]), SOURCE)
     assert effect.name in names(result)
     cause = next(c for c in result.causes if c.effect == effect.name)
@@ -127,9 +139,14 @@ def test_one_effect_is_named_with_its_size(effect):
     assert result.gap.closed > 0.9
 
 
+def diagnosed_push():
+    few = [ConstantForce, ActuatorBias, ActuatorGain, ViscousFriction, Spring, PoleMass, PeriodicForce, Dropout]
+    return diagnose(record([ConstantForce(force=0.5)]), SOURCE, few)
+
+
 @pytest.fixture(scope="module")
 def pushed():
-    return diagnose(record([ConstantForce(force=0.5)]), SOURCE)
+    return diagnosed_push()
 
 
 def test_effects_that_no_data_can_separate_are_named_together(pushed):
@@ -143,14 +160,17 @@ def test_effects_that_no_data_can_separate_are_named_together(pushed):
     assert "motor" in result.next_experiment
 
 
-def test_two_simultaneous_effects_are_both_named():
-    result = diagnose(record([ViscousFriction(coefficient=1.5), ActuatorGain(scale=0.8)], episodes=6), SOURCE)
+def test_two_simultaneous_effects_are_both_named(only_effects):
+    rubbing = ("viscous_friction", "coulomb_friction", "quadratic_drag")
+    only_effects(*rubbing, "actuator_gain", "cart_mass", "pole_mass", "actuator_lag", "actuator_delay")
+    result = diagnose(record([ViscousFriction(coefficient=1.5), ActuatorGain(scale=0.8)]), SOURCE)
     assert "viscous_friction" in names(result)
     assert names(result) & {"actuator_gain", "cart_mass"}
     assert sum(result.where.stages.values()) == pytest.approx(1)
 
 
-def test_a_heavier_cart_is_not_a_weaker_motor_with_a_lighter_pole():
+def test_a_heavier_cart_is_not_a_weaker_motor_with_a_lighter_pole(only_effects):
+    only_effects("cart_mass", "actuator_gain", "pole_mass", "pole_length", "viscous_friction", "coulomb_friction")
     result = diagnose(record([CartMass(scale=1.8)], measured=("x", "x_dot", "theta", "theta_dot")), SOURCE)
     assert names(result) == {"cart_mass"}
     assert result.causes[0].parameters["scale"].value == pytest.approx(1.8, rel=0.02)
@@ -158,16 +178,16 @@ def test_a_heavier_cart_is_not_a_weaker_motor_with_a_lighter_pole():
 
 
 def test_two_large_effects_are_both_named(only_effects):
-    only_effects("coulomb_friction", "stribeck_friction", "actuator_gain", "cart_mass", "pole_mass")
+    only_effects("coulomb_friction", "stribeck_friction", "actuator_gain", "cart_mass")
     effects = [CoulombFriction(force=3.0), ActuatorGain(scale=0.7)]
-    result = diagnose(record(effects, measured=("x", "x_dot", "theta", "theta_dot"), episodes=6), SOURCE)
+    result = diagnose(record(effects, measured=("x", "x_dot", "theta", "theta_dot")), SOURCE)
     carrying = {cause.effect: cause for cause in result.causes if not cause.slight}
     assert carrying.keys() == {"coulomb_friction", "actuator_gain"}
     assert carrying["coulomb_friction"].parameters["force"].value == pytest.approx(3.0, rel=0.02)
 
 
 def test_the_region_of_a_friction_patch_is_found(only_effects):
-    only_effects("friction_patch", "viscous_friction", "coulomb_friction", "spring", "actuator_gain", "pole_mass")
+    only_effects("friction_patch", "viscous_friction", "spring", "actuator_gain")
     result = diagnose(record([FrictionPatch(start=-0.1, end=0.15, coefficient=6.0)], episodes=6), SOURCE)
     assert names(result) == {"friction_patch"}
     region = result.where.regions[0]
@@ -176,7 +196,9 @@ def test_the_region_of_a_friction_patch_is_found(only_effects):
     assert region.end == pytest.approx(0.15, abs=0.03)
 
 
-def test_an_effect_outside_the_catalogue_is_unexplained():
+def test_an_effect_outside_the_catalogue_is_unexplained(only_effects):
+    only_effects("friction_patch", "spring", "constant_force", "viscous_friction", "actuator_gain")
+
     class Cogging(CartForce):
         table = (Parameter("force", "N", 0.0, 5.0, 0.0),)
 
@@ -208,7 +230,9 @@ def test_a_heavier_pole_is_named_with_what_else_moves_alike():
     assert not any("weigh the pole" in warning for warning in other.warnings)
 
 
-def test_a_late_sensor_is_named_with_its_delay():
+def test_a_late_sensor_is_named_with_its_delay(only_effects):
+    late = ("angle_delay", "position_delay", "measurement_delay", "actuator_delay", "actuator_lag")
+    only_effects(*late, "angle_offset", "viscous_friction")
     result = diagnose(record([AngleDelay(delay=0.02)]), SOURCE)
     assert names(result) == {"angle_delay"}
     low, high = result.causes[0].parameters["delay"].ci90
@@ -217,7 +241,7 @@ def test_a_late_sensor_is_named_with_its_delay():
 
 @pytest.mark.parametrize("others", [[], [CoulombFriction(force=1.5)]])
 def test_a_sensor_later_than_a_row_is_found_also_where_the_joint_stops(only_effects, others):
-    only_effects("coulomb_friction", "position_delay", "angle_delay", "pole_mass", "actuator_gain", "periodic_force")
+    only_effects("coulomb_friction", "position_delay", "angle_delay")
     noise = (2e-4, 0.005, 5e-4, 0.005)
     recording = record([*others, PositionDelay(delay=0.08)], measured=("x", "x_dot", "theta", "theta_dot"), noise=noise)
     result = diagnose(recording, SOURCE)
@@ -282,7 +306,7 @@ def test_an_effect_of_the_users_own_is_found():
 
 
 def test_a_repeated_diagnosis_is_equal(pushed):
-    assert diagnose(record([ConstantForce(force=0.5)]), SOURCE).to_json() == pushed.to_json()
+    assert diagnosed_push().to_json() == pushed.to_json()
 
 
 def test_probabilities_sum_to_one(pushed):

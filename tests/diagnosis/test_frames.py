@@ -11,8 +11,16 @@ import visadapt as va
 from renderers import DrawnCartPole, load_renderer
 from tests.diagnosis.test_report import SCHEMA
 from visadapt.cli import main as cli
-from visadapt.diagnosis.search.camera import find_camera
-from visadapt.effects import Blur, Brightness, CameraRotation, CameraShift, Occlusion, ViscousFriction
+from visadapt.diagnosis.search import camera
+from visadapt.effects import (
+    Blur,
+    Brightness,
+    CameraRotation,
+    CameraShift,
+    Gamma,
+    Occlusion,
+    ViscousFriction,
+)
 from visadapt.estimation.camera_fit import through
 from visadapt.estimation.poses import PoseFinder
 
@@ -20,7 +28,19 @@ RENDERER = va.shipped("renderer")
 MOTION = ("viscous_friction", "coulomb_friction", "pole_damping", "actuator_gain", "actuator_delay", "angle_offset")
 
 
-def film(path, effects=(), camera=lambda frames: frames, episodes=5, rows=60, seed=2):
+@pytest.fixture(autouse=True)
+def few_frames(monkeypatch):
+    """A camera is fitted to half as many frames of a film, for the time it takes."""
+    monkeypatch.setattr(camera, "FRAMES", 8)
+
+
+@pytest.fixture
+def only_cameras(monkeypatch):
+    """Leaves these effects of the camera to be looked for."""
+    return lambda *kinds: monkeypatch.setattr(camera, "SEARCHED", kinds)
+
+
+def film(path, effects=(), seen=lambda frames: frames, episodes=3, rows=40, seed=2):
     """A film of the drawn cart-pole, kept upright with some noise in the command; two grey levels of noise."""
     target = va.SyntheticTarget(lambda batch, generator: effects, camera=DrawnCartPole())
     policy = va.load_policy(va.shipped("cartpole_frames"))
@@ -28,7 +48,7 @@ def film(path, effects=(), camera=lambda frames: frames, episodes=5, rows=60, se
     noise = np.random.default_rng(seed)
     shown = []
     for one in runs:
-        frame = 255 * camera(torch.from_numpy(one.episode.frame) / 255).numpy()
+        frame = 255 * seen(torch.from_numpy(one.episode.frame) / 255).numpy()
         frame = (frame + 2 * noise.standard_normal(frame.shape)).round().clip(0, 255).astype(np.uint8)
         shown.append(va.Episode(time=one.episode.time, action=one.episode.action, frame=frame))
     va.write_recording(path, shown)
@@ -68,13 +88,18 @@ def diagnosed(path, **options):
 
 
 class TestMotion:
-    def test_friction_is_found_in_a_film(self, tmp_path):
+    def test_friction_is_found_in_a_film(self, tmp_path, only_effects, only_cameras):
+        only_effects(*MOTION)
+        only_cameras(Brightness, CameraRotation)
         found = diagnosed(film(tmp_path / "run.h5", [ViscousFriction(coefficient=3.0)]))
         assert found.verdict == "identified"
         assert [cause.effect for cause in found.causes] == ["viscous_friction"]
         assert found.causes[0].parameters["coefficient"].value == pytest.approx(3.0, rel=0.02)
 
-    def test_frames_that_are_not_explained_are_left_out_with_a_warning(self, still):
+    def test_frames_that_are_not_explained_are_left_out_with_a_warning(self, still, only_effects, only_cameras):
+        only_effects(*MOTION)
+        only_cameras(Brightness, CameraRotation)
+
         def flash(frame):
             frame[[7, 8, 20]] = 0
             return frame
@@ -89,7 +114,7 @@ class TestMotion:
 def poses():
     """A renderer, the finder of poses in its frames, and drawn frames in [0, 1] of cart-poles anywhere."""
     renderer = load_renderer(Path(RENDERER)).requires_grad_(False)
-    places = np.random.default_rng(0).uniform((-0.8, -0.2), (0.8, 0.2), (16, 2))
+    places = np.random.default_rng(0).uniform((-0.8, -0.2), (0.8, 0.2), (8, 2))
     drawn = torch.from_numpy(DrawnCartPole()(*places.T)).float() / 255
     return renderer, PoseFinder(renderer, 1.5, 0.5), drawn
 
@@ -100,7 +125,7 @@ def camera_of(poses, *effects):
     frames = 255 * through(drawn, effects).detach()
     noise = 2 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
-        return find_camera(renderer, finder, (frames + noise).round().clamp(0, 255).to(torch.uint8))
+        return camera.find_camera(renderer, finder, (frames + noise).round().clamp(0, 255).to(torch.uint8))
 
 
 def values(cause):
@@ -128,13 +153,14 @@ class TestCamera:
         assert cause.parameters["dy"].value == pytest.approx(-3.0, abs=0.05)
         assert cause.parameters["dx"].ci90 == (-20.0, 20.0)
 
-    def test_it_is_a_cause_beside_that_of_the_motion(self, tmp_path, only_effects):
+    def test_it_is_a_cause_beside_that_of_the_motion(self, tmp_path, only_effects, only_cameras):
         only_effects(*MOTION)
+        only_cameras(Blur, Brightness, Gamma)
 
         def blurred(frames):
             return through(frames.float(), [Blur(sigma=1.0)]).detach()
 
-        path = film(tmp_path / "run.h5", [ViscousFriction(coefficient=3.0)], blurred, episodes=3)
+        path = film(tmp_path / "run.h5", [ViscousFriction(coefficient=3.0)], blurred, episodes=2)
         found = diagnosed(path)
         assert (found.verdict, [cause.effect for cause in found.causes]) == ("identified", ["blur", "viscous_friction"])
         assert found.where.stages["camera"] > 0
@@ -142,29 +168,34 @@ class TestCamera:
         assert [effect.name for effect in found.effects()] == ["blur", "viscous_friction"]
         jsonschema.Draft202012Validator(SCHEMA).validate(found.to_json())
 
-    def test_lost_frames(self, tmp_path):
-        path = rewritten(film(tmp_path / "run.h5", episodes=1), frame=repeat_every_fifth)
+    def test_lost_frames(self, tmp_path, only_effects):
+        only_effects(*MOTION)
+        path = rewritten(film(tmp_path / "run.h5", episodes=1, rows=60), frame=repeat_every_fifth)
         (cause,) = diagnosed(path).causes
         assert cause.effect == "frame_drop"
         assert values(cause)["rate"] == pytest.approx(0.2, abs=0.03)
 
 
 class TestPixels:
-    def test_a_shadow_is_unexplained_and_the_motion_is_told_nevertheless(self, tmp_path, only_effects):
+    def test_a_shadow_is_unexplained_and_the_motion_is_told_nevertheless(self, tmp_path, only_effects, only_cameras):
         only_effects(*MOTION)
+        only_cameras(Brightness, Gamma, Occlusion)
 
         def shaded(frames):
             column = torch.arange(frames.shape[2])
             middle = 20 + 1.5 * torch.arange(len(frames))[:, None]
             return frames * (1 - 0.3 * torch.exp(-0.5 * ((column - middle) / 12).square()))[:, None]
 
-        found = diagnosed(film(tmp_path / "run.h5", [ViscousFriction(coefficient=3.0)], shaded, episodes=3))
+        found = diagnosed(film(tmp_path / "run.h5", [ViscousFriction(coefficient=3.0)], shaded))
         assert (found.verdict, found.causes) == ("unexplained", ())
         assert found.where.pixels.unexplained
         assert any(line.startswith("found in the motion") and "viscous_friction" in line for line in found.warnings)
         jsonschema.Draft202012Validator(SCHEMA).validate(found.to_json())
 
-    def test_what_is_wrong_in_one_place_is_found_there(self, still):
+    def test_what_is_wrong_in_one_place_is_found_there(self, still, only_effects, only_cameras):
+        only_effects(*MOTION)
+        only_cameras(Brightness, Gamma, Occlusion)
+
         def blinking(frame):
             frame[::2, 5:15, 80:110] -= 60
             return frame
@@ -175,7 +206,9 @@ class TestPixels:
         assert (box.left, box.top, box.right, box.bottom) == pytest.approx((80, 5, 110, 15), abs=2)
         assert box.share > 0.9
 
-    def test_a_film_of_states_is_beside_its_predictions(self, still):
+    def test_a_film_of_states_is_beside_its_predictions(self, still, only_effects, only_cameras):
+        only_effects(*MOTION)
+        only_cameras(Brightness, CameraRotation)
         found = diagnosed(still)
         assert found.where.pixels.boxes == ()
         frames = found.figures.film
@@ -206,7 +239,8 @@ class TestBadInput:
             capsys, path, "--renderer", RENDERER
         )
 
-    def test_another_scene(self, still, capsys):
+    def test_another_scene(self, still, capsys, only_cameras):
+        only_cameras(Brightness, CameraRotation, Gamma)
         path = rewritten(still, frame=lambda frame: 255 - frame)
         assert "it is of another scene" in refused(capsys, path, "--renderer", RENDERER)
 

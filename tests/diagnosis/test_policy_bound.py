@@ -187,7 +187,8 @@ class TestWholeDiagnosis:
         assert result.policy.delta[0] == pytest.approx(FORCE * PERIOD * PER_NEWTON, rel=0.02)
         assert result.policy.bound[1] < result.policy.bound[0]
 
-    def test_of_a_file(self, tmp_path, capsys):
+    def test_of_a_file(self, tmp_path, capsys, only_effects):
+        only_effects("constant_force", "actuator_bias", "viscous_friction", "actuator_gain")
         run, saved, out, page = (tmp_path / name for name in ("run.h5", "p.safetensors", "a.json", "a.html"))
         recording = record([ConstantForce(force=FORCE)])
         write_recording(run, recording.episodes, recording.measured, ["command"])

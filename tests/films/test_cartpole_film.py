@@ -1,6 +1,4 @@
 import resource
-import subprocess
-import sys
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -10,6 +8,7 @@ import pytest
 from matplotlib.colors import to_rgb
 from PIL import Image
 
+from tests.full_disk import error_on_a_full_disk
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.films.widgets import RED
 from visadapt.recordings import Episode
@@ -154,19 +153,11 @@ def test_a_disk_that_fills_up_leaves_the_old_film(tmp_path: Path):
     """A limit on the size of a file stands for a full disk: ffmpeg is stopped in the middle of writing."""
     old = tmp_path / "film.mp4"
     old.write_bytes(b"the film of yesterday")
-    code = (
-        "import resource, sys; from tests.films.test_cartpole_film import *\n"
-        "panels = [CartPolePanel('a', make_run(10))]\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
-        "try: CartPoleFilm(panels, PERIOD).write(sys.argv[1])\n"
-        "except OSError as error: print(error); sys.exit(7)\n"
-    )
-    root = Path(__file__).parents[2]
-    done = subprocess.run([sys.executable, "-c", code, str(old)], cwd=root, capture_output=True, text=True)
-    assert done.returncode == 7, done.stderr
-    assert str(old) in done.stdout
-    assert "was not written" in done.stdout
-    assert len(done.stdout.strip().splitlines()) == 1
+    film = CartPoleFilm([CartPolePanel("a", make_run(10))], PERIOD)
+    said = error_on_a_full_disk(lambda: film.write(old))
+    assert str(old) in said
+    assert "was not written" in said
+    assert len(said.strip().splitlines()) == 1
     assert old.read_bytes() == b"the film of yesterday"
     assert list(tmp_path.iterdir()) == [old]
 

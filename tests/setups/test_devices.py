@@ -15,7 +15,7 @@ from tests.flying import small_quadrotor
 from tests.second_device import DEVICE, second_device
 from visadapt.diagnosis.policy_bound import actions
 from visadapt.history import History
-from visadapt.learning import training_state
+from visadapt.learning import stability, training_state
 from visadapt.learning.perception import PerceptionSettings
 from visadapt.setups.cartpole import cartpole_frames, cartpole_states, from_frames
 from visadapt.setups.flight import fixed_wing
@@ -24,10 +24,13 @@ from visadapt.targets import synthetic
 CPU = torch.device("cpu")
 
 
-@pytest.fixture(autouse=True)
-def coarse_targets(monkeypatch):
-    """Simulated in few steps, for the time they take."""
-    monkeypatch.setattr(synthetic, "SMOOTH_STEP", 0.05)
+@pytest.fixture(scope="module", autouse=True)
+def coarse_targets():
+    """Simulated in few steps, and learnt worlds judged by few plans, for the time they take."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(synthetic, "SMOOTH_STEP", 0.05)
+        patch.setattr(stability, "PLANS", 3)
+        yield
 
 
 def frames():
@@ -88,9 +91,14 @@ def learnt(name, like, folder):
     return losses, weights(policy), va.score(policy, target(setup), episodes=2, steps=2)
 
 
-@pytest.mark.parametrize("name", SETUPS)
-def test_a_policy_in_double_precision_learns_the_same_up_to_rounding(name, tmp_path):
-    single, _, _ = learnt(name, torch.zeros(()), tmp_path / "single")
+@pytest.fixture(scope="module", params=SETUPS)
+def learnt_here(request, coarse_targets, tmp_path_factory):
+    """The name of a setup, and what is learnt with it on the CPU in single precision."""
+    return request.param, learnt(request.param, torch.zeros(()), tmp_path_factory.mktemp("here"))
+
+
+def test_a_policy_in_double_precision_learns_the_same_up_to_rounding(learnt_here, tmp_path):
+    name, (single, _, _) = learnt_here
     double, found, _ = learnt(name, torch.zeros((), dtype=torch.float64), tmp_path / "double")
     assert double == pytest.approx(single, rel=0.01)
     assert all(value.isfinite().all() for value in found.values())
@@ -106,9 +114,8 @@ def test_the_second_device_refuses_tensors_of_the_first():
                 mix()
 
 
-@pytest.mark.parametrize("name", SETUPS)
-def test_a_policy_on_another_device_learns_the_same_there(name, tmp_path):
-    here = learnt(name, torch.zeros(()), tmp_path / "here")
+def test_a_policy_on_another_device_learns_the_same_there(learnt_here, tmp_path):
+    name, here = learnt_here
     with second_device():
         there = learnt(name, torch.zeros((), device=DEVICE), tmp_path / "there")
     assert there[0] == here[0]

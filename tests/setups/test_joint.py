@@ -116,9 +116,11 @@ class TestSettings:
 
 @pytest.fixture(scope="module", autouse=True)
 def checkpoints():
-    """States of a training are kept after 20 iterations, not after 100."""
+    """States of a training are kept after 20 iterations, not after 100; 3 plans, not 15, show whether a world is
+    stable."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("visadapt.learning.training_state.CHECKPOINT_ITERATIONS", 20)
+        patch.setattr("visadapt.learning.stability.PLANS", 3)
         yield
 
 

@@ -11,8 +11,10 @@ from tests.flying import drag, trained_as
 from visadapt.effects import MotorLag, PeriodicForce
 from visadapt.evaluation import score
 from visadapt.history import History
+from visadapt.learning import stability
 from visadapt.setups.flight import fixed_wing, quadrotor
 from visadapt.systems.rigid_body import POSITION, VELOCITY
+from visadapt.targets import synthetic
 from visadapt.targets.rotorpy import SOURCE
 from visadapt.tasks.follow import Follow
 from visadapt.tasks.references import Reference
@@ -20,6 +22,15 @@ from visadapt.weights import shipped
 from visadapt.world import World
 
 SECONDS = 3.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse_targets():
+    """Simulated in fewer steps, and learnt worlds judged by few plans, for the time they take."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(synthetic, "SMOOTH_STEP", 0.02)
+        patch.setattr(stability, "PLANS", 3)
+        yield
 
 
 def shortened(references):
@@ -78,7 +89,7 @@ def test_200_samples_of_a_drag_lower_its_error_by_half_or_more(references, tmp_p
     setup = quadrotor(*references)
     policy, dragged = setup.load(shipped("quadrotor")), flight_target(setup, drag(0.3))
     before = score(policy, dragged, 20, 0)
-    brief = trained_as(setup, iterations=40, learning_rate=1e-3, batch=32)
+    brief = trained_as(setup, iterations=25, learning_rate=1e-3, batch=32)
     adapted = brief.adapt(policy, flight_target(setup, drag(0.3), test=False), tmp_path, 200, 200, seed=0)
     after = score(policy, dragged, 20, 0)
     assert adapted.ledger.used == 200
