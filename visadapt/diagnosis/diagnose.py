@@ -34,6 +34,7 @@ from visadapt.diagnosis.search.causes import (
     ranking,
     stage_shares,
 )
+from visadapt.diagnosis.search.coloured import with_coloured_noise
 from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
 from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
 from visadapt.diagnosis.search.preparation import PreparedRecording, limited, prepare
@@ -196,6 +197,7 @@ def _explore(
     named = [in_use.get(effect.name, effect) for effect in effects]
     comparison = compare(search)
     repeats = repeated_reading_causes(prepared, search, comparison, repeating)
+    search, comparison = with_coloured_noise(search, comparison, staged(progress, "search with coloured noise"))
     return _Explored(named, prepared, search, comparison, alternatives(comparison, named, system), repeats)
 
 

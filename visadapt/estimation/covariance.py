@@ -28,7 +28,7 @@ def deviations(model: CandidateModel, fits: FitState) -> Tensor:
     covariance = torch.linalg.inv(posterior(model.effects, fits)[1])
     problem = linear_problem([model], fits)
     filtered = forward(problem, *variances(model, fits, problem))
-    white = filtered.white
+    white = filtered.white if rows.colour is None else rows.colour.whitened(filtered.white)
     score = (white[..., :1] * white[..., 1:]).sum(2)
     length = score.shape[1]
     last = min(length - 1, round(CORRELATION_TIME / rows.period))

@@ -51,10 +51,16 @@ def fit(
     """The best fits of C models of the same rows in at most `iterations` damped Gauss-Newton steps from `start`.
 
     Args:
-        process_noise: without it, process noise stays at its lower bound.
+        process_noise: without it, process noise stays at its lower bound. Where the rows have a `colour`, all noise
+            is as that states.
         rival: log likelihood of another fit; fits that cannot come near it stop early.
     """
-    if not process_noise:
+    colour = models[0].rows.colour
+    if colour is not None:
+        process_noise = True
+        noise = colour.log_process.expand_as(start.log_process), colour.log_noise.expand_as(start.log_noise)
+        start = replace(start, log_process=noise[0], log_noise=noise[1])
+    elif not process_noise:
         start = replace(start, log_process=torch.full_like(start.log_process, MIN_LOG_PROCESS))
     bounds = _bounds(models, start)
     every = torch.ones(start.state.shape[:2], dtype=torch.float64)

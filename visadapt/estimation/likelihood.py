@@ -21,6 +21,7 @@ from torch import Tensor
 
 from visadapt.batch import Batch
 from visadapt.estimation.candidate import CandidateModel, linearise
+from visadapt.estimation.colour import Colour
 from visadapt.estimation.kalman import Linear, adjoints, forward, log_likelihood, noise_scores, respond, weights
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
@@ -209,7 +210,8 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState) -> Derivativ
     parts = []
     for first in range(0, count * windows, at_once):
         at = slice(first, first + at_once)
-        parts.append(_of_systems(problem[at], process[at], noise[at], used[at], counted[at], drawn[at], members))
+        systems = problem[at], process[at], noise[at], used[at], counted[at], drawn[at]
+        parts.append(_of_systems(*systems, members, rows.colour))
     return Derivatives(*(torch.cat(each).unflatten(0, (count, windows)) for each in zip(*parts, strict=True)))
 
 
@@ -221,16 +223,18 @@ def _of_systems(
     counted: Tensor,
     drawn: Tensor,
     members: tuple[Tensor, Tensor],
+    colour: Colour | None,
 ) -> tuple[Tensor, ...]:
     """The fields of `Derivatives` for N linear systems.
 
     Args:
         used: (N, T, m) 1 where there is a reading; `counted` is its weight in the likelihood.
         drawn: (N, T, m) standard normal.
+        colour: of the innovations, which states the noise: its derivatives are then 0. None: they are white.
     """
     here = forward(problem, process, noise)
-
-    error, columns = here.white.flatten(1, 2).tensor_split([1], -1)
+    errors = here.white if colour is None else colour.whitened(here.white)
+    error, columns = errors.flatten(1, 2).tensor_split([1], -1)
     # The information of the log variances: that of inputs which are the smoothed noises of one group (Gilmour, Thompson
     # and Cullis 1995, Biometrics 51(4)), in the mean of the data and of data that the model draws. The data alone would
     # give steps that are too long far from the optimum, where they are unlike the model.
@@ -249,11 +253,14 @@ def _of_systems(
     reading = (noise[:, None, :, None] * weight)[..., None] * measured.T[:, None]
     working = respond(here, drive.flatten(-2), reading.flatten(-2)).flatten(1, 2)
     working = working.unflatten(-1, (2, len(driven))).flatten(1, 2)
+    likelihood = log_likelihood(replace(here, white=errors), counted)
+    if colour is not None:
+        likelihood = likelihood + counted.mean(2).sum(1) * colour.whitening.logdet()
     return (
-        log_likelihood(here, counted),
+        likelihood,
         columns.mT @ columns,
         -(columns.mT @ error)[..., 0],
         0.25 * working.mT @ working,
-        score,
+        score if colour is None else torch.zeros_like(score),
         smoothed,
     )

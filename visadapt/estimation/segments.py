@@ -9,6 +9,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from visadapt.estimation.colour import Colour
+
 ROUNDING_ERROR = 1e-6
 """In a reading's unit; smaller differences between readings come from arithmetic, such as wrapping an angle."""
 
@@ -28,6 +30,7 @@ class Segments:
     channels: tuple[int, ...]  # the m columns of the state that were measured
     period: float  # s between rows, the median where the clock is unsteady
     resolution: tuple[float, ...]  # of each channel: the smallest difference between two different readings
+    colour: Colour | None = None  # of a fit's innovations, where they are known not to be white
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -28,7 +28,7 @@ class Innovations:
         self.model = model
         problem = linear_problem([model], fits)
         self._filtered = forward(problem, *variances(model, fits, problem))
-        white = self._filtered.white.flatten(0, 2)
+        white = self._white(self._filtered.white)
         self._known, _ = torch.linalg.qr(white[:, 1:])
         self.error: Tensor = self._projected(white[:, :1])[:, 0]
         """(N,)"""
@@ -36,7 +36,12 @@ class Innovations:
     def response(self, drive: Tensor, reading: Tensor) -> Tensor:
         """Change (N, M) of the innovations with M inputs: `drive` (W, T - 1, n, M) and `reading` (W, T, m, M), which is
         0 where nothing was measured."""
-        return self._projected(respond(self._filtered, drive, reading).flatten(0, 2))
+        return self._projected(self._white(respond(self._filtered, drive, reading)))
+
+    def _white(self, innovations: Tensor) -> Tensor:
+        """(N, M) of innovations (W, T, m, M)."""
+        colour = self.model.rows.colour
+        return (innovations if colour is None else colour.whitened(innovations)).flatten(0, 2)
 
     def _projected(self, white: Tensor) -> Tensor:
         return white - self._known @ (self._known.T @ white)

@@ -82,6 +82,18 @@ class Search(FittedModels):
         if progress is not None:
             progress(MAX_EFFECTS, MAX_EFFECTS, -self.best.log_odds)
 
+    def resume(self, sets: Sequence[ScoredModel]) -> bool:
+        """Fit sets that another search has found, and go on from the best if it is a new one; return whether it is."""
+        before = self.best
+        starts = [(each.effects, each.fits) for each in sets]
+        self.fit([(each.effects, each.fits) for each in self.fit(starts, CAREFUL, process_noise=False)], CAREFUL)
+        if self.best.names == before.names:
+            return False
+        exchanged = Exchanges()
+        self._settle(exchanged)
+        self._improve_while_unexplained(exchanged)
+        return True
+
     def promised(self) -> float:
         """Log likelihood that the best effect adds to the source, by the screening."""
         return max((one.gain for one in self.screening(self.source)), default=0.0)

@@ -1,0 +1,59 @@
+"""A second search where what the first leaves unexplained is not white.
+
+A real machine resonates, and its model does not: white noise that is as strong as that at every frequency hides what
+the model gets right at others, and parameters take up what they can of the rest. So the search is made again with the
+colour of the best model's innovations as noise (`estimation/colour.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from visadapt.diagnosis.search.fitted_models import ScoredModel
+from visadapt.diagnosis.search.model_comparison import MIN_LEFTOVER, ModelComparison, compare
+from visadapt.diagnosis.search.search import Search
+from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.colour import Colour, colour_of
+from visadapt.estimation.kalman import forward
+from visadapt.estimation.likelihood import linear_problem, variances
+from visadapt.progress import Progress
+
+ROUNDS = 3  # Searches with coloured noise at most; the last has the colour of what its own best set leaves
+
+
+def with_coloured_noise(
+    search: Search, comparison: ModelComparison, progress: Progress | None = None
+) -> tuple[Search, ModelComparison]:
+    """The search and its comparison made with coloured noise, where something is unexplained that is not white; else as
+    they are.
+
+    Sets that are found only so are tried with white noise too, where they may explain all. What is unexplained is what
+    the best set with white noise leaves.
+    """
+    found, other = comparison, search
+    for made in range(ROUNDS):
+        coloured_by = found.best
+        colour = _colour(search, coloured_by) if comparison.leftover > MIN_LEFTOVER else None
+        if colour is None:
+            break
+        other = Search(search.system, replace(search.rows, colour=colour), search.catalogue, jobs=search.jobs)
+        other.run(progress)
+        found = compare(other)
+        # The source predicts as it was fitted, with noise of its own.
+        other.fitted[frozenset()] = search.source
+        if search.resume([each.model for each in found.models]):
+            comparison = found = compare(search)
+            other = search
+        elif made and found.best.names == coloured_by.names:
+            break
+    return other, replace(comparison, models=found.models, alternatives=found.alternatives)
+
+
+def _colour(search: Search, best: ScoredModel) -> Colour | None:
+    """The colour of the innovations of a model with white noise, or with that of an earlier colour."""
+    model = CandidateModel(search.system, best.effects, search.rows)
+    problem = linear_problem([model], best.fits).data()
+    innovations = forward(problem, *variances(model, best.fits, problem)).white[..., 0]
+    return colour_of(
+        innovations, search.rows.inside, search.rows.period, best.fits.log_process[0], best.fits.log_noise[0]
+    )

@@ -1,0 +1,80 @@
+"""Innovations of a model that is not right, which are not white.
+
+What a model leaves out, such as the resonance of a belt, lasts for several rows. White process noise has the power of
+the whole of it at every frequency, so that the frequencies at which the model is wrong outweigh those at which it is
+right. Here the whitened innovations e (m channels) are described as a vector autoregression,
+
+    e_t = A_1 e_{t-1} + ... + A_p e_{t-p} + L n_t,   n_t ~ N(0, I),
+
+and parameters are fitted to n: generalised least squares (Cochrane and Orcutt 1949, Journal of the American Statistical
+Association 44(245)), as prediction errors with a noise model are in system identification (Ljung 1999, System
+Identification, section 4.2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+LONGEST = 0.15  # s that the autoregression reaches back at most
+
+ORDERS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # that are tried, in rows
+
+ROWS_PER_COEFFICIENT = 10  # Readings at least for each coefficient
+
+MIN_GAIN = 10.0  # Log likelihood, less the number of coefficients, that an order must gain over white innovations
+
+
+@dataclass(frozen=True)
+class Colour:
+    """The noise that a model's innovations show: that of the filter, and how its innovations go on."""
+
+    coefficients: Tensor  # (p, m, m) A
+    whitening: Tensor  # (m, m) L^-1
+    log_process: Tensor  # (G,) log process noise variances of the filter, by group
+    log_noise: Tensor  # (m,) log variances of its measurements
+
+    def whitened(self, innovations: Tensor) -> Tensor:
+        """n (N, T, m, M) of innovations (N, T, m, M); before the first row they are taken as 0."""
+        out = innovations.clone()
+        for lag, matrix in enumerate(self.coefficients, 1):
+            out[:, lag:] -= matrix @ innovations[:, :-lag]
+        return self.whitening @ out
+
+
+def colour_of(
+    innovations: Tensor, inside: Tensor, period: float, log_process: Tensor, log_noise: Tensor
+) -> Colour | None:
+    """The colour of a filter's whitened innovations (N, T, m), `inside` (N, T) its windows; None where they are white.
+
+    The order is the one with the largest log likelihood less the number of coefficients (Akaike 1974, IEEE Transactions
+    on Automatic Control 19(6)). `log_process` (G,) and `log_noise` (m,) are the noise of the filter.
+    """
+    channels = innovations.shape[2]
+    orders = [p for p in ORDERS if p <= LONGEST / period and p < innovations.shape[1] // 2]
+    if not orders:
+        return None
+    first = orders[-1]
+    here = inside[:, first:] > 0
+    now = innovations[:, first:][here]
+    white = _log_likelihood(now)
+    best: tuple[float, Colour | None] = MIN_GAIN, None
+    for order in orders:
+        if order * channels**2 * ROWS_PER_COEFFICIENT > now.numel():
+            break
+        past = torch.cat([innovations[:, first - k : innovations.shape[1] - k] for k in range(1, order + 1)], -1)[here]
+        weights = torch.linalg.lstsq(past, now, driver="gelsd").solution
+        left = now - past @ weights
+        gain = _log_likelihood(left) - white - order * channels**2
+        if gain > best[0]:
+            root = torch.linalg.cholesky(left.T @ left / len(left))
+            coefficients = weights.unflatten(0, (order, channels)).mT
+            best = gain, Colour(coefficients, torch.linalg.inv(root), log_process, log_noise)
+    return best[1]
+
+
+def _log_likelihood(errors: Tensor) -> float:
+    """Largest log likelihood of errors (N, m) as draws of one normal distribution, up to a constant."""
+    return -0.5 * len(errors) * float(torch.linalg.slogdet(errors.T @ errors / len(errors))[1])
