@@ -197,7 +197,8 @@ def _explore(
     named = [in_use.get(effect.name, effect) for effect in effects]
     comparison = compare(search)
     repeats = repeated_reading_causes(prepared, search, comparison, repeating)
-    search, comparison = with_coloured_noise(search, comparison, staged(progress, "search with coloured noise"))
+    again = staged(progress, "search with coloured noise")
+    search, comparison = with_coloured_noise(search, comparison, prepared.searched, again)
     return _Explored(named, prepared, search, comparison, alternatives(comparison, named, system), repeats)
 
 

@@ -9,6 +9,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from torch import Tensor
+
+from visadapt.diagnosis.search.all_rows import on_all_rows
 from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.model_comparison import MIN_LEFTOVER, ModelComparison, compare
 from visadapt.diagnosis.search.search import Search
@@ -22,13 +25,13 @@ ROUNDS = 3  # Searches with coloured noise at most; the last has the colour of w
 
 
 def with_coloured_noise(
-    search: Search, comparison: ModelComparison, progress: Progress | None = None
+    search: Search, comparison: ModelComparison, searched: Tensor, progress: Progress | None = None
 ) -> tuple[Search, ModelComparison]:
     """The search and its comparison made with coloured noise, where something is unexplained that is not white; else as
     they are.
 
-    Sets that are found only so are tried with white noise too, where they may explain all. What is unexplained is what
-    the best set with white noise leaves.
+    The best set that is found only so is tried with white noise too, where it may explain all. What is unexplained is
+    what the best set with white noise leaves. `searched` are the windows, by index, in which sets are looked for.
     """
     found, other = comparison, search
     for made in range(ROUNDS):
@@ -36,12 +39,15 @@ def with_coloured_noise(
         colour = _colour(search, coloured_by) if comparison.leftover > MIN_LEFTOVER else None
         if colour is None:
             break
-        other = Search(search.system, replace(search.rows, colour=colour), search.catalogue, jobs=search.jobs)
+        rows = replace(search.rows, colour=colour)
+        other = Search(search.system, rows.select(searched), search.catalogue, jobs=search.jobs)
         other.run(progress)
+        if len(searched) < rows.shape[0]:
+            other = on_all_rows(other, rows)
         found = compare(other)
         # The source predicts as it was fitted, with noise of its own.
         other.fitted[frozenset()] = search.source
-        if search.resume([each.model for each in found.models]):
+        if search.resume(found.best):
             comparison = found = compare(search)
             other = search
         elif made and found.best.names == coloured_by.names:

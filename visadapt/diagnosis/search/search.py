@@ -82,11 +82,11 @@ class Search(FittedModels):
         if progress is not None:
             progress(MAX_EFFECTS, MAX_EFFECTS, -self.best.log_odds)
 
-    def resume(self, sets: Sequence[ScoredModel]) -> bool:
-        """Fit sets that another search has found, and go on from the best if it is a new one; return whether it is."""
+    def resume(self, found: ScoredModel) -> bool:
+        """Fit a set that another search has found, and go on from it where it is the best; return whether it is."""
         before = self.best
-        starts = [(each.effects, each.fits) for each in sets]
-        self.fit([(each.effects, each.fits) for each in self.fit(starts, CAREFUL, process_noise=False)], CAREFUL)
+        (alone,) = self.fit([(found.effects, found.fits)], CAREFUL, process_noise=False)
+        self.fit([(alone.effects, alone.fits)], CAREFUL)
         if self.best.names == before.names:
             return False
         exchanged = Exchanges()
