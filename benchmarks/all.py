@@ -177,6 +177,7 @@ COMMANDS = (
         15,
         work="--work",
     ),
+    Command("vibrations", "vibrations.csv", ("benchmarks.vibrations", "--seeds", "2"), 10, work="--work"),
     Command(
         "baselines",
         "baselines.csv",

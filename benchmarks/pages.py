@@ -79,6 +79,7 @@ TABLES = {
     "blind frames": Table(diagnosis.blind_frames, ("blind_frames",)),
     "blind flights": Table(diagnosis.blind_flights, ("blind_quadrotor", "blind_fixed_wing")),
     "planned experiments": Table(diagnosis.planned, ("planned_experiments",)),
+    "vibrations": Table(diagnosis.vibrations, ("vibrations",)),
     "rotorpy diagnosis": Table(diagnosis.crazyflie, ("rotorpy_diagnosis",)),
     "baselines, constant": Table(paper.baselines_constant, ("baselines",)),
     "baselines, changing": Table(paper.baselines_changing, ("baselines",)),

@@ -7,6 +7,7 @@ from itertools import pairwise
 from benchmarks.blind.tables import STRENGTH_EDGES
 from benchmarks.planned_experiments import OUTCOMES
 from benchmarks.tables_adaptation import Lines, Rows
+from benchmarks.vibrations import OTHERS
 
 DIAGNOSERS = ("ours", "afternoon", "greedy", "refit", "pysindy", "chance")
 """Order of the columns."""
@@ -104,6 +105,17 @@ def planned(rows: Rows) -> Lines:
         own = {row["measure"]: row for row in rows if row["method"] == method}
         shares = [f"{100 * float(own[name]['mean']):.0f} %" for name in OUTCOMES]
         lines.append([method, own[OUTCOMES[0]]["episodes"], *shares])
+    return lines
+
+
+def vibrations(rows: Rows) -> Lines:
+    """One hidden effect beside a vibration, diagnosed with white noise alone, and with the search that has its colour."""
+    found = {(row["method"], row["measure"]): row for row in rows}
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    lines = [[f"beside a vibration, {rows[0]['episodes']} recordings", *methods]]
+    for measure in dict.fromkeys(row["measure"] for row in rows):
+        numbers = [float(found[method, measure]["mean"] or "nan") for method in methods]
+        lines.append([measure, *(f"{x:.1f}" if measure == OTHERS else f"{100 * x:.0f} %" for x in numbers)])
     return lines
 
 

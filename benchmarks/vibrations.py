@@ -39,7 +39,8 @@ HIDDEN: Mapping[str, Callable[[], va.Effect]] = {
     "gain 0.8": lambda: effects.ActuatorGain(scale=0.8),
 }
 WHITE, COLOURED = "white noise alone", "and its colour"
-MEASURES = NAMED, ERROR, COVERED, OTHERS, CLOSED = (
+SEARCHES = coloured.ROUNDS
+NAMED, ERROR, COVERED, OTHERS, CLOSED = (
     "hidden effect named",
     "parameter error, median",
     "90 % interval covers",
@@ -87,7 +88,7 @@ def _judged(settings: Settings, name: str, method: str, seed: int) -> dict[str, 
     torch.set_num_threads(1)
     folder = settings.work / f"{name} {method}".replace(" ", "-").replace("/", "-") / str(seed)
     open_run(folder, {"hidden": name, "seed": seed, "noise": NOISE, "rows": EPISODES * ROWS})
-    coloured.ROUNDS = 0 if method == WHITE else coloured.ROUNDS
+    coloured.ROUNDS = 0 if method == WHITE else SEARCHES
     return once(folder / "outcome.json", lambda: _outcome(HIDDEN[name](), seed))
 
 

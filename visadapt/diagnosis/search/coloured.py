@@ -21,7 +21,7 @@ from visadapt.estimation.kalman import forward
 from visadapt.estimation.likelihood import linear_problem, variances
 from visadapt.progress import Progress
 
-ROUNDS = 3  # Searches with coloured noise at most; the last has the colour of what its own best set leaves
+ROUNDS = 2  # Searches with coloured noise at most; the last has the colour of what the best set of the first leaves
 
 
 def with_coloured_noise(
