@@ -109,7 +109,7 @@ def planned(rows: Rows) -> Lines:
 
 
 def vibrations(rows: Rows) -> Lines:
-    """One hidden effect beside a vibration, diagnosed with white noise alone, and with the search that has its colour."""
+    """One hidden effect beside a vibration, with white noise alone and with the search that has its colour."""
     found = {(row["method"], row["measure"]): row for row in rows}
     methods = list(dict.fromkeys(row["method"] for row in rows))
     lines = [[f"beside a vibration, {rows[0]['episodes']} recordings", *methods]]
