@@ -14,7 +14,7 @@ def drawn(coefficients):
     """Innovations (WINDOWS, ROWS, 2) of a vector autoregression."""
     noise = torch.randn(WINDOWS, ROWS + 100, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     noise = noise @ MIXING.T
-    rows = []
+    rows: list[torch.Tensor] = []
     for t in range(ROWS + 100):
         now = noise[:, t]
         for lag, matrix in enumerate(coefficients, 1):
