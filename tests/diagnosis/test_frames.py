@@ -177,9 +177,8 @@ class TestCamera:
 
 
 class TestPixels:
-    def test_a_shadow_is_unexplained_and_the_motion_is_told_nevertheless(self, tmp_path, only_effects, only_cameras):
+    def test_a_shadow_is_unexplained_and_the_motion_is_told_nevertheless(self, tmp_path, only_effects):
         only_effects(*MOTION)
-        only_cameras(Brightness, Gamma, Occlusion)
 
         def shaded(frames):
             column = torch.arange(frames.shape[2])
@@ -239,8 +238,7 @@ class TestBadInput:
             capsys, path, "--renderer", RENDERER
         )
 
-    def test_another_scene(self, still, capsys, only_cameras):
-        only_cameras(Brightness, CameraRotation, Gamma)
+    def test_another_scene(self, still, capsys):
         path = rewritten(still, frame=lambda frame: 255 - frame)
         assert "it is of another scene" in refused(capsys, path, "--renderer", RENDERER)
 

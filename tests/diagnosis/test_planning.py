@@ -9,7 +9,6 @@ import torch
 import visadapt as va
 from visadapt.diagnosis import planning
 from visadapt.diagnosis.result import Cause, Estimate, Gap, RecordingSummary, Where
-from visadapt.targets import synthetic
 
 STATES = ("x", "x_dot", "theta", "theta_dot")
 NOISE = np.array([0.005, 0.02, 0.009, 0.05])
@@ -18,10 +17,8 @@ SOURCE = va.World(va.CartPole())
 
 @pytest.fixture(autouse=True)
 def few_excitations(monkeypatch):
-    """Two frequencies of six, two sizes of five, and coarser steps of the target, for the time they take."""
+    """Two frequencies of six, for the time it takes."""
     monkeypatch.setattr(planning, "FREQUENCIES", (0.2, 0.8))
-    monkeypatch.setattr(planning, "SIZES", (0.1, 0.4))
-    monkeypatch.setattr(synthetic, "SMOOTH_STEP", 0.0125)
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ PAIRS = [
 
 SMOOTH = [(name, system) for name, system in PAIRS if not EFFECTS[name].no_gradient]
 
-PERIOD, STEPS = 0.05, 2
+PERIOD, STEPS = 0.05, 3
 CART_POLE = CartPole()
 
 STRONG = {
@@ -56,7 +56,7 @@ def build(name, values):
     return EFFECTS[name](**{key: torch.tensor(value) for key, value in values.items()}).double()
 
 
-def drawn(name, system, test, examples=5, batch=None):
+def drawn(name, system, test, examples=10, batch=None):
     """Runs `test` on parameters of the effect; on the vehicles, whose steps cost more, on fewer."""
 
     @settings(max_examples=examples if isinstance(system, CartPole) else 2)
@@ -68,14 +68,14 @@ def drawn(name, system, test, examples=5, batch=None):
 
 
 def world_of(*effects, system=CART_POLE):
-    return World(system, effects, PERIOD, "rk4", substeps=2 if isinstance(system, CartPole) else 1)
+    return World(system, effects, PERIOD, "rk4", substeps=3 if isinstance(system, CartPole) else 1)
 
 
-def inputs(batch, system=CART_POLE, seed=0, steps=3):
-    """States (batch, n_state) and actions (steps, batch, n_action), away from the limits of the command."""
+def inputs(batch, system=CART_POLE, seed=0):
+    """States (batch, n_state) and actions (STEPS, batch, n_action), away from the limits of the command."""
     generator = torch.Generator().manual_seed(seed)
     state = torch.randn(batch, len(system.states), generator=generator, dtype=torch.float64)
-    actions = torch.rand(steps, batch, len(system.actions), generator=generator, dtype=torch.float64)
+    actions = torch.rand(STEPS, batch, len(system.actions), generator=generator, dtype=torch.float64)
     if isinstance(system, CartPole):
         state *= 0.5
     else:
@@ -92,7 +92,7 @@ def draw(state):
 
 
 def readings(world, state, actions):
-    """What is measured (T + 1, B, n_state) of a run, or what is seen of it (T + 1, B, pixels)."""
+    """What is measured (STEPS + 1, B, n_state) of a run, or what is seen of it (STEPS + 1, B, pixels)."""
     generator = torch.Generator().manual_seed(1)
     camera = any(effect.stage is Stage.CAMERA for effect in world.effects)
 
@@ -193,7 +193,7 @@ class TestContract:
     """What every effect promises on every system that it acts on."""
 
     def test_neutral_parameters_change_nothing(self, name, system):
-        state, actions = inputs(4, system, steps=STEPS)
+        state, actions = inputs(4, system)
         without = readings(world_of(*source_of(name), system=system), state, actions)
 
         def test(values):
@@ -205,12 +205,12 @@ class TestContract:
 
     def test_it_does_something(self, name, system):
         values = STRONG.get(name, {p.name: p.low + 0.8 * (p.high - p.low) for p in EFFECTS[name].table})
-        state, actions = inputs(4, system, steps=STEPS)
+        state, actions = inputs(4, system)
         with_it = readings(world_of(build(name, values), system=system), state, actions)
         assert (with_it - readings(world_of(*source_of(name), system=system), state, actions)).abs().max() > 1e-4
 
     def test_it_pickles(self, name, system):
-        state, actions = inputs(2, system, steps=STEPS)
+        state, actions = inputs(2, system)
 
         def test(values):
             effect = build(name, values)
@@ -219,12 +219,12 @@ class TestContract:
             own, other = (readings(world_of(e, system=system), state, actions) for e in (effect, copy))
             assert torch.equal(own, other)
 
-        drawn(name, system, test, 2)
+        drawn(name, system, test, 5)
 
     def test_device_and_dtype_come_from_the_tensors(self, name, system):
         values = {p.name: 0.5 * (p.low + p.high) for p in EFFECTS[name].table}
         world = world_of(EFFECTS[name](**values), system=system)
-        state, actions = inputs(2, system, steps=STEPS)
+        state, actions = inputs(2, system)
         assert readings(world, state, actions).dtype == torch.float64
         assert readings(world, state.float(), actions.float()).dtype == torch.float32
 
@@ -232,7 +232,7 @@ class TestContract:
         table = EFFECTS[name].table
         linear = [p for p in table if p.linear]
         values = STRONG.get(name, {p.name: p.low + 0.7 * (p.high - p.low) for p in table})
-        (state, actions), h = inputs(4, system, steps=STEPS), PERIOD
+        (state, actions), h = inputs(4, system), PERIOD
 
         def added(share):
             """What the effect adds when its linear parameters have gone a share of the way from neutral."""
@@ -280,7 +280,7 @@ class TestSmoothContract:
         high = [p.high if p.neutral == p.high else math.inf for p in table]
         ranges = free.new_tensor([low, high])
         limits = torch.cat((torch.stack((-free, free)), ranges), 1)
-        state, actions = inputs(2, system, steps=STEPS)
+        state, actions = inputs(2, system)
 
         def test(values):
             given = torch.tensor([values[p.name] for p in table], dtype=torch.float64).expand(2, -1)
@@ -290,8 +290,8 @@ class TestSmoothContract:
 
     def test_a_row_does_not_depend_on_its_batch(self, name, system):
         """Nor on whether its parameters are scalars or entries of (B,)."""
-        batch = 2
-        state, actions = inputs(batch, system, steps=STEPS)
+        batch = 3
+        state, actions = inputs(batch, system)
 
         def test(values):
             together = readings(world_of(build(name, values), system=system), state, actions)

@@ -11,25 +11,22 @@ import torch
 
 import visadapt as va
 from renderers import DrawnCartPole
+from tests.coarse import coarse_targets
 from tests.flying import small_quadrotor
 from tests.second_device import DEVICE, second_device
 from visadapt.diagnosis.policy_bound import actions
 from visadapt.history import History
-from visadapt.learning import stability, training_state
+from visadapt.learning import training_state
 from visadapt.learning.perception import PerceptionSettings
 from visadapt.setups.cartpole import cartpole_frames, cartpole_states, from_frames
 from visadapt.setups.flight import fixed_wing
-from visadapt.targets import synthetic
 
 CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module", autouse=True)
-def coarse_targets():
-    """Simulated in few steps, and learnt worlds judged by few plans, for the time they take."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(synthetic, "SMOOTH_STEP", 0.05)
-        patch.setattr(stability, "PLANS", 3)
+def coarse():
+    with coarse_targets(0.05):
         yield
 
 
@@ -92,7 +89,7 @@ def learnt(name, like, folder):
 
 
 @pytest.fixture(scope="module", params=SETUPS)
-def learnt_here(request, coarse_targets, tmp_path_factory):
+def learnt_here(request, coarse, tmp_path_factory):
     """The name of a setup, and what is learnt with it on the CPU in single precision."""
     return request.param, learnt(request.param, torch.zeros(()), tmp_path_factory.mktemp("here"))
 

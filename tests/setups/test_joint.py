@@ -116,11 +116,9 @@ class TestSettings:
 
 @pytest.fixture(scope="module", autouse=True)
 def checkpoints():
-    """States of a training are kept after 20 iterations, not after 100; 3 plans, not 15, show whether a world is
-    stable."""
+    """States of a training are kept after 20 iterations, not after 100."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("visadapt.learning.training_state.CHECKPOINT_ITERATIONS", 20)
-        patch.setattr("visadapt.learning.stability.PLANS", 3)
         yield
 
 

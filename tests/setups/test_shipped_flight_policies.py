@@ -7,14 +7,13 @@ import torch
 
 from datasets import quadrotor_references
 from experiments.flights import flight_target
+from tests.coarse import coarse_targets
 from tests.flying import drag, trained_as
 from visadapt.effects import MotorLag, PeriodicForce
 from visadapt.evaluation import score
 from visadapt.history import History
-from visadapt.learning import stability
 from visadapt.setups.flight import fixed_wing, quadrotor
 from visadapt.systems.rigid_body import POSITION, VELOCITY
-from visadapt.targets import synthetic
 from visadapt.targets.rotorpy import SOURCE
 from visadapt.tasks.follow import Follow
 from visadapt.tasks.references import Reference
@@ -25,11 +24,8 @@ SECONDS = 3.0
 
 
 @pytest.fixture(scope="module", autouse=True)
-def coarse_targets():
-    """Simulated in fewer steps, and learnt worlds judged by few plans, for the time they take."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(synthetic, "SMOOTH_STEP", 0.02)
-        patch.setattr(stability, "PLANS", 3)
+def coarse():
+    with coarse_targets(0.02):
         yield
 
 

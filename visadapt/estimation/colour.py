@@ -44,6 +44,11 @@ class Colour:
         return self.whitening @ out
 
 
+def whitened(innovations: Tensor, colour: Colour | None) -> Tensor:
+    """Innovations (N, T, m, M) with their `colour` taken out; as they are where they have none."""
+    return innovations if colour is None else colour.whitened(innovations)
+
+
 def colour_of(
     innovations: Tensor, inside: Tensor, period: float, log_process: Tensor, log_noise: Tensor
 ) -> Colour | None:

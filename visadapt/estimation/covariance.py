@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.colour import whitened
 from visadapt.estimation.fit_states import posterior
 from visadapt.estimation.kalman import forward
 from visadapt.estimation.likelihood import FitState, linear_problem, variances
@@ -28,7 +29,7 @@ def deviations(model: CandidateModel, fits: FitState) -> Tensor:
     covariance = torch.linalg.inv(posterior(model.effects, fits)[1])
     problem = linear_problem([model], fits)
     filtered = forward(problem, *variances(model, fits, problem))
-    white = filtered.white if rows.colour is None else rows.colour.whitened(filtered.white)
+    white = whitened(filtered.white, rows.colour)
     score = (white[..., :1] * white[..., 1:]).sum(2)
     length = score.shape[1]
     last = min(length - 1, round(CORRELATION_TIME / rows.period))

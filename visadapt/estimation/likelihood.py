@@ -21,7 +21,7 @@ from torch import Tensor
 
 from visadapt.batch import Batch
 from visadapt.estimation.candidate import CandidateModel, linearise
-from visadapt.estimation.colour import Colour
+from visadapt.estimation.colour import Colour, whitened
 from visadapt.estimation.kalman import Linear, adjoints, forward, log_likelihood, noise_scores, respond, weights
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
@@ -233,7 +233,7 @@ def _of_systems(
         colour: of the innovations, which states the noise: its derivatives are then 0. None: they are white.
     """
     here = forward(problem, process, noise)
-    errors = here.white if colour is None else colour.whitened(here.white)
+    errors = whitened(here.white, colour)
     error, columns = errors.flatten(1, 2).tensor_split([1], -1)
     # The information of the log variances: that of inputs which are the smoothed noises of one group (Gilmour, Thompson
     # and Cullis 1995, Biometrics 51(4)), in the mean of the data and of data that the model draws. The data alone would

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, SensingEffect
 from visadapt.estimation.candidate import COARSEST, SHORT_PERIOD, CandidateModel, with_loads
+from visadapt.estimation.colour import whitened
 from visadapt.estimation.kalman import forward, respond
 from visadapt.estimation.late_readings import earlier
 from visadapt.estimation.likelihood import FitState, linear_problem, variances
@@ -40,8 +41,7 @@ class Innovations:
 
     def _white(self, innovations: Tensor) -> Tensor:
         """(N, M) of innovations (W, T, m, M)."""
-        colour = self.model.rows.colour
-        return (innovations if colour is None else colour.whitened(innovations)).flatten(0, 2)
+        return whitened(innovations, self.model.rows.colour).flatten(0, 2)
 
     def _projected(self, white: Tensor) -> Tensor:
         return white - self._known @ (self._known.T @ white)
