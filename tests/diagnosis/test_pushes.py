@@ -155,12 +155,14 @@ def test_of_a_balanced_cart_pole_none_is_named_where_there_is_none(jitter, seed)
         assert pushes(balanced(0.0, jitter, seed), World(CartPole())) == ()
 
 
-@pytest.mark.parametrize("jitter", [0.0, 0.2])
-@pytest.mark.parametrize("force", [2.0, -4.0])
-def test_feedback_does_not_hide_a_push(force, jitter):
+@pytest.mark.parametrize(
+    ("force", "jitter", "seed"), [(2.0, 0.0, 0), (2.0, 0.2, 2), (2.0, 0.2, 7), (-4.0, 0.0, 3), (-4.0, 0.2, 0)]
+)
+def test_feedback_does_not_hide_a_push_and_the_pole_is_not_pushed(force, jitter, seed):
     with torch.inference_mode():
-        (push,) = pushes(balanced(force, jitter), World(CartPole()))
+        (push,) = pushes(balanced(force, jitter, seed), World(CartPole()))
     assert push.load == "cart_force"
-    assert push.size == pytest.approx(force, rel=0.25)
+    impulse = force * 0.11 * math.sqrt(2 * math.pi)
+    assert push.impulse == pytest.approx(impulse, rel=0.25)
     assert push.start == pytest.approx(8 - 2.45 * 0.11, abs=0.1)
-    assert push.ci90[0] < force * 0.11 * math.sqrt(2 * math.pi) < push.ci90[1]
+    assert push.ci90[0] < impulse < push.ci90[1]

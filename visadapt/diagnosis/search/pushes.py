@@ -40,8 +40,8 @@ SHAPE_ERROR = 0.15  # Deviation of an impulse, as a share of it, because a push 
 
 MAX_BUMPS = 6  # Bumps on an episode at most
 
-COLUMN_PRIOR = 0.3
-"""Prior standard deviation of the load that a column explains, over the size of the unexplained load."""
+COLUMN_PRIOR = 0.2
+"""Prior standard deviation of the load that a column explains, over that of the unexplained load."""
 
 EPISODE_PRIOR = 0.5
 """Prior standard deviation of an episode's weights about the common weights, in units of the common weights' prior
@@ -61,7 +61,7 @@ WHITE_SHARE = 0.03  # Share of the errors' variance that is taken as white, so t
 
 MIN_DISTINCT = 0.15  # Least share of a bump's information that columns and other bumps leave to it
 
-BUMP_PRIOR = 10.0  # Prior standard deviation of a bump's height, over the size of the unexplained load
+BUMP_PRIOR = 7.0  # Prior standard deviation of a bump's height, over that of the unexplained load
 
 
 def pushes(recording: Recording, world: World) -> tuple[Push, ...]:
@@ -76,7 +76,7 @@ def pushes(recording: Recording, world: World) -> tuple[Push, ...]:
     middles = sum(float(track.time[-1] - track.time[0]) / (SPACING * width) for track in tracks for width in WIDTHS)
     tries = round(middles) * tracks[0].load.shape[1]
     loads = world.system.loads
-    named = [_named(one, tracks[one.part].episode, loads[one.joint], tries) for one in found]
+    named = [_named(one, tracks[one.part], loads[one.joint], tries) for one in found]
     return tuple(sorted(named, key=lambda push: (push.episode, push.start)))
 
 
@@ -88,7 +88,7 @@ class _Bump:
     joint: int
     middle: float  # s
     width: float  # s, deviation
-    height: float = 0.0  # in the load's unit
+    height: float = 0.0  # over the root mean square of the joint's load
     deviation: float = math.inf  # of the height
 
     @property
@@ -115,15 +115,16 @@ def _bumps(track: LoadTrack, middles: Tensor, width: float) -> Tensor:
     return width / whole * torch.exp(-0.5 * ((track.time - middles[:, None]) / whole).square())
 
 
-def _named(bump: _Bump, episode: int, load: Variable, tries: int) -> Push:
-    area = bump.width * math.sqrt(2 * math.pi)
-    impulse = bump.height * area
-    spread = Z_90 * math.hypot(bump.deviation * area, SHAPE_ERROR * impulse)
+def _named(bump: _Bump, track: LoadTrack, load: Variable, tries: int) -> Push:
+    unit = float(track.unit[bump.joint])
+    size, area = unit * bump.height, bump.width * math.sqrt(2 * math.pi)
+    impulse = size * area
+    spread = Z_90 * math.hypot(unit * bump.deviation * area, SHAPE_ERROR * impulse)
     reach = EDGE * bump.width
     p_value = min(1.0, tries * math.erfc(bump.score / math.sqrt(2)))
     ends = max(0.0, bump.middle - reach), bump.middle + reach
     ci90 = impulse - spread, impulse + spread
-    return Push(episode, load.name, *ends, bump.height, load.unit, impulse, ci90, p_value)
+    return Push(track.episode, load.name, *ends, size, load.unit, impulse, ci90, p_value)
 
 
 class _Fit:
@@ -133,13 +134,12 @@ class _Fit:
         self.tracks = tracks
         self.bumps: list[_Bump] = []
         joints = tracks[0].load.shape[1]
-        self.size = torch.cat([track.load for track in tracks]).square().mean().sqrt() + 1e-300
         # At first all of the load, so that `_design` takes the columns along the world's motion: along the measured
         # motion, one factor common to all columns would explain a push away.
         self.left = [track.load.clone() for track in tracks]
         self.weights = [torch.zeros(0, dtype=torch.float64) for _ in tracks]
         self.roots = [torch.zeros(0, 0, dtype=torch.float64) for _ in tracks]
-        self.spread = [self.size.expand_as(track.load) for track in tracks]
+        self.spread = [torch.ones_like(track.load) for track in tracks]
         self.autoregression = torch.zeros(joints, LAGS, dtype=torch.float64)
         self.innovation = torch.ones(joints, dtype=torch.float64)
 
@@ -170,8 +170,8 @@ class _Fit:
         """(K, N, J) loads of unit prior deviation: of the columns, and of the bumps on this part."""
         track = self.tracks[part]
         columns = track.columns - torch.einsum("knij,nj->kni", track.reaction, self.left[part])
-        bumps = [BUMP_PRIOR * self.size * one.on(track) for one in self.bumps if one.part == part]
-        return torch.cat((COLUMN_PRIOR * self.size * columns, *(one[None] for one in bumps)))
+        bumps = [BUMP_PRIOR * one.on(track) for one in self.bumps if one.part == part]
+        return torch.cat((COLUMN_PRIOR * columns, *(one[None] for one in bumps)))
 
     def _whitened(self, part: int, values: Tensor) -> Tensor:
         """Loads (..., N, J) over the errors' deviation, less their autoregressive prediction; (..., N J)."""
@@ -269,7 +269,7 @@ class _Fit:
         """() the size of a joint's dry friction."""
         track = self.tracks[part]
         column = track.dry[joint]
-        return COLUMN_PRIOR * self.size * self.weights[part][column].abs() * track.columns[column].abs().amax()
+        return COLUMN_PRIOR * self.weights[part][column].abs() * track.columns[column].abs().amax()
 
     def _highest(self, part: int) -> _Bump:
         """The bump on a part that stands out most beside what is fitted."""
@@ -302,9 +302,8 @@ class _Fit:
             bumps = [one for one in self.bumps if one.part == part]
             if not bumps:
                 continue
-            unit = BUMP_PRIOR * float(self.size)
-            deviation = unit * torch.cholesky_inverse(self.roots[part]).diagonal().sqrt()
-            heights = unit * self.weights[part]
+            deviation = BUMP_PRIOR * torch.cholesky_inverse(self.roots[part]).diagonal().sqrt()
+            heights = BUMP_PRIOR * self.weights[part]
             for k, one in enumerate(bumps, len(heights) - len(bumps)):
                 out.append(replace(one, height=float(heights[k]), deviation=float(deviation[k])))
         return out

@@ -51,7 +51,8 @@ class LoadTrack:
 
     episode: int
     time: Tensor  # (N,) s since the episode began
-    load: Tensor  # (N, J)
+    unit: Tensor  # (J,) root mean square of each joint's load over the recording, in its own unit: N or N m
+    load: Tensor  # (N, J) in these units
     columns: Tensor  # (K, N, J) loads that state and command may explain, of unit root mean square over the recording
     reaction: Tensor
     """(K, N, J, J) change of the columns, which follow the modelled motion, per unit of load that nothing explains"""
@@ -96,11 +97,25 @@ def load_tracks(recording: Recording, world: World) -> list[LoadTrack]:
     ]
     if not found:
         return []
+    unit = torch.cat([track.load for track in found]).square().mean(0).sqrt()
+    unit = torch.where(unit > 0, unit, 1.0)
+    found = [_in_units(track, unit) for track in found]
     size = torch.cat([track.columns.square().flatten(1) for track in found], 1).mean(1).sqrt() + 1e-300
     return [
         replace(t, columns=t.columns / size[:, None, None], reaction=t.reaction / size[:, None, None, None])
         for t in found
     ]
+
+
+def _in_units(track: LoadTrack, unit: Tensor) -> LoadTrack:
+    """A track whose loads, in N or N m, are over `unit` (J,): only so do those of a slide and a hinge compare."""
+    return replace(
+        track,
+        unit=unit,
+        load=track.load / unit,
+        columns=track.columns / unit,
+        reaction=track.reaction * unit / unit[:, None],
+    )
 
 
 def _track(number: int, episode: Episode, world: World, measured: Sequence[int], period: float) -> list[LoadTrack]:
@@ -152,6 +167,7 @@ def _track(number: int, episode: Episode, world: World, measured: Sequence[int],
     whole = LoadTrack(
         number,
         time[inner],
+        torch.ones_like(smoothed[0, 0]),
         smoothed[:, 0],
         smoothed[:, 1:].movedim(1, 0),
         found.reaction[inner].movedim(1, 0),
