@@ -22,7 +22,16 @@ from torch import Tensor
 from visadapt.batch import Batch
 from visadapt.estimation.candidate import CandidateModel, linearise
 from visadapt.estimation.colour import Colour, whitened
-from visadapt.estimation.kalman import Linear, adjoints, forward, log_likelihood, noise_scores, respond, weights
+from visadapt.estimation.kalman import (
+    Filtered,
+    Linear,
+    adjoints,
+    forward,
+    log_likelihood,
+    noise_scores,
+    respond,
+    weights,
+)
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
@@ -235,32 +244,38 @@ def _of_systems(
     here = forward(problem, process, noise)
     errors = whitened(here.white, colour)
     error, columns = errors.flatten(1, 2).tensor_split([1], -1)
+    likelihood = log_likelihood(replace(here, white=errors), counted)
+    if colour is None:
+        adjoint, information, score = _by_noise(here, process, noise, used, drawn, members)
+    else:
+        likelihood = likelihood + counted.mean(2).sum(1) * colour.whitening.logdet()
+        adjoint = adjoints(here, here.white)
+        score = likelihood.new_zeros(len(likelihood), len(members[0]))
+        information = torch.diag_embed(score)
+    smoothed = here.predicted - here.covariance @ adjoint
+    return likelihood, columns.mT @ columns, -(columns.mT @ error)[..., 0], information, score, smoothed
+
+
+def _by_noise(
+    here: Filtered, process: Tensor, noise: Tensor, used: Tensor, drawn: Tensor, members: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The adjoints (N, T, n, 1 + K), and the Fisher information (N, G + S, G + S) of the log variances with the
+    derivatives (N, G + S) of the log likelihood by them."""
     # The information of the log variances: that of inputs which are the smoothed noises of one group (Gilmour, Thompson
     # and Cullis 1995, Biometrics 51(4)), in the mean of the data and of data that the model draws. The data alone would
     # give steps that are too long far from the optimum, where they are unlike the model.
     white = torch.cat((here.white, (drawn * used)[..., None]), -1)
     adjoint = adjoints(here, white)
-    smoothed = here.predicted - here.covariance @ adjoint[..., :-1]
     both = [0, -1]
-    adjoint = adjoint[..., both]
-    weight = weights(here, white[..., both], adjoint)
+    of_both = adjoint[..., both]
+    weight = weights(here, white[..., both], of_both)
     process = process.diagonal(dim1=1, dim2=2)
     driven, measured = members
-    by_process, by_noise = noise_scores(here, adjoint[..., 0], weight[..., 0], process, noise)
+    by_process, by_noise = noise_scores(here, of_both[..., 0], weight[..., 0], process, noise)
     score = by_process.sum(1) @ driven.T + (by_noise * used).sum(1) @ measured.T
     # The smoothed w is minus Q times the adjoint; what inputs add to the states is subtracted from the readings.
-    drive = (process[:, None, :, None] * adjoint[:, 1:])[..., None] * driven.T[:, None]
+    drive = (process[:, None, :, None] * of_both[:, 1:])[..., None] * driven.T[:, None]
     reading = (noise[:, None, :, None] * weight)[..., None] * measured.T[:, None]
     working = respond(here, drive.flatten(-2), reading.flatten(-2)).flatten(1, 2)
     working = working.unflatten(-1, (2, len(driven))).flatten(1, 2)
-    likelihood = log_likelihood(replace(here, white=errors), counted)
-    if colour is not None:
-        likelihood = likelihood + counted.mean(2).sum(1) * colour.whitening.logdet()
-    return (
-        likelihood,
-        columns.mT @ columns,
-        -(columns.mT @ error)[..., 0],
-        0.25 * working.mT @ working,
-        score if colour is None else torch.zeros_like(score),
-        smoothed,
-    )
+    return adjoint[..., :-1], 0.25 * working.mT @ working, score

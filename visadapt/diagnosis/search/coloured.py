@@ -13,7 +13,7 @@ from torch import Tensor
 
 from visadapt.diagnosis.search.all_rows import on_all_rows
 from visadapt.diagnosis.search.fitted_models import ScoredModel
-from visadapt.diagnosis.search.model_comparison import MIN_LEFTOVER, ModelComparison, compare
+from visadapt.diagnosis.search.model_comparison import MIN_LEFTOVER, ModelComparison, compare, compare_coloured
 from visadapt.diagnosis.search.search import Search
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.colour import Colour, colour_of
@@ -23,12 +23,14 @@ from visadapt.progress import Progress
 
 ROUNDS = 2  # Searches with coloured noise at most; the last has the colour of what the best set of the first leaves
 
+START_FROM = 4  # Best sets of a search from which the next one begins
+
 
 def with_coloured_noise(
     search: Search, comparison: ModelComparison, searched: Tensor, progress: Progress | None = None
 ) -> tuple[Search, ModelComparison]:
-    """The search and its comparison made with coloured noise, where something is unexplained that is not white; else as
-    they are.
+    """The search and its comparison gone on with coloured noise, where something is unexplained that is not white; else
+    as they are.
 
     The best set that is found only so is tried with white noise too, where it may explain all. What is unexplained is
     what the best set with white noise leaves. `searched` are the windows, by index, in which sets are looked for.
@@ -40,11 +42,12 @@ def with_coloured_noise(
         if colour is None:
             break
         rows = replace(search.rows, colour=colour)
+        begin = [(each.effects, each.fits.on(searched)) for each in other.close()[:START_FROM]]
         other = Search(search.system, rows.select(searched), search.catalogue, jobs=search.jobs)
-        other.run(progress)
+        other.go_on_from(begin, progress)
         if len(searched) < rows.shape[0]:
             other = on_all_rows(other, rows)
-        found = compare(other)
+        found = compare_coloured(other, comparison)
         # The source predicts as it was fitted, with noise of its own.
         other.fitted[frozenset()] = search.source
         if search.resume(found.best):
@@ -52,7 +55,7 @@ def with_coloured_noise(
             other = search
         elif made and found.best.names == coloured_by.names:
             break
-    return other, replace(comparison, models=found.models, alternatives=found.alternatives)
+    return other, found
 
 
 def _colour(search: Search, best: ScoredModel) -> Colour | None:

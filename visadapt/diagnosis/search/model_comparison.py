@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -81,25 +81,50 @@ class ModelComparison:
 
 def compare(search: Search) -> ModelComparison:
     """Compare the best models that a search has fitted, and the source."""
-    close = [f for f in search.ranked if f.log_odds >= search.best.log_odds - COMPARE_WITHIN]
-    close = close[: search.profile.compared_models]
+    close = _close(search)
     leftover = search.refit_without_process_noise(close)
     close = [search.fitted[key_of(f.effects)] for f in close]  # some of which may now have a better fit
-    if all(f is not search.source for f in close):
-        # So far behind that what process noise adds to it makes no difference.
-        close.append(search.source)
-        leftover.append(0.0)
-    scores = [f.log_odds - min(rest, MIN_LEFTOVER) for f, rest in zip(close, leftover, strict=True)]
-    probabilities = torch.tensor(scores, dtype=torch.float64).softmax(0).tolist()
-    order = sorted(range(len(close)), key=lambda k: -scores[k])
-    models = [ComparedModel(close[k], probabilities[k]) for k in order]
+    models = _weighed(search, close, leftover)
     best = models[0].model
     functions = smooth_functions(CandidateModel(search.system, best.effects, search.rows), best.fits)
-    alternatives = {effect: _alternatives(models, effect) for effect in best.effects}
     gained = float(best.fits.likelihood[0] - search.source.fits.likelihood[0])
     threshold = search.profile.smooth_function_threshold
     loads = tuple(load.name for load in search.system.loads)
-    return ModelComparison(models, leftover[order[0]], functions, alternatives, gained, threshold, loads)
+    # The source, which is not refitted, is best only where it is close.
+    left = {f.names: rest for f, rest in zip(close, leftover, strict=True)}.get(best.names, 0.0)
+    return ModelComparison(models, left, functions, _alternatives_to(models), gained, threshold, loads)
+
+
+def compare_coloured(search: Search, white: ModelComparison) -> ModelComparison:
+    """Compare the best models of a search with coloured noise; what is unexplained, the comparison with `white` noise
+    says."""
+    close = _close(search)
+    models = _weighed(search, close, [0.0] * len(close))
+    return replace(white, models=models, alternatives=_alternatives_to(models))
+
+
+def _close(search: Search) -> list[ScoredModel]:
+    """The models that are compared, the most probable first."""
+    close = [f for f in search.ranked if f.log_odds >= search.best.log_odds - COMPARE_WITHIN]
+    return close[: search.profile.compared_models]
+
+
+def _weighed(search: Search, close: Sequence[ScoredModel], leftover: Sequence[float]) -> list[ComparedModel]:
+    """Models and the source with their probabilities, the most probable first; `leftover` is what process noise adds to
+    the log likelihood of each."""
+    scores = [f.log_odds - min(rest, MIN_LEFTOVER) for f, rest in zip(close, leftover, strict=True)]
+    every = list(close)
+    if all(f is not search.source for f in every):
+        # So far behind that what process noise adds to it makes no difference.
+        every.append(search.source)
+        scores.append(search.source.log_odds)
+    probabilities = torch.tensor(scores, dtype=torch.float64).softmax(0).tolist()
+    return [ComparedModel(every[k], probabilities[k]) for k in sorted(range(len(every)), key=lambda k: -scores[k])]
+
+
+def _alternatives_to(models: Sequence[ComparedModel]) -> dict[type[Effect], list[ComparedModel]]:
+    """For each effect of the most probable model, the models that fit as well without it."""
+    return {effect: _alternatives(models, effect) for effect in models[0].model.effects}
 
 
 def _alternatives(models: Sequence[ComparedModel], effect: type[Effect]) -> list[ComparedModel]:

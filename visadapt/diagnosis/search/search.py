@@ -82,6 +82,23 @@ class Search(FittedModels):
         if progress is not None:
             progress(MAX_EFFECTS, MAX_EFFECTS, -self.best.log_odds)
 
+    def go_on_from(self, starts: Sequence[tuple[Effects, FitState]], progress: Progress | None = None) -> None:
+        """Fit sets that were found with other noise, and every promising effect alone; then change the best of them
+        while that raises the posterior odds."""
+        self.fit([each for each in starts if each[0]], QUICK)
+        self.extend([self.source])
+        exchanged, before = Exchanges(), None
+        for size in range(MAX_EFFECTS):
+            if progress is not None:
+                progress(size, MAX_EFFECTS, -self.best.log_odds)
+            self._settle(exchanged)
+            if self.best is before or len(self.best.effects) >= MAX_EFFECTS:
+                break
+            before = self.best
+            self.extend([before])
+        if progress is not None:
+            progress(MAX_EFFECTS, MAX_EFFECTS, -self.best.log_odds)
+
     def resume(self, found: ScoredModel) -> bool:
         """Fit a set that another search has found, and go on from it where it is the best; return whether it is."""
         before = self.best
