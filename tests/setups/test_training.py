@@ -46,3 +46,8 @@ def test_a_flight_is_scored_over_fewer_steps_than_its_task_has_but_not_over_more
     assert va.score(policy, target, episodes=3, steps=5).flights == 3
     with pytest.raises(ValueError, match="a flight of this task has 20 steps, got steps = 21"):
         va.score(policy, target, episodes=3, steps=21)
+
+
+def test_effects_with_a_value_for_each_row_of_a_batch_are_refused():
+    with pytest.raises(ValueError, match="periodic_force has 64 values of a parameter, one for each row of a batch"):
+        va.train(va.World(va.CartPole(), va.sine_force(64, torch.Generator())), iterations=1)

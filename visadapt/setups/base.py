@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from visadapt.effects import Residual
+from visadapt.effects import Effect, Residual
 from visadapt.learning.joint import Adapted, adapt
 from visadapt.learning.policy import tune
 from visadapt.learning.rounds import Label
@@ -63,6 +63,15 @@ class Setup:
     """called on a new policy before it is trained"""
     test: Task | None = None
     """the task that the policy is scored in; None: the one it is trained in"""
+
+    def __post_init__(self) -> None:
+        for effect in self.source.effects:
+            rows = max((p.numel() for p in effect.parameters()), default=1) if isinstance(effect, Effect) else 1
+            if rows > 1:
+                raise ValueError(
+                    f"the source's {effect.name} has {rows} values of a parameter, one for each row of a batch; a setup "
+                    "needs one value of each, which holds for batches of any size"
+                )
 
     def pretrain(self, path: Path, seed: int, report: Report | None = None) -> Policy:
         """The policy trained in the source, or read from `path` where that exists; an interrupted training goes on.
