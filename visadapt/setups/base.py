@@ -69,8 +69,8 @@ class Setup:
             rows = max((p.numel() for p in effect.parameters()), default=1) if isinstance(effect, Effect) else 1
             if rows > 1:
                 raise ValueError(
-                    f"the source's {effect.name} has {rows} values of a parameter, one for each row of a batch; a setup "
-                    "needs one value of each, which holds for batches of any size"
+                    f"the source's {effect.name} has {rows} values of a parameter, one for each row of a batch; a "
+                    "setup needs one value of each, which holds for batches of any size"
                 )
 
     def pretrain(self, path: Path, seed: int, report: Report | None = None) -> Policy:
