@@ -1,7 +1,51 @@
+import tempfile
+from pathlib import Path
+
 import numpy as np
 import pytest
+from hypothesis import given, strategies as st
 
 from tests.recorded import HEADER, STATES, a_table, load, refuses, write
+from visadapt.recordings import RecordingError
+from visadapt.recordings.csv import Table
+
+CELLS = st.one_of(
+    st.floats().map(str),
+    st.floats().map("{:.9g}".format),
+    st.sampled_from(
+        (
+            "",
+            " ",
+            " 1 ",
+            "1.",
+            "+.5",
+            "1e",
+            "1d3",
+            "1e400",
+            "0x1",
+            "1_0",
+            "1#2",
+            "-nan",
+            "Infinity",
+            "1 2",
+            "1\f",
+            "\v1",
+        )
+    ),
+    st.text("0123456789.eE+-_# \t\0\x1c\u0661", max_size=5),
+)
+
+
+def rows_of(text):
+    """The rows of a file of two columns, or why they are refused, without the name of the file."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "rows.csv"
+        file.write_text(text)
+        try:
+            rows = Table.open(file).rows([0, 1])
+        except RecordingError as error:
+            return str(error).removeprefix(str(file))
+        return np.column_stack((rows.numbers, rows.lines, rows.values)).tolist()
 
 
 class TestText:
@@ -26,6 +70,12 @@ class TestText:
         lines.insert(20, "# paused, resumed")
         file.write_text("\n".join(lines).replace("theta_dot", '"theta_dot"'))
         assert load(file).samples == 40
+
+    @given(st.lists(st.tuples(CELLS, CELLS), min_size=1, max_size=4))
+    def test_a_quoted_cell_changes_nothing_in_the_rows_beside_it(self, cells):
+        below = "".join(f"{one},{other}\n" for one, other in cells)
+        plain, quoted = rows_of("a,b\n0,1\n" + below), rows_of('a,b\n"0",1\n' + below)
+        assert repr(plain) == repr(quoted)
 
     @pytest.mark.parametrize(
         ("cell", "message"),

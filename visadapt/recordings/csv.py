@@ -10,10 +10,11 @@ import csv
 import io
 import math
 import os
+import string
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import count, islice, pairwise
+from itertools import chain, count, islice, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,12 @@ from visadapt.recordings.thinning import STRETCH, thinned
 from visadapt.systems import System
 
 SEPARATORS = ",;\t"
+
 UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
+
+PLAIN = frozenset(string.printable) - frozenset('"#_')  # Characters of lines without quoted cells and comments
+
+LONGEST_LINE = 10_000  # Characters; a longer line is read cell by cell, which bounds the length of cells
 
 OTHER_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
     "cartpole": {
@@ -107,10 +113,9 @@ class Table:
         every, total = 1, 0
         with closing(_lines(self.path, progress)) as lines:
             next(lines)  # the header
-            rows = self._parsed(lines, columns)
-            while block := [*islice(rows, STRETCH)]:
+            for block in self._stretches(lines, columns):
                 if total // STRETCH % every == 0:
-                    stretches.append(np.array(block))
+                    stretches.append(block)
                 total += len(block)
                 if len(stretches) * STRETCH > most:
                     stretches, every = stretches[::2], 2 * every
@@ -119,8 +124,38 @@ class Table:
         table = np.concatenate(stretches)
         return Rows(table[:, 2:], table[:, 0].astype(np.intp), table[:, 1].astype(np.intp), total)
 
-    def _parsed(self, lines: Iterator[tuple[int, str]], columns: Sequence[int]) -> Iterator[list[float]]:
-        """For each row its number, its line number, and its values in `columns`."""
+    def _stretches(self, lines: Iterator[tuple[int, str]], columns: Sequence[int]) -> Iterator[NDArray[np.float64]]:
+        """The rows as `_parsed` gives them, STRETCH at a time; cell by cell, which takes far longer, from the first
+        stretch on that is not `_plain`."""
+        read = 0
+        while stretch := [*islice(lines, STRETCH)]:
+            block = self._plain(stretch, columns, read)
+            if block is None:
+                rows = self._parsed(chain(stretch, lines), columns, read)
+                while some := [*islice(rows, STRETCH)]:
+                    yield np.array(some)
+                return
+            yield block
+            read += len(block)
+
+    def _plain(
+        self, stretch: Sequence[tuple[int, str]], columns: Sequence[int], before: int
+    ) -> NDArray[np.float64] | None:
+        """What `_parsed` gives of lines without quotation marks and comments whose cells in `columns` are numbers; None
+        of others."""
+        numbers, texts = zip(*stretch, strict=True)
+        if not PLAIN.issuperset("".join(texts)) or max(map(len, texts)) > LONGEST_LINE:
+            return None
+        if any(text.count(self.separator) != len(self.header) - 1 for text in texts):
+            return None
+        try:
+            values = np.loadtxt(texts, delimiter=self.separator, comments=None, usecols=columns, ndmin=2)
+        except ValueError:
+            return None
+        return np.column_stack((before + 1 + np.arange(len(texts)), numbers, values))
+
+    def _parsed(self, lines: Iterator[tuple[int, str]], columns: Sequence[int], before: int) -> Iterator[list[float]]:
+        """For each row its number, `before` and on, its line number, and its values in `columns`."""
         pulled: list[int] = []
 
         def texts() -> Iterator[str]:
@@ -129,7 +164,7 @@ class Table:
                 yield text
 
         reader = csv.reader(texts(), delimiter=self.separator, strict=True)
-        for number in count(1):
+        for number in count(before + 1):
             pulled.clear()
             try:
                 cells = next(reader, None)
