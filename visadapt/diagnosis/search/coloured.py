@@ -1,8 +1,8 @@
-"""A second search where what the first leaves unexplained is not white.
+"""The search gone on with coloured noise, where what it leaves unexplained is not white.
 
 A real machine resonates, and its model does not: white noise that is as strong as that at every frequency hides what
-the model gets right at others, and parameters take up what they can of the rest. So the search is made again with the
-colour of the best model's innovations as noise (`estimation/colour.py`).
+the model gets right at others, and parameters take up what they can of the rest. So the search goes on from the best
+sets with the colour of the best one's innovations as noise (`estimation/colour.py`).
 """
 
 from __future__ import annotations
