@@ -3,8 +3,8 @@
     python -m benchmarks.vibrations
 
 The source policy runs on a cart-pole with the effect and a force of 4 N at 3.3 Hz: 600 noisy rows, diagnosed without
-the periodic force in the catalogue. Once as `visadapt diagnose` does, which searches again with the colour of what is
-unexplained as noise (visadapt/diagnosis/search/coloured.py), and once without that search. Counted are the effects that
+the periodic force in the catalogue. Once as `visadapt diagnose` does, whose search goes on with the colour of what is
+unexplained as noise (visadapt/diagnosis/search/coloured.py), and once without that. Counted are the effects that
 are named, or said to explain a part.
 
 Writes results/vibrations.csv. Interrupt it anywhere; started again, it goes on.

@@ -163,6 +163,7 @@ def test_feedback_does_not_hide_a_push_and_the_pole_is_not_pushed(force, jitter,
         (push,) = pushes(balanced(force, jitter, seed), World(CartPole()))
     assert push.load == "cart_force"
     impulse = force * 0.11 * math.sqrt(2 * math.pi)
+    assert push.size == pytest.approx(force, rel=0.25)
     assert push.impulse == pytest.approx(impulse, rel=0.25)
     assert push.start == pytest.approx(8 - 2.45 * 0.11, abs=0.1)
     assert push.ci90[0] < impulse < push.ci90[1]

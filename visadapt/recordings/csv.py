@@ -32,8 +32,6 @@ UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 
 PLAIN = frozenset(string.printable) - frozenset('"#_')  # Characters of lines without quoted cells and comments
 
-LONGEST_LINE = 10_000  # Characters; a longer line is read cell by cell, which bounds the length of cells
-
 OTHER_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
     "cartpole": {
         "x": ("position", "cart_position", "pos", "s"),
@@ -144,7 +142,7 @@ class Table:
         """What `_parsed` gives of lines without quotation marks and comments whose cells in `columns` are numbers; None
         of others."""
         numbers, texts = zip(*stretch, strict=True)
-        if not PLAIN.issuperset("".join(texts)) or max(map(len, texts)) > LONGEST_LINE:
+        if not PLAIN.issuperset("".join(texts)) or max(map(len, texts)) > csv.field_size_limit():
             return None
         if any(text.count(self.separator) != len(self.header) - 1 for text in texts):
             return None

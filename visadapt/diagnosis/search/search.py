@@ -61,8 +61,7 @@ class Search(FittedModels):
         """Grow sets while that raises the posterior odds, then try sets near the best."""
         beam, exchanged = [self.source], Exchanges()
         for size in range(MAX_EFFECTS):
-            if progress is not None:
-                progress(size, MAX_EFFECTS, -self.best.log_odds)
+            self._report(progress, size)
             before = self.best
             children = (size == 0 and self._alone()) or self.extend(beam)
             if not children:
@@ -79,8 +78,7 @@ class Search(FittedModels):
             self._with_late_sensors()
             self._settle(exchanged)
             self._phases_of_episodes()
-        if progress is not None:
-            progress(MAX_EFFECTS, MAX_EFFECTS, -self.best.log_odds)
+        self._report(progress, MAX_EFFECTS)
 
     def go_on_from(self, starts: Sequence[tuple[Effects, FitState]], progress: Progress | None = None) -> None:
         """Fit sets that were found with other noise, and every promising effect alone; then change the best of them
@@ -89,15 +87,13 @@ class Search(FittedModels):
         self.extend([self.source])
         exchanged, before = Exchanges(), None
         for size in range(MAX_EFFECTS):
-            if progress is not None:
-                progress(size, MAX_EFFECTS, -self.best.log_odds)
+            self._report(progress, size)
             self._settle(exchanged)
             if self.best is before or len(self.best.effects) >= MAX_EFFECTS:
                 break
             before = self.best
             self.extend([before])
-        if progress is not None:
-            progress(MAX_EFFECTS, MAX_EFFECTS, -self.best.log_odds)
+        self._report(progress, MAX_EFFECTS)
 
     def resume(self, found: ScoredModel) -> bool:
         """Fit a set that another search has found, and go on from it where it is the best; return whether it is."""
@@ -110,6 +106,11 @@ class Search(FittedModels):
         self._settle(exchanged)
         self._improve_while_unexplained(exchanged)
         return True
+
+    def _report(self, progress: Progress | None, step: int) -> None:
+        """Report a step of MAX_EFFECTS, with the loss of the best set so far."""
+        if progress is not None:
+            progress(step, MAX_EFFECTS, -self.best.log_odds)
 
     def promised(self) -> float:
         """Log likelihood that the best effect adds to the source, by the screening."""

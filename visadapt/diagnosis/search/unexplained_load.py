@@ -99,23 +99,19 @@ def load_tracks(recording: Recording, world: World) -> list[LoadTrack]:
         return []
     unit = torch.cat([track.load for track in found]).square().mean(0).sqrt()
     unit = torch.where(unit > 0, unit, 1.0)
-    found = [_in_units(track, unit) for track in found]
-    size = torch.cat([track.columns.square().flatten(1) for track in found], 1).mean(1).sqrt() + 1e-300
+    # Only over a unit of its own for each joint do the loads of a slide and a hinge compare.
+    columns = [(track.columns / unit).square().flatten(1) for track in found]
+    size = (torch.cat(columns, 1).mean(1).sqrt() + 1e-300)[:, None, None]
     return [
-        replace(t, columns=t.columns / size[:, None, None], reaction=t.reaction / size[:, None, None, None])
-        for t in found
+        replace(
+            track,
+            unit=unit,
+            load=track.load / unit,
+            columns=track.columns / unit / size,
+            reaction=track.reaction * unit / unit[:, None] / size[..., None],
+        )
+        for track in found
     ]
-
-
-def _in_units(track: LoadTrack, unit: Tensor) -> LoadTrack:
-    """A track whose loads, in N or N m, are over `unit` (J,): only so do those of a slide and a hinge compare."""
-    return replace(
-        track,
-        unit=unit,
-        load=track.load / unit,
-        columns=track.columns / unit,
-        reaction=track.reaction * unit / unit[:, None],
-    )
 
 
 def _track(number: int, episode: Episode, world: World, measured: Sequence[int], period: float) -> list[LoadTrack]:
