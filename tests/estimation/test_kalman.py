@@ -27,8 +27,14 @@ def problem():
     )
 
 
-PROCESS = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64).expand(N, -1)
+PROCESS = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64).expand(N, -1)
+SOURCES = torch.randn(N, T - 1, STATES, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 MEASUREMENT = torch.tensor([0.5, 0.2], dtype=torch.float64).expand(N, -1)
+
+
+def process_of(variances):
+    """Covariances of noises with variances (N, 3), which enter the states by SOURCES."""
+    return (SOURCES * variances[:, None, None]) @ SOURCES.mT
 
 
 def dense(problem, n, column):
@@ -41,7 +47,7 @@ def dense(problem, n, column):
         a = problem.transition[n, t]
         mean.append(a @ mean[-1] + problem.drive[n, t, :, column])
         rows.append([a @ m for m in rows[-1]] + [torch.eye(STATES, dtype=torch.float64)])
-        sources.append(torch.diag(PROCESS[n]))
+        sources.append(process_of(PROCESS)[n, t])
     whole = torch.zeros(T * STATES, T * STATES, dtype=torch.float64)
     for i, row in enumerate(rows):
         for j, m in enumerate(row):
@@ -51,7 +57,7 @@ def dense(problem, n, column):
 
 
 def test_likelihood_is_that_of_the_whole_gaussian(problem):
-    filtered = forward(problem, torch.diag_embed(PROCESS), MEASUREMENT)
+    filtered = forward(problem, process_of(PROCESS), MEASUREMENT)
     found = log_likelihood(filtered, torch.ones(N, T, CHANNELS))
     for n in range(N):
         mean, covariance = dense(problem, n, 0)
@@ -63,7 +69,7 @@ def test_likelihood_is_that_of_the_whole_gaussian(problem):
 
 
 def test_smoothed_states_are_the_conditional_mean_for_every_column(problem):
-    smoothed, _ = backward(forward(problem, torch.diag_embed(PROCESS), MEASUREMENT))
+    smoothed, _ = backward(forward(problem, process_of(PROCESS), MEASUREMENT))
     for n in range(N):
         for column in range(COLUMNS):
             mean, covariance = dense(problem, n, column)
@@ -75,19 +81,19 @@ def test_smoothed_states_are_the_conditional_mean_for_every_column(problem):
 
 
 def test_smoothed_states_follow_the_model_with_the_smoothed_disturbances(problem):
-    smoothed, adjoint = backward(forward(problem, torch.diag_embed(PROCESS), MEASUREMENT))
-    disturbance = -(PROCESS[:, None, :, None] * adjoint)[:, 1:]
+    smoothed, adjoint = backward(forward(problem, process_of(PROCESS), MEASUREMENT))
+    disturbance = -process_of(PROCESS) @ adjoint[:, 1:]
     carried = problem.transition @ smoothed[:, :-1] + problem.drive + disturbance
     torch.testing.assert_close(carried, smoothed[:, 1:])
 
 
 def test_without_process_noise_the_smoothed_states_follow_the_model(problem):
-    smoothed, _ = backward(forward(problem, torch.zeros(N, STATES, STATES).double(), MEASUREMENT))
+    smoothed, _ = backward(forward(problem, torch.zeros(N, T - 1, STATES, STATES).double(), MEASUREMENT))
     torch.testing.assert_close(problem.transition @ smoothed[:, :-1] + problem.drive, smoothed[:, 1:])
 
 
 def test_inputs_pass_through_the_gains_like_columns(problem):
-    filtered = forward(problem, torch.diag_embed(PROCESS), MEASUREMENT)
+    filtered = forward(problem, process_of(PROCESS), MEASUREMENT)
     quiet = Linear(
         problem.transition,
         problem.drive,
@@ -96,23 +102,23 @@ def test_inputs_pass_through_the_gains_like_columns(problem):
         torch.zeros_like(problem.start),
         problem.initial_variance,
     )
-    expected = forward(quiet, torch.diag_embed(PROCESS), MEASUREMENT).white
+    expected = forward(quiet, process_of(PROCESS), MEASUREMENT).white
     torch.testing.assert_close(respond(filtered, problem.drive, problem.reading), expected)
 
 
 def test_noise_scores_are_the_derivatives_of_the_likelihood(problem):
     process, noise = (x.clone().requires_grad_() for x in (PROCESS.log(), MEASUREMENT.log()))
-    filtered = forward(problem, torch.diag_embed(process.exp()), noise.exp())
+    filtered = forward(problem, process_of(process.exp()), noise.exp())
     log_likelihood(filtered, torch.ones(N, T, CHANNELS)).sum().backward()
     _, adjoint = backward(filtered)
     weight = weights(filtered, filtered.white, adjoint)
-    by_process, by_noise = noise_scores(filtered, adjoint[..., 0], weight[..., 0], PROCESS, MEASUREMENT)
+    by_process, by_noise = noise_scores(filtered, adjoint[..., 0], weight[..., 0], SOURCES, PROCESS, MEASUREMENT)
     torch.testing.assert_close(by_process.sum(1), process.grad)
     torch.testing.assert_close(by_noise.sum(1), noise.grad)
 
 
 def test_weighted_variances_are_what_the_smoothed_states_leave_of_the_readings(problem):
-    filtered = forward(problem, torch.diag_embed(PROCESS), MEASUREMENT)
+    filtered = forward(problem, process_of(PROCESS), MEASUREMENT)
     smoothed, adjoint = backward(filtered)
     noise = MEASUREMENT[:, None, :, None] * weights(filtered, filtered.white, adjoint)
     torch.testing.assert_close(noise, problem.reading - problem.sensing @ smoothed)
@@ -136,5 +142,5 @@ def test_states_of_an_unstable_system_are_found_over_many_precise_readings():
         torch.tensor([[2.25, 25.0, 0.1, 100.0, 100.0, 0.1]], dtype=torch.float64),
     )
     process = torch.diag(torch.tensor([0.0, 0, 0, 0, 1e-2, 1e-5], dtype=torch.float64))
-    smoothed, _ = backward(forward(problem, process[None], torch.full((1, 2), 10.0).double()))
+    smoothed, _ = backward(forward(problem, process.expand(1, rows - 1, 6, 6), torch.full((1, 2), 10.0).double()))
     assert smoothed[0, :, [0, 2]].abs().max() < 10 / precision

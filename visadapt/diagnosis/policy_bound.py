@@ -106,7 +106,7 @@ def _estimated_steps(model: CandidateModel, best: ScoredModel) -> tuple[Tensor, 
     problem = linear_problem([model], fits)
     process, noise = variances(model, fits, problem)
     smoothed, adjoint = backward(forward(problem.data(), process, noise))
-    disturbance = -(adjoint[..., 0] @ process)[:, 1:]
+    disturbance = -(process @ adjoint[:, 1:, :, :1])[..., 0]
     by_parameter = problem.drive[..., 1:]
     covariance = torch.linalg.inv(posterior(best.effects, fits)[1])
     variance = ((by_parameter @ covariance) * by_parameter).sum((-1, -2))

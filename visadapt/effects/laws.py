@@ -145,7 +145,7 @@ class StribeckLaw(DryFrictionLaw):
     def limits(self, state: Tensor, command: Tensor, system: System) -> tuple[Tensor, Tensor]:
         at_speed, breakaway = self.value(self.table[0].name, state), self.value("breakaway", state)
         share = (-(self.joint_velocity(state, system) / self.value("velocity", state)).square()).exp()
-        limit = at_speed + (breakaway - at_speed) * share
+        limit = at_speed + (breakaway - at_speed).clamp_min(0) * share
         return limit, limit
 
 

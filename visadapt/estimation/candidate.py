@@ -64,9 +64,18 @@ class CandidateModel:
         self.acting_parameters = [k for k, effect in enumerate(named) if acting and (effect in acting or not alone)]
         """columns of the parameters that change what acts of the commands"""
         self._late = [(k, effect.late) for k, effect in enumerate(named) if issubclass(effect, LateSensors)]
+        self._load_directions: Tensor | None = None
         self._phase_columns = phase_columns(effects, len(rows.command))
         self.slopes: tuple[Tensor, Tensor] | None = None
         """transition (W, T - 1, n, n) and sensing (W, T, m, n) of an earlier linearisation, reused where given"""
+
+    @property
+    def load_directions(self) -> Tensor:
+        """(W, T - 1, n, L) change of the states by loads held for a period, each as large as changes the velocity of
+        its own coordinate by 1; of the source along the measured states."""
+        if self._load_directions is None:
+            self._load_directions = load_directions(self.system, self.rows)
+        return self._load_directions
 
     def at(self, theta: Tensor) -> World:
         """The world with parameters (P,), or (N, P) for a batch of N states; `by_row` gives those of rows."""
@@ -160,6 +169,36 @@ class CandidateModel:
         """s by which states are read late."""
         columns = {column for _, late in self._late for column in late}
         return {c: sum(float(theta[k]) for k, late in self._late if c in late) for c in sorted(columns)}
+
+
+def initial_states(rows: Segments, system: System) -> Tensor:
+    """Initial guess (W, T, n) of the states: the measurements, and difference quotients for missing velocities."""
+    out = torch.zeros(*rows.shape, len(system.states), dtype=torch.float64)
+    for k, channel in enumerate(rows.channels):
+        out[..., channel] = rows.measured[..., k]
+    for channel, position_column in profile_of(system).position_of.items():
+        if channel not in rows.channels:
+            position = out[..., position_column]
+            change = torch.zeros_like(position)
+            change[:, 1:-1] = (position[:, 2:] - position[:, :-2]) / (rows.time[:, 2:] - rows.time[:, :-2])
+            change[:, 0] = (position[:, 1] - position[:, 0]) / rows.duration[:, 0]
+            out[..., channel] = change
+    return out * rows.inside[..., None]
+
+
+def load_directions(system: System, rows: Segments) -> Tensor:
+    """`CandidateModel.load_directions` of all candidate models of these rows."""
+    model = CandidateModel(system, [load_effect(type(system))], rows, COARSEST)
+    theta = torch.zeros(len(model.table), dtype=torch.float64)
+    state = initial_states(rows, system)
+    windows, length = rows.shape
+    world, acting = model.stepping(theta, model.commands(theta[None])[0, :, :-1].flatten(0, 1))
+    time, duration = rows.time[:, :-1].flatten(), rows.duration[:, :-1].flatten()
+    step = linearise_step(world, theta, time, state[:, :-1].flatten(0, 1), acting, by_state=False, duration=duration)
+    by_load = step.by_parameter.unflatten(0, (windows, length - 1))
+    groups = [list(group) for group in model.profile.driven for _ in group]
+    own = torch.stack([by_load[:, :, group, k].norm(dim=-1) for k, group in enumerate(groups)], -1)
+    return by_load / own[:, :, None] * rows.inside[:, 1:, None, None]
 
 
 def with_loads(model: CandidateModel, accuracy: int) -> CandidateModel:

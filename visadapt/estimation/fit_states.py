@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from visadapt.effects import Effect
-from visadapt.estimation.candidate import COARSE, FINE
-from visadapt.estimation.likelihood import FitState, initial_states
+from visadapt.estimation.candidate import COARSE, FINE, initial_states
+from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System

@@ -1,6 +1,6 @@
 """Kalman filter and smoother of linear systems in a batch, each with several columns of inputs.
 
-    x_{t+1} = A_t x_t + c_t + w_t,   w_t ~ N(0, Q)              x_0 ~ N(0, diag(p))
+    x_{t+1} = A_t x_t + c_t + w_t,   w_t ~ N(0, Q_t)            x_0 ~ N(0, diag(p))
     r_t     = H_t x_t + v_t,         v_t ~ N(0, diag(s))
 
 Kalman (1960, J. Basic Eng. 82(1)) forwards, with a Cholesky factor of the innovations' covariance, so that a channel's
@@ -62,15 +62,15 @@ class Filtered:
 
 
 def forward(problem: Linear, process: Tensor, noise: Tensor) -> Filtered:
-    """Filter with process covariances Q (N, n, n) and measurement variances s (N, m)."""
+    """Filter with process covariances Q (N, T - 1, n, n) and measurement variances s (N, m)."""
     covariance = torch.diag_embed(problem.initial_variance)
     disturbed = torch.diag_embed(noise)
-    transitions, sensings = problem.transition.unbind(1), problem.sensing.unbind(1)
+    transitions, sensings, disturbances = (each.unbind(1) for each in (problem.transition, problem.sensing, process))
     covariances, roots, crosses, failures = [], [], [], []
     for t, sensing in enumerate(sensings):
         if t:
             a = transitions[t - 1]
-            covariance = torch.baddbmm(process, torch.bmm(a, covariance), a.mT)
+            covariance = torch.baddbmm(disturbances[t - 1], torch.bmm(a, covariance), a.mT)
             # No reading damps rounding errors that are not symmetric: in an unstable system they would grow.
             covariance = (covariance + covariance.mT) / 2
         seen = torch.bmm(sensing, covariance)
@@ -138,7 +138,7 @@ def weights(filtered: Filtered, white: Tensor, adjoint: Tensor) -> Tensor:
 
 
 def noise_scores(
-    filtered: Filtered, adjoint: Tensor, weight: Tensor, process: Tensor, noise: Tensor
+    filtered: Filtered, adjoint: Tensor, weight: Tensor, sources: Tensor, process: Tensor, noise: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Derivatives of the log likelihood by the logs of the noises' variances.
 
@@ -146,19 +146,20 @@ def noise_scores(
     (Koopman and Shephard 1992, Biometrika 79(4)).
 
     Args:
-        filtered: a filter run with the variances `process` (N, n) and `noise` (N, m) of uncorrelated noises.
+        filtered: a filter run with the variances `process` (N, L) of uncorrelated process noises, which enter the
+            states by `sources` (N, T - 1, n, L), and `noise` (N, m) of the measurements.
         adjoint, weight: (N, T, n) and (N, T, m) of the data.
 
     Returns:
-        The derivatives by each process noise before each row but the first, (N, T - 1, n), and by each measurement
+        The derivatives by each process noise before each row but the first, (N, T - 1, L), and by each measurement
         noise, (N, T, m), which are -1/2 where nothing was measured.
     """
-    sources = (filtered.sensing.mT @ filtered.sensing).unbind(1)
-    covariances = [sources[-1]]  # of the adjoints
-    for loop, source in zip(reversed(filtered.closed_loop.unbind(1)), reversed(sources[1:-1]), strict=False):
-        covariances.append(torch.baddbmm(source, torch.bmm(loop.mT, covariances[-1]), loop))
+    own = (filtered.sensing.mT @ filtered.sensing).unbind(1)
+    covariances = [own[-1]]  # of the adjoints
+    for loop, each in zip(reversed(filtered.closed_loop.unbind(1)), reversed(own[1:-1]), strict=False):
+        covariances.append(torch.baddbmm(each, torch.bmm(loop.mT, covariances[-1]), loop))
     covariance = torch.stack(covariances[::-1], 1)
-    by_process = adjoint[:, 1:].square() - covariance.diagonal(dim1=-2, dim2=-1)
+    by_process = (sources * adjoint[:, 1:, :, None]).sum(-2).square() - (sources * (covariance @ sources)).sum(-2)
     # The variance of the weights: of the row's own innovation, and of the rows after.
     injected = filtered.injection @ filtered.whitening[:, :-1]
     variance = filtered.whitening.square().sum(-2)

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from visadapt.batch import Batch
-from visadapt.estimation.candidate import CandidateModel, linearise
+from visadapt.estimation.candidate import CandidateModel, initial_states, linearise
 from visadapt.estimation.colour import Colour, whitened
 from visadapt.estimation.kalman import (
     Filtered,
@@ -32,13 +32,9 @@ from visadapt.estimation.kalman import (
     respond,
     weights,
 )
-from visadapt.estimation.profiles import profile_of
-from visadapt.estimation.segments import Segments
-from visadapt.systems import System
 
-POSITION_PROCESS_NOISE = 1e-6
-"""Standard deviation of the process noise of states other than driven velocities, in their units (m, rad): practically
-none, since they follow from their velocities."""
+LEAST_PROCESS_NOISE = 1e-6
+"""Standard deviation of a process noise of every state, in its unit, beside that of the loads: practically none."""
 
 MIN_LOG_PROCESS = math.log(1e-4**2)
 MAX_LOG_PROCESS = math.log(3.0**2)
@@ -62,21 +58,6 @@ class FitState(Batch):
     def on(self, windows: Tensor) -> FitState:
         """The same, with the states of these windows, by index."""
         return replace(self, state=self.state[:, windows])
-
-
-def initial_states(rows: Segments, system: System) -> Tensor:
-    """Initial guess (W, T, n) of the states: the measurements, and difference quotients for missing velocities."""
-    out = torch.zeros(*rows.shape, len(system.states), dtype=torch.float64)
-    for k, channel in enumerate(rows.channels):
-        out[..., channel] = rows.measured[..., k]
-    for channel, position_column in profile_of(system).position_of.items():
-        if channel not in rows.channels:
-            position = out[..., position_column]
-            change = torch.zeros_like(position)
-            change[:, 1:-1] = (position[:, 2:] - position[:, :-2]) / (rows.time[:, 2:] - rows.time[:, :-2])
-            change[:, 0] = (position[:, 1] - position[:, 0]) / rows.duration[:, 0]
-            out[..., channel] = change
-    return out * rows.inside[..., None]
 
 
 def linear_problem(models: Sequence[CandidateModel], fits: FitState) -> Linear:
@@ -138,31 +119,39 @@ def _reading_per_state(sensing: Tensor, model: CandidateModel) -> Tensor:
 
 
 def variances(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[Tensor, Tensor]:
-    """Process noise covariances (C W, n, n) and measurement variances (C W, m) for the filter of `problem`.
+    """Process noise covariances (C W, T - 1, n, n) and measurement variances (C W, m) for the filter of `problem`."""
+    sources, process, noise = noises(model, fits, problem)
+    least = torch.full_like(problem.initial_variance, LEAST_PROCESS_NOISE**2)[:, None]
+    return (sources * process[:, None, None]) @ sources.mT + torch.diag_embed(least), noise
 
-    Process noise is in units of the readings too, since its lower bound would otherwise favour a sensor scale below 1.
+
+def noises(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[Tensor, Tensor, Tensor]:
+    """How process noises enter the states (C W, T - 1, n, L), their variances (C W, L), and those of measurements.
+
+    Process noise is a load that is held for a period, in the velocity that it gives to its own coordinate. It is in
+    units of the readings, since its lower bound would otherwise favour a sensor scale below 1.
     """
     windows = model.rows.shape[0]
-    process = torch.full((len(fits.log_process), len(model.system.states)), POSITION_PROCESS_NOISE**2).double()
-    for k, group in enumerate(model.profile.driven):
-        process[:, list(group)] = fits.log_process[:, k, None].exp()
     per_reading = problem.initial_variance / problem.initial_variance.new_tensor(model.profile.initial_variance)
-    process = process.repeat_interleave(windows, 0) * per_reading
-    return torch.diag_embed(process), fits.log_noise.exp().repeat_interleave(windows, 0)
+    sources = model.load_directions.repeat(len(fits.theta), 1, 1, 1) * per_reading.sqrt()[:, None, :, None]
+    group = [k for k, columns in enumerate(model.profile.driven) for _ in columns]
+    process, noise = fits.log_process[:, group].exp(), fits.log_noise.exp()
+    return sources, process.repeat_interleave(windows, 0), noise.repeat_interleave(windows, 0)
 
 
 def noise_members(model: CandidateModel) -> tuple[Tensor, Tensor]:
-    """Which noises share a free variance: (G + S, n) for the states and (G + S, m) for the channels, 1 where the noise
+    """Which noises share a free variance: (G + S, L) for the loads and (G + S, m) for the channels, 1 where the noise
     has the variance of that row.
 
     There is one variance for each of G groups of driven velocities, and one for each of S kinds of sensors.
     """
     channels = model.rows.channels
-    driven = [[float(k in group) for k in range(len(model.system.states))] for group in model.profile.driven]
+    driven = [[float(k in group) for k in model.profile.driven_columns] for group in model.profile.driven]
     sensors = [[float(c in kind) for c in channels] for kind in model.profile.sensors]
     measured = [row for row in sensors if any(row)]
     whole = torch.block_diag(torch.tensor(driven), torch.tensor(measured)).double()
-    return whole[:, : len(model.system.states)], whole[:, len(model.system.states) :]
+    loads = len(model.profile.driven_columns)
+    return whole[:, :loads], whole[:, loads:]
 
 
 @dataclass(frozen=True)
@@ -201,6 +190,7 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState) -> Derivativ
     count, windows = fits.state.shape[:2]
     problem = linear_problem(models, fits)
     process, noise = variances(models[0], fits, problem)
+    sources, of_loads, _ = noises(models[0], fits, problem)
     rows = models[0].rows
     # The same draws for every fit.
     drawn = torch.randn(rows.used.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -219,7 +209,8 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState) -> Derivativ
     parts = []
     for first in range(0, count * windows, at_once):
         at = slice(first, first + at_once)
-        systems = problem[at], process[at], noise[at], used[at], counted[at], drawn[at]
+        loads = sources[at], of_loads[at]
+        systems = problem[at], process[at], noise[at], loads, used[at], counted[at], drawn[at]
         parts.append(_of_systems(*systems, members, rows.colour))
     return Derivatives(*(torch.cat(each).unflatten(0, (count, windows)) for each in zip(*parts, strict=True)))
 
@@ -228,6 +219,7 @@ def _of_systems(
     problem: Linear,
     process: Tensor,
     noise: Tensor,
+    loads: tuple[Tensor, Tensor],
     used: Tensor,
     counted: Tensor,
     drawn: Tensor,
@@ -237,6 +229,7 @@ def _of_systems(
     """The fields of `Derivatives` for N linear systems.
 
     Args:
+        loads: how process noises enter the states, and their variances, as `noises` gives them.
         used: (N, T, m) 1 where there is a reading; `counted` is its weight in the likelihood.
         drawn: (N, T, m) standard normal.
         colour: of the innovations, which states the noise: its derivatives are then 0. None: they are white.
@@ -246,7 +239,7 @@ def _of_systems(
     error, columns = errors.flatten(1, 2).tensor_split([1], -1)
     likelihood = log_likelihood(replace(here, white=errors), counted)
     if colour is None:
-        adjoint, information, score = _by_noise(here, process, noise, used, drawn, members)
+        adjoint, information, score = _by_noise(here, noise, loads, used, drawn, members)
     else:
         likelihood = likelihood + counted.mean(2).sum(1) * colour.whitening.logdet()
         adjoint = adjoints(here, here.white)
@@ -257,7 +250,12 @@ def _of_systems(
 
 
 def _by_noise(
-    here: Filtered, process: Tensor, noise: Tensor, used: Tensor, drawn: Tensor, members: tuple[Tensor, Tensor]
+    here: Filtered,
+    noise: Tensor,
+    loads: tuple[Tensor, Tensor],
+    used: Tensor,
+    drawn: Tensor,
+    members: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The adjoints (N, T, n, 1 + K), and the Fisher information (N, G + S, G + S) of the log variances with the
     derivatives (N, G + S) of the log likelihood by them."""
@@ -269,12 +267,13 @@ def _by_noise(
     both = [0, -1]
     of_both = adjoint[..., both]
     weight = weights(here, white[..., both], of_both)
-    process = process.diagonal(dim1=1, dim2=2)
+    sources, process = loads
     driven, measured = members
-    by_process, by_noise = noise_scores(here, of_both[..., 0], weight[..., 0], process, noise)
+    by_process, by_noise = noise_scores(here, of_both[..., 0], weight[..., 0], sources, process, noise)
     score = by_process.sum(1) @ driven.T + (by_noise * used).sum(1) @ measured.T
     # The smoothed w is minus Q times the adjoint; what inputs add to the states is subtracted from the readings.
-    drive = (process[:, None, :, None] * of_both[:, 1:])[..., None] * driven.T[:, None]
+    held = process[:, None, :, None] * (sources.mT @ of_both[:, 1:])
+    drive = (sources[:, :, None] @ (held.movedim(-1, -2)[..., None] * driven.T)).movedim(2, 3)
     reading = (noise[:, None, :, None] * weight)[..., None] * measured.T[:, None]
     working = respond(here, drive.flatten(-2), reading.flatten(-2)).flatten(1, 2)
     working = working.unflatten(-1, (2, len(driven))).flatten(1, 2)

@@ -40,7 +40,7 @@ def disturbance(model: CandidateModel, fits: FitState, log_process: Tensor) -> D
     problem = linear_problem([model], fits)
     process, noise = variances(model, fits, problem)
     _, adjoint = backward(forward(problem, process, noise))
-    added = -(adjoint[..., 0] @ process)[:, 1:, driven]
+    added = -(process @ adjoint[:, 1:, :, :1])[..., driven, 0]
     by_load = loads_of(model, fits)[:, :, driven]
     # A coordinate that sticks does not respond to a load, nor does the padding: the pseudo-inverse gives 0 there.
     valid = rows.inside[:, 1:]
