@@ -11,9 +11,10 @@ from tests.diagnosed import record
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.search import Search
 from visadapt.effects import ActuatorDelay, CartMass, ConstantForce, SensorScale, ViscousFriction
-from visadapt.estimation.candidate import CandidateModel, initial_states, linearise
+from visadapt.estimation.candidate import CandidateModel, linearise
 from visadapt.estimation.fit_states import CAREFUL
 from visadapt.estimation.fitting import LEAST_NOISE, fit, refitted
+from visadapt.estimation.unmodelled_loads import initial_states
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole
 from visadapt.world import World

@@ -9,11 +9,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from visadapt.effects import ActuationEffect, Effect
+from visadapt.effects import ActuationEffect, DynamicsEffect, Effect
 from visadapt.effects.late_sensors import LateSensors
 from visadapt.estimation.episode_phases import phase_columns
 from visadapt.estimation.late_readings import Delays, Following, following, reading, rows_later
 from visadapt.estimation.linearise import (
+    Tangent,
     linearise_reading,
     linearise_step,
     load_effect,
@@ -22,6 +23,7 @@ from visadapt.estimation.linearise import (
 )
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
+from visadapt.estimation.unmodelled_loads import leading_loads, load_response
 from visadapt.systems import System
 from visadapt.world import World, WorldState
 
@@ -44,6 +46,7 @@ class CandidateModel:
         self.profile = profile_of(system)
         self.effects = tuple(effects)
         self.rows = rows
+        self.accuracy = accuracy
         smooth = math.inf if accuracy == COARSEST else self.profile.longest_step
         longest_step = smooth
         if any(effect.abrupt for effect in effects):
@@ -64,18 +67,20 @@ class CandidateModel:
         self.acting_parameters = [k for k, effect in enumerate(named) if acting and (effect in acting or not alone)]
         """columns of the parameters that change what acts of the commands"""
         self._late = [(k, effect.late) for k, effect in enumerate(named) if issubclass(effect, LateSensors)]
-        self._load_directions: Tensor | None = None
+        self._load_response: Tensor | None = None
+        rub = [issubclass(e, DynamicsEffect) and e.dry_friction is not DynamicsEffect.dry_friction for e in effects]
+        self.feels_unmodelled_loads = rows.colour is not None and any(rub)
+        """whether what is missing from the model decides which way friction acts"""
         self._phase_columns = phase_columns(effects, len(rows.command))
         self.slopes: tuple[Tensor, Tensor] | None = None
         """transition (W, T - 1, n, n) and sensing (W, T, m, n) of an earlier linearisation, reused where given"""
 
     @property
-    def load_directions(self) -> Tensor:
-        """(W, T - 1, n, L) change of the states by loads held for a period, each as large as changes the velocity of
-        its own coordinate by 1; of the source along the measured states."""
-        if self._load_directions is None:
-            self._load_directions = load_directions(self.system, self.rows)
-        return self._load_directions
+    def load_response(self) -> Tensor:
+        """(W, T - 1, n, L) change of the states by unit loads held for a period; see `unmodelled_loads`."""
+        if self._load_response is None:
+            self._load_response = load_response(self.rows, self.system)
+        return self._load_response
 
     def at(self, theta: Tensor) -> World:
         """The world with parameters (P,), or (N, P) for a batch of N states; `by_row` gives those of rows."""
@@ -171,36 +176,6 @@ class CandidateModel:
         return {c: sum(float(theta[k]) for k, late in self._late if c in late) for c in sorted(columns)}
 
 
-def initial_states(rows: Segments, system: System) -> Tensor:
-    """Initial guess (W, T, n) of the states: the measurements, and difference quotients for missing velocities."""
-    out = torch.zeros(*rows.shape, len(system.states), dtype=torch.float64)
-    for k, channel in enumerate(rows.channels):
-        out[..., channel] = rows.measured[..., k]
-    for channel, position_column in profile_of(system).position_of.items():
-        if channel not in rows.channels:
-            position = out[..., position_column]
-            change = torch.zeros_like(position)
-            change[:, 1:-1] = (position[:, 2:] - position[:, :-2]) / (rows.time[:, 2:] - rows.time[:, :-2])
-            change[:, 0] = (position[:, 1] - position[:, 0]) / rows.duration[:, 0]
-            out[..., channel] = change
-    return out * rows.inside[..., None]
-
-
-def load_directions(system: System, rows: Segments) -> Tensor:
-    """`CandidateModel.load_directions` of all candidate models of these rows."""
-    model = CandidateModel(system, [load_effect(type(system))], rows, COARSEST)
-    theta = torch.zeros(len(model.table), dtype=torch.float64)
-    state = initial_states(rows, system)
-    windows, length = rows.shape
-    world, acting = model.stepping(theta, model.commands(theta[None])[0, :, :-1].flatten(0, 1))
-    time, duration = rows.time[:, :-1].flatten(), rows.duration[:, :-1].flatten()
-    step = linearise_step(world, theta, time, state[:, :-1].flatten(0, 1), acting, by_state=False, duration=duration)
-    by_load = step.by_parameter.unflatten(0, (windows, length - 1))
-    groups = [list(group) for group in model.profile.driven for _ in group]
-    own = torch.stack([by_load[:, :, group, k].norm(dim=-1) for k, group in enumerate(groups)], -1)
-    return by_load / own[:, :, None] * rows.inside[:, 1:, None, None]
-
-
 def with_loads(model: CandidateModel, accuracy: int) -> CandidateModel:
     """The set of a model with a constant load on each degree of freedom, whose values are its last parameters."""
     return CandidateModel(model.system, [*model.effects, load_effect(type(model.system))], model.rows, accuracy)
@@ -227,12 +202,7 @@ def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised
     variants = [0, *(1 + k for k in model.acting_parameters)]
     variant = [variants.index(k) if k in variants else 0 for k in range(len(shifted))]
     whole = model.acting(shifted[variants])
-    world, acting = model.stepping(theta, model.in_windows(whole)[:, :, :-1].flatten(1, 2))
-    time, duration = model.rows.time[:, :-1].flatten(), model.rows.duration[:, :-1].flatten()
-    values = model.by_row(theta, length - 1)
-    step = linearise_step(
-        world, values, time, state[:, :-1].flatten(0, 1), acting[variant], by_state=known is None, duration=duration
-    )
+    step = _step(model, theta, state, model.in_windows(whole)[:, :, :-1].flatten(1, 2), variant)
     followings = [shown for each in whole if (shown := model.following(theta, each)) is not None]
     after = [followings[k] for k in variant] if followings else []
     values = model.by_row(theta, length)
@@ -248,3 +218,27 @@ def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised
         model.by_theta(read.by_parameter[:, channels].unflatten(0, rows)),
     )
     return out if known is None else replace(out, transition=known[0], sensing=known[1])
+
+
+def _step(model: CandidateModel, theta: Tensor, state: Tensor, acting: Tensor, variant: Sequence[int]) -> Tangent:
+    """The step with parameters (K,) from states (W, T, n), less the last, of which the derivative by the state only
+    where it is not known; in row v of `acting` (V, W (T - 1), substeps, n_action) is what acts with each variant of the
+    parameters."""
+    length = state.shape[1] - 1
+    time, duration = model.rows.time[:, :-1].flatten(), model.rows.duration[:, :-1].flatten()
+    now, by_state = state[:, :-1].flatten(0, 1), model.slopes is None
+    if not model.feels_unmodelled_loads:
+        world, acting = model.stepping(theta, acting)
+        values = model.by_row(theta, length)
+        return linearise_step(world, values, time, now, acting[list(variant)], by_state, duration=duration)
+    loaded, response = with_loads(model, model.accuracy), model.load_response.flatten(0, 1)
+    none = theta.new_zeros(response.shape[-1])
+    values = loaded.by_row(torch.cat((theta, none)), length).expand(len(now), -1)
+    world, following = loaded.at(values), state[:, 1:].flatten(0, 1)
+    loads = leading_loads(world, values, time, now, following, acting[0], duration, response)
+    given = acting[[*variant, *[0] * len(none)]]
+    out = linearise_step(
+        world, torch.cat((values[:, : len(theta)], loads), 1), time, now, given, by_state, duration=duration
+    )
+    without_friction = (response @ loads[..., None])[..., 0]
+    return replace(out, value=out.value - without_friction, by_parameter=out.by_parameter[..., : len(theta)])

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from visadapt.batch import Batch
-from visadapt.estimation.candidate import CandidateModel, initial_states, linearise
+from visadapt.estimation.candidate import CandidateModel, linearise
 from visadapt.estimation.colour import Colour, whitened
 from visadapt.estimation.kalman import (
     Filtered,
@@ -32,6 +32,7 @@ from visadapt.estimation.kalman import (
     respond,
     weights,
 )
+from visadapt.estimation.unmodelled_loads import initial_states, noise_directions
 
 LEAST_PROCESS_NOISE = 1e-6
 """Standard deviation of a process noise of every state, in its unit, beside that of the loads: practically none."""
@@ -133,7 +134,10 @@ def noises(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[Tens
     """
     windows = model.rows.shape[0]
     per_reading = problem.initial_variance / problem.initial_variance.new_tensor(model.profile.initial_variance)
-    sources = model.load_directions.repeat(len(fits.theta), 1, 1, 1) * per_reading.sqrt()[:, None, :, None]
+    sources = (
+        noise_directions(model.load_response, model.system).repeat(len(fits.theta), 1, 1, 1)
+        * per_reading.sqrt()[:, None, :, None]
+    )
     group = [k for k, columns in enumerate(model.profile.driven) for _ in columns]
     process, noise = fits.log_process[:, group].exp(), fits.log_noise.exp()
     return sources, process.repeat_interleave(windows, 0), noise.repeat_interleave(windows, 0)

@@ -1,0 +1,89 @@
+"""The loads that a candidate model leaves out: how they move the states, and what they do to dry friction.
+
+Process noise is such a load, held for a period: what is missing from a model of a machine is mostly a load on one of
+its joints, which moves the others through the mass matrix and its own position by half of the period.
+
+It is added to the state at the end of the period, so that dry friction does not feel it: beside a vibration that is
+stronger than the friction, a joint sticks in the model wherever it turns round, but not on the machine. Where the noise
+has a colour, something strong is known to be missing; there the step of a set with dry friction is taken under the load
+that leads from each state to the next, less what that load does without friction.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from visadapt.estimation.linearise import integrate, linearise_step, load_effect
+from visadapt.estimation.profiles import profile_of
+from visadapt.estimation.segments import Segments
+from visadapt.systems import System
+from visadapt.world import World
+
+LOAD_STEPS = 3
+"""Fixed-point steps to the load that leads to the next state: exact after one where friction does not change its
+direction within the period."""
+
+
+def initial_states(rows: Segments, system: System) -> Tensor:
+    """Initial guess (W, T, n) of the states: the measurements, and difference quotients for missing velocities."""
+    out = torch.zeros(*rows.shape, len(system.states), dtype=torch.float64)
+    for k, channel in enumerate(rows.channels):
+        out[..., channel] = rows.measured[..., k]
+    for channel, position_column in profile_of(system).position_of.items():
+        if channel not in rows.channels:
+            position = out[..., position_column]
+            change = torch.zeros_like(position)
+            change[:, 1:-1] = (position[:, 2:] - position[:, :-2]) / (rows.time[:, 2:] - rows.time[:, :-2])
+            change[:, 0] = (position[:, 1] - position[:, 0]) / rows.duration[:, 0]
+            out[..., channel] = change
+    return out * rows.inside[..., None]
+
+
+def load_response(rows: Segments, system: System) -> Tensor:
+    """(W, T - 1, n, L) change of the source's next state per unit of each load, held for a period, along the measured
+    states."""
+    windows, length = rows.shape
+    load = load_effect(type(system))
+    world = World(system, [load(**{parameter.name: 0.0 for parameter in load.table})], rows.period)
+    time, duration = rows.time[:, :-1].flatten(), rows.duration[:, :-1].flatten()
+    state = initial_states(rows, system)[:, :-1].flatten(0, 1)
+    commands = rows.command[rows.episode[:, None], rows.index][:, :-1].flatten(0, 1)[:, None]
+    none = torch.zeros(len(system.loads), dtype=torch.float64)
+    step = linearise_step(world, none, time, state, commands, by_state=False, duration=duration)
+    return step.by_parameter.unflatten(0, (windows, length - 1)) * rows.inside[:, 1:, None, None]
+
+
+def noise_directions(response: Tensor, system: System) -> Tensor:
+    """A `load_response` (W, T - 1, n, L) of loads that each change the velocities of their own group by 1."""
+    groups = [list(group) for group in profile_of(system).driven for _ in group]
+    own = torch.stack([response[:, :, group, k].norm(dim=-1) for k, group in enumerate(groups)], -1)
+    return response / torch.where(own > 0, own, 1.0)[:, :, None]
+
+
+def leading_loads(
+    world: World,
+    values: Tensor,
+    time: Tensor,
+    state: Tensor,
+    following: Tensor,
+    acting: Tensor,
+    duration: Tensor,
+    response: Tensor,
+) -> Tensor:
+    """Loads (N, L) under which the velocities of N states (N, n) become those of the `following` ones (N, n).
+
+    Args:
+        world: its last effect is `load_effect`, with which N rows of `values` (N, P + L) end; they are not used.
+        time, acting, duration: (N,) s, (N, substeps, n_action), and (N,) s, as in `linearise_step`.
+        response: (N, n, L) of `load_response`.
+    """
+    driven = profile_of(world.system).driven_columns
+    of_velocity = response[:, driven]
+    loads = state.new_zeros(len(state), response.shape[-1])
+    for _ in range(LOAD_STEPS):
+        given = torch.cat((values[:, : values.shape[1] - loads.shape[1]], loads), 1)
+        left = (following - integrate(world, given, time, state, acting, duration))[:, driven]
+        # The padding of windows does not respond.
+        loads = loads + torch.linalg.solve_ex(of_velocity, left).result.nan_to_num(0, 0, 0)
+    return loads
