@@ -11,6 +11,7 @@ from hypothesis import given, settings, strategies as st
 import visadapt.effects
 from tests.effects.registry import LIBRARY
 from visadapt.effects import EFFECTS, CameraEffect, ConstantForce, Effect, Role, Stage
+from visadapt.effects.laws import StribeckLaw
 from visadapt.systems import SYSTEMS, CartPole
 from visadapt.world import World
 
@@ -284,6 +285,8 @@ class TestSmoothContract:
 
         def test(values):
             given = torch.tensor([values[p.name] for p in table], dtype=torch.float64).expand(2, -1)
+            if issubclass(EFFECTS[name], StribeckLaw) and given[0, 0] == given[0, 1]:
+                return  # a corner: above it either friction is the larger one
             assert_gradients_agree(total, torch.cat((state, actions.movedim(0, 1).flatten(1), given), 1), limits)
 
         drawn(name, system, test)

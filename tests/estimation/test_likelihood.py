@@ -102,14 +102,17 @@ def test_a_batch_of_sets_is_fitted_as_each_alone(viscous):
         assert found.log_odds == pytest.approx(alone.log_odds, abs=0.05)
 
 
-def test_a_large_effect_is_found_from_a_source_that_took_positions_as_free_of_noise():
+def test_noise_of_measurements_is_told_from_a_load_that_is_missing():
+    """A load moves the position by half of a period's velocity too: taken as a jump of the velocity alone, it made
+    readings of positions look free of noise, and velocities and the pole noisier than they are."""
     noise = (1e-3, 5e-3, 1e-3, 5e-3)
     measured = ("x", "x_dot", "theta", "theta_dot")
     rows = prepare(record([CartMass(scale=1.774)], 8, 120, measured=measured, noise=noise), CartPole()).rows
     search = Search(CartPole(), rows, [CartMass])
-    assert float(search.source.fits.log_noise[0, 0]) < math.log(1e-4**2)
-    fits = search.single(CartMass).fits
-    torch.testing.assert_close((fits.log_noise[0] / 2).exp(), torch.tensor(noise).double(), rtol=0.1, atol=0)
+    for fits, within in ((search.source.fits, 0.25), (search.single(CartMass).fits, 0.1)):
+        torch.testing.assert_close((fits.log_noise[0] / 2).exp(), torch.tensor(noise).double(), rtol=within, atol=0)
+    cart, pole = (search.source.fits.log_process[0] / 2).exp()
+    assert cart > 50 * pole  # what is missing acts on the cart
 
 
 def test_no_sensor_scale_is_favoured_where_none_can_be_told():

@@ -58,7 +58,9 @@ class StribeckFriction(StribeckLaw):
     """Dry friction of the cart that is larger near rest than at speed."""
 
     name = "stribeck_friction"
-    equation = "F = -(force + (breakaway - force) exp(-(x_dot / velocity)^2)) sign(x_dot); at rest, up to breakaway"
+    equation = (
+        "F = -(force + max(breakaway - force, 0) exp(-(x_dot / velocity)^2)) sign(x_dot); at rest, up to breakaway"
+    )
     table = (
         Parameter("force", "N", 0.0, 15.0, 0.0),
         Parameter("breakaway", "N", 0.0, 15.0, 0.0),

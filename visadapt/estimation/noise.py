@@ -38,7 +38,8 @@ class UnknownNoise:
         """The forward pass under K candidates of the noise."""
         process = torch.einsum("kd,dij->kij", noise.process.square(), self.shapes)
         measured = noise.measurement.square()[:, None].expand(-1, self.used.shape[-1])
-        return forward(self.system.repeat(len(noise.process)), process, measured)
+        every = process[:, None].expand(-1, self.used.shape[1] - 1, -1, -1)
+        return forward(self.system.repeat(len(noise.process)), every, measured)
 
 
 @dataclass(frozen=True)

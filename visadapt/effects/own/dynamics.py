@@ -73,7 +73,7 @@ def _laws(
         ),
         "stribeck_friction": (
             laws.StribeckLaw,
-            f"Q = -({size} + (breakaway - {size}) exp(-({v} / velocity)^2)) sign({v}); at rest, up to breakaway",
+            f"Q = -({size} + max(breakaway - {size}, 0) exp(-({v} / velocity)^2)) sign({v}); at rest, up to breakaway",
             (*friction(size, "breakaway"), Parameter("velocity", velocity.unit, fastest / 500, fastest / 5, None)),
         ),
         "directional_friction": (
