@@ -140,8 +140,8 @@ def _fitted(system: System, effects: Effects, rows: Segments, present: Sequence[
     starts = [replace(base, theta=base.theta[:, order])]
     if list(present) != [value for effect in effects for value in neutral(effect)]:
         starts.append(replace(base, theta=torch.tensor([list(present)], dtype=torch.float64)))
-    if any(issubclass(effect, LateSensors) for effect in effects):
-        # With process noise a fit may end where noise explains what a longer delay would.
+    if effects:
+        # With process noise a fit may end where noise explains what an effect would.
         starts += [_best(system, effects, starts, rows, QUICK, process_noise=False)]
     return _best(system, effects, starts, rows, CAREFUL)
 
