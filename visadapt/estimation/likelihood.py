@@ -121,26 +121,39 @@ def _reading_per_state(sensing: Tensor, model: CandidateModel) -> Tensor:
 
 def variances(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[Tensor, Tensor]:
     """Process noise covariances (C W, T - 1, n, n) and measurement variances (C W, m) for the filter of `problem`."""
-    sources, process, noise = noises(model, fits, problem)
-    least = torch.full_like(problem.initial_variance, LEAST_PROCESS_NOISE**2)[:, None]
-    return (sources * process[:, None, None]) @ sources.mT + torch.diag_embed(least), noise
+    loads, noise = _noises(model, fits, problem)
+    return loads.covariance(), noise
 
 
-def noises(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[Tensor, Tensor, Tensor]:
-    """How process noises enter the states (C W, T - 1, n, L), their variances (C W, L), and those of measurements.
+@dataclass(frozen=True)
+class LoadNoise(Batch):
+    """The process noise of N systems: loads held for a period, each in the velocity that it gives to its coordinate."""
 
-    Process noise is a load that is held for a period, in the velocity that it gives to its own coordinate. It is in
-    units of the readings, since its lower bound would otherwise favour a sensor scale below 1.
+    sources: Tensor  # (N, T - 1, n, L) change of the states per unit of each load
+    variance: Tensor  # (N, L)
+
+    def covariance(self) -> Tensor:
+        """(N, T - 1, n, n) of the states, of which each has LEAST_PROCESS_NOISE of its own."""
+        least = torch.full_like(self.sources[..., 0], LEAST_PROCESS_NOISE**2)
+        return (self.sources * self.variance[:, None, None]) @ self.sources.mT + torch.diag_embed(least)
+
+    def smoothed(self, adjoint: Tensor) -> Tensor:
+        """Smoothed loads (N, T - 1, L, M), with the other sign, from the smoother's adjoints (N, T, n, M)."""
+        return self.variance[:, None, :, None] * (self.sources.mT @ adjoint[:, 1:])
+
+
+def _noises(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[LoadNoise, Tensor]:
+    """Process noise of the C W systems of `problem`, and measurement variances (C W, m).
+
+    Process noise is in units of the readings, since its lower bound would otherwise favour a sensor scale below 1.
     """
     windows = model.rows.shape[0]
     per_reading = problem.initial_variance / problem.initial_variance.new_tensor(model.profile.initial_variance)
-    sources = (
-        noise_directions(model.load_response, model.system).repeat(len(fits.theta), 1, 1, 1)
-        * per_reading.sqrt()[:, None, :, None]
-    )
+    sources = noise_directions(model.load_response, model.system).repeat(len(fits.theta), 1, 1, 1)
     group = [k for k, columns in enumerate(model.profile.driven) for _ in columns]
-    process, noise = fits.log_process[:, group].exp(), fits.log_noise.exp()
-    return sources, process.repeat_interleave(windows, 0), noise.repeat_interleave(windows, 0)
+    variance, noise = fits.log_process[:, group].exp(), fits.log_noise.exp()
+    loads = LoadNoise(sources * per_reading.sqrt()[:, None, :, None], variance.repeat_interleave(windows, 0))
+    return loads, noise.repeat_interleave(windows, 0)
 
 
 def noise_members(model: CandidateModel) -> tuple[Tensor, Tensor]:
@@ -193,8 +206,7 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState) -> Derivativ
     """Likelihood, gradient and Fisher information of every window at `fits`."""
     count, windows = fits.state.shape[:2]
     problem = linear_problem(models, fits)
-    process, noise = variances(models[0], fits, problem)
-    sources, of_loads, _ = noises(models[0], fits, problem)
+    loads, noise = _noises(models[0], fits, problem)
     rows = models[0].rows
     # The same draws for every fit.
     drawn = torch.randn(rows.used.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -213,17 +225,15 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState) -> Derivativ
     parts = []
     for first in range(0, count * windows, at_once):
         at = slice(first, first + at_once)
-        loads = sources[at], of_loads[at]
-        systems = problem[at], process[at], noise[at], loads, used[at], counted[at], drawn[at]
+        systems = problem[at], loads[at], noise[at], used[at], counted[at], drawn[at]
         parts.append(_of_systems(*systems, members, rows.colour))
     return Derivatives(*(torch.cat(each).unflatten(0, (count, windows)) for each in zip(*parts, strict=True)))
 
 
 def _of_systems(
     problem: Linear,
-    process: Tensor,
+    loads: LoadNoise,
     noise: Tensor,
-    loads: tuple[Tensor, Tensor],
     used: Tensor,
     counted: Tensor,
     drawn: Tensor,
@@ -233,17 +243,16 @@ def _of_systems(
     """The fields of `Derivatives` for N linear systems.
 
     Args:
-        loads: how process noises enter the states, and their variances, as `noises` gives them.
         used: (N, T, m) 1 where there is a reading; `counted` is its weight in the likelihood.
         drawn: (N, T, m) standard normal.
         colour: of the innovations, which states the noise: its derivatives are then 0. None: they are white.
     """
-    here = forward(problem, process, noise)
+    here = forward(problem, loads.covariance(), noise)
     errors = whitened(here.white, colour)
     error, columns = errors.flatten(1, 2).tensor_split([1], -1)
     likelihood = log_likelihood(replace(here, white=errors), counted)
     if colour is None:
-        adjoint, information, score = _by_noise(here, noise, loads, used, drawn, members)
+        adjoint, information, score = _by_noise(here, loads, noise, used, drawn, members)
     else:
         likelihood = likelihood + counted.mean(2).sum(1) * colour.whitening.logdet()
         adjoint = adjoints(here, here.white)
@@ -255,8 +264,8 @@ def _of_systems(
 
 def _by_noise(
     here: Filtered,
+    loads: LoadNoise,
     noise: Tensor,
-    loads: tuple[Tensor, Tensor],
     used: Tensor,
     drawn: Tensor,
     members: tuple[Tensor, Tensor],
@@ -271,13 +280,12 @@ def _by_noise(
     both = [0, -1]
     of_both = adjoint[..., both]
     weight = weights(here, white[..., both], of_both)
-    sources, process = loads
     driven, measured = members
-    by_process, by_noise = noise_scores(here, of_both[..., 0], weight[..., 0], sources, process, noise)
+    by_process, by_noise = noise_scores(here, of_both[..., 0], weight[..., 0], loads.sources, loads.variance, noise)
     score = by_process.sum(1) @ driven.T + (by_noise * used).sum(1) @ measured.T
-    # The smoothed w is minus Q times the adjoint; what inputs add to the states is subtracted from the readings.
-    held = process[:, None, :, None] * (sources.mT @ of_both[:, 1:])
-    drive = (sources[:, :, None] @ (held.movedim(-1, -2)[..., None] * driven.T)).movedim(2, 3)
+    # What inputs add to the states is subtracted from the readings.
+    by_group = loads.smoothed(of_both).mT[..., None] * driven.T
+    drive = (loads.sources[:, :, None] @ by_group).movedim(2, 3)
     reading = (noise[:, None, :, None] * weight)[..., None] * measured.T[:, None]
     working = respond(here, drive.flatten(-2), reading.flatten(-2)).flatten(1, 2)
     working = working.unflatten(-1, (2, len(driven))).flatten(1, 2)
