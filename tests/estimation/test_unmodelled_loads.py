@@ -1,0 +1,58 @@
+"""Loads that a model leaves out: against worlds in which they act."""
+
+import torch
+
+from tests.diagnosed import record
+from visadapt.diagnosis.search.preparation import prepare
+from visadapt.effects import ConstantForce, CoulombFriction
+from visadapt.estimation.linearise import load_effect
+from visadapt.estimation.unmodelled_loads import initial_states, leading_loads, load_response, noise_directions
+from visadapt.systems import CartPole
+from visadapt.world import World
+
+NEWTONS = 4.0
+
+
+def rows_of(*effects):
+    measured = ("x", "x_dot", "theta", "theta_dot")
+    return prepare(record(list(effects), 4, 120, measured=measured, noise=(0.0,) * 4), CartPole()).rows
+
+
+def steps_of(rows):
+    """Times, states, those that follow, commands (N, 1, 1) and durations of every row but the last of each window."""
+    state, command = initial_states(rows, CartPole()), rows.command[rows.episode[:, None], rows.index]
+    before = (each[:, :-1].flatten(0, 1) for each in (rows.time, state, command, rows.duration))
+    time, now, given, duration = before
+    return time, now, state[:, 1:].flatten(0, 1), given[:, None], duration
+
+
+def test_the_response_to_loads_is_that_of_the_forces_that_they_are():
+    rows = rows_of(ConstantForce(force=0.1))
+    (time, now, _, command, _), response = steps_of(rows), load_response(rows, CartPole())
+    forces = (0.0, 0.01)
+    free, pushed = (
+        World(CartPole(), [ConstantForce(force=force).double()]).integrate(time, now, command) for force in forces
+    )
+    torch.testing.assert_close(response[..., 0].flatten(0, 1), (pushed - free) / 0.01, atol=1e-6, rtol=1e-4)
+    # Of noise, each load is as large as changes the velocity of its own coordinate by 1.
+    own = noise_directions(response, CartPole())[:, :, [1, 3]].diagonal(dim1=-2, dim2=-1)
+    torch.testing.assert_close(own.abs(), torch.ones_like(own))
+
+
+def test_the_load_that_acted_is_found_beside_dry_friction_also_where_the_cart_turns_round():
+    rows = rows_of(CoulombFriction(force=2.0), ConstantForce(force=NEWTONS))
+    time, now, following, command, duration = steps_of(rows)
+    turns, rests = now[:, 1] * following[:, 1] < 0, following[:, 1] == 0
+    assert turns.sum() > 5
+    assert rests.sum() > 5
+    zeros = {parameter.name: 0.0 for parameter in load_effect(CartPole).table}
+    world = World(CartPole(), [CoulombFriction(force=0.0), load_effect(CartPole)(**zeros)], rows.period, "rk4", 20)
+    values = torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64).expand(len(now), -1)
+    response, command = load_response(rows, CartPole()).flatten(0, 1), command.expand(-1, 20, -1)
+    cart, pole = leading_loads(world, values, time, now, following, command, duration, response).unbind(-1)
+    found = (cart - NEWTONS).abs() < 0.05
+    assert found[now[:, 1] * following[:, 1] > 0].all()
+    assert found[turns].double().mean() > 0.7
+    assert pole[~rests].abs().max() < 0.01
+    # Of what holds a cart at rest no more is known than that it is no larger than friction and load together.
+    assert (cart[rests].abs() < NEWTONS + 2.0).all()
