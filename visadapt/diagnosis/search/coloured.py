@@ -38,7 +38,7 @@ def with_coloured_noise(
     found, other = comparison, search
     for made in range(ROUNDS):
         coloured_by = found.best
-        colour = _colour(search, coloured_by) if comparison.leftover > MIN_LEFTOVER else None
+        colour = colour_left_by(search, coloured_by) if comparison.leftover > MIN_LEFTOVER else None
         if colour is None:
             break
         rows = replace(search.rows, colour=colour)
@@ -58,7 +58,7 @@ def with_coloured_noise(
     return other, found
 
 
-def _colour(search: Search, best: ScoredModel) -> Colour | None:
+def colour_left_by(search: Search, best: ScoredModel) -> Colour | None:
     """The colour of the innovations of a model with white noise, or with that of an earlier colour."""
     model = CandidateModel(search.system, best.effects, search.rows)
     problem = linear_problem([model], best.fits).data()
