@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import torch
-
 from visadapt.diagnosis.prediction_errors import PredictionErrors
 from visadapt.diagnosis.result import Gap
 from visadapt.diagnosis.search import heldout
 from visadapt.diagnosis.search.causes import Alternative, GapClosed
 from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.heldout import RolloutErrors
-from visadapt.diagnosis.search.model_comparison import MIN_LEFTOVER, ModelComparison
+from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.verdict import MIN_GAP_CLOSED
 from visadapt.estimation.fit_states import Effects
-from visadapt.estimation.likelihood import MIN_LOG_PROCESS, FitState
+from visadapt.estimation.likelihood import FitState
 
 RUNNERS_UP = 2  # Sets after the best for which the share of the gap that they close is computed
 
@@ -58,7 +56,7 @@ def measure(
     runners_up = [compared.model for compared in comparison.models[1 : 1 + RUNNERS_UP]]
     without = [search.without(best, effect) for effect in best.effects]
     noise = (best.fits.log_noise[0] / 2).exp()
-    shown = {frozenset(f.names): f for f in [search.source, _predicting(best, comparison)]}
+    shown = {frozenset(f.names): f for f in [search.source, replace(best, fits=comparison.predicting)]}
     sets = {names: f for f in [*alone, *without, *runners_up] if (names := frozenset(f.names)) not in shown}
     rollouts = heldout.held_out(search.system, rows, _fitted(shown), lambda errors: errors, jobs)
     source, corrected = rollouts[0], rollouts[-1]
@@ -77,15 +75,6 @@ def measure(
         improvable = left > 1 - MIN_GAP_CLOSED and heldout.predicts_better(black_box, corrected, noise)
     closed = {names: errors.closed_by(each) for names, each in zip([*shown, *sets], rms, strict=True)}
     return MeasuredGap(source, corrected, errors, closed, improvable, is_held_out)
-
-
-def _predicting(best: ScoredModel, comparison: ModelComparison) -> ScoredModel:
-    """The best set as it predicts: without process noise that the data do not need, which would move the states from
-    which predictions start."""
-    if comparison.leftover > MIN_LEFTOVER:
-        return best
-    least = torch.full_like(best.fits.log_process, MIN_LOG_PROCESS)
-    return replace(best, fits=replace(best.fits, log_process=least))
 
 
 def _fitted(sets: Mapping[frozenset[str], ScoredModel]) -> list[tuple[Effects, FitState]]:

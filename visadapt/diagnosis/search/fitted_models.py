@@ -54,6 +54,14 @@ class ScoredModel:
         return tuple(effect.name for effect in self.effects)
 
 
+@dataclass(frozen=True)
+class WithoutProcessNoise:
+    """The fit of a set without process noise."""
+
+    fits: FitState
+    left: float  # log likelihood that process noise adds to the set: a measure of what it leaves unexplained
+
+
 class FittedModels:
     """The sets of effects of a catalogue fitted so far to one recording, and how to fit more.
 
@@ -139,9 +147,8 @@ class FittedModels:
         found = screen(self.system, base.effects, base.fits, self.rows, [effect])
         return with_effect(base.fits, found[0].values if found else neutral(effect))
 
-    def refit_without_process_noise(self, sets: Sequence[ScoredModel]) -> list[float]:
-        """Fit each set without process noise; return the log likelihood that process noise adds to it, a measure of
-        what it leaves unexplained.
+    def without_process_noise(self, sets: Sequence[ScoredModel]) -> list[WithoutProcessNoise]:
+        """Fit each set without process noise.
 
         Where a set is likelier without, that fit replaces the other one, which has ended where process noise explains
         what other parameters would.
@@ -151,7 +158,10 @@ class FittedModels:
         for each, fits in zip(sets, out, strict=True):
             if fits.likelihood > each.fits.likelihood + MIN_BETTER:
                 self._keep(each.effects, fits)
-        return [max(0.0, float(each.fits.likelihood - fits.likelihood)) for each, fits in zip(sets, out, strict=True)]
+        return [
+            WithoutProcessNoise(fits, max(0.0, float(each.fits.likelihood - fits.likelihood)))
+            for each, fits in zip(sets, out, strict=True)
+        ]
 
     def fit(
         self, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int], process_noise: bool = True

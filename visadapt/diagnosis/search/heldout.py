@@ -196,11 +196,14 @@ def rollout_errors(model: CandidateModel, fits: FitState, black_box: BlackBox | 
     predicted = _rollouts(model, fits.theta[0], estimated, horizon, stride, black_box)
 
     measured, shown = model.shown(fits.theta[0])
+    # A window's first state is known from what follows alone; where a joint sticks, that does not show its velocity.
+    others = rows.inside.sum(1) > horizon + stride
     left = model.measure(fits.theta[0], estimated) - measured
     parts = []
     for h in range(horizon + 1):
         ends = slice(h, None, stride)
-        used, found = shown[:, ends], predicted[:, : len(range(h, length, stride)), h]
+        used, found = shown[:, ends].clone(), predicted[:, : len(range(h, length, stride)), h]
+        used[others, 0] = 0
         error = (model.measure(fits.theta[0], found, ends) - measured[:, ends]) * used
         # Predictions that would end beyond the window are not valid.
         parts.append([pad(x, (0, 0, 0, predicted.shape[1] - x.shape[1])) for x in (error, used, left[:, ends] * used)])

@@ -12,6 +12,7 @@ from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.unexplained import SmoothFunction, smooth_functions
 from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.likelihood import FitState
 
 COMPARE_WITHIN = 10.0  # Log posterior odds; models further behind the best are not compared
 
@@ -45,6 +46,9 @@ class ModelComparison:
     """The models that were compared, and what the best leaves unexplained."""
 
     models: list[ComparedModel]  # the most probable first
+    predicting: FitState
+    """the best's fit from which predictions start: without process noise that the data do not need, which moves the
+    states"""
     leftover: float  # log likelihood that process noise adds to the best
     functions: list[SmoothFunction]  # each added alone to the best, the largest log odds first
     alternatives: dict[type[Effect], list[ComparedModel]]
@@ -82,17 +86,19 @@ class ModelComparison:
 def compare(search: Search) -> ModelComparison:
     """Compare the best models that a search has fitted, and the source."""
     close = _close(search)
-    leftover = search.refit_without_process_noise(close)
+    quiet = search.without_process_noise(close)
     close = [search.fitted[key_of(f.effects)] for f in close]  # some of which may now have a better fit
-    models = _weighed(search, close, leftover)
+    models = _weighed(search, close, [each.left for each in quiet])
     best = models[0].model
     functions = smooth_functions(CandidateModel(search.system, best.effects, search.rows), best.fits)
     gained = float(best.fits.likelihood[0] - search.source.fits.likelihood[0])
     threshold = search.profile.smooth_function_threshold
     loads = tuple(load.name for load in search.system.loads)
     # The source, which is not refitted, is best only where it is close.
-    left = {f.names: rest for f, rest in zip(close, leftover, strict=True)}.get(best.names, 0.0)
-    return ModelComparison(models, left, functions, _alternatives_to(models), gained, threshold, loads)
+    alone = {f.names: each for f, each in zip(close, quiet, strict=True)}.get(best.names)
+    left = alone.left if alone else 0.0
+    predicting = alone.fits if alone and left <= MIN_LEFTOVER else best.fits
+    return ModelComparison(models, predicting, left, functions, _alternatives_to(models), gained, threshold, loads)
 
 
 def compare_coloured(search: Search, white: ModelComparison) -> ModelComparison:
@@ -100,7 +106,7 @@ def compare_coloured(search: Search, white: ModelComparison) -> ModelComparison:
     says."""
     close = _close(search)
     models = _weighed(search, close, [0.0] * len(close))
-    return replace(white, models=models, alternatives=_alternatives_to(models))
+    return replace(white, models=models, predicting=models[0].model.fits, alternatives=_alternatives_to(models))
 
 
 def _close(search: Search) -> list[ScoredModel]:

@@ -135,7 +135,7 @@ class Search(FittedModels):
         before, left = None, 0.0
         while self.best is not before:
             before = self.best
-            (left,) = self.refit_without_process_noise([before])
+            left = self.without_process_noise([before])[0].left
             if self.best is not before:
                 self._prune()
                 self._settle(exchanged)
@@ -179,7 +179,7 @@ class Search(FittedModels):
     def _phases_of_episodes(self) -> None:
         """Where something is unexplained, try periodic effects with a phase for each episode; keep them if they win."""
         catalogue = tuple(with_episode_phases(effect, len(self.rows.command)) for effect in self.catalogue)
-        if catalogue == self.catalogue or self.refit_without_process_noise([self.best])[0] <= WIDEN_ABOVE:
+        if catalogue == self.catalogue or self.without_process_noise([self.best])[0].left <= WIDEN_ABOVE:
             return
         periodic = {effect.name for effect in catalogue if has_episode_phases(effect)}
         other = copy(self)
