@@ -27,8 +27,8 @@ class SystemProfile:
     """What estimation and diagnosis must know of a system: its sensors, and how much work the search may spend."""
 
     driven: tuple[Columns, ...]
-    """velocities that process noise changes, one for each load in the order of the loads; the velocities of a group
-    have the same noise variance"""
+    """velocities that the loads drive, one for each load in the order of the loads; process noise, which is a load, has
+    the same variance in each velocity of a group"""
     position_of: Mapping[int, int]
     """column of a velocity to the column of its position, for velocities that a recording may lack"""
     sensors: tuple[Columns, ...]  # columns that one kind of sensor measures, with the same noise variance
