@@ -224,21 +224,31 @@ def _step(model: CandidateModel, theta: Tensor, state: Tensor, acting: Tensor, v
     """The step with parameters (K,) from states (W, T, n), less the last, of which the derivative by the state only
     where it is not known; in row v of `acting` (V, W (T - 1), substeps, n_action) is what acts with each variant of the
     parameters."""
-    length = state.shape[1] - 1
-    time, duration = model.rows.time[:, :-1].flatten(), model.rows.duration[:, :-1].flatten()
+    if model.feels_unmodelled_loads:
+        return _step_under_loads(model, theta, state, acting, variant)
+    world, acting = model.stepping(theta, acting)
+    values, time, duration = model.by_row(theta, state.shape[1] - 1), *_clock(model.rows)
     now, by_state = state[:, :-1].flatten(0, 1), model.slopes is None
-    if not model.feels_unmodelled_loads:
-        world, acting = model.stepping(theta, acting)
-        values = model.by_row(theta, length)
-        return linearise_step(world, values, time, now, acting[list(variant)], by_state, duration=duration)
+    return linearise_step(world, values, time, now, acting[list(variant)], by_state, duration=duration)
+
+
+def _step_under_loads(
+    model: CandidateModel, theta: Tensor, state: Tensor, acting: Tensor, variant: Sequence[int]
+) -> Tangent:
+    """The same under the loads that lead from each state to the next, less what these do without friction."""
     loaded, response = with_loads(model, model.accuracy), model.load_response.flatten(0, 1)
-    none = theta.new_zeros(response.shape[-1])
-    values = loaded.by_row(torch.cat((theta, none)), length).expand(len(now), -1)
-    world, following = loaded.at(values), state[:, 1:].flatten(0, 1)
+    (time, duration), count = _clock(model.rows), response.shape[-1]
+    now, following = state[:, :-1].flatten(0, 1), state[:, 1:].flatten(0, 1)
+    values = loaded.by_row(torch.cat((theta, theta.new_zeros(count))), state.shape[1] - 1).expand(len(now), -1)
+    world = loaded.at(values)
     loads = leading_loads(world, values, time, now, following, acting[0], duration, response)
-    given = acting[[*variant, *[0] * len(none)]]
-    out = linearise_step(
-        world, torch.cat((values[:, : len(theta)], loads), 1), time, now, given, by_state, duration=duration
-    )
+    values = torch.cat((values[:, : len(theta)], loads), 1)
+    given = acting[[*variant, *[0] * count]]
+    out = linearise_step(world, values, time, now, given, model.slopes is None, duration=duration)
     without_friction = (response @ loads[..., None])[..., 0]
     return replace(out, value=out.value - without_friction, by_parameter=out.by_parameter[..., : len(theta)])
+
+
+def _clock(rows: Segments) -> tuple[Tensor, Tensor]:
+    """Times, and durations, (W (T - 1),) s, of every row but the last of each window."""
+    return rows.time[:, :-1].flatten(), rows.duration[:, :-1].flatten()
