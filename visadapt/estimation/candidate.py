@@ -23,7 +23,7 @@ from visadapt.estimation.linearise import (
 )
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
-from visadapt.estimation.unmodelled_loads import leading_loads, load_response
+from visadapt.estimation.unmodelled_loads import leading_loads, load_response, response_without_friction
 from visadapt.systems import System
 from visadapt.world import World, WorldState
 
@@ -236,11 +236,12 @@ def _step_under_loads(
     model: CandidateModel, theta: Tensor, state: Tensor, acting: Tensor, variant: Sequence[int]
 ) -> Tangent:
     """The same under the loads that lead from each state to the next, less what these do without friction."""
-    loaded, response = with_loads(model, model.accuracy), model.load_response.flatten(0, 1)
-    (time, duration), count = _clock(model.rows), response.shape[-1]
+    loaded, count = with_loads(model, model.accuracy), len(model.system.loads)
+    time, duration = _clock(model.rows)
     now, following = state[:, :-1].flatten(0, 1), state[:, 1:].flatten(0, 1)
     values = loaded.by_row(torch.cat((theta, theta.new_zeros(count))), state.shape[1] - 1).expand(len(now), -1)
     world = loaded.at(values)
+    response = response_without_friction(world, now, acting[0, :, 0], duration)
     loads = leading_loads(world, values, time, now, following, acting[0], duration, response)
     values = torch.cat((values[:, : len(theta)], loads), 1)
     given = acting[[*variant, *[0] * count]]
