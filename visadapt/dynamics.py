@@ -26,7 +26,7 @@ class Dynamics:
         # Most effects do one of these three alone, and a step asks for them at every derivative.
         self._varying = [e for e in effects if type(e).vary is not DynamicsEffect.vary]
         self._loading = [e for e in effects if type(e).load is not DynamicsEffect.load]
-        self._rubbing = [e for e in effects if type(e).dry_friction is not DynamicsEffect.dry_friction]
+        self._rubbing = [e for e in effects if e.rubs()]
         self._friction_varies = any(e.dry_friction_by_velocity for e in self._rubbing)
         self._columns = torch.tensor([velocity for _, velocity in system.coordinates], dtype=torch.long)
 

@@ -14,7 +14,7 @@ from visadapt.effects import ActuatorDelay, CartMass, ConstantForce, SensorScale
 from visadapt.estimation.candidate import CandidateModel, linearise
 from visadapt.estimation.fit_states import CAREFUL
 from visadapt.estimation.fitting import LEAST_NOISE, fit, refitted
-from visadapt.estimation.unmodelled_loads import initial_states
+from visadapt.estimation.segments import initial_states
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole
 from visadapt.world import World

@@ -7,8 +7,8 @@ from tests.diagnosed import record
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.effects import ConstantForce, CoulombFriction, PoleMass
 from visadapt.estimation.linearise import load_effect
+from visadapt.estimation.segments import initial_states
 from visadapt.estimation.unmodelled_loads import (
-    initial_states,
     leading_loads,
     load_response,
     noise_directions,
@@ -27,10 +27,9 @@ def rows_of(*effects):
 
 def steps_of(rows):
     """Times, states, those that follow, commands (N, 1, 1) and durations of every row but the last of each window."""
-    state, command = initial_states(rows, CartPole()), rows.command[rows.episode[:, None], rows.index]
-    before = (each[:, :-1].flatten(0, 1) for each in (rows.time, state, command, rows.duration))
-    time, now, given, duration = before
-    return time, now, state[:, 1:].flatten(0, 1), given[:, None], duration
+    (time, duration), state = rows.clock, initial_states(rows, CartPole())
+    now, following, command = state[:, :-1], state[:, 1:], rows.given[:, :-1]
+    return time, now.flatten(0, 1), following.flatten(0, 1), command.flatten(0, 1)[:, None], duration
 
 
 def test_the_response_to_loads_is_that_of_the_forces_that_they_are():
@@ -42,7 +41,7 @@ def test_the_response_to_loads_is_that_of_the_forces_that_they_are():
     )
     torch.testing.assert_close(response[..., 0].flatten(0, 1), (pushed - free) / 0.01, atol=1e-6, rtol=1e-4)
     # Of noise, each load is as large as changes the velocity of its own coordinate by 1.
-    own = noise_directions(response, CartPole())[:, :, [1, 3]].diagonal(dim1=-2, dim2=-1)
+    own = noise_directions(rows, CartPole())[:, :, [1, 3]].diagonal(dim1=-2, dim2=-1)
     torch.testing.assert_close(own.abs(), torch.ones_like(own))
 
 

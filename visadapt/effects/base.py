@@ -239,7 +239,12 @@ class DynamicsEffect(Effect):
     def only_loads(cls) -> bool:
         """Whether it does nothing but add a load."""
         base = DynamicsEffect
-        return cls.alter is base.alter and cls.vary is base.vary and cls.dry_friction is base.dry_friction
+        return cls.alter is base.alter and cls.vary is base.vary and not cls.rubs()
+
+    @classmethod
+    def rubs(cls) -> bool:
+        """Whether it is, or brings, dry friction."""
+        return cls.dry_friction is not DynamicsEffect.dry_friction
 
     def dry_friction(self, time: Tensor, state: Tensor, command: Tensor, system: System) -> Tensor:
         """The largest dry friction (B, n_load, 2) against positive and against negative motion.

@@ -23,7 +23,7 @@ from visadapt.estimation.linearise import (
 )
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
-from visadapt.estimation.unmodelled_loads import leading_loads, load_response, response_without_friction
+from visadapt.estimation.unmodelled_loads import leading_loads, noise_directions, response_without_friction
 from visadapt.systems import System
 from visadapt.world import World, WorldState
 
@@ -67,20 +67,20 @@ class CandidateModel:
         self.acting_parameters = [k for k, effect in enumerate(named) if acting and (effect in acting or not alone)]
         """columns of the parameters that change what acts of the commands"""
         self._late = [(k, effect.late) for k, effect in enumerate(named) if issubclass(effect, LateSensors)]
-        self._load_response: Tensor | None = None
-        rub = [issubclass(e, DynamicsEffect) and e.dry_friction is not DynamicsEffect.dry_friction for e in effects]
-        self.feels_unmodelled_loads = rows.colour is not None and any(rub)
+        self._noise_directions: Tensor | None = None
+        rubs = any(issubclass(effect, DynamicsEffect) and effect.rubs() for effect in effects)
+        self.feels_unmodelled_loads = rows.colour is not None and rubs
         """whether what is missing from the model decides which way friction acts"""
         self._phase_columns = phase_columns(effects, len(rows.command))
         self.slopes: tuple[Tensor, Tensor] | None = None
         """transition (W, T - 1, n, n) and sensing (W, T, m, n) of an earlier linearisation, reused where given"""
 
     @property
-    def load_response(self) -> Tensor:
-        """(W, T - 1, n, L) change of the states by unit loads held for a period; see `unmodelled_loads`."""
-        if self._load_response is None:
-            self._load_response = load_response(self.rows, self.system)
-        return self._load_response
+    def noise_directions(self) -> Tensor:
+        """(W, T - 1, n, L) how process noise enters the states; see `unmodelled_loads`."""
+        if self._noise_directions is None:
+            self._noise_directions = noise_directions(self.rows, self.system)
+        return self._noise_directions
 
     def at(self, theta: Tensor) -> World:
         """The world with parameters (P,), or (N, P) for a batch of N states; `by_row` gives those of rows."""
@@ -227,7 +227,7 @@ def _step(model: CandidateModel, theta: Tensor, state: Tensor, acting: Tensor, v
     if model.feels_unmodelled_loads:
         return _step_under_loads(model, theta, state, acting, variant)
     world, acting = model.stepping(theta, acting)
-    values, time, duration = model.by_row(theta, state.shape[1] - 1), *_clock(model.rows)
+    values, time, duration = model.by_row(theta, state.shape[1] - 1), *model.rows.clock
     now, by_state = state[:, :-1].flatten(0, 1), model.slopes is None
     return linearise_step(world, values, time, now, acting[list(variant)], by_state, duration=duration)
 
@@ -237,7 +237,7 @@ def _step_under_loads(
 ) -> Tangent:
     """The same under the loads that lead from each state to the next, less what these do without friction."""
     loaded, count = with_loads(model, model.accuracy), len(model.system.loads)
-    time, duration = _clock(model.rows)
+    time, duration = model.rows.clock
     now, following = state[:, :-1].flatten(0, 1), state[:, 1:].flatten(0, 1)
     values = loaded.by_row(torch.cat((theta, theta.new_zeros(count))), state.shape[1] - 1).expand(len(now), -1)
     world = loaded.at(values)
@@ -248,8 +248,3 @@ def _step_under_loads(
     out = linearise_step(world, values, time, now, given, model.slopes is None, duration=duration)
     without_friction = (response @ loads[..., None])[..., 0]
     return replace(out, value=out.value - without_friction, by_parameter=out.by_parameter[..., : len(theta)])
-
-
-def _clock(rows: Segments) -> tuple[Tensor, Tensor]:
-    """Times, and durations, (W (T - 1),) s, of every row but the last of each window."""
-    return rows.time[:, :-1].flatten(), rows.duration[:, :-1].flatten()

@@ -13,8 +13,7 @@ from visadapt.effects import Effect
 from visadapt.estimation.candidate import COARSE, FINE
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
-from visadapt.estimation.segments import Segments
-from visadapt.estimation.unmodelled_loads import initial_states
+from visadapt.estimation.segments import Segments, initial_states
 from visadapt.systems import System
 
 Effects = tuple[type[Effect], ...]

@@ -32,7 +32,7 @@ from visadapt.estimation.kalman import (
     respond,
     weights,
 )
-from visadapt.estimation.unmodelled_loads import initial_states, noise_directions
+from visadapt.estimation.segments import initial_states
 
 LEAST_PROCESS_NOISE = 1e-6
 """Standard deviation of a process noise of every state, in its unit, beside that of the loads: practically none."""
@@ -149,7 +149,7 @@ def _noises(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[Loa
     """
     windows = model.rows.shape[0]
     per_reading = problem.initial_variance / problem.initial_variance.new_tensor(model.profile.initial_variance)
-    sources = noise_directions(model.load_response, model.system).repeat(len(fits.theta), 1, 1, 1)
+    sources = model.noise_directions.repeat(len(fits.theta), 1, 1, 1)
     group = [k for k, columns in enumerate(model.profile.driven) for _ in columns]
     variance, noise = fits.log_process[:, group].exp(), fits.log_noise.exp()
     loads = LoadNoise(sources * per_reading.sqrt()[:, None, :, None], variance.repeat_interleave(windows, 0))

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from visadapt.estimation.colour import Colour
+from visadapt.estimation.profiles import profile_of
+from visadapt.systems import System
 
 ROUNDING_ERROR = 1e-6
 """In a reading's unit; smaller differences between readings come from arithmetic, such as wrapping an angle."""
@@ -47,6 +49,16 @@ class Segments:
         """(W, T) s from each row to the next; it continues in the padding."""
         return self.held[self.episode[:, None], self.index]
 
+    @property
+    def given(self) -> Tensor:
+        """(W, T, n_action) commands of the rows."""
+        return self.command[self.episode[:, None], self.index]
+
+    @property
+    def clock(self) -> tuple[Tensor, Tensor]:
+        """Times, and durations, (W (T - 1),) s, of every row but the last of each window."""
+        return self.time[:, :-1].flatten(), self.duration[:, :-1].flatten()
+
     def later(self, values: Tensor, by: Sequence[int]) -> Tensor:
         """Of values (W, T, m) of every row those of `by` (m,) rows later in the episode; 0 where no window has them."""
         if not any(by):
@@ -78,6 +90,21 @@ class Segments:
             channels=tuple(self.channels[k] for k in kept),
             resolution=tuple(self.resolution[k] for k in kept),
         )
+
+
+def initial_states(rows: Segments, system: System) -> Tensor:
+    """Initial guess (W, T, n) of the states: the measurements, and difference quotients for missing velocities."""
+    out = torch.zeros(*rows.shape, len(system.states), dtype=torch.float64)
+    for k, channel in enumerate(rows.channels):
+        out[..., channel] = rows.measured[..., k]
+    for channel, position_column in profile_of(system).position_of.items():
+        if channel not in rows.channels:
+            position = out[..., position_column]
+            change = torch.zeros_like(position)
+            change[:, 1:-1] = (position[:, 2:] - position[:, :-2]) / (rows.time[:, 2:] - rows.time[:, :-2])
+            change[:, 0] = (position[:, 1] - position[:, 0]) / rows.duration[:, 0]
+            out[..., channel] = change
+    return out * rows.inside[..., None]
 
 
 def cut(

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from visadapt.estimation.linearise import integrate, linearise_step, load_effect
 from visadapt.estimation.profiles import profile_of
-from visadapt.estimation.segments import Segments
+from visadapt.estimation.segments import Segments, initial_states
 from visadapt.systems import System
 from visadapt.world import World
 
@@ -25,37 +25,22 @@ LOAD_STEPS = 5
 the period; where a cart turns round, five come within 0.05 N in most rows."""
 
 
-def initial_states(rows: Segments, system: System) -> Tensor:
-    """Initial guess (W, T, n) of the states: the measurements, and difference quotients for missing velocities."""
-    out = torch.zeros(*rows.shape, len(system.states), dtype=torch.float64)
-    for k, channel in enumerate(rows.channels):
-        out[..., channel] = rows.measured[..., k]
-    for channel, position_column in profile_of(system).position_of.items():
-        if channel not in rows.channels:
-            position = out[..., position_column]
-            change = torch.zeros_like(position)
-            change[:, 1:-1] = (position[:, 2:] - position[:, :-2]) / (rows.time[:, 2:] - rows.time[:, :-2])
-            change[:, 0] = (position[:, 1] - position[:, 0]) / rows.duration[:, 0]
-            out[..., channel] = change
-    return out * rows.inside[..., None]
-
-
 def load_response(rows: Segments, system: System) -> Tensor:
     """(W, T - 1, n, L) change of the source's next state per unit of each load, held for a period, along the measured
     states."""
     windows, length = rows.shape
     load = load_effect(type(system))
     world = World(system, [load(**{parameter.name: 0.0 for parameter in load.table})], rows.period)
-    time, duration = rows.time[:, :-1].flatten(), rows.duration[:, :-1].flatten()
-    state = initial_states(rows, system)[:, :-1].flatten(0, 1)
-    commands = rows.command[rows.episode[:, None], rows.index][:, :-1].flatten(0, 1)[:, None]
+    (time, duration), state = rows.clock, initial_states(rows, system)[:, :-1].flatten(0, 1)
+    commands = rows.given[:, :-1].flatten(0, 1)[:, None]
     none = torch.zeros(len(system.loads), dtype=torch.float64)
     step = linearise_step(world, none, time, state, commands, by_state=False, duration=duration)
     return step.by_parameter.unflatten(0, (windows, length - 1)) * rows.inside[:, 1:, None, None]
 
 
-def noise_directions(response: Tensor, system: System) -> Tensor:
-    """A `load_response` (W, T - 1, n, L) of loads that each change the velocities of their own group by 1."""
+def noise_directions(rows: Segments, system: System) -> Tensor:
+    """The `load_response` (W, T - 1, n, L) to loads that each change the velocities of their own group by 1."""
+    response = load_response(rows, system)
     groups = [list(group) for group in profile_of(system).driven for _ in group]
     own = torch.stack([response[:, :, group, k].norm(dim=-1) for k, group in enumerate(groups)], -1)
     return response / torch.where(own > 0, own, 1.0)[:, :, None]

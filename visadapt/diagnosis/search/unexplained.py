@@ -85,7 +85,7 @@ def variables_of(model: CandidateModel, state: Tensor) -> dict[str, Tensor]:
     """(W, T) of every state, command and previous command, and of time last, by name; along states (W, T, n)."""
     rows = model.rows
     index = rows.index
-    command = rows.command[rows.episode[:, None], index]
+    command = rows.given
     before = rows.command[rows.episode[:, None], (index - 1).clamp(min=0)] * (index > 0)[..., None]
     out = {variable.name: state[..., k] for k, variable in enumerate(model.system.states)}
     for k, action in enumerate(model.system.actions):
