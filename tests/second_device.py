@@ -1,8 +1,8 @@
-"""A second device, pretended on the CPU, to find operations on tensors of two devices where there is no GPU.
+"""A second device: the GPU where there is one, and otherwise one that is pretended on the CPU.
 
-Its name is "meta", torch's device of tensors without values; but within `second_device` they have values, on the CPU.
-What CUDA refuses is refused: an operation on tensors of both devices, unless the one on the CPU has no axes, indexes
-the other, or is copied from or to it.
+The name of the pretended one is "meta", torch's device of tensors without values; but within `second_device` they have
+values, on the CPU. What CUDA refuses is refused: an operation on tensors of both devices, unless the one on the CPU has
+no axes, indexes the other, or is copied from or to it.
 """
 
 import warnings
@@ -15,7 +15,8 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_map
 
-DEVICE = torch.device("meta")
+GPU = torch.cuda.is_available()
+DEVICE = torch.device("cuda", 0) if GPU else torch.device("meta")
 
 aten = torch.ops.aten
 COPIES = (aten._to_copy.default, aten.copy_.default)
@@ -25,6 +26,9 @@ INDEXED = (aten.index.Tensor, aten.index_put.default, aten.index_put_.default, a
 @contextmanager
 def second_device():
     """Within it, `policy.to(DEVICE)` moves a policy to the second device."""
+    if GPU:
+        yield
+        return
     with warnings.catch_warnings(), _Creation(), _Operations():
         warnings.filterwarnings("ignore", ".*copying from a non-meta parameter")  # which would have no values
         yield
