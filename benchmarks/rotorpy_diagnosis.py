@@ -17,7 +17,6 @@ Recordings and answers are kept in `out`, so started again it goes on; recording
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -31,6 +30,7 @@ import tyro
 
 from datasets import quadrotor_references
 from datasets.blind import flights as blind_flights
+from experiments.result_tables import write_csv
 from experiments.rotorpy_published import published
 from visadapt import diagnose
 from visadapt.diagnosis.search.causes import Z_90
@@ -42,7 +42,6 @@ from visadapt.policies import Policy
 from visadapt.progress import reporting
 from visadapt.recordings import Episode, load_recording, write_recording
 from visadapt.setups.policy_file import load_policy
-from visadapt.storage.atomic_files import replacing
 from visadapt.storage.run_folder import once, open_run
 from visadapt.targets import TargetError
 from visadapt.targets.rollout import run
@@ -112,7 +111,7 @@ def main(settings: Settings) -> None:
         sizes = once(path.with_suffix(".sizes.json"), partial(sized, path))
         true = published(target)
         rows += rows_of(kind, answer, sizes, true if air is not None else {"lag": true["lag"]})
-    write(settings.results, rows)
+    write_csv(settings.results, list(rows[0]), rows)
     for row in rows:
         print(f"{row['air']:12} {row['what']:12} {row['value']} {row['unit']}  rotorpy: {row['published']}")
 
@@ -184,14 +183,6 @@ def _row(kind: str, what: str, value: str, unit: str = "") -> dict[str, str]:
 
 def _number(value: float | None) -> str:
     return "" if value is None or math.isnan(value) else f"{value:.4g}"
-
-
-def write(path: Path, rows: list[dict[str, str]]) -> None:
-    """The table, whole or not at all; 90 % intervals."""
-    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,6 @@ Writes results/theorem.csv, a row for each policy. Interrupt it anywhere; starte
 from __future__ import annotations
 
 import copy
-import csv
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -41,11 +40,11 @@ from benchmarks.cartpole_states import CONSTANT, FORCE, PLANS, Settings as CartP
 from benchmarks.flight import Settings as FlightSettings
 from datasets import quadrotor_references
 from experiments.flights import EXPERIMENTS, flight_target
+from experiments.result_tables import write_csv
 from visadapt.evaluation import SCORE_SEED
 from visadapt.learning.transitions import Transitions
 from visadapt.policies import Policy
 from visadapt.setups.base import Setup
-from visadapt.storage.atomic_files import replacing
 from visadapt.storage.run_folder import once
 from visadapt.systems.rigid_body import POSITION
 from visadapt.targets import FlightTarget, SyntheticTarget, Target, constant_force
@@ -145,10 +144,7 @@ def main(settings: Settings) -> None:
             f"{own.lipschitz_between:.4f} * {own.action_distance:.4f} + {own.zeta:.4f} = {own.right:.4f}",
             flush=True,
         )
-    with replacing(settings.out) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(settings.out, list(rows[0]), rows)
 
 
 def _rows(settings: Settings) -> Iterator[Row]:

@@ -32,11 +32,12 @@ import tyro
 from benchmarks.blind.baselines import BASELINES, FLYING
 from benchmarks.blind.flight_onestep import system_of
 from benchmarks.blind.scoring import Answer, Score, Truth, score
-from benchmarks.blind.tables import Row, confusion, label, read_table, tabulate, write_csv, write_table
+from benchmarks.blind.tables import Row, confusion, label, tabulate, write_table
 from datasets.blind import films as blind_films, flights as blind_flights, gaps as blind_gaps
 from datasets.blind.kinds import Effects
 from datasets.blind.scene import COLUMN, ROW, SCALE
 from datasets.blind.table import ROWS
+from experiments.result_tables import read_rows, write_csv
 
 Kind = Literal["easy", "hard", "large", "rig", "table", "film_plain", "film_textured", "quadrotor", "fixed_wing"]
 """One of the sets of the cart-pole, or the set of a vehicle."""
@@ -286,7 +287,8 @@ def write(out: Path, rows: list[Row], taken: list[dict[str, str | int]]) -> None
     run = {(row.kind, row.diagnoser) for row in rows}
 
     def others(path: Path) -> list[dict[str, Any]]:
-        return [line for line in read_table(path) if (line["kind"], line["diagnoser"]) not in run]
+        lines = read_rows(path) if path.exists() else []
+        return [line for line in lines if (line["kind"], line["diagnoser"]) not in run]
 
     if rows:
         write_table(out, rows, others(out))

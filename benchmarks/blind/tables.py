@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -12,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.blind.scoring import Answer, Score, Truth, classes
+from experiments.result_tables import write_csv
 from visadapt.confidence import wilson
-from visadapt.storage.atomic_files import replacing
 
 STRENGTH_EDGES = (0.0, 1.0, 1.5, 2.5, 4.0, 8.0, 15.0, np.inf)
 """edges of the bins of strength"""
@@ -140,7 +139,7 @@ def confusion(kind: str, diagnoser: str, pairs: Iterable[tuple[Truth, Answer]]) 
     ]
 
 
-def write_table(path: Path, rows: Sequence[Row], others: Iterable[dict[str, str | int]] = ()) -> None:
+def write_table(path: Path, rows: Sequence[Row], others: Iterable[dict[str, str]]) -> None:
     """Write the rows after the lines that are kept; numbers to four digits, empty where not applicable."""
     shown = [
         {name: _shown(value) if isinstance(value, float) else value for name, value in asdict(row).items()}
@@ -151,19 +150,3 @@ def write_table(path: Path, rows: Sequence[Row], others: Iterable[dict[str, str 
 
 def _shown(value: float) -> str:
     return "" if np.isnan(value) else f"{value:.4g}"
-
-
-def write_csv(path: Path, columns: Sequence[str], lines: Iterable[dict[str, str | int]]) -> None:
-    """Write a CSV atomically."""
-    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(lines)
-
-
-def read_table(path: Path) -> list[dict[str, str]]:
-    """The lines of an existing table; none if there is no file."""
-    if not path.exists():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))

@@ -12,17 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from datasets.blind.kinds import Kind, Shape
+from datasets.blind.kinds import Kind, Shape, scale, sign, signed
 from datasets.blind.plant import Array
 from datasets.blind.scene import HEIGHT, WIDTH, Look, draw, pixels
 
 NOISE = 2.0 / 255
 """standard deviation of a pixel"""
 TOGETHER = 100  # Frames drawn at a time
-
-
-def _sign(rng: np.random.Generator, _: float) -> Shape:
-    return {"sign": float(rng.choice((-1.0, 1.0)))}
 
 
 def _turned(rng: np.random.Generator, _: float) -> Shape:
@@ -59,10 +55,8 @@ CAMERA: tuple[Kind, ...] = (
         lambda size, shape: {"dx": size * np.cos(shape["direction"]), "dy": size * np.sin(shape["direction"])},
         _turned,
     ),
-    Kind("camera_rotation", "camera", 0.015, 0.2, lambda size, shape: {"angle": shape["sign"] * size}, _sign),
-    Kind(
-        "camera_zoom", "camera", 0.015, 0.2, lambda size, shape: {"scale": float(np.exp(shape["sign"] * size))}, _sign
-    ),
+    Kind("camera_rotation", "camera", 0.015, 0.2, signed("angle"), sign),
+    Kind("camera_zoom", "camera", 0.015, 0.2, scale, sign),
     Kind("blur", "camera", 0.5, 2.0, lambda size, shape: {"sigma": size}),
     Kind(
         "brightness",
@@ -70,9 +64,9 @@ CAMERA: tuple[Kind, ...] = (
         0.06,
         0.4,
         lambda size, shape: {"gain": float(np.exp(shape["sign"] * size)), "offset": shape["offset"]},
-        lambda rng, length: _sign(rng, length) | {"offset": float(rng.uniform(-0.08, 0.08))},
+        lambda rng, length: sign(rng, length) | {"offset": float(rng.uniform(-0.08, 0.08))},
     ),
-    Kind("gamma", "camera", 0.08, 0.6, lambda size, shape: {"exponent": float(np.exp(shape["sign"] * size))}, _sign),
+    Kind("gamma", "camera", 0.08, 0.6, lambda size, shape: {"exponent": float(np.exp(shape["sign"] * size))}, sign),
     Kind("occlusion", "camera", 12.0, 45.0, _covering, _box),
     Kind("camera_delay", "camera", 0.015, 0.12, lambda size, shape: {"delay": size}),
     Kind("frame_drop", "camera", 0.03, 0.3, lambda size, shape: {"rate": size}),
@@ -80,7 +74,7 @@ CAMERA: tuple[Kind, ...] = (
 """those of the catalogue, their sizes drawn between the smallest and the largest"""
 
 FOREIGN_IN_FILMS: tuple[Kind, ...] = (
-    Kind("lens_distortion", "camera", 0.02, 0.1, lambda size, shape: {"coefficient": shape["sign"] * size}, _sign),
+    Kind("lens_distortion", "camera", 0.02, 0.1, signed("coefficient"), sign),
     Kind(
         "moving_shadow",
         "camera",
@@ -107,7 +101,7 @@ FOREIGN_IN_FILMS: tuple[Kind, ...] = (
         0.1,
         0.4,
         lambda size, shape: {"width": float(np.exp(shape["sign"] * size)), "grey": 0.5 * size},
-        _sign,
+        sign,
     ),
 )
 """no effect of the catalogue: coefficient of r^2, r over half the frame's width; shadow's depth, px/s, px and px; share

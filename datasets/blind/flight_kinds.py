@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from datasets.blind.kinds import Build, Draw, Effects, Kind, Shape
+from datasets.blind.kinds import Draw, Effects, Kind, Shape, plain, scale, sign, signed
 
 BOTH, QUADROTOR, WING = ("quadrotor", "fixed_wing"), ("quadrotor",), ("fixed_wing",)
 
@@ -62,22 +62,6 @@ NEUTRAL: dict[str, float] = {
     ),
 }
 """Every parameter of every effect at the value without effect."""
-
-
-def _sign(rng: np.random.Generator, _: float = 0.0) -> Shape:
-    return {"sign": float(rng.choice((-1.0, 1.0)))}
-
-
-def _signed(parameter: str) -> Build:
-    return lambda size, shape: {parameter: shape["sign"] * size}
-
-
-def _plain(parameter: str) -> Build:
-    return lambda size, shape: {parameter: size}
-
-
-def _scale(size: float, shape: Shape) -> Shape:
-    return {"scale": float(np.exp(shape["sign"] * size))}
 
 
 def _directed(names: tuple[str, ...]) -> Draw:
@@ -146,32 +130,32 @@ ROTORS = tuple(f"scale_{k}" for k in (1, 2, 3, 4))
 SURFACES = ("elevator", "aileron", "rudder")
 
 NAMED: tuple[tuple[Kind, tuple[str, ...]], ...] = (
-    (Kind("actuator_gain", "actuation", 0.01, 0.6, _scale, _sign), BOTH),
-    (Kind("actuator_bias", "actuation", 0.001, 0.2, _signed("offset"), _sign), BOTH),
+    (Kind("actuator_gain", "actuation", 0.01, 0.6, scale, sign), BOTH),
+    (Kind("actuator_bias", "actuation", 0.001, 0.2, signed("offset"), sign), BOTH),
     # A multiple of the integration step.
     (Kind("actuator_delay", "actuation", 0.005, 0.15, lambda s, _: {"delay": 0.005 * max(1, round(s / 0.005))}), BOTH),
-    (Kind("actuator_lag", "actuation", 0.005, 0.2, _plain("time_constant")), BOTH),
-    (Kind("actuator_deadzone", "actuation", 0.003, 0.2, _plain("width")), BOTH),
+    (Kind("actuator_lag", "actuation", 0.005, 0.2, plain("time_constant")), BOTH),
+    (Kind("actuator_deadzone", "actuation", 0.003, 0.2, plain("width")), BOTH),
     (Kind("actuator_saturation", "actuation", 0.3, 2.5, lambda s, _: {"limit": float(np.exp(-s))}), BOTH),
-    (Kind("actuator_backlash", "actuation", 0.005, 0.3, _plain("width")), BOTH),
-    (Kind("constant_force", "dynamics", 0.01, 3.0, _signed("force"), _sign), BOTH),
+    (Kind("actuator_backlash", "actuation", 0.005, 0.3, plain("width")), BOTH),
+    (Kind("constant_force", "dynamics", 0.01, 3.0, signed("force"), sign), BOTH),
     (Kind("periodic_force", "dynamics", 0.02, 4.0, lambda s, f: {"amplitude": s, "offset": 0.0, **f}, _periodic), BOTH),
-    (Kind("linear_drag", "dynamics", 0.01, 1.0, _plain("coefficient")), BOTH),
-    (Kind("quadratic_drag", "dynamics", 0.005, 1.0, _plain("coefficient")), BOTH),
+    (Kind("linear_drag", "dynamics", 0.01, 1.0, plain("coefficient")), BOTH),
+    (Kind("quadratic_drag", "dynamics", 0.005, 1.0, plain("coefficient")), BOTH),
     # On the wing, wind acts without a drag coefficient.
     (Kind("wind", "dynamics", 0.5, 5.0, _wind, _windy(0.1, 0.5)), QUADROTOR),
     (Kind("wind", "dynamics", 0.05, 5.0, _wind, _windy(0.0, 0.0)), WING),
     (Kind("periodic_wind", "dynamics", 0.5, 6.0, _waves, _wavy(0.1, 0.5)), QUADROTOR),
     (Kind("periodic_wind", "dynamics", 0.05, 5.0, _waves, _wavy(0.0, 0.0)), WING),
-    (Kind("thrust_gain", "dynamics", 0.005, 0.3, _scale, _sign), BOTH),
-    (Kind("payload", "dynamics", 0.005, 0.35, _plain("mass")), QUADROTOR),
+    (Kind("thrust_gain", "dynamics", 0.005, 0.3, scale, sign), BOTH),
+    (Kind("payload", "dynamics", 0.005, 0.35, plain("mass")), QUADROTOR),
     (Kind("center_of_mass_offset", "dynamics", 0.0003, 0.01, _along, _directed(("x", "y"))), QUADROTOR),
     (Kind("inertia", "dynamics", 0.05, 0.9, _scales, _directed(("scale_x", "scale_y", "scale_z"))), QUADROTOR),
-    (Kind("battery_sag", "dynamics", 0.001, 0.04, _plain("rate")), QUADROTOR),
+    (Kind("battery_sag", "dynamics", 0.001, 0.04, plain("rate")), QUADROTOR),
     (Kind("rotor_efficiency", "dynamics", 0.005, 0.15, _scales, _one_weak(ROTORS)), QUADROTOR),
-    (Kind("mass", "dynamics", 0.01, 0.4, _scale, _sign), WING),
-    (Kind("lift_slope", "dynamics", 0.02, 0.7, _scale, _sign), WING),
-    (Kind("drag", "dynamics", 0.03, 1.2, _scale, _sign), WING),
+    (Kind("mass", "dynamics", 0.01, 0.4, scale, sign), WING),
+    (Kind("lift_slope", "dynamics", 0.02, 0.7, scale, sign), WING),
+    (Kind("drag", "dynamics", 0.03, 1.2, scale, sign), WING),
     (
         Kind("control_effectiveness", "dynamics", 0.03, 1.2, _scales, _one_weak(tuple(f"scale_{s}" for s in SURFACES))),
         WING,
@@ -185,8 +169,8 @@ REST: tuple[tuple[Kind, tuple[str, ...]], ...] = (
         Kind("rotor_drag", "dynamics", 0.01, 1.5, _along, _slowing(tuple(f"coefficient_{axis}" for axis in "xyz"))),
         QUADROTOR,
     ),
-    (Kind("translational_lift", "dynamics", 0.003, 0.6, _plain("coefficient")), QUADROTOR),
-    (Kind("motor_lag", "actuation", 0.008, 0.15, _plain("time_constant")), QUADROTOR),
+    (Kind("translational_lift", "dynamics", 0.003, 0.6, plain("coefficient")), QUADROTOR),
+    (Kind("motor_lag", "actuation", 0.008, 0.15, plain("time_constant")), QUADROTOR),
     (
         Kind("rate_damping", "dynamics", 0.1, 18.0, _along, _slowing(tuple(f"rate_{axis}" for axis in "xyz"))),
         QUADROTOR,
@@ -203,17 +187,17 @@ REST: tuple[tuple[Kind, tuple[str, ...]], ...] = (
         ),
         QUADROTOR,
     ),
-    (Kind("dropout", "sensing", 0.003, 0.5, _plain("rate")), BOTH),
+    (Kind("dropout", "sensing", 0.003, 0.5, plain("rate")), BOTH),
 )
 """The rest of the catalogue."""
 
 FOREIGN: tuple[tuple[Kind, tuple[str, ...]], ...] = (
-    (Kind("one_way_drag", "dynamics", 0.05, 3.0, _plain("coefficient")), BOTH),
-    (Kind("beating_force", "dynamics", 0.1, 6.0, _plain("amplitude")), BOTH),
-    (Kind("layer", "dynamics", 0.3, 20.0, _signed("force"), _sign), BOTH),
-    (Kind("thrust_curve", "dynamics", 0.02, 2.0, _plain("share")), BOTH),
-    (Kind("crossed_rates", "dynamics", 0.02, 1.0, _signed("share"), _sign), QUADROTOR),
-    (Kind("crossed_surfaces", "dynamics", 0.02, 1.0, _signed("share"), _sign), WING),
+    (Kind("one_way_drag", "dynamics", 0.05, 3.0, plain("coefficient")), BOTH),
+    (Kind("beating_force", "dynamics", 0.1, 6.0, plain("amplitude")), BOTH),
+    (Kind("layer", "dynamics", 0.3, 20.0, signed("force"), sign), BOTH),
+    (Kind("thrust_curve", "dynamics", 0.02, 2.0, plain("share")), BOTH),
+    (Kind("crossed_rates", "dynamics", 0.02, 1.0, signed("share"), sign), QUADROTOR),
+    (Kind("crossed_surfaces", "dynamics", 0.02, 1.0, signed("share"), sign), WING),
 )
 """Kinds that no effect of the catalogue describes."""
 

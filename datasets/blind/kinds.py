@@ -37,7 +37,8 @@ class Kind:
     """(random numbers, episode length in s) -> shape"""
 
 
-def _sign(rng: np.random.Generator, _: float = 0.0) -> Shape:
+def sign(rng: np.random.Generator, _: float = 0.0) -> Shape:
+    """Draws the sign of an effect."""
     return {"sign": float(rng.choice((-1.0, 1.0)))}
 
 
@@ -45,15 +46,18 @@ def _log(rng: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def _plain(parameter: str) -> Build:
+def plain(parameter: str) -> Build:
+    """The size is the value of the parameter."""
     return lambda size, shape: {parameter: size}
 
 
-def _signed(parameter: str) -> Build:
+def signed(parameter: str) -> Build:
+    """The size is the magnitude of the parameter, with the sign that was drawn."""
     return lambda size, shape: {parameter: shape["sign"] * size}
 
 
-def _scale(size: float, shape: Shape) -> Shape:
+def scale(size: float, shape: Shape) -> Shape:
+    """The size is the magnitude of the logarithm of a factor."""
     return {"scale": float(np.exp(shape["sign"] * size))}
 
 
@@ -78,11 +82,11 @@ def _periodic(rng: np.random.Generator, _: float) -> Shape:
 def _gust(rng: np.random.Generator, length: float) -> Shape:
     lasts = float(rng.uniform(0.15, 0.4)) * length
     start = float(rng.uniform(0.1 * length, 0.9 * length - lasts))
-    return _sign(rng) | {"start": round(start, 3), "end": round(start + lasts, 3)}
+    return sign(rng) | {"start": round(start, 3), "end": round(start + lasts, 3)}
 
 
 def _scaled_sensor(rng: np.random.Generator, _: float) -> Shape:
-    return _sign(rng) | {"position": float(rng.random() < 0.5)}
+    return sign(rng) | {"position": float(rng.random() < 0.5)}
 
 
 def _patch(rng: np.random.Generator, _: float) -> Shape:
@@ -90,15 +94,15 @@ def _patch(rng: np.random.Generator, _: float) -> Shape:
 
 
 NAMED: tuple[Kind, ...] = (
-    Kind("actuator_gain", "actuation", 0.01, 0.7, _scale, _sign),
-    Kind("actuator_bias", "actuation", 0.001, 0.3, _signed("offset"), _sign),
-    Kind("actuator_delay", "actuation", 0.001, 0.15, _plain("delay")),
-    Kind("actuator_lag", "actuation", 0.001, 0.25, _plain("time_constant")),
-    Kind("actuator_deadzone", "actuation", 0.001, 0.3, _plain("width")),
+    Kind("actuator_gain", "actuation", 0.01, 0.7, scale, sign),
+    Kind("actuator_bias", "actuation", 0.001, 0.3, signed("offset"), sign),
+    Kind("actuator_delay", "actuation", 0.001, 0.15, plain("delay")),
+    Kind("actuator_lag", "actuation", 0.001, 0.25, plain("time_constant")),
+    Kind("actuator_deadzone", "actuation", 0.001, 0.3, plain("width")),
     # A size of 0 would limit commands to 1, which they never exceed; 3.5 limits them to 0.03.
     Kind("actuator_saturation", "actuation", 0.05, 3.5, lambda size, shape: {"limit": float(np.exp(-size))}),
-    Kind("actuator_backlash", "actuation", 0.002, 0.5, _plain("width")),
-    Kind("constant_force", "dynamics", 0.02, 8.0, _signed("force"), _sign),
+    Kind("actuator_backlash", "actuation", 0.002, 0.5, plain("width")),
+    Kind("constant_force", "dynamics", 0.02, 8.0, signed("force"), sign),
     Kind(
         "periodic_force",
         "dynamics",
@@ -113,20 +117,20 @@ NAMED: tuple[Kind, ...] = (
         _periodic,
     ),
     Kind("gust", "dynamics", 0.05, 15.0, _shaped("force"), _gust),
-    Kind("viscous_friction", "dynamics", 0.02, 15.0, _plain("coefficient")),
-    Kind("coulomb_friction", "dynamics", 0.02, 6.0, _plain("force")),
-    Kind("quadratic_drag", "dynamics", 0.02, 20.0, _plain("coefficient")),
+    Kind("viscous_friction", "dynamics", 0.02, 15.0, plain("coefficient")),
+    Kind("coulomb_friction", "dynamics", 0.02, 6.0, plain("force")),
+    Kind("quadratic_drag", "dynamics", 0.02, 20.0, plain("coefficient")),
     Kind("friction_patch", "dynamics", 0.1, 40.0, _shaped("coefficient"), _patch),
     Kind(
         "spring", "dynamics", 0.05, 40.0, _shaped("stiffness"), lambda rng, _: {"rest": float(rng.uniform(-0.4, 0.4))}
     ),
-    Kind("pole_damping", "dynamics", 0.0003, 0.15, _plain("coefficient")),
-    Kind("track_tilt", "dynamics", 0.001, 0.2, _signed("angle"), _sign),
-    Kind("cart_mass", "dynamics", 0.01, 1.1, _scale, _sign),
-    Kind("pole_mass", "dynamics", 0.05, 1.6, _scale, _sign),
-    Kind("pole_length", "dynamics", 0.01, 0.9, _scale, _sign),
-    Kind("angle_offset", "sensing", 0.0005, 0.2, _signed("offset"), _sign),
-    Kind("measurement_delay", "sensing", 0.001, 0.15, _plain("delay")),
+    Kind("pole_damping", "dynamics", 0.0003, 0.15, plain("coefficient")),
+    Kind("track_tilt", "dynamics", 0.001, 0.2, signed("angle"), sign),
+    Kind("cart_mass", "dynamics", 0.01, 1.1, scale, sign),
+    Kind("pole_mass", "dynamics", 0.05, 1.6, scale, sign),
+    Kind("pole_length", "dynamics", 0.01, 0.9, scale, sign),
+    Kind("angle_offset", "sensing", 0.0005, 0.2, signed("offset"), sign),
+    Kind("measurement_delay", "sensing", 0.001, 0.15, plain("delay")),
     Kind(
         "sensor_scale",
         "sensing",
@@ -150,11 +154,11 @@ NAMED: tuple[Kind, ...] = (
         },
         lambda rng, _: {"centre": float(rng.normal(0, 0.04)), "holds_rate": float(rng.random() < 0.5)},
     ),
-    Kind("dropout", "sensing", 0.005, 0.5, _plain("rate")),
+    Kind("dropout", "sensing", 0.005, 0.5, plain("rate")),
 )
 """the core of the catalogue, from which the sets 2028 and 2029 are drawn; adding a kind here would change them"""
 
-REST: tuple[Kind, ...] = (Kind("position_offset", "sensing", 0.001, 0.4, _signed("offset"), _sign),)
+REST: tuple[Kind, ...] = (Kind("position_offset", "sensing", 0.001, 0.4, signed("offset"), sign),)
 """the rest of the catalogue: a cart-pole moves alike at every place, so that no recording shows where x is 0"""
 
 LATER: tuple[Kind, ...] = (
@@ -166,11 +170,11 @@ LATER: tuple[Kind, ...] = (
         lambda size, shape: {"forward": size * shape["forward"], "backward": size * (1 - shape["forward"])},
         lambda rng, _: {"forward": float(rng.uniform(0.1, 0.9))},
     ),
-    Kind("pole_friction", "dynamics", 0.0002, 0.3, _plain("torque")),
-    Kind("pole_spring", "dynamics", 0.001, 1.0, _plain("stiffness")),
-    Kind("load_dependent_friction", "dynamics", 0.005, 0.7, _plain("share")),
-    Kind("position_delay", "sensing", 0.001, 0.1, _plain("delay")),
-    Kind("angle_delay", "sensing", 0.0005, 0.1, _plain("delay")),
+    Kind("pole_friction", "dynamics", 0.0002, 0.3, plain("torque")),
+    Kind("pole_spring", "dynamics", 0.001, 1.0, plain("stiffness")),
+    Kind("load_dependent_friction", "dynamics", 0.005, 0.7, plain("share")),
+    Kind("position_delay", "sensing", 0.001, 0.1, plain("delay")),
+    Kind("angle_delay", "sensing", 0.0005, 0.1, plain("delay")),
 )
 """effects that joined the catalogue after the sets 2028 and 2029 were made"""
 
@@ -210,12 +214,10 @@ FOREIGN: tuple[Kind, ...] = (
         0.1,
         20.0,
         _shaped("force"),
-        lambda rng, _: (
-            _sign(rng) | {"position": float(rng.uniform(-0.3, 0.3)), "reach": float(rng.uniform(0.05, 0.15))}
-        ),
+        lambda rng, _: sign(rng) | {"position": float(rng.uniform(-0.3, 0.3)), "reach": float(rng.uniform(0.05, 0.15))},
     ),
-    Kind("one_way_drag", "dynamics", 0.1, 30.0, _shaped("coefficient"), lambda rng, _: {"side": _sign(rng)["sign"]}),
-    Kind("aerodynamic_coupling", "dynamics", 0.1, 80.0, _shaped("coefficient"), _sign),
+    Kind("one_way_drag", "dynamics", 0.1, 30.0, _shaped("coefficient"), lambda rng, _: {"side": sign(rng)["sign"]}),
+    Kind("aerodynamic_coupling", "dynamics", 0.1, 80.0, _shaped("coefficient"), sign),
     Kind(
         "sloshing",
         "dynamics",
@@ -232,7 +234,7 @@ FOREIGN: tuple[Kind, ...] = (
         _shaped("torque"),
         lambda rng, _: {"teeth": float(rng.uniform(20, 50)), "phase": float(rng.uniform(-np.pi, np.pi))},
     ),
-    Kind("pivot_cable", "dynamics", 0.001, 0.5, _shaped("torque"), _sign),
+    Kind("pivot_cable", "dynamics", 0.001, 0.5, _shaped("torque"), sign),
     Kind(
         "sticky_bearing",
         "dynamics",
@@ -241,9 +243,9 @@ FOREIGN: tuple[Kind, ...] = (
         _shaped("torque"),
         lambda rng, _: _span(rng, 0.04, float(rng.uniform(0.04, 0.1))),
     ),
-    Kind("directional_gain", "actuation", 0.01, 0.7, _signed("share"), _sign),
-    Kind("even_motor", "actuation", 0.02, 4.0, _signed("coefficient"), _sign),
-    Kind("fading_gain", "actuation", 0.002, 0.15, _plain("rate")),
+    Kind("directional_gain", "actuation", 0.01, 0.7, signed("share"), sign),
+    Kind("even_motor", "actuation", 0.02, 4.0, signed("coefficient"), sign),
+    Kind("fading_gain", "actuation", 0.002, 0.15, plain("rate")),
     # No drift of the position: at a constant rate, it is a change of the inertial frame, which no recording shows.
     Kind(
         "encoder_ripple",
@@ -253,8 +255,8 @@ FOREIGN: tuple[Kind, ...] = (
         _shaped("amplitude"),
         lambda rng, _: {"wavelength": _log(rng, 0.1, 0.4), "phase": float(rng.uniform(-np.pi, np.pi))},
     ),
-    Kind("angle_drift", "sensing", 0.0003, 0.05, _signed("rate"), _sign),
-    Kind("angle_quantisation", "sensing", 0.002, 0.15, _plain("step")),
+    Kind("angle_drift", "sensing", 0.0003, 0.05, signed("rate"), sign),
+    Kind("angle_quantisation", "sensing", 0.002, 0.15, plain("step")),
 )
 """kinds that no effect of the catalogue described when the sets 2028 and 2029 were made"""
 

@@ -10,7 +10,8 @@ from benchmarks.blind import diagnosis as blind_diagnosis
 from benchmarks.blind.baselines import afternoon, chance
 from benchmarks.blind.diagnosis import Settings, diagnose_one, read_log, run_one, write
 from benchmarks.blind.scoring import Truth, classes, matches, region_of, score, sizes
-from benchmarks.blind.tables import Row, confusion, label, read_table, tabulate
+from benchmarks.blind.tables import Row, confusion, label, tabulate
+from experiments.result_tables import read_rows
 from visadapt.confidence import wilson
 from visadapt.effects.catalogue import catalogue
 
@@ -283,7 +284,7 @@ def test_other_lines_of_a_table_stay(tmp_path):
     out = tmp_path / "table.csv"
     write(out, [Row("hard", "a", "m", 0.5, 0.1, 0.9, 4)], [])
     write(out, [Row("hard", "b", "m", 0.25, math.nan, math.nan, 4)], [])
-    assert read_table(out) == [
+    assert read_rows(out) == [
         {"kind": "hard", "diagnoser": "a", "measure": "m", "value": "0.5", "low": "0.1", "high": "0.9", "n": "4"},
         {"kind": "hard", "diagnoser": "b", "measure": "m", "value": "0.25", "low": "", "high": "", "n": "4"},
     ]

@@ -117,7 +117,7 @@ def test_the_second_device_refuses_tensors_of_the_first():
         assert (remote * torch.tensor(3.0)).cpu().tolist() == [3.0, 3.0]
         assert remote[torch.tensor([1])].cpu().tolist() == [1.0]
         for mix in (lambda: remote + here, lambda: torch.cat((remote, here)), lambda: here[remote.long()]):
-            with pytest.raises(RuntimeError, match="(two|same) device"):
+            with pytest.raises(RuntimeError, match=r"(two|same) device"):
                 mix()
 
 

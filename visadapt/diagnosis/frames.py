@@ -47,7 +47,7 @@ are off by 0.14 mm and 0.23 mrad (root mean square), with scales off by up to 0.
 MISFIT = "root mean square of frames less those drawn by the renderer, in grey levels of 255"
 
 UNSEEN = (Dropout, FrozenZone, MeasurementDelay, PositionDelay, AngleDelay)
-"""Faults of sensors that no camera has, which shows cart and pole in one frame: if these are late, the camera is."""
+"""Faults of separate sensors, which a camera cannot have: one frame shows cart and pole at the same instant."""
 
 MIN_MOTION_ERROR = 1.0
 """Error of the source's predictions, over the noise of positions, from which motion shows a gap. Below, it may be the

@@ -112,7 +112,7 @@ def plan(
         source: the world that was diagnosed, without effects.
         policy: gives the commands to which the excitation is added; without one these are zero.
         samples: length of the experiment, in commands.
-        seed: of the simulated noise.
+        seed: of all noise drawn.
         progress: called with (excitations tried, excitations in all, best log odds so far).
 
     Raises:
@@ -141,7 +141,7 @@ def plan(
     white = [k for k, name in enumerate(trials.names) if name.startswith("white")]
     return Plan(
         explanations=tuple(tuple(effect.name for effect in each) for each in sets),
-        excitation=f"{trials.names[best]} of {SIZES[int(trials.largest[best])]:g} of half its range",
+        excitation=f"{trials.names[best]} ({SIZES[int(trials.largest[best])]:g} of half the range)",
         time=recording.period * np.arange(samples),
         added=trials.added[trials.row(best)].numpy(),
         actions=tuple(action.name for action in source.system.actions),

@@ -1,7 +1,7 @@
 """The result of a diagnosis as numbers, and the data that the report plots.
 
-Shares and probabilities are numbers from 0 to 1, parameters in the units that their effects state; what could not be
-determined is NaN, null in the JSON.
+Shares and probabilities are from 0 to 1 (the gap closed may be negative), parameters in their effects' units; what
+could not be determined is NaN, null in the JSON.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ KEYS = {"start": "from", "end": "to"}
 NOT_IN_JSON = ("figures", "policy", "partial")
 """Fields that the report alone shows."""
 SHARES = ("probability", "share", "p_value", "stages", "states")
-"""Fields of numbers from 0 to 1: they are rounded to 12 digits, so that no rounding error exceeds 1."""
+"""Fields of numbers from 0 to 1: rounded to 12 digits, so that no rounding error lifts them above 1."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ class Chart:
     quantity: str  # in words, such as "force on the cart"
     quantity_unit: str
     x: NDArray[np.floating]  # (N,)
-    curves: tuple[Curve, ...]  # of the source and, second, of the source with the causes
+    curves: tuple[Curve, ...]  # source, then with the causes; of errors black box, noise
 
 
 @dataclass(frozen=True)

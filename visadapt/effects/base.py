@@ -41,7 +41,7 @@ class Role(StrEnum):
     END = "end"  # Where that region ends
     FREQUENCY = "frequency"  # In Hz; searched on a logarithmic grid
     PHASE = "phase"  # In rad; equal modulo a turn
-    EPISODE_PHASE = "episode phase"  # That of one later episode alone, in a fit where each has its own
+    EPISODE_PHASE = "episode phase"  # Phase of one episode after the first, where each has its own
     COMMAND = "command"  # A size of the command; tried at values up to the largest that was recorded
 
 
@@ -247,10 +247,10 @@ class DynamicsEffect(Effect):
         return cls.dry_friction is not DynamicsEffect.dry_friction
 
     def dry_friction(self, time: Tensor, state: Tensor, command: Tensor, system: System) -> Tensor:
-        """The largest dry friction (B, n_load, 2) against positive and against negative motion.
+        """The largest dry friction (B, n_load, 2), N or N m, against positive and negative motion.
 
-        Within an integration step, in which `command` (B, n_action) acts, only the velocities in `state` change; the
-        others as in `load`.
+        Within an integration step under `command` (B, n_action), only velocities in `state` change. The other
+        arguments as in `load`.
         """
         raise NotImplementedError
 
@@ -324,7 +324,7 @@ EFFECTS: dict[str, type[Effect]] = {}  # Every effect by its standard name
 
 
 def with_table(name: str, table: tuple[Parameter, ...]) -> type[Effect]:
-    """The effect of a name, searched in the ranges of `table`; `EFFECTS` keeps the original, returned for its own."""
+    """The effect of this name with `table` in place of its own; the class in `EFFECTS` itself if both are equal."""
     effect = EFFECTS[name]
     return effect if table == effect.table else _derived(effect, table)  # type: ignore[arg-type]  # hashable, as types
 

@@ -108,7 +108,7 @@ def _lines(effect: type[Effect]) -> list[str]:
 
 
 def _summary(effect: type[Effect]) -> str:
-    """The first sentence or two of its docstring."""
+    """The first paragraph of its docstring."""
     return " ".join((inspect.getdoc(effect) or "").split("\n\n")[0].split())
 
 

@@ -1,4 +1,4 @@
-"""Forces other than friction: two along x on any system, the others on a cart-pole. Positive forces act towards +x."""
+"""Forces other than friction, on a cart-pole; two also on vehicles. Positive forces act towards +x."""
 
 from __future__ import annotations
 

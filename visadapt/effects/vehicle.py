@@ -20,7 +20,7 @@ from visadapt.effects.parameters import ParameterScale, ParameterShift
 from visadapt.effects.recurrence import linear_recurrence
 from visadapt.systems import Quadrotor, System
 from visadapt.systems.integrators import Duration
-from visadapt.systems.rigid_body import stack_parameters
+from visadapt.systems.rigid_body import matvec, stack_parameters
 
 __all__ = [
     "BatterySag",
@@ -106,8 +106,8 @@ class MotorLag(ActuationEffect):
         ratio = self.value("time_constant", commands).reshape(-1, 1) / length
         kept, brought = self._of_a_substep(ratio, length, commands)
         kept = kept.expand(-1, count, -1, -1, -1)
-        after, kept = linear_recurrence(kept, commands[..., None] * brought, torch.matmul, _matvec)
-        after = after + _matvec(kept, memory.movedim(1, 2)[:, None])
+        after, kept = linear_recurrence(kept, commands[..., None] * brought, torch.matmul, matvec)
+        after = after + matvec(kept, memory.movedim(1, 2)[:, None])
         before = torch.cat((memory[:, 1:], after[:, :-1, :, 1]), 1)
         # The mean of w + d over a substep, since time_constant dd/dt = command - (w + d).
         return commands + ratio[..., None] * (before - after[..., 1]), after[:, -1].movedim(2, 1)
@@ -127,11 +127,6 @@ class MotorLag(ActuationEffect):
         flow = torch.stack((-damping, gain, zero, -rate, -rate, rate, zero, zero, zero), -1)
         whole = flow.unflatten(-1, (3, 3)).matrix_exp()
         return whole[..., :2, :2], whole[..., :2, 2]
-
-
-def _matvec(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Matrices (..., 2, 2) times vectors (..., 2)."""
-    return (matrix @ vector[..., None])[..., 0]
 
 
 class RateDamping(ParameterShift):

@@ -62,7 +62,7 @@ def smoothed(frames: Tensor, camera: Sequence[CameraEffect]) -> Tensor:
     """Frames (B, H, W), smoothed where a camera is moved.
 
     A picture that is moved by a fraction of a pixel loses its sharpest edges, and a fit to sharp frames then prefers
-    whole pixels, or no motion at all: by 0.1 px, a zoom of 0.2 %.
+    whole pixels, or no motion: errors of 0.1 px, or 0.2 % of zoom.
     """
     if all(effect.motion(frames) is None for effect in camera):
         return frames

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -67,7 +68,6 @@ class CandidateModel:
         self.acting_parameters = [k for k, effect in enumerate(named) if acting and (effect in acting or not alone)]
         """columns of the parameters that change what acts of the commands"""
         self._late = [(k, effect.late) for k, effect in enumerate(named) if issubclass(effect, LateSensors)]
-        self._noise_directions: Tensor | None = None
         rubs = any(issubclass(effect, DynamicsEffect) and effect.rubs() for effect in effects)
         self.feels_unmodelled_loads = rows.colour is not None and rubs
         """whether what is missing from the model decides which way friction acts"""
@@ -75,12 +75,10 @@ class CandidateModel:
         self.slopes: tuple[Tensor, Tensor] | None = None
         """transition (W, T - 1, n, n) and sensing (W, T, m, n) of an earlier linearisation, reused where given"""
 
-    @property
+    @cached_property
     def noise_directions(self) -> Tensor:
         """(W, T - 1, n, L) how process noise enters the states; see `unmodelled_loads`."""
-        if self._noise_directions is None:
-            self._noise_directions = noise_directions(self.rows, self.system)
-        return self._noise_directions
+        return noise_directions(self.rows, self.system)
 
     def at(self, theta: Tensor) -> World:
         """The world with parameters (P,), or (N, P) for a batch of N states; `by_row` gives those of rows."""
@@ -221,9 +219,9 @@ def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised
 
 
 def _step(model: CandidateModel, theta: Tensor, state: Tensor, acting: Tensor, variant: Sequence[int]) -> Tangent:
-    """The step with parameters (K,) from states (W, T, n), less the last, of which the derivative by the state only
-    where it is not known; in row v of `acting` (V, W (T - 1), substeps, n_action) is what acts with each variant of the
-    parameters."""
+    """The step with parameters (K,) from all states (W, T, n) but the last, with the derivative by the state unless
+    `model.slopes` has it. Row `variant[k]` of `acting` (V, W (T - 1), substeps, n_action) acts with the base
+    parameters (k = 0) or with the k-th moved."""
     if model.feels_unmodelled_loads:
         return _step_under_loads(model, theta, state, acting, variant)
     world, acting = model.stepping(theta, acting)

@@ -22,7 +22,7 @@ LONGEST = 0.15  # s that the autoregression reaches back at most
 
 ORDERS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # that are tried, in rows
 
-ROWS_PER_COEFFICIENT = 10  # Readings at least for each coefficient
+READINGS_PER_COEFFICIENT = 10  # At least
 
 MIN_GAIN = 10.0  # Log likelihood, less the number of coefficients, that an order must gain over white innovations
 
@@ -67,7 +67,7 @@ def colour_of(
     white = _log_likelihood(now)
     best: tuple[float, Colour | None] = MIN_GAIN, None
     for order in orders:
-        if order * channels**2 * ROWS_PER_COEFFICIENT > now.numel():
+        if order * channels**2 * READINGS_PER_COEFFICIENT > now.numel():
             break
         past = torch.cat([innovations[:, first - k : innovations.shape[1] - k] for k in range(1, order + 1)], -1)[here]
         weights = torch.linalg.lstsq(past, now, driver="gelsd").solution

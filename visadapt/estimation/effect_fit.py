@@ -47,7 +47,7 @@ class EffectFit:
     covariance: dict[type[Effect], Tensor]  # (P, P) of each effect's parameters
     states: list[Tensor]  # (T, n_state) of each episode: the true states, smoothed
     shifts: Tensor
-    """(E,) s to add to the times of each episode for the one phase to be right there too"""
+    """(E,) s to add to an episode's times so that the first one's phase holds there"""
 
 
 @torch.no_grad()
@@ -108,7 +108,7 @@ def fit_effects(
 
 
 def remembers(effect: type[Effect], system: System) -> bool:
-    """Whether it is a sensor of the system whose reading depends on earlier rows in another way than by being late."""
+    """Whether it is a sensing effect whose reading depends on earlier rows in another way than by being late."""
     if not issubclass(effect, SensingEffect) or issubclass(effect, LateSensors):
         return False
     without_effect = effect(**dict.fromkeys((p.name for p in effect.table), 0.0))

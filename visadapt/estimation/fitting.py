@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -26,19 +25,16 @@ LEAST_NOISE = 2e-5
 """Least standard deviation of a measurement, as a share of the largest size in its state's range: below it, as in
 simulated recordings without noise, errors of the integration would be taken for physics."""
 
-MIN_DAMPING = 1e-3  # Damping of a first step, as a share of the information
+FIRST_DAMPING = 1e-3  # Damping of the first step, as a share of the information
 
 MAX_DAMPING = 100.0  # Damping at which a fit stops, since its steps have become too short to gain anything
 
 OUT_OF_REACH = 100.0
 STEPS_TO_COME = 4
-"""A fit stops when the log likelihood that it is expected to end at is more than OUT_OF_REACH below its rival's: its
-present one, plus the gain of its last successful step times the iterations left, STEPS_TO_COME at most."""
+"""A fit stops when its expected final log likelihood (the present one, plus the gain of its last successful step times
+the iterations left, STEPS_TO_COME at most) is more than OUT_OF_REACH below its rival's."""
 
 MAX_LOG_VARIANCE_CHANGE = 1.5  # Largest change of a log variance in one iteration
-
-
-Batched = TypeVar("Batched", "FitState", "Derivatives")
 
 
 def fit(
@@ -64,7 +60,7 @@ def fit(
         start = replace(start, log_process=torch.full_like(start.log_process, MIN_LOG_PROCESS))
     bounds = _bounds(models, start)
     every = torch.ones(start.state.shape[:2], dtype=torch.float64)
-    damping = torch.full((len(models),), MIN_DAMPING, dtype=torch.float64)
+    damping = torch.full((len(models),), FIRST_DAMPING, dtype=torch.float64)
     stalled = torch.zeros(len(models), dtype=torch.long)
     gained = torch.full_like(damping, math.inf)  # by the last step that gained something
     active = torch.arange(len(models))
@@ -84,8 +80,8 @@ def fit(
             better = gain > 0
             damping[active] = torch.where(better, damping[active] / 4, (8 * damping[active]).clamp(min=0.1))
             stalled[active] = torch.where(gain.abs() < MIN_ITERATION_GAIN, stalled[active] + 1, 0)
-            best = _replaced(best, active[better], tried, better)
-            at = _replaced(at, active[better], now, better)
+            best = best.replaced(active[better], tried[better])
+            at = at.replaced(active[better], now[better])
             gained[active] = torch.where(better, gain, gained[active])
             to_come = min(STEPS_TO_COME, iterations - 1 - iteration)
             in_reach = best.likelihood + to_come * gained > rival - OUT_OF_REACH
@@ -128,7 +124,7 @@ def refitted(model: CandidateModel, fits: FitState, window_used: Tensor) -> FitS
     information = whole.summed(torch.ones_like(window_used)).information + torch.diag_embed((2 / widths).square())
     most = MAX_REFIT_CHANGE * torch.linalg.inv(information).diagonal(dim1=1, dim2=2).sqrt()
     bounds = torch.maximum(low, copies.theta - most), torch.minimum(high, copies.theta + most)
-    damping = torch.full((len(every),), MIN_DAMPING, dtype=torch.float64)
+    damping = torch.full((len(every),), FIRST_DAMPING, dtype=torch.float64)
     return replace(_step(copies, at, damping, bounds, model), state=copies.state, likelihood=at.likelihood)
 
 
@@ -163,8 +159,3 @@ def _step(
         log_process=(fits.log_process + log_change[:, :groups]).clamp(MIN_LOG_PROCESS, MAX_LOG_PROCESS),
         log_noise=torch.maximum(fits.log_noise + noise_change, lowest_noise),
     )
-
-
-def _replaced(into: Batched, indices: Tensor, values: Batched, chosen: Tensor) -> Batched:
-    """`into` with its members at `indices` replaced by the `chosen` members of `values`."""
-    return into.map(lambda old, new: old.index_put((indices,), new[chosen]), values)

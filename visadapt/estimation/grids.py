@@ -24,7 +24,7 @@ EDGE_POINTS, FREQUENCY_POINTS, PHASE_POINTS, SHAPE_POINTS = 13, 24, 8, 5
 """Values of a region's start or end, of a frequency, of a phase, and of any other shape parameter."""
 
 START_STRENGTH = 0.05
-"""Share of its range, from neutral, at which each of several strengths starts that Gauss-Newton steps find."""
+"""Share of the way from neutral to the end of its range at which each of several strengths starts."""
 
 Spans = Mapping[str, tuple[float, float]]
 """By unit, the interval that the recording covers of the variable along which regions of that unit lie; and, by
@@ -80,7 +80,7 @@ def _edges(parameter: Parameter, spans: Spans, count: int) -> Tensor:
 
 
 def _reached(parameter: Parameter, spans: Spans) -> Parameter:
-    """The parameter; one that is a size of the command with a range that ends at the largest recorded."""
+    """The parameter; if a size of the command, with a range that ends at the largest one recorded."""
     largest = spans.get(Role.COMMAND, (0.0, math.inf))[1]
     if parameter.role is not Role.COMMAND or not parameter.low < largest < parameter.high:
         return parameter

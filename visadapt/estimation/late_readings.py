@@ -81,7 +81,7 @@ def following(rows: Segments, delays: Delays, acting: Tensor, states: int, chose
     clock, episode, index = _clock(rows), rows.episode[:, None], rows.index[:, chosen]
 
     def passed(periods: int) -> Tensor:
-        """s from each row until so many periods later."""
+        """s from each row to the one `periods` later."""
         return clock[episode, (index + periods).clamp(max=clock.shape[1] - 1)] - clock[episode, index]
 
     read = torch.zeros(*index.shape, states, dtype=torch.float64)

@@ -36,7 +36,7 @@ class SystemProfile:
     initial_variance: tuple[float, ...]
     """(n,) variance of the first state of a window around its measurement, in the states' units squared"""
     region_variables: Mapping[str, str]  # unit of a region's edges to the variable along which that region lies
-    plotted_variables: tuple[str, ...]  # variables over which the report plots the residual, the most instructive first
+    plotted_variables: tuple[str, ...]  # variables over which the report plots the disturbance, most instructive first
     residual_name: str  # the first load in words, as the report's figures label it
     smooth_function_factors: Mapping[str, tuple[str | None, ...]]
     """load to the variables that multiply a smooth function on it (None: no factor); (None,) for loads not listed"""

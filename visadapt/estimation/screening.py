@@ -130,15 +130,15 @@ def _best_phases(sensitivity: Sensitivity, effect: type[Effect], values: Sequenc
 
 
 def _window_stride(most: float, rows: Segments, points: int) -> int:
-    """Smallest k for which every k-th window has at most `most` rows times points; it leaves at least 8 windows."""
+    """Least power of two k: every k-th window has at most `most` rows times points; at least 8 windows stay."""
     wanted = points * float(rows.inside.sum()) / most
     # A power of two, so that effects share their sensitivities.
     return 2 ** max(0, min(math.ceil(math.log2(max(1.0, wanted))), int(math.log2(max(1, rows.shape[0] // 8)))))
 
 
 def _promising(sensitivity: Sensitivity, effect: type[Effect], points: Tensor, columns: list[int]) -> Tensor:
-    """Points (K, P) to which one Gauss-Newton step of `columns` leads from those of points (G, P) that promise most,
-    the best first, then from the best small ones and from the best without a step; last, that one itself."""
+    """Points (K, P) that one Gauss-Newton step of `columns` reaches: from the points (G, P) that are best after it,
+    from the best small ones, and from the one that is best before it; last, that one without a step."""
     change, slopes = sensitivity.around(effect, points, columns)
     left, slopes = sensitivity.innovations.error[:, None] + change, slopes.movedim(1, 0)
     normal = slopes.mT @ slopes

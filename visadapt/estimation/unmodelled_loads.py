@@ -74,7 +74,7 @@ def leading_loads(
     """Loads (N, L) under which the velocities of N states (N, n) become those of the `following` ones (N, n).
 
     Args:
-        world: its last effect is `load_effect`, with which N rows of `values` (N, P + L) end; they are not used.
+        world: its last effect is `load_effect`, whose L values, last in `values` (N, P + L), are not used.
         time, acting, duration: (N,) s, (N, substeps, n_action), and (N,) s, as in `linearise_step`.
         response: (N, n, L) of `response_without_friction`: friction makes it smaller, so that the steps converge.
     """

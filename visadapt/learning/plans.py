@@ -58,11 +58,10 @@ class Plans:
 class ClosedLoop(Plans):
     """The policy decides anew at every step that is imagined, and the gradient is of the actions that it executes.
 
-    Of a plan that is carried out whole, most of the cost is of its later actions where a force acts that cannot be
-    foreseen over half a second, and the first action, the only one executed, is learnt from little of the gradient.
-    All steps are the streams' own, which go on after the last one (Xu et al. 2022, Accelerated policy learning with
-    parallel differentiable simulation, ICLR): no step is imagined to be forgotten, and the next gradient is of other
-    states.
+    Where a force cannot be foreseen, most of the cost of a plan that is simulated whole comes from its later actions,
+    and little of the gradient reaches the first, the only one that is executed on the target. Here the streams go on
+    after the last step (Xu et al. 2022, Accelerated policy learning with parallel differentiable simulation, ICLR): no
+    simulated step is thrown away, and the next gradient is of other states.
     """
 
     def loss(self, iteration: int, progress: float) -> Tensor:

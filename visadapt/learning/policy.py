@@ -2,7 +2,7 @@
 
 A batch of simulated streams runs under the policy. At each iteration the policy plans K actions, the world
 (physics, effects, residual, renderer) carries them out, and the gradient of the cost flows back through all of it; or,
-in closed loop, the policy decides anew at each of K steps. Then every stream takes the first step. A stream further
+in closed loop, the policy decides anew at each of K steps. Streams keep the first step, or these K. A stream further
 than delta_div from the reference starts anew, and delta_div grows as training goes on, so the policy learns to recover
 from ever further off.
 
@@ -53,7 +53,7 @@ class TuneSettings:
     over a plan; None: as many as `batch`, and nothing is kept"""
     every: int = 1  # iterations between two steps of the streams
     closed_loop: bool = False
-    """whether the policy decides anew at every step that is imagined; False: its plan is carried out whole"""
+    """whether the policy decides anew at every step that is imagined; False: its plan is simulated whole"""
     curriculum: bool = True
     """whether streams start closer to the reference, and restart closer to it, early on; False for a trained policy"""
     recorded: float = 0.0  # share of the starts that are recorded transitions of the target, with their histories

@@ -139,8 +139,8 @@ class ImageResidualNetwork(ResidualNetwork):
     without a bias, so that it adds nothing where a bare source explains everything. An MLP instead learns from a few
     hundred samples where along the track the target happened to push, and is wrong in the next episode.
 
-    In the first rows of an episode, whose first frame is repeated, a cart that moves seems to start. To leave these out
-    of the fit, or to hold later accelerations back to them, changed nothing that 60 episodes show.
+    In the first rows of an episode, whose first frame is repeated, a cart that moves seems to start. Leaving these out
+    of the fit, or filling them as `held_back` does, changed nothing that 60 episodes show.
 
     Args:
         background, contrast: those of `FrameEncoder`.
@@ -228,7 +228,7 @@ class StateResidualNetwork(ResidualNetwork):
     def penalties(self, inputs: Tensor) -> Tensor:
         """(inputs,) ACTION_UNIT squared for the actions of a history, else 1.
 
-        Near rest the commands are small, so their weights must be large to say that a motor is late or weak. Held back
+        Near rest the commands are small, so their weights must be large to say that a motor is late or weak. Penalised
         as much as the others, they said a quarter of it after 200 samples, and policies that were tuned with them fell.
         """
         every = super().penalties(inputs)

@@ -20,7 +20,7 @@ from visadapt.world import World
 GROUND = GroundSettings(ridge=0.1, negligible=0.1)
 RECORDED = 0.8
 """Share of the streams that start in a recorded flight, with its history, where the residual reads the history: in
-other starts it reads no changing force, or one that it made itself."""
+other starts it shows no changing force, or only the residual's own."""
 
 _learn = partial(TuneSettings, longest=100, observation_noise=0.0)
 

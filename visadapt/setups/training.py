@@ -173,7 +173,7 @@ def adapt(
         TargetError: the target misbehaves.
 
     >>> import visadapt as va
-    >>> source, target = va.World(va.CartPole()), va.SyntheticTarget(va.sine_force)
+    >>> source, target = va.World(va.CartPole()), va.SyntheticTarget(va.constant_force(2.0))
     >>> policy = va.load_policy(va.shipped("cartpole_states"))
     >>> tuned = va.adapt(policy, va.World(va.CartPole(), [va.effects.ViscousFriction(coefficient=2.0)]), iterations=2)
     >>> result = va.adapt(policy, source, target, samples=20, iterations=2)

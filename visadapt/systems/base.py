@@ -14,7 +14,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Variable:
-    """One entry of a state or action vector: its name, SI unit and expected range.
+    """One entry of a state, action or load: its name, SI unit and expected range.
 
     >>> import visadapt as va
     >>> va.Variable("theta", "rad", -0.3, 0.3).unit
@@ -96,9 +96,9 @@ class System(ABC):
         self.check_parameters()
 
     def load_scale(self, unit: str) -> float:
-        """How much larger the effects of a unit are to be expected than on the system with default parameters.
+        """Factor on the ranges searched of parameters with this unit, at least 1.
 
-        At least 1: they are searched in ranges as much wider.
+        How much larger loads are to be expected than with the default parameters.
         """
         return 1.0
 

@@ -47,11 +47,8 @@ class CartPole(System):
     )
     coordinates: ClassVar[tuple[tuple[int, int], ...]] = ((0, 1), (2, 3))
 
-    def __post_init__(self) -> None:
-        self.check_parameters()
-
     def load_scale(self, unit: str) -> float:
-        """In N: as the weight of cart and pole; in N m: as that of the pole at its centre of mass."""
+        """Forces: ratio of the weights; torques: ratio of the pole's weight times half-length."""
         default = CartPole()
 
         def weight(one: CartPole) -> float:

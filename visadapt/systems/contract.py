@@ -15,7 +15,7 @@ from visadapt.systems.base import System, Variable
 from visadapt.systems.rigid_body import RigidBody
 
 ROWS = 5  # States that the derivative is tried in, drawn from the states' ranges
-TOLERANCE = 1e-4  # Largest error of a derivative by automatic differentiation, as a share of the largest of all
+TOLERANCE = 1e-4  # Largest error of an automatic derivative, as a share of max(1, the largest)
 STEP = 1e-6  # Finite difference, as a share of a variable's range
 ROUNDING = 1e-9  # Share by which numbers may differ that ought to be equal
 

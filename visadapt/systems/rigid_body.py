@@ -135,7 +135,7 @@ def _inverse_inertia(system: RigidBody, dtype: torch.dtype, device: torch.device
 
 
 def matvec(matrix: Tensor, vector: Tensor) -> Tensor:
-    """A matrix (3, 3), or one for each row (B, 3, 3), times vectors (B, 3)."""
+    """A matrix (n, n), or one for each vector (..., n, n), times vectors (..., n)."""
     return (matrix @ vector[..., None])[..., 0] if matrix.dim() > 2 else vector @ matrix.mT
 
 

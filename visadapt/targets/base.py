@@ -26,7 +26,7 @@ class Observation:
     state: Tensor
     """(B, n_state), SI units: for labels and scores, never for an image policy"""
     alive: Tensor
-    """(B,) whether the episode can go on: the pole up and the cart in the frame"""
+    """(B,) whether the episode can go on; of a cart-pole: up, and in the frame"""
     frame: Tensor | None = None
     """(B, H, W) uint8"""
     force: Tensor | None = None

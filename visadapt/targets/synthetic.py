@@ -177,8 +177,7 @@ class SyntheticTarget(WorldTarget):
 class FlightTarget(WorldTarget):
     """A vehicle with hidden effects, integrated more finely and by another method than any source.
 
-    A flight ends after the task's steps, or where its state is no longer finite; how far off it is does not end it,
-    unless `reach` says so.
+    A flight ends where its state is no longer finite; how far off it is does not end it, unless `reach` says so.
 
     Args:
         task: where flights start and what a policy is shown.

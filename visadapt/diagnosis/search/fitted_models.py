@@ -166,9 +166,9 @@ class FittedModels:
     def fit(
         self, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int], process_noise: bool = True
     ) -> list[ScoredModel]:
-        """Fit sets of effects, each from a start, with effort QUICK or CAREFUL; return the best fit so far of each.
+        """Fit sets of effects, each from a start; return the best fit so far of each. `effort`: QUICK, CAREFUL, FINAL.
 
-        Without process noise, a fit comes from far away to the parameters that explain all, if there are such.
+        Without process noise, a fit reaches parameters that explain all, if there are any, from afar.
         """
         rival = max((float(each.fits.likelihood[0]) for each in self.fitted.values()), default=self._rival)
         out = self._fits(starts, effort, rival if process_noise else -math.inf, process_noise)

@@ -1,8 +1,8 @@
 """Pushes: passing loads on one joint that no function of state and command explains; when, where and how hard.
 
 The unexplained load is a sum of columns that state and command explain, of errors, and of pushes: bumps in time. Errors
-grow with speed, acceleration and changes of the command, and neighbouring ones are alike; how much, the recording shows
-itself. A bump is tried at every instant, in several widths, on every joint: a matched filter, by generalised least
+grow with speed, acceleration and changes of the command, and neighbouring ones are correlated; the recording shows how
+much. A bump is tried at every instant, in several widths, on every joint: a matched filter, by generalised least
 squares (Kay 1998, Fundamentals of Statistical Signal Processing II, section 4.4). Those that stand out are fitted
 together with all else, and those that then do not stand out clearly are dropped, the weakest first.
 """
@@ -38,7 +38,7 @@ MAX_CORRECTION = 0.1  # Height over that of an overlapping bump, below which a b
 
 SHAPE_ERROR = 0.15  # Deviation of an impulse, as a share of it, because a push need not have the shape of a bump
 
-MAX_BUMPS = 6  # Bumps on an episode at most
+MAX_BUMPS = 6  # Bumps on a part at most
 
 COLUMN_PRIOR = 0.2
 """Prior standard deviation of the load that a column explains, over that of the unexplained load."""

@@ -48,12 +48,11 @@ def _alike(system: System) -> Iterator[tuple[str, str]]:
     """Pairs of names of equivalent effects: with suitable values both change every derivative alike."""
     state, command, load = inputs(system)
     rest = torch.zeros_like(load)
-    free = system.derivative(state, command, rest)
+    free, by_loads = system.rates_per_load(state, command, rest, range(load.shape[1]))
     for a, action in enumerate(system.actions):
         unit = torch.eye(command.shape[1]).double()[a]
         by_command = system.derivative(state, command + unit, rest) - free
-        for k, joint in enumerate(system.loads):
-            by_load = system.derivative(state, command, rest + torch.eye(load.shape[1]).double()[k]) - free
+        for joint, by_load in zip(system.loads, by_loads, strict=True):
             if bool(by_command.any()) and equal(
                 by_load * (by_command * by_load).sum() / by_load.square().sum(), by_command
             ):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -69,12 +70,4 @@ def _in_units_of(parameter: Parameter, action: Variable) -> Parameter:
         return parameter
     most = action.largest
     neutral = None if parameter.neutral is None else parameter.neutral * most
-    return Parameter(
-        parameter.name,
-        action.unit,
-        parameter.low * most,
-        parameter.high * most,
-        neutral,
-        parameter.linear,
-        parameter.role,
-    )
+    return replace(parameter, unit=action.unit, low=parameter.low * most, high=parameter.high * most, neutral=neutral)
