@@ -151,12 +151,14 @@ class Fit:
 
 def chi_squared(data: Data, residual: Array, effects: Sequence[str]) -> float:
     """Sum of squared residuals; steps held by a dropout or frozen zone of the set count with their expectation."""
-    out = np.zeros(residual.shape[1], bool)
-    if "dropout" in effects:
-        out |= data.rows_lost
-    if "frozen_zone" in effects:
-        out |= data.angle_held
+    out = held(data, effects)
     return float((residual[:, ~out] ** 2).sum()) + len(residual) * int(out.sum())
+
+
+def held(data: Data, effects: Sequence[str]) -> NDArray[np.bool_]:
+    """(N,) steps whose readings are held by a dropout or a frozen zone of the set."""
+    lost, frozen = ("dropout" in effects) & data.rows_lost, ("frozen_zone" in effects) & data.angle_held
+    return np.asarray(lost | frozen)
 
 
 def fit(data: Data, members: Sequence[Candidate], start: Values | None = None, thorough: bool = True) -> Fit:
@@ -178,11 +180,7 @@ def _descend(data: Data, members: Sequence[Candidate], start: Values, rounds: in
     values, inverse = dict(start), np.zeros((len(free), len(free)), np.float64)
     residual = data.residual(values)
     best = chi_squared(data, residual, effects)
-    keep = np.ones(residual.shape[1], bool)
-    if "dropout" in effects:
-        keep &= ~data.rows_lost
-    if "frozen_zone" in effects:
-        keep &= ~data.angle_held
+    keep = ~held(data, effects)
     for _ in range(rounds if free else 0):
         slopes = np.stack([_slope(data, values, parameter, residual)[:, keep].ravel() for parameter in free], 1)
         normal = slopes.T @ slopes

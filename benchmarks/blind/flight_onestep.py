@@ -6,7 +6,6 @@ favours the baselines. All 13 states are measured, and the noise is known.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.blind.fitting import Candidate, Free, on_any, one
-from benchmarks.blind.onestep import Array, Values, actuate
+from benchmarks.blind.onestep import Array, Values, actuate, episodes_of
 from datasets.blind import flight_kinds as blind_flight_kinds
 from datasets.blind.flight_control import PERIODS
 from datasets.blind.flight_plants import PLANTS, RESTING, Motion, step
@@ -115,11 +114,7 @@ def system_of(path: Path) -> str:
 def read_flights(path: Path) -> FlightSteps:
     """Read one recording."""
     system = system_of(path)
-    with path.open(newline="", encoding="utf-8") as file:
-        lines = list(csv.DictReader(file))
-    episodes: dict[str, list[dict[str, str]]] = {}
-    for line in lines:
-        episodes.setdefault(line["episode"], []).append(line)
+    episodes = episodes_of(path)
     commands = np.zeros((len(episodes), max(map(len, episodes.values())), 4))
     states, afters, places = [], [], []
     for number, episode in enumerate(episodes.values()):

@@ -85,30 +85,23 @@ class Steps:
     channels: list[int]
     """columns of the state that are predicted: the measured ones, as a central difference has its rows' noise"""
     scale: Array = field(init=False)
-    """`deviations`, computed once"""
+    """(channels, 1) standard deviations of the source's one-step error, by the noise of both rows"""
     system: str = "cartpole"
     neutral: Values = field(default_factory=lambda: dict(NEUTRAL))
 
     def __post_init__(self) -> None:
-        self.scale = self.deviations
+        if self.channels != ALL_STATES:
+            # The error of x_(t+1) is then half a second difference, with weights (1, -2, 1) / 2 on the noise.
+            self.scale = (self.noise[self.channels] * 1.5**0.5)[:, None]
+            return
+        small, still = 1e-4, np.zeros((1, SUBSTEPS))
+        slopes = np.concatenate([advance(small * unit[:, None], still, np.zeros(1), NEUTRAL) for unit in np.eye(4)], 1)
+        self.scale = np.sqrt(self.noise**2 + ((slopes / small) ** 2) @ self.noise**2)[:, None]
 
     @property
     def time(self) -> Array:
         """s since the episode began, (n,)."""
         return self.where[1].astype(np.float64) * PERIOD
-
-    @property
-    def deviations(self) -> Array:
-        """(channels, 1) standard deviations of the source's one-step error, by the noise of both rows."""
-        deviations: Array
-        if self.channels != ALL_STATES:
-            # The error of x_(t+1) is then half a second difference, with weights (1, -2, 1) / 2 on the noise.
-            deviations = self.noise[self.channels] * 1.5**0.5
-            return deviations[:, None]
-        small, still = 1e-4, np.zeros((1, SUBSTEPS))
-        slopes = np.concatenate([advance(small * unit[:, None], still, np.zeros(1), NEUTRAL) for unit in np.eye(4)], 1)
-        deviations = np.sqrt(self.noise**2 + ((slopes / small) ** 2) @ self.noise**2)
-        return deviations[:, None]
 
     @property
     def size(self) -> int:
@@ -193,14 +186,19 @@ def rates(s: Array, u: Array, t: Array, p: Values) -> Array:
     return np.stack((v, push - moment * turning * cosine / total, rate, turning))
 
 
+def episodes_of(path: Path) -> dict[str, list[dict[str, str]]]:
+    """The lines of a recording by their episode."""
+    episodes: dict[str, list[dict[str, str]]] = {}
+    with path.open(newline="", encoding="utf-8") as file:
+        for line in csv.DictReader(file):
+            episodes.setdefault(line["episode"], []).append(line)
+    return episodes
+
+
 def read_steps(path: Path) -> Steps:
     """Read one recording; its noise is that of its set, which the columns identify."""
-    with path.open(newline="", encoding="utf-8") as file:
-        lines = list(csv.DictReader(file))
-    episodes: dict[str, list[dict[str, str]]] = {}
-    for line in lines:
-        episodes.setdefault(line["episode"], []).append(line)
-    fast = "x_dot" in lines[0]
+    episodes = episodes_of(path)
+    fast = "x_dot" in next(iter(episodes.values()))[0]
     rows = max(len(episode) for episode in episodes.values())
     commands = np.zeros((len(episodes), rows))
     parts: list[tuple[NDArray[np.intp], ...]] = []

@@ -116,7 +116,7 @@ def poses():
     renderer = load_renderer(Path(RENDERER)).requires_grad_(False)
     places = np.random.default_rng(0).uniform((-0.8, -0.2), (0.8, 0.2), (8, 2))
     drawn = torch.from_numpy(DrawnCartPole()(*places.T)).float() / 255
-    return renderer, PoseFinder(renderer, 1.5, 0.5), drawn
+    return renderer, PoseFinder(renderer, 1.5), drawn
 
 
 def camera_of(poses, *effects):

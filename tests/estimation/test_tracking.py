@@ -129,7 +129,7 @@ class TestPoses:
         camera = Camera(width=61, height=45, scale=18.0, column=28.0, row=33.0)
         drawn = DrawnCartPole(camera, pole_width=0.1)
         x, theta = np.array([-1.2, 0.3, 1.0]), np.array([0.1, -0.3, 0.02])
-        poses = PoseFinder(Sketch(drawn), 1.5, 0.5)(torch.from_numpy(drawn(x, theta)))
+        poses = PoseFinder(Sketch(drawn), 1.5)(torch.from_numpy(drawn(x, theta)))
         np.testing.assert_allclose(poses.place[:, 0], x, atol=3e-3)
         np.testing.assert_allclose(poses.place[:, 1], theta, atol=1e-2)
 

@@ -14,22 +14,17 @@ from visadapt.learning.setup_settings import SetupSettings
 from visadapt.policies import ReachPolicy, StatePolicy
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.setups.policy_file import describe, load_policy, load_source, residual_for, save_policy
-from visadapt.storage.checkpoints import CheckpointError, load_tree, save_tree
+from visadapt.storage.checkpoints import CheckpointError, load_tree
 from visadapt.tasks.balance import Balance, Cost
 
 
 @pytest.mark.parametrize("with_history", [False, True])
-@pytest.mark.parametrize("stated", [False, True])
-def test_a_flights_residual_comes_back_with_the_history_that_it_reads(tmp_path, with_history, stated):
+def test_a_flights_residual_comes_back_with_the_history_that_it_reads(tmp_path, with_history):
     world, path = va.World(va.FixedWing()), tmp_path / "policy.safetensors"
     policy = stir(ReachPolicy()).eval()
     policy.residual, policy.grounded_in = stir(residual_for(policy, world, with_history)), describe(world)
     save_policy(path, policy)
-    tree = load_tree(path)
-    assert tree["settings"]["with_history"] == with_history
-    if not stated:  # as files of earlier versions are
-        del tree["settings"]["with_history"]
-        save_tree(path, tree)
+    assert load_tree(path)["settings"]["with_history"] == with_history
     read = load_policy(path)
     assert (read.residual.network.predict is not None) == with_history
     history = History(torch.randn(3, LENGTH, *policy.observation_shape), torch.zeros(3, LENGTH, 4))

@@ -53,8 +53,6 @@ MIN_MOTION_ERROR = 1.0
 """Error of the source's predictions, over the noise of positions, from which motion shows a gap. Below, it may be the
 renderer's own error, which is no noise, and is larger where a moved camera's frames are interpolated."""
 
-LEAN = 0.5  # rad, largest |theta| at which the pole is looked for
-
 VAGUE = 3.0  # Standard deviation of a pose, over the median, above which a frame does not show it
 
 LEAST_EXPLAINED = 0.2
@@ -89,14 +87,14 @@ def watch(recording: Recording, system: System, renderer: nn.Module, report: Rep
         FramesError: frames of another size or scene than the renderer's, or that never change.
     """
     reach = system.states[system.index("x")].largest
-    finder = PoseFinder(renderer, reach, LEAN)
+    finder = PoseFinder(renderer, reach)
     check_frames(recording, finder.size)
     every = torch.cat([torch.from_numpy(np.ascontiguousarray(episode.frame)) for episode in recording.episodes])
     camera = find_camera(renderer, finder, every, staged(report, "camera"))
     effects, seen = camera.best.effects, renderer
     if effects:
         seen = SeenBy(renderer, effects)
-        finder = PoseFinder(seen, reach, LEAN)
+        finder = PoseFinder(seen, reach)
     known = within_frame(effects, every[0].float()).to(torch.uint8)
     poses = found_in(recording, finder, known, staged(report, "poses"))
     left = left_over(seen, effects, every, torch.cat([each.place for each in poses]))

@@ -16,6 +16,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+LEAN = 0.5  # rad, largest |theta| of the grid searched
+
 SPACING = 0.05  # m and rad between the poses of the grid: about 2 px for a camera that sees 3 m in 120 px
 
 DIFFERENCE = 0.0125
@@ -50,15 +52,15 @@ class PoseFinder:
     Args:
         renderer: it is not changed.
         reach: m, largest |x| of the grid searched.
-        lean: rad, largest |theta| of the grid searched; poses a little beyond both are still found.
+            Poses a little beyond it, and beyond LEAN, are still found.
     """
 
-    def __init__(self, renderer: nn.Module, reach: float, lean: float) -> None:
+    def __init__(self, renderer: nn.Module, reach: float) -> None:
         self.renderer = renderer
         self._like = next(renderer.parameters()).detach()
         axes = [
             torch.linspace(-limit, limit, 2 * max(1, round(limit / SPACING)) + 1, dtype=self._like.dtype)
-            for limit in (reach, lean)
+            for limit in (reach, LEAN)
         ]
         self._grid = torch.cartesian_prod(*axes).to(self._like.device)
         rendered = [self._render(part) for part in self._grid.split(CHUNK)]

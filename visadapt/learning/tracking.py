@@ -39,8 +39,6 @@ SMOOTHINGS = 4  # Times that the physics are linearised around the path so far; 
 
 ACCELERATION = 10.0  # m/s2 and rad/s2, standard deviation of the acceleration by a load before any frame is seen
 
-LEAN = 0.5  # rad, largest |theta| at which the pole is looked for
-
 BRIDGED = 10
 """Most consecutive rows without a usable frame: about upright, errors grow by a factor e in about 5 rows."""
 
@@ -75,7 +73,7 @@ class Tracker:
         load = load_effect(type(system))
         nothing = load(**{parameter.name: 0.0 for parameter in load.table})
         self._pushed = world.with_effects((nothing,))
-        self.poses = PoseFinder(renderer, across.largest, LEAN)
+        self.poses = PoseFinder(renderer, across.largest)
 
     def track(self, episodes: Sequence[Episode]) -> list[Episode]:
         """The episodes with states estimated from their frames and actions alone; one noise model is fitted to all.

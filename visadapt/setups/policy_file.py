@@ -71,11 +71,7 @@ def load_policy(path: str | Path) -> Policy:
             sizes = kind(**arguments).to(_dtype(weights)).state_dict()
         check_sizes(sizes, {key: value for key, value in weights.items() if not key.startswith("residual.")}, path)
         policy = kind(**arguments)
-        residual: Callable[[Policy, World], Residual]
-        if "with_history" in made:
-            residual = partial(residual_for, with_history=made["with_history"])
-        else:  # an earlier version wrote it
-            residual = partial(_residual_of_width, weights.get("residual.network.head.weight"))
+        residual = partial(residual_for, with_history=made.get("with_history", False))
         return _restored(policy, tree, path, residual)
 
 
@@ -106,13 +102,6 @@ def _restored(
 def _dtype(weights: Mapping[str, Tensor]) -> torch.dtype:
     """That of the first of the weights, which a policy has in common."""
     return next((weight.dtype for weight in weights.values() if weight.is_floating_point()), torch.float32)
-
-
-def _residual_of_width(head: Tensor | None, policy: Policy, source: World) -> Residual:
-    """The residual whose head has as many inputs as the weights `head`: without a history, or with one."""
-    made = residual_for(policy, source)
-    fits = head is None or made.state_dict()["network.head.weight"].shape == head.shape
-    return made if fits else residual_for(policy, source, with_history=True)
 
 
 def load_source(path: str | Path) -> World:
