@@ -223,7 +223,7 @@ class JointLearning:
         def tuned(partial: Path) -> list[float]:
             if no_gap:
                 return []
-            how, progress = self.settings.with_names(world), self._progress(folder, "tune")
+            how, progress = self.settings.with_names, self._progress(folder, "tune")
             return tune(self.policy, world, self.observe, how, folder.generator(2), None, progress, partial)
 
         return self._kept(folder.policy, tuned)

@@ -11,8 +11,6 @@ from torch import Tensor
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.perception import PerceptionSettings
 from visadapt.learning.policy import TuneSettings
-from visadapt.learning.streams import an_episode, depends_on_time
-from visadapt.world import World
 
 
 @dataclass(frozen=True)
@@ -37,8 +35,6 @@ class SetupSettings:
     """second training of the policy in the source, after `source`: near rest, say, where it is scored"""
     named: TuneSettings | None = None
     """tuning of the policy in the source with named effects and without a residual; None: as `tuning`"""
-    unforeseen: TuneSettings | None = None
-    """tuning with named effects of which some change over time, which no plan foresees; None: as `named`"""
     perception: PerceptionSettings | None = None
     """training of the frame encoder, where the policy is shown frames"""
 
@@ -49,18 +45,15 @@ class SetupSettings:
             finer = replace(finer, iterations=min(iterations, finer.iterations))
         return replace(self, source=replace(self.source, iterations=iterations), refinement=finer)
 
-    def with_names(self, source: World) -> TuneSettings:
+    @property
+    def with_names(self) -> TuneSettings:
         """Tuning in a source that has named effects alone. No start is recorded: these hold in every state, a residual
         only near the recorded ones."""
-        own = self.named or self.tuning
-        if self.unforeseen is not None and depends_on_time(source, *an_episode(source, own.task)):
-            own = self.unforeseen
-        return replace(own, recorded=0.0)
+        return replace(self.named or self.tuning, recorded=0.0)
 
     def with_tuning(self, change: Callable[[TuneSettings], TuneSettings]) -> SetupSettings:
-        """The same with `change` applied to `tuning`, `named` and `unforeseen`."""
-        named, unforeseen = (None if each is None else change(each) for each in (self.named, self.unforeseen))
-        return replace(self, tuning=change(self.tuning), named=named, unforeseen=unforeseen)
+        """The same with `change` applied to `tuning` and `named`."""
+        return replace(self, tuning=change(self.tuning), named=self.named and change(self.named))
 
     def numbers(self) -> dict[str, Any]:
         """All of them as JSON takes them, for a run's folder; a task's tensors, such as references, are left out."""

@@ -121,7 +121,7 @@ class Setup:
         """
         self.check_policy(policy)
         generator = torch.Generator().manual_seed(seed)
-        args = (policy, self.source, self.observe, self.settings.with_names(self.source), generator)
+        args = (policy, self.source, self.observe, self.settings.with_names, generator)
         return tune(*args, progress=staged(report, "tune"))
 
     def adapt(

@@ -82,7 +82,7 @@ def from_frames(source: World) -> SetupSettings:
     """Settings for the cart-pole that is shown frames, with the cost-to-go of a source.
 
     The policy is tuned in closed loop: each imagined step is rendered, and gradients flow through renderer, residual
-    and physics. Where steady effects are named, plans do better.
+    and physics.
     """
     refinement = _near_rest(source)
     rendered = replace(refinement, streams=None, every=1, batch=16, iterations=250, closed_loop=True)
@@ -91,8 +91,7 @@ def from_frames(source: World) -> SetupSettings:
         refinement=refinement,
         # An iteration takes 0.3 s of CPU; 60 are too few.
         tuning=replace(rendered, iterations=100, learning_rate=1e-3),
-        named=replace(refinement, iterations=1200, streams=32),
-        unforeseen=rendered,
+        named=rendered,
         # With 1 too little is learnt of small gaps near rest, where the first episodes are falls, whose gaps are large;
         # with 0.1 and few samples of a force that changes, the cart-pole with the residual may be unstable.
         ground=GroundSettings(ridge=0.1, larger=(1.0, 10.0)),
