@@ -40,12 +40,9 @@ def test_the_response_to_loads_is_that_of_the_forces_that_they_are():
         World(CartPole(), [ConstantForce(force=force).double()]).integrate(time, now, command) for force in forces
     )
     torch.testing.assert_close(response[..., 0].flatten(0, 1), (pushed - free) / 0.01, atol=1e-6, rtol=1e-4)
-    # Of noise, each load is as large as changes the velocity of its own coordinate by 1; so does each jump, alone.
-    loads, jumps = noise_directions(rows, CartPole()).split(2, -1)
-    own = loads[:, :, [1, 3]].diagonal(dim1=-2, dim2=-1)
+    # Of noise, each load is as large as changes the velocity of its own coordinate by 1.
+    own = noise_directions(rows, CartPole())[:, :, [1, 3]].diagonal(dim1=-2, dim2=-1)
     torch.testing.assert_close(own.abs(), torch.ones_like(own))
-    torch.testing.assert_close(jumps[:, :, [1, 3]], torch.eye(2).double().expand(*jumps.shape[:2], 2, 2))
-    assert not jumps[:, :, [0, 2]].any()
 
 
 @pytest.mark.parametrize("mass", [1.0, 0.08])

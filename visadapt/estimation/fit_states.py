@@ -29,7 +29,7 @@ def initial_fit(system: System, rows: Segments) -> FitState:
     return FitState(
         torch.zeros(1, 0, dtype=torch.float64),
         state,
-        torch.full((1, 2 * len(profile_of(system).driven)), math.log(0.2**2), dtype=torch.float64),
+        torch.full((1, len(profile_of(system).driven)), math.log(0.2**2), dtype=torch.float64),
         torch.full((1, len(rows.channels)), math.log(0.01**2), dtype=torch.float64),
         torch.full((1,), -math.inf, dtype=torch.float64),
         torch.zeros(1, 0, 0, dtype=torch.float64),

@@ -35,11 +35,11 @@ from visadapt.estimation.kalman import (
 from visadapt.estimation.segments import initial_states
 
 LEAST_PROCESS_NOISE = 1e-6
-"""Standard deviation of a noise of every state in its unit, beside the process noise: practically none."""
+"""Standard deviation of a process noise of every state, in its unit, beside that of the loads: practically none."""
 
 MIN_LOG_PROCESS = math.log(1e-4**2)
 MAX_LOG_PROCESS = math.log(3.0**2)
-"""Bounds of the log variances of process noise, (m/s)^2 and (rad/s)^2 of the driven velocities in a period."""
+"""Bounds of the log process noise variance of the driven velocities, (m/s)^2 and (rad/s)^2."""
 
 MIN_READING_PER_STATE = 0.01
 """Below it a reading says nothing of its state, as where a frozen sensor repeats."""
@@ -51,7 +51,7 @@ class FitState(Batch):
 
     theta: Tensor  # (C, K) parameters, padded with 0 where a set has fewer than K
     state: Tensor  # (C, W, T, n) states along which the models are linearised
-    log_process: Tensor  # (C, G) log variances of process noise, by group: loads, then jumps of velocities
+    log_process: Tensor  # (C, G) log process noise variances of the driven velocities, by group
     log_noise: Tensor  # (C, m) log variances of the measurements
     likelihood: Tensor  # (C,) log likelihood
     information: Tensor  # (C, K, K) Fisher information of the parameters
@@ -121,15 +121,15 @@ def _reading_per_state(sensing: Tensor, model: CandidateModel) -> Tensor:
 
 def variances(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[Tensor, Tensor]:
     """Process noise covariances (C W, T - 1, n, n) and measurement variances (C W, m) for the filter of `problem`."""
-    process, noise = _noises(model, fits, problem)
-    return process.covariance(), noise
+    loads, noise = _noises(model, fits, problem)
+    return loads.covariance(), noise
 
 
 @dataclass(frozen=True)
-class ProcessNoise(Batch):
-    """The L process noises of N systems: see `noise_directions`."""
+class LoadNoise(Batch):
+    """The process noise of N systems: loads held for a period, each in the velocity that it gives to its coordinate."""
 
-    sources: Tensor  # (N, T - 1, n, L) change of the states per unit of each noise
+    sources: Tensor  # (N, T - 1, n, L) change of the states per unit of each load
     variance: Tensor  # (N, L)
 
     def covariance(self) -> Tensor:
@@ -138,11 +138,11 @@ class ProcessNoise(Batch):
         return (self.sources * self.variance[:, None, None]) @ self.sources.mT + torch.diag_embed(least)
 
     def smoothed(self, adjoint: Tensor) -> Tensor:
-        """Smoothed noises (N, T - 1, L, M), with the other sign, from the smoother's adjoints (N, T, n, M)."""
+        """Smoothed loads (N, T - 1, L, M), with the other sign, from the smoother's adjoints (N, T, n, M)."""
         return self.variance[:, None, :, None] * (self.sources.mT @ adjoint[:, 1:])
 
 
-def _noises(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[ProcessNoise, Tensor]:
+def _noises(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[LoadNoise, Tensor]:
     """Process noise of the C W systems of `problem`, and measurement variances (C W, m).
 
     Process noise is in units of the readings, since its lower bound would otherwise favour a sensor scale below 1.
@@ -150,23 +150,25 @@ def _noises(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[Pro
     windows = model.rows.shape[0]
     per_reading = problem.initial_variance / problem.initial_variance.new_tensor(model.profile.initial_variance)
     sources = model.noise_directions.repeat(len(fits.theta), 1, 1, 1)
-    variance, noise = fits.log_process[:, model.profile.noise_groups].exp(), fits.log_noise.exp()
-    process = ProcessNoise(sources * per_reading.sqrt()[:, None, :, None], variance.repeat_interleave(windows, 0))
-    return process, noise.repeat_interleave(windows, 0)
+    group = [k for k, columns in enumerate(model.profile.driven) for _ in columns]
+    variance, noise = fits.log_process[:, group].exp(), fits.log_noise.exp()
+    loads = LoadNoise(sources * per_reading.sqrt()[:, None, :, None], variance.repeat_interleave(windows, 0))
+    return loads, noise.repeat_interleave(windows, 0)
 
 
 def noise_members(model: CandidateModel) -> tuple[Tensor, Tensor]:
-    """Which noises share a free variance: (G + S, L) for process noise and (G + S, m) for the channels, 1 where the
-    noise has the variance of that row.
+    """Which noises share a free variance: (G + S, L) for the loads and (G + S, m) for the channels, 1 where the noise
+    has the variance of that row.
 
-    There is one variance for each of G groups of process noise, and one for each of S kinds of sensors.
+    There is one variance for each of G groups of driven velocities, and one for each of S kinds of sensors.
     """
-    channels, groups = model.rows.channels, model.profile.noise_groups
-    process = [[float(own == group) for own in groups] for group in range(max(groups) + 1)]
+    channels = model.rows.channels
+    driven = [[float(k in group) for k in model.profile.driven_columns] for group in model.profile.driven]
     sensors = [[float(c in kind) for c in channels] for kind in model.profile.sensors]
     measured = [row for row in sensors if any(row)]
-    whole = torch.block_diag(torch.tensor(process), torch.tensor(measured)).double()
-    return whole[:, : len(groups)], whole[:, len(groups) :]
+    whole = torch.block_diag(torch.tensor(driven), torch.tensor(measured)).double()
+    loads = len(model.profile.driven_columns)
+    return whole[:, :loads], whole[:, loads:]
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,7 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState) -> Derivativ
     """Likelihood, gradient and Fisher information of every window at `fits`."""
     count, windows = fits.state.shape[:2]
     problem = linear_problem(models, fits)
-    process, noise = _noises(models[0], fits, problem)
+    loads, noise = _noises(models[0], fits, problem)
     rows = models[0].rows
     # The same draws for every fit.
     drawn = torch.randn(rows.used.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -223,14 +225,14 @@ def differentiate(models: Sequence[CandidateModel], fits: FitState) -> Derivativ
     parts = []
     for first in range(0, count * windows, at_once):
         at = slice(first, first + at_once)
-        systems = problem[at], process[at], noise[at], used[at], counted[at], drawn[at]
+        systems = problem[at], loads[at], noise[at], used[at], counted[at], drawn[at]
         parts.append(_of_systems(*systems, members, rows.colour))
     return Derivatives(*(torch.cat(each).unflatten(0, (count, windows)) for each in zip(*parts, strict=True)))
 
 
 def _of_systems(
     problem: Linear,
-    process: ProcessNoise,
+    loads: LoadNoise,
     noise: Tensor,
     used: Tensor,
     counted: Tensor,
@@ -245,12 +247,12 @@ def _of_systems(
         drawn: (N, T, m) standard normal.
         colour: of the innovations, which states the noise: its derivatives are then 0. None: they are white.
     """
-    here = forward(problem, process.covariance(), noise)
+    here = forward(problem, loads.covariance(), noise)
     errors = whitened(here.white, colour)
     error, columns = errors.flatten(1, 2).tensor_split([1], -1)
     likelihood = log_likelihood(replace(here, white=errors), counted)
     if colour is None:
-        adjoint, information, score = _by_noise(here, process, noise, used, drawn, members)
+        adjoint, information, score = _by_noise(here, loads, noise, used, drawn, members)
     else:
         likelihood = likelihood + counted.mean(2).sum(1) * colour.whitening.logdet()
         adjoint = adjoints(here, here.white)
@@ -262,7 +264,7 @@ def _of_systems(
 
 def _by_noise(
     here: Filtered,
-    process: ProcessNoise,
+    loads: LoadNoise,
     noise: Tensor,
     used: Tensor,
     drawn: Tensor,
@@ -278,14 +280,13 @@ def _by_noise(
     both = [0, -1]
     of_both = adjoint[..., both]
     weight = weights(here, white[..., both], of_both)
-    groups, measured = members
-    first = of_both[..., 0], weight[..., 0]
-    by_process, by_noise = noise_scores(here, *first, process.sources, process.variance, noise)
-    score = by_process.sum(1) @ groups.T + (by_noise * used).sum(1) @ measured.T
+    driven, measured = members
+    by_process, by_noise = noise_scores(here, of_both[..., 0], weight[..., 0], loads.sources, loads.variance, noise)
+    score = by_process.sum(1) @ driven.T + (by_noise * used).sum(1) @ measured.T
     # What inputs add to the states is subtracted from the readings.
-    by_group = process.smoothed(of_both).mT[..., None] * groups.T
-    drive = (process.sources[:, :, None] @ by_group).movedim(2, 3)
+    by_group = loads.smoothed(of_both).mT[..., None] * driven.T
+    drive = (loads.sources[:, :, None] @ by_group).movedim(2, 3)
     reading = (noise[:, None, :, None] * weight)[..., None] * measured.T[:, None]
     working = respond(here, drive.flatten(-2), reading.flatten(-2)).flatten(1, 2)
-    working = working.unflatten(-1, (2, len(groups))).flatten(1, 2)
+    working = working.unflatten(-1, (2, len(driven))).flatten(1, 2)
     return adjoint[..., :-1], 0.25 * working.mT @ working, score

@@ -27,8 +27,8 @@ class SystemProfile:
     """What estimation and diagnosis must know of a system: its sensors, and how much work the search may spend."""
 
     driven: tuple[Columns, ...]
-    """velocities that the loads drive, one for each load in the order of the loads; a process noise has the same
-    variance in each velocity of a group"""
+    """velocities that the loads drive, one for each load in the order of the loads; process noise, which is a load, has
+    the same variance in each velocity of a group"""
     position_of: Mapping[int, int]
     """column of a velocity to the column of its position, for velocities that a recording may lack"""
     sensors: tuple[Columns, ...]  # columns that one kind of sensor measures, with the same noise variance
@@ -74,12 +74,6 @@ class SystemProfile:
     def driven_columns(self) -> list[int]:
         """The driven columns of all groups."""
         return [column for group in self.driven for column in group]
-
-    @property
-    def noise_groups(self) -> list[int]:
-        """The group of each process noise in `unmodelled_loads.noise_directions`: as many of jumps as of loads."""
-        of_loads = [group for group, columns in enumerate(self.driven) for _ in columns]
-        return of_loads + [len(self.driven) + group for group in of_loads]
 
 
 _CART_POLE = SystemProfile(

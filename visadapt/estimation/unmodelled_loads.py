@@ -1,14 +1,12 @@
-"""What a candidate model leaves out: how it moves the states, and what it does to dry friction.
+"""The loads that a candidate model leaves out: how they move the states, and what they do to dry friction.
 
-Process noise is of two kinds. What is missing from a model is mostly a load on one joint, held for a period: it moves
-the others through the mass matrix, and its own position by half of the period. But a machine whose parts bend, or whose
-motors are late, misses its model in each velocity by itself; taken for loads, that falsifies the masses. So each
-velocity also jumps at the end of a period, and the recording says how much there is of both.
+Process noise is such a load, held for a period: what is missing from a model of a machine is mostly a load on one of
+its joints, which moves the others through the mass matrix and its own position by half of the period.
 
-Process noise is added to the state at the end of the period, so that dry friction does not feel it: beside a vibration
-that is stronger than the friction, a joint sticks in the model wherever it turns round, but not on the machine. Where
-the noise has a colour, something strong is known to be missing; there the step of a set with dry friction is taken
-under the load that leads from each state to the next, less what that load does without friction.
+It is added to the state at the end of the period, so that dry friction does not feel it: beside a vibration that is
+stronger than the friction, a joint sticks in the model wherever it turns round, but not on the machine. Where the noise
+has a colour, something strong is known to be missing; there the step of a set with dry friction is taken under the load
+that leads from each state to the next, less what that load does without friction.
 """
 
 from __future__ import annotations
@@ -41,19 +39,11 @@ def load_response(rows: Segments, system: System) -> Tensor:
 
 
 def noise_directions(rows: Segments, system: System) -> Tensor:
-    """(W, T - 1, n, 2 L) change of the next state by each process noise.
-
-    The first L are the `load_response` to loads that each change the velocities of their own group by 1, the others
-    jumps of one driven velocity by 1.
-    """
+    """The `load_response` (W, T - 1, n, L) to loads that each change the velocities of their own group by 1."""
     response = load_response(rows, system)
-    profile = profile_of(system)
-    groups = [list(group) for group in profile.driven for _ in group]
+    groups = [list(group) for group in profile_of(system).driven for _ in group]
     own = torch.stack([response[:, :, group, k].norm(dim=-1) for k, group in enumerate(groups)], -1)
-    jumps = torch.zeros_like(response)
-    for k, velocity in enumerate(profile.driven_columns):
-        jumps[:, :, velocity, k] = rows.inside[:, 1:]
-    return torch.cat((response / torch.where(own > 0, own, 1.0)[:, :, None], jumps), -1)
+    return response / torch.where(own > 0, own, 1.0)[:, :, None]
 
 
 def response_without_friction(world: World, state: Tensor, command: Tensor, duration: Tensor) -> Tensor:
