@@ -36,6 +36,7 @@ from visadapt.diagnosis.search.causes import (
 )
 from visadapt.diagnosis.search.coloured import with_coloured_noise
 from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
+from visadapt.diagnosis.search.jumps import or_with_jumps
 from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
 from visadapt.diagnosis.search.preparation import PreparedRecording, limited, prepare
 from visadapt.diagnosis.search.pushes import pushes
@@ -192,13 +193,15 @@ def _explore(
     search.run(staged(progress, "search"))
     if len(prepared.searched) < rows.shape[0]:
         search = on_all_rows(search, rows)
-    # Periodic effects may have got a phase for each episode.
-    in_use = {effect.name: effect for effect in search.catalogue}
-    named = [in_use.get(effect.name, effect) for effect in effects]
     comparison = compare(search)
     repeats = repeated_reading_causes(prepared, search, comparison, repeating)
     again = staged(progress, "search with coloured noise")
     search, comparison = with_coloured_noise(search, comparison, prepared.searched, again)
+    again = staged(progress, "search with jumps as noise")
+    search, comparison = or_with_jumps(search, comparison, rows, prepared.searched, candidates, again)
+    # Periodic effects may have got a phase for each episode.
+    in_use = {effect.name: effect for effect in search.catalogue}
+    named = [in_use.get(effect.name, effect) for effect in effects]
     return _Explored(named, prepared, search, comparison, alternatives(comparison, named, system), repeats)
 
 

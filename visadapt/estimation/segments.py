@@ -33,6 +33,7 @@ class Segments:
     period: float  # s between rows, the median where the clock is unsteady
     resolution: tuple[float, ...]  # of each channel: the smallest difference between two different readings
     colour: Colour | None = None  # of a fit's innovations, where they are known not to be white
+    jumps: bool = False  # whether process noise is a jump of each velocity; False: a load on each joint
 
     @property
     def shape(self) -> tuple[int, int]:

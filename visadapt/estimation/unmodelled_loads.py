@@ -1,7 +1,8 @@
 """The loads that a candidate model leaves out: how they move the states, and what they do to dry friction.
 
 Process noise is such a load, held for a period: what is missing from a model of a machine is mostly a load on one of
-its joints, which moves the others through the mass matrix and its own position by half of the period.
+its joints, which moves the others through the mass matrix and its own position by half of the period. Rows with
+`Segments.jumps` have a jump of each velocity by itself instead (`diagnosis/search/jumps.py`).
 
 It is added to the state at the end of the period, so that dry friction does not feel it: beside a vibration that is
 stronger than the friction, a joint sticks in the model wherever it turns round, but not on the machine. Where the noise
@@ -39,7 +40,12 @@ def load_response(rows: Segments, system: System) -> Tensor:
 
 
 def noise_directions(rows: Segments, system: System) -> Tensor:
-    """The `load_response` (W, T - 1, n, L) to loads that each change the velocities of their own group by 1."""
+    """(W, T - 1, n, L) change of the next state by each process noise: the `load_response` to a load that changes the
+    velocities of its own group by 1, or a jump of one velocity by 1."""
+    if rows.jumps:
+        velocities = torch.tensor(profile_of(system).driven_columns)
+        jump = torch.eye(len(system.states), dtype=torch.float64)[:, velocities]
+        return rows.inside[:, 1:, None, None] * jump
     response = load_response(rows, system)
     groups = [list(group) for group in profile_of(system).driven for _ in group]
     own = torch.stack([response[:, :, group, k].norm(dim=-1) for k, group in enumerate(groups)], -1)
