@@ -1,10 +1,14 @@
 """Loads that a model leaves out: against worlds in which they act."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
-from tests.diagnosed import record
+from tests.diagnosed import GAINS, record
 from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.search import Search
 from visadapt.effects import ConstantForce, CoulombFriction, PoleMass
 from visadapt.estimation.linearise import load_effect
 from visadapt.estimation.segments import initial_states
@@ -14,6 +18,7 @@ from visadapt.estimation.unmodelled_loads import (
     noise_directions,
     response_without_friction,
 )
+from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole
 from visadapt.world import World
 
@@ -66,3 +71,23 @@ def test_the_load_that_acted_is_found_beside_dry_friction_also_where_the_cart_tu
     assert pole[~rests].abs().max() < 0.01
     # Of what holds a cart at rest no more is known than that it is no larger than friction and load together.
     assert (cart[rests].abs() < NEWTONS + 2.0).all()
+
+
+@pytest.mark.parametrize("jumps", [False, True])
+def test_a_machine_that_loads_disturb_is_told_from_one_whose_velocities_jump(jumps):
+    """Forces on the cart move the pole too, by the mass matrix; jumps of both velocities are independent."""
+    generator, pushed = torch.Generator().manual_seed(0), World(CartPole(), [ConstantForce(force=0.0)])
+    still, states, commands = torch.zeros(4, 1, dtype=torch.float64), [torch.zeros(4, 4, dtype=torch.float64)], []
+    for _ in range(100):
+        drawn = torch.randn(4, 3, generator=generator, dtype=torch.float64)
+        commands.append((states[-1] @ GAINS[:, None] + 0.1 * drawn[:, 2:]).clamp(-1, 1))
+        world = pushed.with_values(still if jumps else 2 * drawn[:, :1])
+        jump = torch.stack((still[:, 0], drawn[:, 0], still[:, 0], drawn[:, 1]), 1)
+        states.append(world.step(world.start(states[-1]), commands[-1]).state + (0.1 * jump if jumps else 0))
+    seen = torch.stack(states[:-1], 1)[..., [0, 2]]
+    seen = (seen + 1e-4 * torch.randn(seen.shape, generator=generator, dtype=torch.float64)).numpy()
+    given, time = torch.stack(commands, 1).numpy(), 0.05 * np.arange(100)
+    episodes = tuple(Episode(time, given[k], seen[k]) for k in range(4))
+    rows = prepare(Recording(episodes, ("x", "theta"), 0.05, ("",) * 4), CartPole()).rows
+    likelihoods = [Search(CartPole(), replace(rows, jumps=kind), []).source.log_odds for kind in (jumps, not jumps)]
+    assert likelihoods[0] > likelihoods[1] + 50
