@@ -84,8 +84,8 @@ def test_a_machine_that_loads_disturb_is_told_from_one_whose_velocities_jump(jum
         world = pushed.with_values(still if jumps else 2 * drawn[:, :1])
         jump = torch.stack((still[:, 0], drawn[:, 0], still[:, 0], drawn[:, 1]), 1)
         states.append(world.step(world.start(states[-1]), commands[-1]).state + (0.1 * jump if jumps else 0))
-    seen = torch.stack(states[:-1], 1)[..., [0, 2]]
-    seen = (seen + 1e-4 * torch.randn(seen.shape, generator=generator, dtype=torch.float64)).numpy()
+    true = torch.stack(states[:-1], 1)[..., [0, 2]]
+    seen = (true + 1e-4 * torch.randn(true.shape, generator=generator, dtype=torch.float64)).numpy()
     given, time = torch.stack(commands, 1).numpy(), 0.05 * np.arange(100)
     episodes = tuple(Episode(time, given[k], seen[k]) for k in range(4))
     rows = prepare(Recording(episodes, ("x", "theta"), 0.05, ("",) * 4), CartPole()).rows

@@ -33,18 +33,20 @@ MOST_EFFECTS_WITH_SIGNS. LEADS_WITH_SIGNS effects are tried for each."""
 
 
 def opposite_signs(
-    system: System, rows: Segments, catalogue: Sequence[type[Effect]], source: FitState, fitted: FitState | None
+    system: System, rows: Segments, catalogue: Sequence[type[Effect]], source: FitState
 ) -> Convention | None:
     """The convention in which the recording is far likelier than in the source's, if there is one.
 
-    `catalogue` are the effects that may be present, `source` is a fit of the source before bad readings were excluded,
-    `fitted` that to `rows`, if known.
+    `catalogue` are the effects that may be present, `source` is a fit of the source before bad readings were excluded.
     """
     profile = profile_of(system)
     if not profile.sign_conventions or float(source.log_process.max()) < SUSPICIOUS_LOG_PROCESS:
         return None
     required = MIN_GAIN_PER_READING * float(rows.used.sum())
-    as_given = Search(system, rows, catalogue, fitted)
+    # Loads as process noise keep positions and velocities so close to each other that a sensor which is late by a period
+    # is found from next to its delay alone, and a wrong sign from anywhere.
+    rows = replace(rows, jumps=True)
+    as_given = Search(system, rows, catalogue)
     conventions = [to_source(rows, convention) for convention in profile.sign_conventions]
     others = [Search(system, each, catalogue, rival=_likelihood(as_given)) for each in conventions]
     best = max(range(len(others)), key=lambda k: _likelihood(others[k]))
