@@ -43,8 +43,8 @@ def opposite_signs(
     if not profile.sign_conventions or float(source.log_process.max()) < SUSPICIOUS_LOG_PROCESS:
         return None
     required = MIN_GAIN_PER_READING * float(rows.used.sum())
-    # Loads as process noise keep positions and velocities so close to each other that a sensor which is late by a period
-    # is found from next to its delay alone, and a wrong sign from anywhere.
+    # Loads as process noise tie velocities to positions so closely that the delay of a sensor which is late by a period
+    # is found from next to it alone, but a wrong sign from anywhere.
     rows = replace(rows, jumps=True)
     as_given = Search(system, rows, catalogue)
     conventions = [to_source(rows, convention) for convention in profile.sign_conventions]
