@@ -196,9 +196,9 @@ def _explore(
     comparison = compare(search)
     repeats = repeated_reading_causes(prepared, search, comparison, repeating)
     again = staged(progress, "search with coloured noise")
-    search, comparison = with_coloured_noise(search, comparison, prepared.searched, again)
+    found = with_coloured_noise(search, comparison, prepared.searched, again)
     again = staged(progress, "search with jumps as noise")
-    search, comparison = or_with_jumps(search, comparison, rows, prepared.searched, candidates, again)
+    search, comparison = or_with_jumps(search, found, rows, prepared.searched, candidates, again)
     # Periodic effects may have got a phase for each episode.
     in_use = {effect.name: effect for effect in search.catalogue}
     named = [in_use.get(effect.name, effect) for effect in effects]
