@@ -220,7 +220,7 @@ def _in_signs_of_source(draft: _Draft, first: FitState, catalogue: Sequence[type
     """In the signs in which the recording is likeliest; `first` is the source's fit before readings were left out."""
     system, band = draft.readings.system, draft.defect
     rows = draft.rows.select(draft.searched)
-    convention = sensor_checks.opposite_signs(system, rows, catalogue, first)
+    convention = sensor_checks.opposite_signs(system, rows, catalogue, first, draft.source)
     if convention is None:
         return draft
     if band is not None and profile_of(system).angle_sensor[0] in convention.columns:

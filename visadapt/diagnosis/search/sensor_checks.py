@@ -33,26 +33,27 @@ MOST_EFFECTS_WITH_SIGNS. LEADS_WITH_SIGNS effects are tried for each."""
 
 
 def opposite_signs(
-    system: System, rows: Segments, catalogue: Sequence[type[Effect]], source: FitState
+    system: System, rows: Segments, catalogue: Sequence[type[Effect]], source: FitState, fitted: FitState | None
 ) -> Convention | None:
     """The convention in which the recording is far likelier than in the source's, if there is one.
 
-    `catalogue` are the effects that may be present, `source` is a fit of the source before bad readings were excluded.
+    `catalogue` are the effects that may be present, `source` is a fit of the source before bad readings were excluded,
+    `fitted` that to `rows`, if known.
     """
     profile = profile_of(system)
     if not profile.sign_conventions or float(source.log_process.max()) < SUSPICIOUS_LOG_PROCESS:
         return None
     required = MIN_GAIN_PER_READING * float(rows.used.sum())
-    # Loads as process noise tie velocities to positions so closely that the delay of a sensor which is late by a period
-    # is found from next to it alone, but a wrong sign from anywhere.
-    rows = replace(rows, jumps=True)
-    as_given = Search(system, rows, catalogue)
+    as_given = Search(system, rows, catalogue, fitted)
     conventions = [to_source(rows, convention) for convention in profile.sign_conventions]
     others = [Search(system, each, catalogue, rival=_likelihood(as_given)) for each in conventions]
     best = max(range(len(others)), key=lambda k: _likelihood(others[k]))
     other = others[best]
     if _ahead(other, as_given) <= required:
         return None
+    # A sensor that is late by a period can look like a wrong sign, and the screening does not see it.
+    for search in (as_given, other):
+        search.with_late_sensors()
     for added in range(MOST_EFFECTS_WITH_SIGNS):
         if added >= EFFECTS_WITH_SIGNS and not 0 < _ahead(other, as_given) <= required:
             break
