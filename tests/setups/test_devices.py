@@ -117,7 +117,7 @@ def test_the_second_device_refuses_tensors_of_the_first():
         assert (remote * torch.tensor(3.0)).cpu().tolist() == [3.0, 3.0]
         assert remote[torch.tensor([1])].cpu().tolist() == [1.0]
         for mix in (lambda: remote + here, lambda: torch.cat((remote, here)), lambda: here[remote.long()]):
-            with pytest.raises(RuntimeError, match=r"(two|same) device"):
+            with pytest.raises(RuntimeError, match="same device" if GPU else "tensors on two devices"):
                 mix()
 
 
@@ -200,4 +200,4 @@ def test_an_experiment_takes_the_actions_of_a_policy_on_another_device():
     here = actions(policy, va.CartPole(), history)
     with second_device():
         there = actions(policy.to(DEVICE), va.CartPole(), history)
-    assert torch.allclose(there, here, rtol=0, atol=1e-5 * GPU)
+    assert torch.allclose(there, here, rtol=0, atol=1e-5) if GPU else torch.equal(there, here)

@@ -191,8 +191,7 @@ def _explore(
     if announce is not None:
         announce(duration.announcement(rows, len(effects), duration.expected(search, rows), jobs))
     search.run(staged(progress, "search"))
-    if len(prepared.searched) < rows.shape[0]:
-        search = on_all_rows(search, rows)
+    search = on_all_rows(search, rows)
     comparison = compare(search)
     repeats = repeated_reading_causes(prepared, search, comparison, repeating)
     again = staged(progress, "search with coloured noise")

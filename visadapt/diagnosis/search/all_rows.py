@@ -17,10 +17,12 @@ must promise: less would not outweigh the prior odds."""
 
 
 def on_all_rows(search: Search, rows: Segments) -> Search:
-    """The best sets of a search, fitted to all rows, then with further effects.
+    """The best sets of a search, fitted to all rows, then with further effects; the search itself if it has all rows.
 
     All rows show weaker effects than the rows searched do.
     """
+    if search.rows.shape[0] == rows.shape[0]:
+        return search
     whole = Search(search.system, rows, search.catalogue, search.source.fits, search.jobs)
     close = [each for each in search.close() if each.effects][:FINALISTS]
     for group, effort in ((close[:1], CAREFUL), (close[1:], FINAL)):

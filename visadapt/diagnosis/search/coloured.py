@@ -45,8 +45,7 @@ def with_coloured_noise(
         begin = [(each.effects, each.fits.on(searched)) for each in other.close()[:START_FROM]]
         other = Search(search.system, rows.select(searched), search.catalogue, jobs=search.jobs)
         other.go_on_from(begin, progress)
-        if len(searched) < rows.shape[0]:
-            other = on_all_rows(other, rows)
+        other = on_all_rows(other, rows)
         found = compare_coloured(other, comparison)
         # The source predicts as it was fitted, with noise of its own.
         other.fitted[frozenset()] = search.source

@@ -45,8 +45,7 @@ def or_with_jumps(
     rows = replace(rows, jumps=True)
     other = Search(white.system, rows.select(searched), catalogue, jobs=white.jobs)
     other.run(progress)
-    if len(searched) < rows.shape[0]:
-        other = on_all_rows(other, rows)
+    other = on_all_rows(other, rows)
     if other.best.log_odds < white.best.log_odds + CLEARLY:
         return found
     return with_coloured_noise(other, compare(other), searched, progress)

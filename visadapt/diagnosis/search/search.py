@@ -75,7 +75,7 @@ class Search(FittedModels):
             for size in (1, 2):
                 bases = [f for f in self.ranked if len(f.effects) == size and f.log_odds > -math.inf]
                 self.extend(bases[:WIDEN_MODELS])
-            self.with_late_sensors()
+            self.try_late_sensors()
             self._settle(exchanged)
             self._phases_of_episodes()
         self._report(progress, MAX_EFFECTS)
@@ -149,7 +149,7 @@ class Search(FittedModels):
             before = self.best
             self.fit([less(before, [removed]) for removed in before.effects], QUICK, process_noise=False)
 
-    def with_late_sensors(self) -> None:
+    def try_late_sensors(self) -> None:
         """The source, the best set and the best single effects with each late sensor in addition.
 
         The screening, which is linear in the delay, does not see a sensor that is far too late. It keeps to states that

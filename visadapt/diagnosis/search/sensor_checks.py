@@ -53,7 +53,7 @@ def opposite_signs(
         return None
     # A sensor that is late by a period can look like a wrong sign, and the screening does not see it.
     for search in (as_given, other):
-        search.with_late_sensors()
+        search.try_late_sensors()
     for added in range(MOST_EFFECTS_WITH_SIGNS):
         if added >= EFFECTS_WITH_SIGNS and not 0 < _ahead(other, as_given) <= required:
             break
