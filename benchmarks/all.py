@@ -187,6 +187,19 @@ COMMANDS = (
         extra="baselines",
     ),
     Command(
+        "baselines_flight",
+        "baselines_flight.csv",
+        (
+            "benchmarks.baselines",
+            *("--baselines", "mpc", "ppo", "pets"),
+            *("--experiments", "quadrotor, drag", "fixed wing, drag", "--episodes", "20"),
+            *("--out", "results/baselines_flight.csv", "--picture", "assets/baselines_flight.png"),
+        ),
+        50,
+        work="--work",
+        extra="baselines",
+    ),
+    Command(
         "rotorpy",
         "rotorpy.csv",
         ("train.rotorpy_quadrotor", "--seeds", "0", "1", "2"),

@@ -6,9 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchmarks.baselines import ours
-from benchmarks.baselines.problem import Problem, Sizes, Stage
+from benchmarks.baselines.cartpole import CartPoleProblem
+from benchmarks.baselines.problem import Sizes, Stage
 
 
-def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:
+def stages(problem: CartPoleProblem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:
     """As those of `ours`."""
     yield from ours.stages(problem, sizes, folder, seed, diagnose=True)

@@ -2,31 +2,35 @@
 
 At each step, by multiple shooting over the horizon of 10, warm-started with the last plan,
 
-    minimise   C(s_1..s_K, a_0..a_{K-1})                 of `COST`, the cost of all
+    minimise   |e(s_1..s_K, a_0..a_{K-1})|^2             errors e, weighted as in the cost that all are set
     subject to s_{k+1} = f(s_k, a_k) + Delta(history_k)   and |a_k| <= 1
 
 f is the source (Runge-Kutta, a step a period); Delta is the residual, on the past and the planned states and commands,
-as an expression of its weights. The Hessian is Gauss-Newton's. Where IPOPT does not converge its last iterate is used.
+as an expression of its weights (`symbolic`). The Hessian is Gauss-Newton's. Where IPOPT does not converge its last
+iterate is used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from benchmarks.baselines.problem import COST, Problem, Sizes, Stage, grounded
+from benchmarks.baselines.cartpole import COST
+from benchmarks.baselines.problem import Problem, Sizes, Stage, grounded
+from benchmarks.baselines.symbolic import step, weights
 from visadapt.effects import Residual
 from visadapt.history import HORIZON, LENGTH, History
 from visadapt.policies import Policy
-from visadapt.policies.networks import ACCELERATION_UNIT, StateResidualNetwork
-from visadapt.systems import CartPole
-from visadapt.tasks.balance import RegulatorCost
+from visadapt.systems import CartPole, FixedWing, Quadrotor, RigidBody, System
+from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
+from visadapt.tasks.follow import FollowCost
+from visadapt.tasks.reach import Reach
 from visadapt.world import World
 
 OPTIONS = {
@@ -48,14 +52,14 @@ OPTIONS = {
     "calc_lam_p": False,
 }
 LOST = 0.6
-"""rad, beyond which nothing is solved: the episode has ended at half of it"""
+"""rad of a cart-pole, beyond which nothing is solved: the episode has ended at half of it"""
 
 
 class ModelPredictive(Policy):
     """Plans by solving a `Program` at each step, for each episode of a batch by itself."""
 
     def __init__(self, program: Program, residual: Residual | None = None) -> None:
-        super().__init__(4, 1)
+        super().__init__(program.n_state, program.n_action)
         self.program = program
         self.weights = weights(residual)
         self.warm: list[dict[str, Any] | None] = []
@@ -64,141 +68,145 @@ class ModelPredictive(Policy):
         if len(self.warm) != len(history.actions):
             self.warm = [None] * len(history.actions)
         first = history.begins.tolist()
-        past = torch.cat((history.observations.flatten(1), history.actions[:, 1:].flatten(1)), 1).double().numpy()
-        commands = [self._solve(b, past[b], fresh) for b, fresh in enumerate(first)]
-        return torch.tensor(commands, dtype=history.actions.dtype)[:, None]
+        shown, done = history.observations.double(), history.actions[:, 1:].double()
+        past = torch.cat((shown[..., : self.n_state].flatten(1), done.flatten(1)), 1).numpy()
+        goals = shown[:, -1, self.n_state :].numpy()
+        commands = [self._solve(b, past[b], goals[b], fresh) for b, fresh in enumerate(first)]
+        return torch.tensor(np.array(commands), dtype=history.actions.dtype)
 
-    def _solve(self, b: int, past: np.ndarray, fresh: bool) -> float:
-        now = past[4 * (LENGTH - 1) : 4 * LENGTH]
-        if not np.isfinite(past).all() or abs(now[2]) > LOST:
-            return 0.0
+    def _solve(self, b: int, past: np.ndarray, goal: np.ndarray, fresh: bool) -> np.ndarray:
+        now = past[self.n_state * (LENGTH - 1) : self.n_state * LENGTH]
+        if not np.isfinite(past).all() or (isinstance(self.program.system, CartPole) and abs(now[2]) > LOST):
+            return np.zeros(self.n_action)
         warm = None if fresh else self.warm[b]
         if warm is None:
-            warm = {"x0": np.concatenate((np.zeros(HORIZON), np.tile(now, HORIZON)))}
-        found = self.program.solver(p=np.concatenate((past, self.weights)), **self.program.bounds, **warm)
+            warm = {"x0": np.concatenate((np.zeros(HORIZON * self.n_action), np.tile(now, HORIZON)))}
+        given = np.concatenate((past, goal, self.weights))
+        found = self.program.solver(p=given, **self.program.bounds, **warm)
         plan = np.array(found["x"]).ravel()
         if not np.isfinite(plan).all():
             self.warm[b] = None
-            return 0.0
-        self.warm[b] = {"x0": onward(plan), "lam_x0": found["lam_x"], "lam_g0": found["lam_g"]}
-        return float(np.clip(plan[0], -1, 1))
+            return np.zeros(self.n_action)
+        self.warm[b] = {"x0": self._onward(plan), "lam_x0": found["lam_x"], "lam_g0": found["lam_g"]}
+        return np.clip(plan[: self.n_action], -1, 1)
+
+    def _onward(self, plan: np.ndarray) -> np.ndarray:
+        """A plan (commands, then states) a step on, its last step repeated."""
+        commands = plan[: HORIZON * self.n_action].reshape(HORIZON, -1)
+        states = plan[HORIZON * self.n_action :].reshape(HORIZON, -1)
+        return np.concatenate([np.concatenate((each[1:], each[-1:])).ravel() for each in (commands, states)])
 
 
-def onward(plan: np.ndarray) -> np.ndarray:
-    """A plan (commands, then states) a step on, its last step repeated."""
-    commands, states = plan[:HORIZON], plan[HORIZON:].reshape(HORIZON, -1)
-    return np.concatenate((commands[1:], commands[-1:], states[1:].ravel(), states[-1]))
+class FlightPredictive(ModelPredictive):
+    """The same, of a vehicle, which is shown its goal."""
+
+    shown = "state and goal"
 
 
 class Program:
     """The solver and its bounds.
 
-    Its variables are commands, then states; its parameters the past states and commands, oldest first, then the
-    residual's `weights`, so that a residual that has learnt more needs no other program.
+    Its variables are commands, then states; its parameters the past states and commands, oldest first, then what the
+    policy is shown as its goal, then the residual's `weights`, so that a residual that has learnt more needs no other
+    program.
     """
 
-    def __init__(self, source: World, cost: RegulatorCost, residual: Residual | None = None) -> None:
+    def __init__(self, source: World, errors: Errors, n_goal: int = 0, residual: Residual | None = None) -> None:
+        self.system = source.system
+        n_state, n_action = len(self.system.states), len(self.system.actions)
+        self.n_state, self.n_action = n_state, n_action
         model = step(source, residual)
-        commands, states = ca.MX.sym("a", HORIZON), ca.MX.sym("s", 4, HORIZON)
-        past, learnt = ca.MX.sym("past", 4 * LENGTH + LENGTH - 1), ca.MX.sym("weights", len(weights(residual)))
-        seen = [past[4 * k : 4 * (k + 1)] for k in range(LENGTH)]
-        done = [past[4 * LENGTH + k] for k in range(LENGTH - 1)]
-        total, gaps = 0, []
+        variables = ca.SX.sym("plan", (n_action + n_state) * HORIZON)
+        commands = ca.reshape(variables[: n_action * HORIZON], n_action, HORIZON)
+        states = ca.reshape(variables[n_action * HORIZON :], n_state, HORIZON)
+        past = ca.SX.sym("past", n_state * LENGTH + n_action * (LENGTH - 1))
+        goal, learnt = ca.SX.sym("goal", n_goal), ca.SX.sym("weights", len(weights(residual)))
+        seen = ca.vertsplit(past[: n_state * LENGTH], n_state)
+        done = ca.vertsplit(past[n_state * LENGTH :], n_action)
+        now, gaps = seen[-1], []
         for k in range(HORIZON):
-            seen, done = [*seen[-LENGTH:], states[:, k]], [*done[1 - LENGTH :], commands[k]]
-            gaps.append(model(ca.vertcat(*seen[:-1]), ca.vertcat(*done), learnt) - states[:, k])
-            total += ca.dot(ca.DM(cost.state) * states[:, k], states[:, k]) + cost.action * commands[k] ** 2
-        total += ca.dot(ca.DM(cost.to_go) @ states[:, -1], states[:, -1])
-        variables, given, gap = ca.vertcat(commands, ca.vec(states)), ca.vertcat(past, learnt), ca.vertcat(*gaps)
-        options = {**OPTIONS, "hess_lag": _curvature(cost, given, gap)}
-        self.solver = ca.nlpsol("plan", "ipopt", {"x": variables, "p": given, "f": total, "g": gap}, options)
-        low = np.concatenate((-np.ones(HORIZON), np.full(4 * HORIZON, -np.inf)))
+            done = [*done[1 - LENGTH :], commands[:, k]]
+            gaps.append(model(ca.vertcat(*seen[-LENGTH:]), ca.vertcat(*done), learnt) - states[:, k])
+            seen.append(states[:, k])
+        error, gap, given = errors(states, commands, now, goal), ca.vertcat(*gaps), ca.vertcat(past, goal, learnt)
+        problem = {"x": variables, "p": given, "f": ca.sumsqr(error), "g": gap}
+        self.solver = ca.nlpsol("plan", "ipopt", problem, {**OPTIONS, "hess_lag": _curvature(problem, error)})
+        low = np.concatenate((-np.ones(n_action * HORIZON), np.full(n_state * HORIZON, -np.inf)))
         self.bounds = {"lbx": low, "ubx": -low, "lbg": 0, "ubg": 0}
 
 
-def _curvature(cost: RegulatorCost, given: Any, gap: Any) -> Any:
+def _curvature(problem: dict[str, Any], error: Any) -> Any:
     """The Hessian of the cost alone (Gauss-Newton): of the constraints' curvature little is left where they hold."""
-    hessian = 2 * np.diag([cost.action] * HORIZON + list(cost.state) * HORIZON)
-    hessian[-4:, -4:] += 2 * np.array(cost.to_go)
-    symbols = [ca.MX.sym(name, size) for name, size in (("x", 5 * HORIZON), ("p", given.numel()), ("lam_f", 1))]
-    symbols.append(ca.MX.sym("lam_g", gap.numel()))
-    return ca.Function("curvature", symbols, [symbols[2] * ca.sparsify(ca.DM(np.triu(hessian)))])
+    slope = ca.jacobian(error, problem["x"])
+    weight, ignored = ca.SX.sym("lam_f"), ca.SX.sym("lam_g", problem["g"].numel())
+    hessian = ca.triu(2 * weight * ca.mtimes(slope.T, slope))
+    return ca.Function("curvature", [problem["x"], problem["p"], weight, ignored], [hessian])
 
 
-def step(source: World, residual: Residual | None) -> Any:
-    """The state after a period, of the last LENGTH states and commands, the present ones last, and `weights`."""
-    system = source.system
-    assert isinstance(system, CartPole)
-    states, commands = ca.MX.sym("states", 4 * LENGTH), ca.MX.sym("commands", LENGTH)
-    now, command, h = states[-4:], commands[-1], source.period
-    k1 = derivative(system, now, command)
-    k2 = derivative(system, now + h / 2 * k1, command)
-    k3 = derivative(system, now + h / 2 * k2, command)
-    k4 = derivative(system, now + h * k3, command)
-    after = now + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    learnt = ca.MX.sym("weights", len(weights(residual)))
-    if residual is not None:
-        after += correction(system, residual, states, commands, learnt)
-    return ca.Function("step", [states, commands, learnt], [after])
+Errors = Callable[[Any, Any, Any, Any], Any]
+"""Of planned states (n_state, K) and commands (n_action, K), the present state and the goal: a column of weighted
+errors, whose squares add up to the cost of the plan."""
 
 
-def derivative(system: Any, state: Any, command: Any) -> Any:
-    """The equations of `CartPole.derivative` without loads."""
-    velocity, angle, turning = state[1], state[2], state[3]
-    mass, moment = system.cart_mass + system.pole_mass, system.pole_mass * system.pole_half_length
-    sine, cosine = ca.sin(angle), ca.cos(angle)
-    push = (system.max_force * command + moment * turning**2 * sine) / mass
-    inertia = system.pole_half_length * (4 / 3 - system.pole_mass * cosine**2 / mass)
-    spin = (system.gravity * sine - cosine * push) / inertia
-    return ca.vertcat(velocity, push - moment * spin * cosine / mass, turning, spin)
+def rest_errors(states: Any, commands: Any, now: Any, goal: Any) -> Any:
+    """Of a cart-pole: `COST`, the distances from rest and what coming to rest costs after the last planned state."""
+    to_go = np.linalg.cholesky(np.array(COST.to_go)).T
+    weighted = ca.DM(np.sqrt(COST.state)) * states
+    return ca.vertcat(ca.vec(weighted), COST.action**0.5 * ca.vec(commands), ca.mtimes(ca.DM(to_go), states[:, -1]))
 
 
-def weights(residual: Residual | None) -> np.ndarray:
-    """The residual's scale, weights (column after column) and biases, one after the other; nothing without one."""
-    if residual is None:
-        return np.zeros(0)
-    each = [residual.scale, *(part.T if part.dim() == 2 else part for part in residual.network.parameters())]
-    return torch.cat([part.detach().double().flatten() for part in each]).numpy()
+def follow_errors(states: Any, commands: Any, now: Any, goal: Any) -> Any:
+    """Of a quadrotor: `FollowCost` without its weight on turning, since how the reference turns is not shown."""
+    cost = FollowCost()
+    away = states[: VELOCITY.stop, :] - ca.reshape(goal, VELOCITY.stop, HORIZON)
+    return ca.vertcat(
+        cost.position**0.5 * ca.vec(away[POSITION, :]),
+        cost.velocity**0.5 * ca.vec(away[VELOCITY, :]),
+        cost.action**0.5 * ca.vec(commands),
+    )
 
 
-def correction(system: CartPole, residual: Residual, states: Any, commands: Any, learnt: Any) -> Any:
-    """What the residual adds: `StateResidualNetwork` as an expression of its `weights`."""
-    network = residual.network
-    assert isinstance(network, StateResidualNetwork)
-    out = ca.vertcat(states[-4:], commands[-1])
-    if network.system is not None:
-        each, unexplained = [states[4 * k : 4 * (k + 1)] for k in range(LENGTH)], []
-        for k in range(LENGTH - 1):
-            ends = [derivative(system, each[end], commands[k]) for end in (k, k + 1)]
-            missing = (each[k + 1] - each[k]) / network.period - (ends[0] + ends[1]) / 2
-            unexplained += [missing[1] / ACCELERATION_UNIT, missing[3] / ACCELERATION_UNIT]
-        out = ca.vertcat(states, commands, *unexplained)
-    first = len(residual.scale)
-    for layer in network.head if isinstance(network.head, nn.Sequential) else [network.head]:
-        if not isinstance(layer, nn.Linear):
-            out = ca.tanh(out)
-            continue
-        rows, columns = layer.weight.shape
-        weight = ca.reshape(learnt[first : first + rows * columns], rows, columns)
-        first += rows * columns
-        out = weight @ out
-        if layer.bias is not None:
-            out += learnt[first : first + rows]
-            first += rows
-    return learnt[: len(residual.scale)] * out
+def reach_errors(states: Any, commands: Any, now: Any, goal: Any) -> Any:
+    """Of a fixed wing: the cost of `Reach`, along and across the straight line from where it is to the point."""
+    task = Reach()
+    to = goal - now[POSITION]
+    way = to / ca.fmax(ca.norm_2(to), 1e-3)
+    steps = task.speed * task.period * ca.DM(range(1, HORIZON + 1)).T
+    away = states[POSITION, :] - now[POSITION] - ca.mtimes(way, steps)
+    along = ca.mtimes(way.T, away)
+    return ca.vertcat(
+        task.along**0.5 * ca.vec(along),
+        task.across**0.5 * ca.vec(away - ca.mtimes(way, along)),
+        task.rates**0.5 * ca.vec(states[RATES, :]),
+        task.action**0.5 * ca.vec(commands),
+    )
+
+
+ERRORS: dict[type[System], tuple[Errors, int]] = {
+    CartPole: (rest_errors, 0),
+    Quadrotor: (follow_errors, 6 * HORIZON),
+    FixedWing: (reach_errors, 3),
+}
+"""Of each system: the errors that its plans minimise, and how many numbers its goal has."""
+
+
+def planned(source: World, program: Program | None = None, residual: Residual | None = None) -> ModelPredictive:
+    """The planner of a source, with a residual or without; `program` is made where none is given."""
+    if program is None:
+        errors, n_goal = ERRORS[type(source.system)]
+        program = Program(source, errors, n_goal, residual)
+    kind = FlightPredictive if isinstance(source.system, RigidBody) else ModelPredictive
+    return kind(program, residual)
 
 
 def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:
     """On the source, then with the residual."""
     source = problem.setup(sizes).source
-    bare = Program(source, COST)
-    learning: list[Program] = []
+    programs: dict[bool, Program] = {}
 
     def planner(residual: Residual | None) -> Policy:
-        if residual is None:
-            return ModelPredictive(bare)
-        if not learning:
-            learning.append(Program(source, COST, residual))
-        return ModelPredictive(learning[0], residual)
+        policy = planned(source, programs.get(residual is not None), residual)
+        programs[residual is not None] = policy.program
+        return policy
 
     yield from grounded(problem, sizes, seed, planner)

@@ -16,7 +16,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from benchmarks.baselines.problem import COST, Problem, Sizes, Stage, grounded
+from benchmarks.baselines.cartpole import COST
+from benchmarks.baselines.problem import Problem, Sizes, Stage, grounded
 from visadapt.effects import Residual
 from visadapt.history import HORIZON, History
 from visadapt.learning.plans import imagine

@@ -16,7 +16,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage, drawn, source_policy
+from benchmarks.baselines.cartpole import CartPoleProblem, source_policy
+from benchmarks.baselines.problem import TUNING_SEED, Sizes, Stage, drawn
 from visadapt.evaluation import score
 from visadapt.history import History
 from visadapt.policies import Policy
@@ -52,7 +53,7 @@ class DisturbanceObserver(Policy):
         return (self.policy.act(history) - self.disturbance).clamp(-1, 1)
 
 
-def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:
+def stages(problem: CartPoleProblem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:
     """The source policy with the share that loses the fewest episodes in the source, and of these is slowest."""
     policy, source = source_policy(problem, sizes, folder.parents[2], seed), problem.setup(sizes).source
     disturbed = SyntheticTarget(lambda batch, generator: (drawn(problem.kind, batch, generator),))

@@ -6,10 +6,11 @@ import copy
 from collections.abc import Iterator
 from pathlib import Path
 
-from benchmarks.baselines.problem import Problem, Sizes, Stage, source_policy
+from benchmarks.baselines.cartpole import CartPoleProblem, source_policy
+from benchmarks.baselines.problem import Sizes, Stage
 
 
-def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int, diagnose: bool = False) -> Iterator[Stage]:
+def stages(problem: CartPoleProblem, sizes: Sizes, folder: Path, seed: int, diagnose: bool = False) -> Iterator[Stage]:
     """The source policy, and adapted as in `benchmarks.cartpole_states`.
 
     With `diagnose` each number of samples is one round, since a diagnosis takes the longer the more rounds there are.

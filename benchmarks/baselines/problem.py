@@ -1,21 +1,22 @@
 """The problems that every baseline is set, and what several baselines share.
 
 A baseline is a module with `stages(problem, sizes, folder, seed)`, which yields the policies that are scored. What they
-have in common: the paper's CartPole as source, the hidden effects, the cost (`COST` over a horizon of 10),
-the starts, and a ledger that counts every step of the target.
+have in common: the source, the hidden effect, the cost of a plan, the starts, and a ledger that counts every step of
+the target. The problems themselves are in `cartpole` and `flights`.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import torch
 
-from benchmarks.cartpole_states import CONSTANT, FORCE, SINE
-from visadapt.effects import ActuatorDelay, ConstantForce, CoulombFriction, Effect, PeriodicForce, Residual
+from experiments.result_tables import Row
+from visadapt.effects import Effect, Residual
 from visadapt.effects.base import Role
 from visadapt.learning.grounding import ground, rescale
 from visadapt.learning.ledger import Ledger
@@ -24,14 +25,8 @@ from visadapt.learning.transitions import Transitions
 from visadapt.policies import Policy
 from visadapt.recordings import Episode
 from visadapt.setups.base import Setup
-from visadapt.setups.cartpole import REST_WEIGHTS, cartpole_states, from_states
-from visadapt.systems import CartPole
-from visadapt.targets import SyntheticTarget, constant_force, sine_force
-from visadapt.tasks.balance import Cost, RegulatorCost, cost_to_go
-from visadapt.world import World
+from visadapt.targets import Target
 
-COST = RegulatorCost(REST_WEIGHTS, to_go=cost_to_go(World(CartPole()), REST_WEIGHTS, Cost.action))
-"""What ours is tuned with: the distances from rest, and what coming to rest costs after the last planned state."""
 TUNING_SEED = 100
 """Of whatever chooses a setting: neither that of a training, which counts from 0, nor that of the scores."""
 
@@ -62,44 +57,34 @@ SMOKE = Sizes(2, ((20, 20),), (20,), 3, 2, 4096, 4096, 20)
 
 
 @dataclass(frozen=True)
-class Problem:
-    """A CartPole from states under a hidden effect."""
+class Problem(ABC):
+    """A system under a hidden effect, from states."""
 
     name: str
-    hidden: Callable[[int, torch.Generator], Sequence[Effect]]
-    kind: type[Effect]
-    """what is hidden: told to those alone that need it, and the table says which"""
+
     with_history: bool
     """whether policies and models see 5 states and actions, or the last alone"""
 
+    @abstractmethod
     def setup(self, sizes: Sizes) -> Setup:
         """Ours: source, policy, residual and settings."""
-        settings = from_states(World(CartPole())).shortened(sizes.iterations)
-        settings = replace(settings, tuning=replace(settings.tuning, iterations=sizes.tuning))
-        return cartpole_states(with_history=self.with_history, settings=settings)
 
-    def target(self) -> SyntheticTarget:
-        """A new target."""
-        return SyntheticTarget(self.hidden)
+    @abstractmethod
+    def target(self) -> Target:
+        """A new target to learn from."""
 
+    @abstractmethod
+    def scored(self, domain: str) -> Target:
+        """A new target to score a policy in; without the hidden effect where the domain is the source."""
 
-def _friction(batch: int, generator: torch.Generator) -> Sequence[Effect]:
-    return (CoulombFriction(force=4.0),)
+    @abstractmethod
+    def row(self, method: str, domain: str, samples: int, scores: Sequence[Path]) -> Row:
+        """The table's row of the scores that the seeds have kept."""
 
-
-def _delay(batch: int, generator: torch.Generator) -> Sequence[Effect]:
-    return (ActuatorDelay(delay=0.08),)
-
-
-PROBLEMS = {
-    problem.name: problem
-    for problem in (
-        Problem(CONSTANT, constant_force(FORCE), ConstantForce, with_history=False),
-        Problem(SINE, sine_force, PeriodicForce, with_history=True),
-        Problem("CartPole, states, dry friction 4 N", _friction, CoulombFriction, with_history=True),
-        Problem("CartPole, states, delay 0.08 s", _delay, ActuatorDelay, with_history=True),
-    )
-}
+    @property
+    def sizes(self) -> Sizes:
+        """How much is computed at full size."""
+        return Sizes()
 
 
 @dataclass(frozen=True)
@@ -180,9 +165,3 @@ def drawn(kind: type[Effect], batch: int, generator: torch.Generator) -> Effect:
         else:
             values[parameter.name] = low + (high - low) * share
     return kind(**values)
-
-
-def source_policy(problem: Problem, sizes: Sizes, work: Path, seed: int) -> Policy:
-    """The policy of ours in the source, trained once for all that begin with it."""
-    folder = work / ("source-history" if problem.with_history else "source")
-    return problem.setup(sizes).pretrain(folder / f"seed-{seed}.safetensors", seed)

@@ -12,7 +12,9 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.baselines.problem import Problem, Sizes, Stage, drawn
+from benchmarks.baselines.cartpole import CartPoleProblem
+from benchmarks.baselines.problem import Sizes, Stage, drawn
+from visadapt.learning.policy import tune
 from visadapt.setups.cartpole import cartpole_states
 from visadapt.tasks.balance import EPISODE_STEPS
 
@@ -20,7 +22,7 @@ DRAWS = EPISODE_STEPS
 """one for each stream; as many as streams are probed with for a dependence on time"""
 
 
-def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:
+def stages(problem: CartPoleProblem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:
     """One policy, trained as the source policy of ours is, with a draw of the effect in each stream."""
     setup = cartpole_states(with_history=True)
     effect = drawn(problem.kind, DRAWS, torch.Generator().manual_seed(seed))
@@ -28,8 +30,11 @@ def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[
     assert settings.refinement is not None
     # Each stream keeps its draw, so that no batch can be drawn from what other streams passed through.
     refinement = replace(settings.refinement, batch=DRAWS, streams=None, every=1)
-    settings = replace(settings, source=replace(settings.source, batch=DRAWS), refinement=refinement)
-    trained = replace(setup, source=setup.source.with_effects([effect]), settings=settings)
-    policy = trained.pretrain(folder / "policy.safetensors", seed)
+    world = setup.source.with_effects([effect])
+    torch.manual_seed(seed)
+    policy = setup.policy()
+    for number, how in enumerate((replace(settings.source, batch=DRAWS), refinement)):
+        tune(policy, world, None, how, torch.Generator().manual_seed(seed + number))
+    policy.eval()
     yield Stage("source", 0, policy)
     yield Stage("target", 0, policy)

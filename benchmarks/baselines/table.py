@@ -1,10 +1,13 @@
 """What else one could use, on the same task, cost, inputs, starts, budgets and 100 scored episodes as ours.
 
     python -m benchmarks.baselines [--baselines ppo mpc] [--smoke]
+    python -m benchmarks.baselines --baselines mpc ppo pets --experiments 'quadrotor, drag' 'fixed wing, drag' \
+        --out results/baselines_flight.csv --picture assets/baselines_flight.png
 
-CartPole from states under hidden effects (`benchmarks.baselines.problem`). Each baseline is scored in the source, in
-the target before it has seen any of it, and after 50, 100, 200, 500 and 1,000 counted samples; PPO up to 200,000. The
-CPU time of one action is measured over an episode of a single machine, on one thread.
+CartPole from states under hidden effects (`cartpole`), and the vehicles under drag (`flights`), of which ours is in
+`benchmarks.flight`. Each baseline is scored in the source, in the target before it has seen any of it, and after 50 to
+1,000 counted samples, on vehicles after every round; PPO up to 200,000. The CPU time of one action is measured over an
+episode of a single machine, on one thread.
 
 Writes results/baselines.csv and assets/baselines.png. Interrupt it anywhere; started again, it goes on.
 """
@@ -21,15 +24,16 @@ from typing import Any
 
 import torch
 
-from benchmarks.baselines.problem import PROBLEMS, SMOKE, Sizes, score_path, source_policy
+from benchmarks.baselines.cartpole import CARTPOLES, CartPoleProblem, source_policy
+from benchmarks.baselines.flights import FLIGHTS
+from benchmarks.baselines.problem import SMOKE, Problem, Sizes, score_path
 from experiments.curves import Chart, plot_charts
 from experiments.kept_scores import kept_score
 from experiments.parallel import in_processes
-from experiments.result_tables import ACTION_TIME, Row, print_speed, read_rows, speed_row, write_rows
-from visadapt.evaluation import CartPoleScore
+from experiments.result_tables import ACTION_TIME, Row, read_rows, write_rows
 from visadapt.policies import Policy
 from visadapt.storage.run_folder import open_run, read_json, write_json
-from visadapt.targets import SyntheticTarget, Target
+from visadapt.targets import Target
 from visadapt.targets.rollout import run
 
 BASELINES = {
@@ -43,6 +47,9 @@ BASELINES = {
     "randomised": "domain randomisation",
 }
 """Module of this room: method in the table"""
+ON_VEHICLES = ("mpc", "ppo", "pets")
+"""Of BASELINES: those that are written for vehicles too."""
+PROBLEMS: dict[str, Problem] = {problem.name: problem for problem in (*CARTPOLES, *FLIGHTS)}
 ACTION, DONE = "action.json", "done.json"
 SMOKE_STEPS = 10
 """of an episode that is scored, where the numbers mean nothing"""
@@ -78,7 +85,11 @@ def main(settings: Settings) -> None:
     jobs = [
         (name, experiment, seed) for seed in seeds for experiment in settings.experiments for name in settings.baselines
     ]
-    sources = {(PROBLEMS[experiment].with_history, seed): experiment for _, experiment, seed in jobs}
+    for name, experiment, _ in jobs:
+        if name not in ON_VEHICLES and not isinstance(PROBLEMS[experiment], CartPoleProblem):
+            raise SystemExit(f"{name} is not written for vehicles; there are {', '.join(ON_VEHICLES)}")
+    carts = [(experiment, seed) for _, experiment, seed in jobs if isinstance(PROBLEMS[experiment], CartPoleProblem)]
+    sources = {(PROBLEMS[experiment].with_history, seed): experiment for experiment, seed in carts}
     in_processes(_source, settings, [(experiment, seed) for (_, seed), experiment in sources.items()])
     in_processes(_scores, settings, jobs)
     rows = [
@@ -90,21 +101,19 @@ def main(settings: Settings) -> None:
     write_rows(settings.out, rows)
     _draw(settings)
     for row in rows:
-        print(f"{row.experiment:40}", end="")
-        if row.measure == ACTION_TIME:
-            print(f"{row.method:24} {row.mean:8.3f} ms an action")
-        else:
-            print_speed(row)
+        counted = "" if row.measure == ACTION_TIME else f"{row.domain} {row.samples} samples, {row.failed} failed"
+        print(f"{row.experiment:40}{row.method:24} {row.mean:8.3f} +- {row.std:.3f} {row.unit}  {counted}")
 
 
 def _rows(experiment: str, method: str, folders: Sequence[Path]) -> list[Row]:
     """The rows of a method, of the scores that its seeds have left in their folders so far."""
-    found: dict[tuple[str, int], list[CartPoleScore]] = {}
+    found: dict[tuple[str, int], list[Path]] = {}
     for path in sorted(path for folder in folders for path in folder.glob("score-*.json")):
         _, domain, samples = path.stem.split("-")
-        found.setdefault((domain, int(samples)), []).append(CartPoleScore(**read_json(path)))
+        found.setdefault((domain, int(samples)), []).append(path)
     order = sorted(found, key=lambda key: (key[0] == "adapted", key[0] == "target", key[1]))
-    rows = [speed_row(experiment, method, domain, samples, found[domain, samples]) for domain, samples in order]
+    problem = PROBLEMS[experiment]
+    rows = [problem.row(method, domain, samples, found[domain, samples]) for domain, samples in order]
     timed = [read_json(path) for folder in folders if (path := folder / ACTION).exists()]
     if timed:
         times = [each["ms"] for each in timed]
@@ -126,26 +135,29 @@ def _draw(settings: Settings) -> None:
         learning = {row["method"] for row in adapted}
         still = [row for row in own if row["domain"] == "target" and row["method"] not in learning]
         level = [{**row, "samples": end} for row in still for end in ends]
-        charts.append(Chart(experiment, "mean cart speed, m/s", [*adapted, *level]))
+        charts.append(Chart(experiment, f"{own[0]['measure']}, {own[0]['unit']}", [*adapted, *level]))
     plot_charts(settings.picture, charts, columns=min(len(charts), 2))
 
 
 def _source(settings: Settings, experiment: str, seed: int) -> None:
     torch.set_num_threads(1)
-    source_policy(PROBLEMS[experiment], _sizes(settings), settings.work, seed)
+    problem = PROBLEMS[experiment]
+    assert isinstance(problem, CartPoleProblem)
+    source_policy(problem, _sizes(settings, problem), settings.work, seed)
 
 
 def _scores(settings: Settings, name: str, experiment: str, seed: int) -> None:
     """Leave the scores of a job in its folder, and the time of an action of the last policy that was scored."""
     torch.set_num_threads(1)
-    problem, sizes, steps = PROBLEMS[experiment], _sizes(settings), SMOKE_STEPS if settings.smoke else None
+    problem, steps = PROBLEMS[experiment], SMOKE_STEPS if settings.smoke else None
+    sizes = _sizes(settings, problem)
     folder = _folder(settings, name, experiment, seed)
     open_run(folder, {"seed": seed, **asdict(sizes)})
     if (folder / DONE).exists():
         return
     for stage in _module(name).stages(problem, sizes, folder, seed):
-        where = SyntheticTarget() if stage.domain == "source" else problem.target()
-        found = kept_score(score_path(folder, stage), stage.policy, where, sizes.episodes, steps)
+        path, where = score_path(folder, stage), problem.scored(stage.domain)
+        found = kept_score(path, stage.policy, where, sizes.episodes, steps)
         about = {"domain": stage.domain, "samples": stage.samples}
         write_json(folder / ACTION, {**about, "ms": action_time(stage.policy, problem.target())})
         print(f"{name}, {problem.name}, seed {seed}, {stage.domain} {stage.samples}: {found}", flush=True)
@@ -170,8 +182,8 @@ def action_time(policy: Policy, target: Target, steps: int = 50) -> float:
     return statistics.median(times)
 
 
-def _sizes(settings: Settings) -> Sizes:
-    return SMOKE if settings.smoke else Sizes(episodes=settings.episodes)
+def _sizes(settings: Settings, problem: Problem) -> Sizes:
+    return SMOKE if settings.smoke else replace(problem.sizes, episodes=settings.episodes)
 
 
 def _folder(settings: Settings, name: str, experiment: str, seed: int) -> Path:

@@ -1,17 +1,20 @@
 """The baselines are set the same problem, and their models are what they say."""
 
 import csv
+from functools import partial
 
 import pytest
 import torch
 
-from benchmarks.baselines.problem import COST, PROBLEMS, drawn
-from benchmarks.baselines.table import BASELINES, Settings, main
+from benchmarks.baselines.problem import drawn
+from benchmarks.baselines.table import BASELINES, PROBLEMS, Settings, main
 from benchmarks.cartpole_states import SINE
 from visadapt.effects import ConstantForce, PeriodicForce, Residual
 from visadapt.history import LENGTH, History
-from visadapt.policies.networks import StateResidualNetwork
-from visadapt.systems import CartPole
+from visadapt.policies.networks import FlightResidualNetwork, StateResidualNetwork
+from visadapt.setups.policy_file import source_steps
+from visadapt.systems import CartPole, FixedWing, Quadrotor
+from visadapt.targets import SyntheticTarget
 from visadapt.world import World
 
 
@@ -33,7 +36,7 @@ def random_history(batch):
 @pytest.mark.parametrize("with_history", [False, True])
 def test_the_model_of_the_mpc_is_the_world_with_the_residual(with_history):
     pytest.importorskip("casadi")
-    from benchmarks.baselines.mpc import step, weights
+    from benchmarks.baselines.symbolic import step, weights
 
     residual, history = residual_that_is_not_zero(with_history).double(), random_history(5)
     history = history.map(torch.Tensor.double)
@@ -46,9 +49,34 @@ def test_the_model_of_the_mpc_is_the_world_with_the_residual(with_history):
         assert found.full().ravel() == pytest.approx(expected[b].numpy(), abs=1e-9)
 
 
+@pytest.mark.parametrize("with_history", [False, True])
+@pytest.mark.parametrize("kind", [Quadrotor, FixedWing])
+def test_the_model_of_the_mpc_of_a_vehicle_is_the_world_with_the_residual(kind, with_history):
+    pytest.importorskip("casadi")
+    from benchmarks.baselines.symbolic import step, weights
+
+    source = World(kind(), period=0.1, substeps=2)
+    network = FlightResidualNetwork(kind(), 0.1, partial(source_steps, source) if with_history else None).double()
+    assert isinstance(network.head, torch.nn.Linear)
+    generator = torch.Generator().manual_seed(0)
+    network.head.weight.data = 0.01 * torch.randn(network.head.weight.shape, generator=generator, dtype=torch.float64)
+    residual = Residual(network, torch.rand(13, generator=generator, dtype=torch.float64)).requires_grad_(False)
+    states = torch.randn(4, LENGTH, 13, generator=generator, dtype=torch.float64)
+    states[..., 3] += 11
+    states[2:, : LENGTH - 2] = states[2:, LENGTH - 2 : LENGTH - 1]  # a flight that has just begun
+    history = History(states, torch.rand(4, LENGTH, 4, generator=generator, dtype=torch.float64) - 0.5)
+    command = torch.rand(4, 4, generator=generator, dtype=torch.float64) - 0.5
+    world = source.with_effects([residual])
+    expected = world.step(world.start(states[:, -1]), command, history).state
+    model, acting = step(source, residual), history.acting(command)
+    for b in range(4):
+        found = model(acting.observations[b].flatten().numpy(), acting.actions[b].flatten().numpy(), weights(residual))
+        assert found.full().ravel() == pytest.approx(expected[b].numpy(), abs=1e-9)
+
+
 def test_the_mpc_pushes_against_what_the_residual_expects():
     pytest.importorskip("casadi")
-    from benchmarks.baselines.mpc import ModelPredictive, Program
+    from benchmarks.baselines.mpc import planned
 
     residual = residual_that_is_not_zero(with_history=False)
     for weight in residual.network.parameters():
@@ -58,7 +86,7 @@ def test_the_mpc_pushes_against_what_the_residual_expects():
     residual.scale.copy_(pushed)
     residual.network.head[-1].bias.data.fill_(1.0)
     still = History.start(torch.zeros(1, 4), 1)
-    without, with_it = (ModelPredictive(Program(World(CartPole()), COST, r), r).act(still) for r in (None, residual))
+    without, with_it = (planned(World(CartPole()), residual=each).act(still) for each in (None, residual))
     assert abs(float(without)) < 1e-3
     assert float(with_it) < -0.01
 
@@ -95,10 +123,12 @@ def test_a_baseline_that_is_not_there_is_told_in_one_line():
 
 def test_episodes_of_ppo_are_those_of_the_target():
     pytest.importorskip("stable_baselines3")
-    from benchmarks.baselines.ppo import MACHINES, Machines
+    from benchmarks.baselines.courses import balancing
+    from benchmarks.baselines.machines import MACHINES, Machines
 
     target = PROBLEMS[SINE].target()
-    machines = Machines(target.draw_effects, target.initial.draw, with_history=True, fine=True, seed=0)
+    assert isinstance(target, SyntheticTarget)
+    machines = Machines(balancing(target, with_history=True), target.draw_effects, None, seed=0)
     machines.reset()
     seen, still = target.reset(MACHINES, torch.Generator().manual_seed(0)), torch.zeros(MACHINES, 1)
     standing = seen.alive

@@ -141,7 +141,7 @@ class FixedWing(RigidBody):
     def wrench(self, velocity: Tensor, rates: Tensor, command: Tensor) -> tuple[Tensor, Tensor]:
         """Beard and McLain's section 4.2, and thrust; force and torque (B, 3) each."""
         like = velocity.dtype, velocity.device
-        table, limit = _constant_table(self, *like) if self.is_constant else self._table(velocity)
+        table, limit = _constant_table(self, *like) if self.is_constant else self.coefficients(velocity)
         plane, speed = velocity[:, ::2], velocity.norm(dim=-1, keepdim=True)
         in_plane = plane.norm(dim=-1, keepdim=True).clamp_min(_LEAST_AIRSPEED)
         ahead = torch.where(in_plane > _LEAST_AIRSPEED, velocity[:, :1], 1.0)  # atan2 has no gradient at (0, 0)
@@ -191,7 +191,7 @@ class FixedWing(RigidBody):
             raise ValueError(f"fixed_wing: no level flight within the commands at {float(speeds[~found][0]):g} m/s")
         return state.to(speed), command.to(speed)
 
-    def _table(self, like: Tensor) -> tuple[Tensor, Tensor]:
+    def coefficients(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """What one unit of each cause adds to each effect, in the body's axes, and the limit of the angles.
 
         (6, 9) and (1,), or (B, 6, 9) and (B, 1) where a parameter is (B,). Entries become N and N m when they are
@@ -213,7 +213,7 @@ class FixedWing(RigidBody):
 @lru_cache(64)
 def _constant_table(wing: FixedWing, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     with torch.inference_mode(False):
-        return wing._table(torch.empty(0, dtype=dtype, device=device))
+        return wing.coefficients(torch.empty(0, dtype=dtype, device=device))
 
 
 _TABLE = tuple(

@@ -1,0 +1,161 @@
+"""What a reinforcement learner's episodes are: where they start, what it sees, what a step is worth, when they end.
+
+The reward of a step is exp(-cost), of a vehicle exp(-sqrt(cost)), whose errors are larger: between 0 and 1, so that to
+go on always pays. A failed episode ends with nothing.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from benchmarks.baselines.cartpole import COST
+from benchmarks.baselines.subjects import CartPoleSubject
+from visadapt.history import History
+from visadapt.policies import FollowPolicy, ReachPolicy
+from visadapt.policies.flight import FlightPolicy
+from visadapt.systems import CartPole, FixedWing, Quadrotor, System
+from visadapt.systems.rigid_body import ATTITUDE, POSITION, VELOCITY, rotation
+from visadapt.targets import SyntheticTarget
+from visadapt.tasks.balance import EPISODE_STEPS
+from visadapt.tasks.base import FlightTask
+from visadapt.tasks.follow import Follow
+from visadapt.tasks.reach import Reach
+
+Begin = Callable[[int, torch.Generator], tuple[Tensor, Tensor]]
+"""First states and task states of a batch of episodes."""
+Judged = tuple[Tensor, Tensor, Tensor]
+"""Rewards (B,) of steps, whether they failed, and whether they are at the end of their course."""
+
+
+class Course(ABC):
+    """The episodes of one system."""
+
+    system: System
+    period: float
+    """s between commands"""
+    steps: int
+    """in the longest episode"""
+    start: Begin
+
+    @abstractmethod
+    def shown(self, history: History) -> Tensor:
+        """What the network sees (B, inputs) of a policy's history."""
+
+    @abstractmethod
+    def judge(self, before: Tensor, command: Tensor, state: Tensor, task_state: Tensor) -> Judged:
+        """Steps from states `before` to states and task states."""
+
+    def observed(self, seen: Tensor, task_state: Tensor) -> Tensor:
+        """What a history holds of what sensors read."""
+        return seen
+
+    def advance(self, task_state: Tensor) -> Tensor:
+        """The task states one period later."""
+        return task_state
+
+
+class Balancing(Course):
+    """A cart-pole that is held up.
+
+    Args:
+        begin: first states of a batch of episodes, and task states, which are empty.
+        with_history: whether the network sees 5 states and actions, or the last alone.
+    """
+
+    system = CartPole()
+    period = 0.05
+    steps = EPISODE_STEPS
+    scale = torch.tensor((1.0, 1.0, 0.1, 1.0))
+    """of position, velocity, angle and angular velocity as shown"""
+
+    def __init__(self, begin: Begin, with_history: bool) -> None:
+        self.start, self.with_history = begin, with_history
+
+    def shown(self, history: History) -> Tensor:
+        """The position, and what the ensemble of PETS sees."""
+        states = history.observations / self.scale
+        others = CartPoleSubject(self.with_history).inputs(History(states, history.actions))
+        return torch.cat((states[:, -1, :1], others), 1)
+
+    def judge(self, before: Tensor, command: Tensor, state: Tensor, task_state: Tensor) -> Judged:
+        weights = torch.tensor(COST.state)
+        cost = (weights * state.square()).sum(1) + COST.action * command[:, 0].square()
+        fallen = state[:, 2].abs() > 0.3
+        return (-cost).exp(), fallen, torch.zeros_like(fallen)
+
+
+class Flying(Course):
+    """A vehicle on a course. The network sees what the policy of ours makes of state and goal."""
+
+    task: FlightTask
+    eyes: FlightPolicy
+    FARTHEST = 5.0
+    """m off its course at which a flight fails"""
+
+    def __init__(self, task: FlightTask, system: System, eyes: FlightPolicy, begin: Begin) -> None:
+        self.task, self.system, self.eyes, self.start = task, system, eyes, begin
+        self.period, self.steps = task.period, task.steps
+
+    def observed(self, seen: Tensor, task_state: Tensor) -> Tensor:
+        return self.task.show(seen, task_state)
+
+    def advance(self, task_state: Tensor) -> Tensor:
+        return self.task.advance(task_state)
+
+    @torch.no_grad()
+    def shown(self, history: History) -> Tensor:
+        last = history.observations[:, -1]
+        state, goal = last[:, : self.eyes.n_state], last[:, self.eyes.n_state :]
+        return self.eyes.own_inputs(state, goal, rotation(state[:, ATTITUDE]))
+
+
+class Following(Flying):
+    """A quadrotor along its reference."""
+
+    task: Follow
+
+    def judge(self, before: Tensor, command: Tensor, state: Tensor, task_state: Tensor) -> Judged:
+        own, row = self.task.plan_cost, task_state[:, 1].clamp(max=self.steps)
+        away = state - self.task.on(task_state[:, 0], row)
+        cost = own.position * away[:, POSITION].square().sum(1) + own.velocity * away[:, VELOCITY].square().sum(1)
+        cost = cost + own.action * command.square().sum(1)
+        failed = ~(self.task.distance_off(state, task_state) <= self.FARTHEST)
+        return (-cost.sqrt()).exp(), failed, task_state[:, 1] >= self.steps
+
+
+class Reaching(Flying):
+    """A fixed wing to its point. What counts most is its miss, as much as PASSING steps without an error."""
+
+    task: Reach
+    PASSING, SHARPNESS = 50.0, 3.0
+    """reward for a pass without a miss, and 1/m by which it falls"""
+
+    def judge(self, before: Tensor, command: Tensor, state: Tensor, task_state: Tensor) -> Judged:
+        cost = self.task.cost(state[:, None], command[:, None], before, task_state)
+        failed = ~(self.task.distance_off(state, task_state) <= self.FARTHEST)
+        passed = state[:, 0] >= task_state[:, 0]
+        missed = self.task.misses(torch.stack((before, state), 1), task_state)[:, 0]
+        reward = (-cost.sqrt()).exp() + passed * self.PASSING * (-self.SHARPNESS * missed).exp()
+        return reward, failed, passed
+
+
+def balancing(target: SyntheticTarget, with_history: bool) -> Balancing:
+    """The course of a cart-pole whose episodes start as the target's."""
+
+    def begin(batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        state = target.initial.draw(batch, generator)
+        return state, state[:, :0]
+
+    return Balancing(begin, with_history)
+
+
+def flying(task: FlightTask, system: System, begin: Begin) -> Flying:
+    """The course of a vehicle in its task."""
+    if isinstance(system, Quadrotor):
+        return Following(task, system, FollowPolicy(task.period), begin)
+    assert isinstance(system, FixedWing)
+    return Reaching(task, system, ReachPolicy(), begin)
