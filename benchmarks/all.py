@@ -83,6 +83,7 @@ COMMANDS = (
     Command("residual_samples", "residual_samples.csv", ("benchmarks.residual_samples",), 5),
     Command("cartpole_states", "cartpole_states.csv", ("benchmarks.cartpole_states",), 10, work="--work"),
     Command("swing_up", "swing_up.csv", ("train.swing_up",), 20, work="--work"),
+    Command("swing_up_ppo", "swing_up_ppo.csv", ("benchmarks.swing_up_ppo",), 10, extra="baselines"),
     Command(
         "cartpole_pixels",
         "cartpole_pixels.csv",
@@ -150,8 +151,9 @@ COMMANDS = (
         "data_collection",
         "data_collection.csv",
         ("benchmarks.data_collection",),
-        30,
+        40,
         work="--work",
+        extra="baselines",
         reads=(("--current", "flight"),),
     ),
     Command(

@@ -1,10 +1,11 @@
-"""Who is to collect the target's data (the paper's figures 2 and 6): the policy that is tuned, or a random one.
+"""Who is to collect the target's data (the paper's figures 2 and 6): the policy that is tuned, an MPC, or a random one.
 
     python -m benchmarks.data_collection
 
 The experiments of `benchmarks.flight`, whose own adaptations are those with data of the current policy: where they are
 kept, they are read. The random policy wanders about hover or level flight, on the same courses; a flight that it leads
-5 m off ends, and all its samples count. Nothing else differs. After every round 100 flights of the policy as it then
+5 m off ends, and all its samples count. The MPC (`benchmarks.baselines.mpc`) plans in the source with the residual as
+it was fitted in the round before. Nothing else differs. After every round 100 flights of the policy as it then
 stands, on courses that were not trained on and of which nothing was learnt, tell how far it misses, and the dynamics
 mismatch delta (equation 6): the mean norm of the error in velocity of one step of the simulator, residual and all.
 
@@ -49,7 +50,7 @@ LASTING = 1.0
 MISMATCH = "dynamics mismatch in velocity"
 
 
-def random_policy(setup: Setup) -> Policy:
+def random_policy(setup: Setup, learner: Policy) -> Policy:
     """Commands that wander about hover, or about level flight."""
     system = setup.source.system
     if isinstance(system, Quadrotor):
@@ -60,9 +61,19 @@ def random_policy(setup: Setup) -> Policy:
     return AutoregressivePolicy(len(system.states), rest, math.exp(-setup.source.period / LASTING))
 
 
+def mpc(setup: Setup, learner: Policy) -> Policy:
+    """An MPC that plans with the residual that `learner` reads, as it stands."""
+    from benchmarks.baselines.mpc import following  # whose CasADi no other collector needs
+
+    return following(setup, learner)
+
+
 CURRENT = "data of the current policy"
-EXPLORERS: dict[str, Callable[[Setup], Policy]] = {"data of a random policy": random_policy}
-"""Who else may collect."""
+EXPLORERS: dict[str, Callable[[Setup, Policy], Policy]] = {
+    "data of a random policy": random_policy,
+    "data of the MPC": mpc,
+}
+"""Who else may collect: of a setup, and the policy that is tuned."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +81,7 @@ class Settings:
     """What is run, and where."""
 
     seeds: int = 3
-    experiments: tuple[str, ...] = ("quadrotor, drag", "fixed wing, drag")
+    experiments: tuple[str, ...] = tuple(EXPERIMENTS)
     flights: int = 100
     """that each policy is scored on"""
     jobs: int = 2
@@ -169,7 +180,7 @@ def _stands(settings: Settings, name: str, by: str, seed: int) -> dict[int, Stan
     torch.set_num_threads(1)
     experiment = EXPERIMENTS[name]
     setup, policy = _prepared(settings, name)
-    explorer = EXPLORERS[by](setup) if by in EXPLORERS else None
+    explorer = EXPLORERS[by](setup, policy) if by in EXPLORERS else None
     work = settings.current if explorer is None else settings.work / by.replace(" ", "-")
     folder = experiment.open(setup, work, seed, settings.flights)
     reach = math.inf if explorer is None else REACH

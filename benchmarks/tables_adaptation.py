@@ -157,11 +157,11 @@ def residual(rows: Rows) -> Lines:
 
 def collection(rows: Rows) -> Lines:
     """Who collects: the mismatch in mm/s and the error in mm, before, after the first and after the last round."""
-    lines = [["drag 0.3 1/s", "delta in mm/s: before", "first round", "last", "error in mm: before", "first", "last"]]
-    for system, method in dict.fromkeys((row["system"], row["method"]) for row in rows if row["domain"] == "adapted"):
-        line = [f"{system.replace('_', ' ')}, {method}"]
+    lines = [["", "delta in mm/s: before", "first round", "last", "error in mm: before", "first", "last"]]
+    for name, method in dict.fromkeys((row["experiment"], row["method"]) for row in rows if row["domain"] == "adapted"):
+        line = [f"{name.removesuffix(', data collection')}: {method}"]
         for unit in ("m/s", "m"):
-            measured = [row for row in rows if (row["system"], row["unit"]) == (system, unit)]
+            measured = [row for row in rows if (row["experiment"], row["unit"]) == (name, unit)]
             after = sorted((row for row in measured if row["method"] == method), key=lambda row: int(row["samples"]))
             for row in (*(row for row in measured if row["domain"] == "target"), after[0], after[-1]):
                 samples = f" ({int(row['samples']):,})" if int(row["samples"]) else ""

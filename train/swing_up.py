@@ -29,7 +29,7 @@ from torch import Tensor
 
 from experiments.parallel import in_processes
 from experiments.result_tables import Row, write_rows
-from visadapt.evaluation import SCORE_SEED
+from experiments.swing_up import ANYWHERE, STEPS, SWING, Score, score
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.learning.policy import TuneSettings, tune
 from visadapt.learning.training_state import train_or_load
@@ -40,16 +40,11 @@ from visadapt.storage.run_folder import once, open_run
 from visadapt.systems import CartPole
 from visadapt.targets import Start, SyntheticTarget
 from visadapt.targets.rollout import run, see_within_a_turn
-from visadapt.tasks.balance import SettlingCost, SwingUp, within_a_turn
+from visadapt.tasks.balance import SettlingCost, SwingUp
 from visadapt.world import World
 
 SAMPLES = 20_000
-STEPS, SWING = 300, 100
-"""of an episode, and how many of them may pass before the pole is up"""
-UP = math.radians(10)
 POLICY = "policy.safetensors"
-ANYWHERE = (0.5, 0.5, math.pi, 1.0)
-"""half-widths of the uniform distribution of the first state"""
 TASK = SwingUp(
     SettlingCost(state=(20.0, 3.0, 10.0, 1.0), end=9.0),
     start_spread=ANYWHERE,
@@ -104,29 +99,16 @@ class Filmed(Start):
         return torch.tensor(list(FILMED.values()))[:batch]
 
 
-@dataclass(frozen=True)
-class Score:
-    """How 100 episodes went; speeds and distances are over those that succeeded, in m/s and m."""
-
-    succeeded: int
-    speed: float
-    """mean |x_dot| over the whole episode"""
-    speed_held: float
-    """mean |x_dot| once the pole is to be up"""
-    distance: float
-    """mean |x| once the pole is to be up"""
-
-
 def main(settings: Settings) -> None:
     """Train what is missing, then write the table."""
     scores = list(in_processes(_seed, settings, [(seed,) for seed in range(settings.seeds)]).values())
-    succeeded = sum(score.succeeded for score in scores)
+    succeeded = sum(each.succeeded for each in scores)
     failed = settings.seeds * settings.episodes - succeeded
     rows = []
     for measure, unit, values in (
-        ("mean cart speed", "m/s", [score.speed for score in scores]),
-        ("mean cart speed after 100 steps", "m/s", [score.speed_held for score in scores]),
-        ("mean distance from the middle after 100 steps", "m", [score.distance for score in scores]),
+        ("mean cart speed", "m/s", [each.speed for each in scores]),
+        ("mean cart speed after 100 steps", "m/s", [each.speed_held for each in scores]),
+        ("mean distance from the middle after 100 steps", "m", [each.distance for each in scores]),
     ):
         mean, std = round(float(np.nanmean(values)), 4), round(float(np.nanstd(values)), 4)
         rows.append(
@@ -180,21 +162,6 @@ def _seed(settings: Settings, seed: int) -> Score:
     kept = once(folder / "score.json", lambda: asdict(score(policy, settings.episodes)))
     missing: dict[str, Any] = {key: math.nan for key, value in kept.items() if value is None}  # JSON has no NaN
     return Score(**(kept | missing))
-
-
-def score(policy: StatePolicy, episodes: int) -> Score:
-    """Run episodes from anywhere."""
-    target = SyntheticTarget(start=Start(*ANYWHERE), angle_limit=math.inf)
-    runs = run(target, policy, episodes, STEPS, torch.Generator().manual_seed(SCORE_SEED), see=see_within_a_turn)
-    states = torch.stack([within_a_turn(torch.as_tensor(each.episode.state)) for each in runs])
-    held = states[:, SWING + 1 :]
-    good = (held[..., 2].abs() < UP).all(1)
-    return Score(
-        int(good.sum()),
-        float(states[good, :, 1].abs().mean()),
-        float(held[good][..., 1].abs().mean()),
-        float(held[good][..., 0].abs().mean()),
-    )
 
 
 if __name__ == "__main__":

@@ -14,12 +14,13 @@ from torch import Tensor
 
 from benchmarks.baselines.cartpole import COST
 from benchmarks.baselines.subjects import CartPoleSubject
+from experiments.swing_up import ANYWHERE, STEPS
 from visadapt.history import History
 from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.policies.flight import FlightPolicy
 from visadapt.systems import CartPole, FixedWing, Quadrotor, System
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, VELOCITY, rotation
-from visadapt.targets import SyntheticTarget
+from visadapt.targets import Start, SyntheticTarget
 from visadapt.tasks.balance import EPISODE_STEPS
 from visadapt.tasks.base import FlightTask
 from visadapt.tasks.follow import Follow
@@ -86,6 +87,30 @@ class Balancing(Course):
         cost = (weights * state.square()).sum(1) + COST.action * command[:, 0].square()
         fallen = state[:, 2].abs() > 0.3
         return (-cost).exp(), fallen, torch.zeros_like(fallen)
+
+
+class SwingingUp(Course):
+    """A cart-pole from anywhere, whose pole is to be swung up and held in the middle of the track."""
+
+    system = CartPole()
+    period = 0.05
+    steps = STEPS
+    FARTHEST = 8.0
+    """m from the middle at which an episode fails, as ours starts anew"""
+
+    def start(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        state = Start(*ANYWHERE).draw(batch, generator)
+        return state, state[:, :0]
+
+    def shown(self, history: History) -> Tensor:
+        x, velocity, angle, turning = history.observations[:, -1].unbind(1)
+        return torch.stack((x, velocity, angle.sin(), angle.cos(), turning / 5), 1)
+
+    def judge(self, before: Tensor, command: Tensor, state: Tensor, task_state: Tensor) -> Judged:
+        x, velocity, angle, _ = state.unbind(1)
+        reward = (1 + angle.cos()) / 2 * (-x.square() / 4 - velocity.square() / 10).exp()
+        failed = ~(x.abs() <= self.FARTHEST)
+        return reward, failed, torch.zeros_like(failed)
 
 
 class Flying(Course):

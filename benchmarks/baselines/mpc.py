@@ -27,6 +27,7 @@ from benchmarks.baselines.symbolic import step, weights
 from visadapt.effects import Residual
 from visadapt.history import HORIZON, LENGTH, History
 from visadapt.policies import Policy
+from visadapt.setups.base import Setup
 from visadapt.systems import CartPole, FixedWing, Quadrotor, RigidBody, System
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
 from visadapt.tasks.follow import FollowCost
@@ -101,6 +102,18 @@ class FlightPredictive(ModelPredictive):
     """The same, of a vehicle, which is shown its goal."""
 
     shown = "state and goal"
+
+
+class GroundedPredictive(FlightPredictive):
+    """Plans with the residual that another policy reads, as it is fitted round after round."""
+
+    def __init__(self, program: Program, learner: Policy) -> None:
+        super().__init__(program)
+        self.learner = [learner]  # in a list, so that its weights are not of this policy
+
+    def act(self, history: History) -> Tensor:
+        self.weights = weights(self.learner[0].residual)
+        return super().act(history)
 
 
 class Program:
@@ -197,6 +210,12 @@ def planned(source: World, program: Program | None = None, residual: Residual | 
         program = Program(source, errors, n_goal, residual)
     kind = FlightPredictive if isinstance(source.system, RigidBody) else ModelPredictive
     return kind(program, residual)
+
+
+def following(setup: Setup, learner: Policy) -> Policy:
+    """The planner of a vehicle's setup, with the residual that `learner` reads."""
+    source = setup.source
+    return GroundedPredictive(Program(source, *ERRORS[type(source.system)], setup.residual(learner, source)), learner)
 
 
 def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:

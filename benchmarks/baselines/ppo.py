@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
 from stable_baselines3 import PPO
@@ -63,6 +64,12 @@ def trained(model: PPO, course: Course) -> Trained:
     return (TrainedFlight if isinstance(course, Flying) else Trained)(model, course)
 
 
+def settings_of(seed: int) -> dict[str, Any]:
+    """What is not the library's default."""
+    args = {"n_steps": ROLLOUT // MACHINES, "batch_size": BATCH, "gamma": GAMMA, "seed": seed, "device": "cpu"}
+    return {**args, "policy_kwargs": {"log_std_init": LOG_STD}}
+
+
 def courses(problem: Problem, sizes: Sizes) -> tuple[Course, Course]:
     """Those of the pretraining, which start as widely as those of ours, and of the target."""
     task, target = problem.setup(sizes).settings.source.task, problem.target()
@@ -82,8 +89,7 @@ def pretrained(problem: Problem, course: Course, sizes: Sizes, path: Path, seed:
     machines = Machines(course, no_effects, problem.setup(sizes).source, seed)
     if path.exists():
         return PPO.load(path, env=machines, device="cpu")
-    args = {"n_steps": ROLLOUT // MACHINES, "batch_size": BATCH, "gamma": GAMMA, "seed": seed, "device": "cpu"}
-    model = PPO("MlpPolicy", machines, policy_kwargs={"log_std_init": LOG_STD}, **args)
+    model = PPO("MlpPolicy", machines, **settings_of(seed))
     best = (math.inf, math.inf)
     for look in range(LOOKS):
         model.learn(sizes.source_steps // LOOKS, reset_num_timesteps=False)

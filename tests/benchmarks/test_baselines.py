@@ -9,12 +9,15 @@ import torch
 from benchmarks.baselines.problem import drawn
 from benchmarks.baselines.table import BASELINES, PROBLEMS, Settings, main
 from benchmarks.cartpole_states import SINE
-from visadapt.effects import ConstantForce, PeriodicForce, Residual
+from tests.flying import waves
+from visadapt.effects import ConstantForce, LinearDrag, PeriodicForce, Residual
 from visadapt.history import LENGTH, History
 from visadapt.policies.networks import FlightResidualNetwork, StateResidualNetwork
 from visadapt.setups.policy_file import source_steps
 from visadapt.systems import CartPole, FixedWing, Quadrotor
-from visadapt.targets import SyntheticTarget
+from visadapt.targets import FlightTarget, SyntheticTarget
+from visadapt.tasks.follow import Follow
+from visadapt.tasks.reach import Reach
 from visadapt.world import World
 
 
@@ -140,3 +143,49 @@ def test_episodes_of_ppo_are_those_of_the_target():
         assert torch.allclose(seen.state[standing], machines.at.state[standing], atol=1e-6)
     assert not bool(standing.any())  # so that episodes have begun anew
     assert bool((machines.age < 60).all())
+
+
+@pytest.mark.parametrize(("task", "vehicle"), [(Follow(waves(4)), Quadrotor()), (Reach(), FixedWing())])
+def test_flights_of_ppo_are_those_of_the_target(task, vehicle):
+    pytest.importorskip("stable_baselines3")
+    from benchmarks.baselines.courses import flying
+    from benchmarks.baselines.machines import MACHINES, Machines
+
+    target = FlightTarget(task, vehicle, lambda batch, generator: (LinearDrag(coefficient=0.3),))
+    course = flying(task, vehicle, task.evaluation_start)
+    machines = Machines(course, target.draw_effects, None, seed=0)
+    machines.reset()
+    seen, command = target.reset(MACHINES, torch.Generator().manual_seed(0)), torch.zeros(MACHINES, 4)
+    command[:, 0] = 0.3
+    for _ in range(10):
+        seen = target.step(command)
+        machines.step_async(command.numpy())
+        _, rewards, ended, _ = machines.step_wait()
+        assert not ended.any()
+        assert ((rewards > 0) & (rewards < 1)).all()
+        assert torch.allclose(seen.state, machines.at.state, atol=1e-5)
+        assert torch.equal(seen.goal, machines.history.observations[:, -1, 13:])
+
+
+def test_a_wing_is_rewarded_for_its_pass_and_a_quadrotor_for_being_on_its_reference():
+    from benchmarks.baselines.courses import flying
+
+    task = Reach()
+    course = flying(task, FixedWing(), task.evaluation_start)
+    state, point = task.evaluation_start(2, torch.Generator().manual_seed(0))
+    before, after = state.clone(), state.clone()
+    before[:, :3], after[:, :3] = point - 0.1, point + 0.1
+    after[1, 1] += 1.0
+    before[1, 1] += 1.0
+    reward, failed, over = course.judge(before, torch.zeros(2, 4), after, point)
+    assert bool(over.all())
+    assert not bool(failed.any())
+    assert float(reward[0]) > float(reward[1]) + 30
+
+    follow = Follow(waves(2))
+    course = flying(follow, Quadrotor(), follow.evaluation_start)
+    state, at = follow.evaluation_start(2, torch.Generator().manual_seed(0))
+    state[1, 0] += 6.0
+    reward, failed, _ = course.judge(state, torch.zeros(2, 4), state, at)
+    assert float(reward[0]) == pytest.approx(1.0, abs=1e-3)
+    assert failed.tolist() == [False, True]
