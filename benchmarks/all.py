@@ -84,13 +84,7 @@ COMMANDS = (
     Command("cartpole_states", "cartpole_states.csv", ("benchmarks.cartpole_states",), 10, work="--work"),
     Command("swing_up", "swing_up.csv", ("train.swing_up",), 20, work="--work"),
     Command("swing_up_ppo", "swing_up_ppo.csv", ("benchmarks.swing_up_ppo",), 10, extra="baselines"),
-    Command(
-        "cartpole_pixels",
-        "cartpole_pixels.csv",
-        ("benchmarks.cartpole_pixels", "--variants", "0", "1"),
-        25,
-        work="--work",
-    ),
+    Command("cartpole_pixels", "cartpole_pixels.csv", ("benchmarks.cartpole_pixels",), 30, work="--work"),
     Command(
         "ablations",
         "ablations.csv",

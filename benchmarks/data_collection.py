@@ -200,7 +200,7 @@ def _stand(settings: Settings, setup: Setup, name: str, folder: Path, key: str, 
     def mismatch() -> dict[str, float]:
         generator = torch.Generator().manual_seed(SCORE_SEED)
         flown = run(target, policy, settings.flights, target.task.steps, generator, strict=False)
-        transitions = Transitions.cut([each.episode for each in flown], "state")
+        transitions = Transitions.cut([each.episode for each in flown])
         return {"mean": float(_error(policy.residual, setup, transitions)[:, VELOCITY].norm(dim=1).mean())}
 
     return Stand(found, once(folder / f"mismatch-{key}.json", mismatch)["mean"])

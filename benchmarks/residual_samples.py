@@ -98,7 +98,7 @@ def _flown(setup: Setup, policy: Policy, seed: int) -> Transitions:
     target = flight_target(setup, EXPERIMENT.effects(setup), test=False)
     generator = torch.Generator().manual_seed(seed)
     runs = run(target, policy, FLIGHTS, target.task.steps, generator, NOISE)
-    return Transitions.cut([each.episode for each in runs], "state")
+    return Transitions.cut([each.episode for each in runs])
 
 
 def _share(setup: Setup, method: str, train: Transitions, samples: int, test: Transitions, seed: int) -> float:

@@ -10,7 +10,6 @@ Writes results/swing_up_ppo.csv. Interrupted, it begins again.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,7 +49,6 @@ def main(settings: Settings) -> None:
     while model.num_timesteps < settings.most and (not rows or rows[-1].failed):
         model.learn(settings.every, reset_num_timesteps=False)
         found = score(trained(model, course), settings.episodes)
-        speed = found.speed if found.succeeded else math.inf
         rows.append(
             Row(
                 experiment="CartPole, swing-up",
@@ -60,7 +58,7 @@ def main(settings: Settings) -> None:
                 samples=model.num_timesteps,
                 measure="mean cart speed",
                 unit="m/s",
-                mean=round(speed, 4),
+                mean=round(found.speed, 4),
                 std=None,
                 episodes=settings.episodes,
                 failed=settings.episodes - found.succeeded,

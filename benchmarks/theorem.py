@@ -183,7 +183,7 @@ def measured(setup: Setup, policy: Policy, target: Target, episodes: int = EPISO
     steps = target.task.steps if isinstance(target, FlightTarget) else EPISODE_STEPS
     drawn = torch.Generator().manual_seed(SCORE_SEED)
     runs = run(target, policy.eval(), episodes, steps, drawn, strict=False)
-    transitions = to_come(task, Transitions.cut([each.episode for each in runs], "state"))
+    transitions = to_come(task, Transitions.cut([each.episode for each in runs]))
     nu, columns = reference(task, transitions)
     residual = [] if policy.residual is None else [copy.deepcopy(policy.residual).double()]
     model = source.with_effects([*source.effects, *residual]).requires_grad_(False)

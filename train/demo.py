@@ -17,7 +17,7 @@ Interrupt it anywhere; started again, it goes on and ends with the same numbers.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import tyro
@@ -47,10 +47,6 @@ class Settings:
     """N: target samples in all, all counted"""
     round_samples: int = 200
     """B: target samples in a round"""
-    observations: str = "camera"
-    """frames that ground the residual: the target's own ("camera"), or rendered from estimated states ("rendered")"""
-    states_from_target: bool = False
-    """learn from the target's own states, as the paper does, instead of from its frames alone"""
     episodes: int = 100
     """episodes of each evaluation"""
     seed: int = 0
@@ -63,11 +59,6 @@ def main(settings: Settings) -> None:
     stream = DrawnCartPole()
     source, target = SyntheticTarget(no_effects, stream), SyntheticTarget(sine_force, stream)
     setup = cartpole_frames(renderer=_renderer(settings, out))
-    setup = replace(
-        setup,
-        settings=replace(setup.settings, observations=settings.observations),
-        label=None if settings.states_from_target else setup.label,
-    )
     chosen = {key: value for key, value in asdict(settings).items() if key != "out"}
     about = open_run(out, {**chosen, "training": setup.settings.numbers()})
     scores: dict[str, CartPoleScore] = {}

@@ -123,7 +123,7 @@ def in_rounds(
             new = collect(made(), problem.target(), min(round_samples, ledger.left), longest, generator)
             ledger.count("data", sum(episode.samples for episode in new))
             episodes += new
-            made = learn(Transitions.cut(episodes, "state"), generator)
+            made = learn(Transitions.cut(episodes), generator)
             if ledger.used in sizes.scored:
                 yield Stage("adapted", ledger.used, made())
 

@@ -107,5 +107,5 @@ def test_a_wing_that_has_passed_its_point_has_no_reference():
     state[:, 0] = torch.tensor([48.0, 49.0, 50.0, 51.0, 52.0])
     point = torch.tensor([[50.0, 1.0, 2.0]]).expand(5, 3)
     episode = Episode(0.05 * np.arange(5), np.zeros((5, 4)), state.numpy(), None, point.numpy())
-    kept = to_come(Reach(), Transitions.cut([episode], "state"))
+    kept = to_come(Reach(), Transitions.cut([episode]))
     assert kept.state[:, 0].tolist() == [48.0, 49.0]

@@ -72,7 +72,7 @@ def test_one_force_is_fitted_to_all_episodes_and_leaves_nothing_in_any(recording
 def test_the_gap_that_a_residual_learns_is_that_beside_the_force_in_every_episode():
     clean = record([running()], measured=STATES, noise=[1e-3 * noise for noise in NOISE])
     source = World(CartPole(), [PeriodicForce(amplitude=0.0, frequency=1.0, phase=0.0, offset=0.0)], substeps=10)
-    transitions = Transitions.cut(clean.episodes, "state")
+    transitions = Transitions.cut(clean.episodes)
     missing = gap(source, transitions).square().mean(0).sqrt()
     left = gap(source, fit_named(source, transitions)).square().mean(0).sqrt()
     assert (left < 0.03 * missing).all()

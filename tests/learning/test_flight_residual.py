@@ -69,7 +69,7 @@ def left(residual, transitions):
 
 @pytest.fixture(scope="module")
 def residual():
-    transitions = Transitions.cut(flights([LinearDrag(coefficient=RATE)], 30, 11), "state")
+    transitions = Transitions.cut(flights([LinearDrag(coefficient=RATE)], 30, 11))
     assert len(transitions) == 300
     return fitted(a_network(), transitions)
 
@@ -87,15 +87,15 @@ class TestDrag:
         assert weight[VELOCITY.stop :].abs().max() < 1e-4
 
     def test_on_flights_not_seen_nine_tenths_of_the_gap_are_closed(self, residual):
-        transitions = Transitions.cut(flights([LinearDrag(coefficient=RATE)], 30, 11, seed=1), "state")
+        transitions = Transitions.cut(flights([LinearDrag(coefficient=RATE)], 30, 11, seed=1))
         before, after = gap(SOURCE, transitions).square().mean(0).sqrt(), left(residual, transitions)
         assert (after[: VELOCITY.stop] < 0.1 * before[: VELOCITY.stop]).all()
 
 
 class TestForceThatChanges:
     def test_with_a_history_it_is_followed_whatever_its_phase_and_without_one_it_is_not(self):
-        transitions = Transitions.cut(flights(swaying(8, 0), 8, 51), "state")
-        unseen = Transitions.cut(flights(swaying(8, 1), 8, 51, seed=1), "state")
+        transitions = Transitions.cut(flights(swaying(8, 0), 8, 51))
+        unseen = Transitions.cut(flights(swaying(8, 1), 8, 51, seed=1))
         before = gap(SOURCE, unseen).square().mean(0).sqrt()[VELOCITY.start]
         seeing, blind = (
             left(fitted(a_network(history), transitions), unseen)[VELOCITY.start] for history in (True, False)
@@ -105,9 +105,9 @@ class TestForceThatChanges:
 
     def test_imagined_on_from_a_seventh_row_it_goes_on_for_seconds_as_it_does_in_truth(self):
         """Fed with what it says itself, the residual neither dies down nor runs away."""
-        residual = fitted(a_network(True), Transitions.cut(flights(swaying(8, 0), 8, 51), "state"))
+        residual = fitted(a_network(True), Transitions.cut(flights(swaying(8, 0), 8, 51)))
         unseen = flights(swaying(8, 1), 8, 51, seed=1)
-        transitions = Transitions.cut(unseen, "state")
+        transitions = Transitions.cut(unseen)
         rows = torch.arange(6, len(transitions), 50)
         plan = torch.stack([transitions.action[rows + k] for k in range(40)], 1)
         truth = torch.stack([transitions.next_state[rows + k] for k in range(40)], 1)
@@ -122,9 +122,8 @@ class TestForceThatChanges:
         assert off[0] < 0.02 * off[1]
 
     def test_before_a_flight_begins_stands_what_its_first_period_left_unexplained(self):
-        transitions = Transitions.cut(
-            flights([PeriodicForce(amplitude=2.0, frequency=0.2, phase=0.5, offset=0.0)], 4, 4), "state"
-        )
+        force = PeriodicForce(amplitude=2.0, frequency=0.2, phase=0.5, offset=0.0)
+        transitions = Transitions.cut(flights([force], 4, 4))
         network = a_network(True)
 
         def found(row):
@@ -137,7 +136,7 @@ class TestForceThatChanges:
         assert torch.equal(found(2)[:, :-1], found(1)[:, 1:])
 
     def test_samples_whose_past_is_not_whole_are_not_learnt_from(self):
-        network, transitions = a_network(True), Transitions.cut(flights(swaying(8, 0), 8, 11), "state")
+        network, transitions = a_network(True), Transitions.cut(flights(swaying(8, 0), 8, 11))
         fitted(network, transitions)
         seen = network.embed(transitions.history(torch.arange(len(transitions))).acting(transitions.action))
         assert network.informed(seen).tolist() == ([False] * 4 + [True] * 6) * 8
@@ -145,7 +144,7 @@ class TestForceThatChanges:
 
     def test_what_the_source_left_unexplained_is_the_force_over_the_mass_and_nothing_else(self):
         force = PeriodicForce(amplitude=2.0, frequency=0.2, phase=0.5, offset=0.0)
-        transitions = Transitions.cut(flights([force], 4, LENGTH + 1), "state")
+        transitions = Transitions.cut(flights([force], 4, LENGTH + 1))
         history = transitions.history(torch.arange(LENGTH - 1, len(transitions), LENGTH))
         states = torch.stack([transitions.state[k : k + LENGTH] for k in range(0, len(transitions), LENGTH)])
         actions = torch.stack([transitions.action[k : k + LENGTH] for k in range(0, len(transitions), LENGTH)])
@@ -159,7 +158,7 @@ class TestForceThatChanges:
 
     def test_it_tells_how_much_pushes_and_how_fast_that_changes(self):
         force = PeriodicForce(amplitude=2.0, frequency=0.2, phase=0.5, offset=0.0)
-        transitions = Transitions.cut(flights([force], 4, LENGTH + 1), "state")
+        transitions = Transitions.cut(flights([force], 4, LENGTH + 1))
         rows = torch.arange(LENGTH - 1, len(transitions), LENGTH)
         estimate = a_network(True).disturbance(transitions.history(rows).acting(transitions.action[rows]))
         turn = 2 * math.pi * 0.2

@@ -64,7 +64,7 @@ class TestOnStates:
     def test_more_than_nine_tenths_of_the_one_step_gap_closes_on_episodes_not_seen(self, with_history, count):
         torch.manual_seed(0)
         residual = Residual(state_residual_network(with_history), torch.ones(4))
-        transitions, unseen = Transitions.cut(recorded(1, count), "state"), Transitions.cut(recorded(2), "state")
+        transitions, unseen = Transitions.cut(recorded(1, count)), Transitions.cut(recorded(2))
         settings = GroundSettings(steps=500)
         losses = fit(residual, SOURCE, transitions, settings, torch.Generator().manual_seed(0))
         before, after = gap(SOURCE, unseen), gap_left(unseen, residual)
@@ -81,14 +81,14 @@ class TestOnStates:
         upright = np.zeros((2, 4))
         acceleration = NEWTONS / (1.0 + 0.1 / 4)
         upright[1] = [0.0, 0.05 * acceleration, 0.0, -0.05 * 1.5 * acceleration]
-        transitions = Transitions.cut([Episode(np.array([0.0, 0.05]), np.zeros((2, 1)), upright)], "state")
+        transitions = Transitions.cut([Episode(np.array([0.0, 0.05]), np.zeros((2, 1)), upright)])
         source = World(CartPole(), integrator="euler")
         np.testing.assert_allclose(gap(source, transitions).numpy()[0], upright[1], atol=1e-6)
         pushed = World(CartPole(), [ConstantForce(force=NEWTONS)], integrator="euler").requires_grad_(False)
         np.testing.assert_allclose(gap(pushed, transitions).numpy(), 0.0, atol=1e-6)
 
     def test_what_is_left_over_is_the_error_of_a_world_with_the_residual(self):
-        transitions = Transitions.cut(recorded(0), "state")
+        transitions = Transitions.cut(recorded(0))
         residual = Residual(state_residual_network(False), torch.ones(4))
         fit(residual, SOURCE, transitions, GroundSettings(steps=50), torch.Generator().manual_seed(0))
         left = left_over(residual, SOURCE, transitions)
@@ -97,7 +97,7 @@ class TestOnStates:
 
     def test_the_scale_is_the_root_mean_square_of_the_gap(self):
         residual = Residual(StateResidualNetwork(4), torch.ones(4))
-        transitions = Transitions.cut(recorded(1), "state")
+        transitions = Transitions.cut(recorded(1))
         rescale(residual, SOURCE, transitions)
         with torch.no_grad():
             stepped = SOURCE.step(SOURCE.start(transitions.state), transitions.action).state
@@ -107,7 +107,7 @@ class TestOnStates:
     def test_a_gap_that_is_nought_but_rounding_is_not_heard_beside_the_others(self):
         """Under a hundredth of what a state changes by, the unit is that hundredth."""
         residual = Residual(StateResidualNetwork(4), torch.ones(4))
-        transitions = Transitions.cut(recorded(1), "state")
+        transitions = Transitions.cut(recorded(1))
         right = World(CartPole(), [ConstantForce(force=NEWTONS)]).requires_grad_(False)
         rescale(residual, right, transitions, negligible=1e-2)
         change = np.sqrt(np.mean((transitions.next_state - transitions.state).numpy() ** 2, 0))
@@ -116,14 +116,14 @@ class TestOnStates:
     def test_a_source_that_is_right_leaves_numbers_finite_and_corrections_nought(self):
         residual = Residual(StateResidualNetwork(4), torch.ones(4))
         right = World(CartPole(), [ConstantForce(force=NEWTONS)]).requires_grad_(False)
-        transitions = Transitions.cut(recorded(1), "state")
+        transitions = Transitions.cut(recorded(1))
         losses = fit(residual, right, transitions, GroundSettings(steps=25), torch.Generator().manual_seed(0))
         assert all(np.isfinite((loss.train, loss.held_out)).all() for loss in losses)
         with torch.no_grad():
             assert residual.delta(transitions.history(torch.arange(len(transitions)))).abs().max() < 1e-6
 
     def test_the_weights_kept_are_those_that_did_best_on_what_was_held_out(self):
-        transitions, overshot = Transitions.cut(recorded(1), "state"), []
+        transitions, overshot = Transitions.cut(recorded(1)), []
         # Most of these are far too fast and jump about, so that the last weights are not the best.
         for rate in (0.03, 0.1, 0.3, 1.0, 3.0):
             torch.manual_seed(0)
@@ -138,7 +138,7 @@ class TestOnStates:
         assert any(overshot)
 
     def test_the_same_seed_gives_the_same_weights_and_fitted_again_it_goes_on_from_them(self):
-        transitions = Transitions.cut(recorded(1), "state")
+        transitions = Transitions.cut(recorded(1))
         settings = GroundSettings(steps=100)
         found = []
         for _ in range(2):
@@ -157,7 +157,7 @@ class TestOnStates:
         torch.manual_seed(0)
         residual = Residual(state_residual_network(with_history=True), torch.ones(4))
         late = recorded(1, count=20, effects=[ActuatorDelay(delay=0.05)], size=0.05)
-        fit(residual, SOURCE, Transitions.cut(late, "state"), GroundSettings(), torch.Generator().manual_seed(0))
+        fit(residual, SOURCE, Transitions.cut(late), GroundSettings(), torch.Generator().manual_seed(0))
         rest, command = torch.zeros(1, 4), torch.full((1, 1), 0.1)
         history = History.start(rest, 1)
         with torch.no_grad():
@@ -172,7 +172,14 @@ class TestOnFrames:
         """A residual network that sees frames, and transitions of a world with a force."""
         torch.manual_seed(0)
         renderer = small_renderer()
-        transitions = Transitions.cut(recorded(1, count=4, rows=11), "rendered", observing(renderer))
+        observe = observing(renderer)
+
+        def filmed(episode):
+            with torch.no_grad():
+                grey = 255 * observe(torch.tensor(episode.state)).clamp(0, 1)
+            return replace(episode, frame=grey.round().to(torch.uint8).numpy())
+
+        transitions = Transitions.cut([filmed(each) for each in recorded(1, count=4, rows=11)], frames=True)
         return Residual(image_residual_network(renderer), torch.ones(4)), transitions
 
     def test_the_head_is_fitted_and_what_sees_stays_as_it_is(self, seen):
@@ -235,13 +242,13 @@ class TestNamed:
 
     def fitted(self, *effects):
         source = World(CartPole(), effects)
-        fit_named(source, Transitions.cut(recorded(3), "state"))
+        fit_named(source, Transitions.cut(recorded(3)))
         return source
 
     def test_the_right_one_is_found_and_nothing_is_left(self):
         source = self.fitted(ConstantForce(force=0.0))
         assert source.effects[0].force.item() == pytest.approx(NEWTONS, abs=1e-3)
-        transitions = Transitions.cut(recorded(4), "state")
+        transitions = Transitions.cut(recorded(4))
         assert gap(source, transitions).abs().max() < 1e-3 * gap(SOURCE, transitions).abs().max()
 
     def test_a_wrong_one_beside_it_stays_at_what_does_nothing(self):
@@ -250,18 +257,18 @@ class TestNamed:
 
     def test_what_would_leave_its_range_ends_at_its_border(self):
         world = World(CartPole(), [QuadraticDrag(coefficient=0.5)])
-        transitions = Transitions.cut(recorded(3, effects=[QuadraticDrag(coefficient=-1.0)]), "state")
+        transitions = Transitions.cut(recorded(3, effects=[QuadraticDrag(coefficient=-1.0)]))
         fit_named(world, transitions)
         assert world.values.tolist() == [QuadraticDrag.table[0].low]
 
     def test_the_true_states_behind_a_biased_sensor_are_learnt_from_and_the_readings_are_shown(self):
         true, bias = recorded(3), np.array([0.0, 0.0, 0.05, 0.0], np.float32)
-        transitions = Transitions.cut([replace(episode, state=episode.state + bias) for episode in true], "state")
+        transitions = Transitions.cut([replace(episode, state=episode.state + bias) for episode in true])
         source = World(CartPole(), [ConstantForce(force=0.0), AngleOffset(offset=0.0)])
         found = fit_named(source, transitions)
         assert [each.item() for each in source.parameters()] == pytest.approx([NEWTONS, 0.05], abs=2e-3)
         assert gap(source, found).abs().max() < 1e-3
-        wanted = Transitions.cut(true, "state")
+        wanted = Transitions.cut(true)
         torch.testing.assert_close(found.state, wanted.state, rtol=0, atol=1e-3)
         torch.testing.assert_close(found.next_state, wanted.next_state, rtol=0, atol=1e-3)
         assert torch.equal(found.observations, transitions.observations)

@@ -162,7 +162,7 @@ class TestOnStates:
         """The policy is tuned where the target was: here at a state that random starts never reach."""
         row = [0.0, 0.0, 0.3, 0.0]
         recorded = Episode(torch.arange(2.0).numpy(), torch.zeros(2, 1).numpy(), torch.tensor([row, row]).numpy())
-        transitions = Transitions.cut([recorded], "state")
+        transitions = Transitions.cut([recorded])
         weighs_angle = Cost((0.0, 0.0, 1.0, 0.0), action=0.0)
         costs = []
         for share in (0.0, 1.0):

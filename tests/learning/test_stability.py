@@ -57,7 +57,7 @@ class TestStable:
             next(network.head.parameters())[1, 17] = feedback  # x_dot of the last state
         residual = Residual(network, torch.full((4,), 0.1))
         rolled = run(SyntheticTarget(constant_force(1.0)), policy(), 1, 60, torch.Generator().manual_seed(0))
-        transitions = Transitions.cut([rolled[0].episode], "state", None)
+        transitions = Transitions.cut([rolled[0].episode])
         made = setup()
         world = made.source.with_effects([residual])
         about = made.settings.tuning, torch.Generator().manual_seed(0), transitions

@@ -54,7 +54,7 @@ def streams_of(world, task=WIDE, observe=None, transitions=None, recorded=0.0, c
 @pytest.mark.parametrize("name", HIDDEN)
 def test_the_world_that_was_recorded_leaves_no_gap_in_any_window(name):
     world = world_with(EFFECTS[name](**HIDDEN[name]))
-    transitions = Transitions.cut(episodes_of(world), "state")
+    transitions = Transitions.cut(episodes_of(world))
     assert gap(world, transitions).abs().max() < 1e-5
     assert gap(world_with(), transitions).abs().max() > 0.01
 
@@ -62,7 +62,7 @@ def test_the_world_that_was_recorded_leaves_no_gap_in_any_window(name):
 @pytest.mark.parametrize("name", HIDDEN)
 def test_streams_that_start_in_a_recording_go_on_as_it_did(name):
     world = world_with(EFFECTS[name](**HIDDEN[name]))
-    transitions = Transitions.cut(episodes_of(world), "state")
+    transitions = Transitions.cut(episodes_of(world))
     streams = streams_of(world, transitions=transitions, recorded=1.0)
     rows = (transitions.state[:, None] == streams.now.at.state).all(2).int().argmax(0)
     assert len(rows.unique()) > 15
@@ -74,7 +74,7 @@ def test_streams_that_start_in_a_recording_go_on_as_it_did(name):
 class TestTimeOfOtherStarts:
     def test_where_effects_depend_on_time_all_times_of_the_recording_are_met(self):
         world = world_with(EFFECTS["gust"](**HIDDEN["gust"]))
-        transitions = Transitions.cut(episodes_of(world), "state")
+        transitions = Transitions.cut(episodes_of(world))
         time = streams_of(world, transitions=transitions).now.at.time
         assert float(time.max()) > 1.0
         assert len(time.unique()) > 10
@@ -83,7 +83,7 @@ class TestTimeOfOtherStarts:
     @pytest.mark.parametrize("name", ["actuator_delay", "actuator_backlash"])
     def test_elsewhere_they_begin_at_zero(self, name):
         world = world_with(EFFECTS[name](**HIDDEN[name]))
-        transitions = Transitions.cut(episodes_of(world), "state")
+        transitions = Transitions.cut(episodes_of(world))
         assert not streams_of(world, transitions=transitions).now.at.time.any()
 
     def test_without_a_recording_all_times_of_an_episode_are_met(self):
@@ -107,7 +107,7 @@ class TestSensors:
 
     def test_late_measurements_stay_late_in_streams_and_recorded_ones_begin_with_their_past(self):
         delay = MeasurementDelay(delay=0.1)
-        transitions = Transitions.cut(episodes_of(world_with()), "state")
+        transitions = Transitions.cut(episodes_of(world_with()))
         world = world_with(delay)
         streams = streams_of(world, transitions=transitions, recorded=1.0)
         before = (transitions.state[:, None] == streams.now.at.state).all(2).int().argmax(0)

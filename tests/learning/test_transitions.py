@@ -30,7 +30,7 @@ TWO = [episode(1, 8), episode(2, 3)]
 
 class TestAlignment:
     def test_a_sample_is_a_state_the_action_there_and_the_state_after(self):
-        transitions = Transitions.cut(TWO, "state")
+        transitions = Transitions.cut(TWO)
         assert len(transitions) == 9
         assert transitions.state[:, 0].tolist() == [100, 101, 102, 103, 104, 105, 106, 200, 201]
         assert transitions.next_state[:, 0].tolist() == [101, 102, 103, 104, 105, 106, 107, 201, 202]
@@ -40,7 +40,7 @@ class TestAlignment:
         assert transitions.lengths == [8, 3]
 
     def test_the_history_shows_the_5_latest_rows_and_stands_still_before_the_episode(self):
-        transitions = Transitions.cut(TWO, "state")
+        transitions = Transitions.cut(TWO)
         history = transitions.history(torch.arange(9))
         wanted = {
             0: [100, 100, 100, 100, 100],
@@ -53,7 +53,7 @@ class TestAlignment:
             assert history.observations[row, :, 0].tolist() == states
 
     def test_past_actions_are_those_before_the_one_taken_now_and_zero_before_the_episode(self):
-        transitions = Transitions.cut(TWO, "state")
+        transitions = Transitions.cut(TWO)
         wanted = {
             0: [0, 0, 0, 0, 0],
             2: [0, 0, 0, 0.010, 0.011],
@@ -65,7 +65,7 @@ class TestAlignment:
             assert transitions.history(torch.tensor([row])).actions[0, :, 0].tolist() == pytest.approx(actions)
 
     def test_it_is_the_history_that_a_policy_had_when_it_chose_the_action(self):
-        transitions = Transitions.cut(TWO, "state")
+        transitions = Transitions.cut(TWO)
         state = torch.as_tensor(TWO[0].state, dtype=torch.float32)
         action = torch.as_tensor(TWO[0].action, dtype=torch.float32)
         lived = History.start(state[:1], 1)
@@ -77,70 +77,49 @@ class TestAlignment:
 
     def test_task_states_are_those_of_the_rows_that_it_shows_and_none_where_there_are_none(self):
         placed = [replace(each, task_state=np.stack([each.time, -each.time], 1)) for each in TWO]
-        transitions = Transitions.cut(placed, "state")
+        transitions = Transitions.cut(placed)
         assert transitions.task_states[transitions.rows].shape == (len(transitions), LENGTH, 2)
         for row in (0, 3, 6):
             first = [max(row - back, 0) for back in range(LENGTH - 1, -1, -1)]
             np.testing.assert_array_equal(transitions.task_states[transitions.rows[row], 0], TWO[0].time[first])
-        assert Transitions.cut(TWO, "state").task_states.shape == (11, 0)
+        assert Transitions.cut(TWO).task_states.shape == (11, 0)
 
     def test_the_action_of_the_last_row_was_not_executed_and_is_nowhere(self):
-        transitions = Transitions.cut(TWO, "state")
+        transitions = Transitions.cut(TWO)
         assert transitions.action.max() < 1
         assert transitions.history(torch.arange(9)).actions.max() < 1
 
     def test_an_episode_of_one_row_adds_no_sample_and_shifts_no_other(self):
-        transitions = Transitions.cut([episode(1, 3), episode(3, 1), episode(2, 3)], "camera")
+        transitions = Transitions.cut([episode(1, 3), episode(3, 1), episode(2, 3)], frames=True)
         assert transitions.state[:, 0].tolist() == [100, 101, 200, 201]
         assert (255 * transitions.history(torch.tensor([3])).observations[0, :, 0, 0]).round().tolist() == [40] * 4 + [
             41
         ]
 
 
-class TestSources:
-    def test_camera_frames_are_the_cameras_and_rendered_ones_the_renderers(self):
-        def observe(state):
-            return ((state[:, 0] - 100) / 10)[:, None, None].expand(-1, 2, 3)
-
-        row = torch.tensor([6])
-        camera, rendered = Transitions.cut(TWO[:1], "camera", observe), Transitions.cut(TWO[:1], "rendered", observe)
-        for transitions, wanted in ((camera, [22, 23, 24, 25, 26]), (rendered, [51, 76, 102, 128, 153])):
-            seen = transitions.history(row).observations
-            assert seen.shape == (1, LENGTH, 2, 3)
-            assert seen.dtype == torch.float32
-            assert (255 * seen[0, :, 1, 2]).round().tolist() == pytest.approx(wanted, abs=1)
-        assert torch.equal(camera.next_state, rendered.next_state)
-
-    def test_rendered_frames_need_no_camera_and_bytes_do_not_overflow(self):
-        transitions = Transitions.cut(
-            [episode(1, 3, frames=False)], "rendered", lambda state: state[:, :, None] - 101.0
-        )
-        assert transitions.observations[:, 0, 0].tolist() == [0, 0, 255]
+class TestShown:
+    def test_frames_are_the_cameras(self):
+        seen = Transitions.cut(TWO[:1], frames=True).history(torch.tensor([6])).observations
+        assert seen.shape == (1, LENGTH, 2, 3)
+        assert seen.dtype == torch.float32
+        assert (255 * seen[0, :, 1, 2]).round().tolist() == pytest.approx([22, 23, 24, 25, 26], abs=1)
 
     def test_states_are_shown_as_they_are(self):
-        seen = Transitions.cut(TWO, "state").history(torch.tensor([8])).observations
+        seen = Transitions.cut(TWO).history(torch.tensor([8])).observations
         assert seen[0].tolist() == [[200.0, 200.25]] * 4 + [[201.0, 201.25]]
 
 
 class TestErrors:
-    @pytest.mark.parametrize("source", ["camera", "rendered", "state"])
-    def test_an_episode_without_states_is_named(self, source):
+    @pytest.mark.parametrize("frames", [False, True])
+    def test_an_episode_without_states_is_named(self, frames):
         with pytest.raises(ValueError, match="episode 1 has no states"):
-            Transitions.cut([TWO[0], episode(2, 3, states=False)], source, lambda state: state)
+            Transitions.cut([TWO[0], episode(2, 3, states=False)], frames)
 
     def test_an_episode_without_frames_is_named(self):
         with pytest.raises(ValueError, match="episode 1 has no camera frames"):
-            Transitions.cut([TWO[0], episode(2, 3, frames=False)], "camera")
-
-    def test_rendered_without_a_renderer(self):
-        with pytest.raises(ValueError, match="need a renderer"):
-            Transitions.cut(TWO, "rendered")
-
-    def test_an_unknown_source_is_quoted_and_those_there_are_listed(self):
-        with pytest.raises(ValueError, match="'frames'; there are camera, rendered, state"):
-            Transitions.cut(TWO, "frames")
+            Transitions.cut([TWO[0], episode(2, 3, frames=False)], frames=True)
 
     @pytest.mark.parametrize("episodes", [[], [episode(1, 1)]])
     def test_no_sample_at_all(self, episodes):
         with pytest.raises(ValueError, match="no sample"):
-            Transitions.cut(episodes, "state")
+            Transitions.cut(episodes)

@@ -137,9 +137,10 @@ def test_an_impossible_parameter_is_named_with_its_value(name, value):
     if name == "min_thrust" and value == 0:
         assert Quadrotor(min_thrust=0.0).min_thrust == 0  # rotors that may stop
         return
-    with pytest.raises(ValueError, match=rf"quadrotor: {name} must be positive, got {value}"):
+    right = "0 or positive" if name == "min_thrust" else "positive"
+    with pytest.raises(ValueError, match=rf"quadrotor: {name} must be {right}, got {value}"):
         Quadrotor(**{name: value})
-    with pytest.raises(ValueError, match=f"{name} must be positive"):
+    with pytest.raises(ValueError, match=f"{name} must be {right}"):
         Quadrotor(**{name: torch.tensor([getattr(HEAVY, name), value])})
 
 

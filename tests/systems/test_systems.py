@@ -6,7 +6,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from tests.worlds import energy_of
-from visadapt.systems import SYSTEMS, CartPole, System
+from visadapt.systems import SYSTEMS, CartPole, FixedWing, Quadrotor, System
 from visadapt.systems.integrators import rk4
 from visadapt.world import World
 
@@ -126,6 +126,12 @@ def test_the_motors_load_moves_the_system_as_the_command_does():
 def test_an_impossible_parameter_is_named_with_its_value(name, value):
     with pytest.raises(ValueError, match=f"{name} must be positive, got {value}"):
         CartPole(**{name: value})
+
+
+@pytest.mark.parametrize(("kind", "name"), [(CartPole, "cart_mass"), (FixedWing, "lift_zero"), (Quadrotor, "payload")])
+def test_an_infinite_parameter_is_named(kind, name):
+    with pytest.raises(ValueError, match=f"{kind.name}: {name} must be finite, got inf"):
+        kind(**{name: math.inf})
 
 
 @pytest.mark.parametrize("name", ["cart_mass", "pole_mass", "pole_half_length", "max_force", "gravity"])

@@ -252,7 +252,7 @@ class TestStreams:
         target = FlightTarget(task, Quadrotor(), push(2.0))
         torch.manual_seed(0)
         flown = run(target, FollowPolicy(PERIOD), 2, 12, seeded(4))
-        transitions = Transitions.cut([each.episode for each in flown], "state")
+        transitions = Transitions.cut([each.episode for each in flown])
         made = Streams(self.WORLD, task, identity, transitions, 40, 1000, 1.0, torch.zeros(()))
         made.start(0.0, seeded(5))
         network = FlightResidualNetwork(Quadrotor(), PERIOD, partial(source_steps, self.WORLD))
@@ -289,7 +289,7 @@ class TestStreams:
         target = FlightTarget(task, FixedWing(), push(2.0))
         torch.manual_seed(0)
         flown = run(target, ReachPolicy(), 2, 12, seeded(4))
-        transitions = Transitions.cut([each.episode for each in flown], "state")
+        transitions = Transitions.cut([each.episode for each in flown])
         made = Streams(World(FixedWing(), period=0.05), task, identity, transitions, 20, 1000, 1.0, torch.zeros(()))
         made.start(0.0, seeded(5))
         for b in range(20):

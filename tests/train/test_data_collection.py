@@ -11,6 +11,6 @@ from visadapt.targets.rollout import run
 def test_a_random_policy_moves_every_command_and_keeps_a_vehicle_in_reach_for_a_while(made):
     setup = made()
     target = flight_target(setup, drag(0.3), test=False, reach=REACH)
-    for each in run(target, random_policy(setup), 8, 20, seeded(), exploration=0.05):
+    for each in run(target, random_policy(setup, setup.policy()), 8, 20, seeded(), exploration=0.05):
         assert each.episode.samples == 20
         assert (each.episode.action[:-1].std(0) > 0.02).all()

@@ -160,7 +160,7 @@ class JointLearning:
         could be estimated."""
         self.labelled += self.label(self.waiting) if self.label else self.waiting
         self.waiting = []
-        return Transitions.cut(self.labelled, self.settings.observations, self.observe)
+        return Transitions.cut(self.labelled, frames=self.observe is not None)
 
     def _ground(self, folder: RoundFolder) -> tuple[list[GroundLoss], Transitions]:
         """Fit the named effects and the residual to all samples; the residual's losses, and the transitions with the

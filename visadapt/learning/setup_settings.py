@@ -23,8 +23,6 @@ class SetupSettings:
     """tuning of the policy in the grounded source, in each round"""
     ground: GroundSettings = field(default_factory=GroundSettings)
     """fit of the residual"""
-    observations: str = "state"
-    """what grounding shows the residual: one of `learning.transitions.SOURCES`"""
     longest_episode: int = 250
     """most steps of an episode of the target while data are collected"""
     feedforward: bool = True

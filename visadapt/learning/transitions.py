@@ -19,9 +19,6 @@ from visadapt.world import World, WorldState
 Observe = Callable[[Tensor], Tensor]
 """True states (B, n_state) to frames (B, H, W): a camera. Without one (None) a policy sees what the sensors measure."""
 
-SOURCES = ("camera", "rendered", "state")
-"""What a transition shows: the camera's frames, frames rendered from the states, or the states themselves."""
-
 
 @dataclass(frozen=True)
 class Transitions:
@@ -41,14 +38,12 @@ class Transitions:
     """(N, LENGTH) rows of the history, up to that of s_t; before an episode its first row is repeated"""
 
     @classmethod
-    def cut(cls, episodes: Sequence[Episode], source: str, observe: Observe | None = None) -> Transitions:
-        """Transitions of all samples of the episodes.
+    def cut(cls, episodes: Sequence[Episode], frames: bool = False) -> Transitions:
+        """Transitions of all samples of the episodes, which show the camera's frames, or the states.
 
         Raises:
-            ValueError: an unknown source, episodes without what it needs, or no sample at all.
+            ValueError: episodes without states, or without the frames that are asked for, or no sample at all.
         """
-        if source not in SOURCES:
-            raise ValueError(f"unknown source of observations {source!r}; there are {', '.join(SOURCES)}")
         dtype = torch.get_default_dtype()
         parts: list[tuple[Tensor, ...]] = []
         first = 0
@@ -56,7 +51,7 @@ class Transitions:
             if episode.state is None:
                 raise ValueError(f"episode {number} has no states to learn from: estimate them first")
             state = torch.as_tensor(episode.state, dtype=dtype)
-            seen = _seen(episode, number, state, source, observe)
+            seen = _frames(episode, number) if frames else state
             action = pad(torch.as_tensor(episode.action[:-1], dtype=dtype), (0, 0, 0, 1))
             time = torch.as_tensor(episode.time - episode.time[0], dtype=dtype)
             task_state = state[:, :0] if episode.task_state is None else torch.as_tensor(episode.task_state)
@@ -119,15 +114,7 @@ class Transitions:
         return History(seen, self.actions[rows - 1])
 
 
-def _seen(episode: Episode, number: int, state: Tensor, source: str, observe: Observe | None) -> Tensor:
-    if source == "camera":
-        if episode.frame is None:
-            raise ValueError(f"episode {number} has no camera frames")
-        return torch.from_numpy(np.ascontiguousarray(episode.frame))
-    if source == "rendered":
-        if observe is None:
-            raise ValueError("rendered observations need a renderer")
-        with torch.no_grad():
-            # In 8 bits, as the frames of a camera.
-            return (observe(state).clamp(0, 1) * 255).round().to(torch.uint8)
-    return state
+def _frames(episode: Episode, number: int) -> Tensor:
+    if episode.frame is None:
+        raise ValueError(f"episode {number} has no camera frames")
+    return torch.from_numpy(np.ascontiguousarray(episode.frame))

@@ -95,7 +95,6 @@ def from_frames(source: World) -> SetupSettings:
         # With 1 too little is learnt of small gaps near rest, where the first episodes are falls, whose gaps are large;
         # with 0.1 and few samples of a force that changes, the cart-pole with the residual may be unstable.
         ground=GroundSettings(ridge=0.1, larger=(1.0, 10.0)),
-        observations="camera",
         perception=PerceptionSettings(),
     )
 

@@ -116,14 +116,19 @@ class System(ABC):
         return replace(itself, **differing) if differing else self
 
     def check_parameters(self, either_sign: Collection[str] = (), may_be_zero: Collection[str] = ()) -> None:
-        """Raise ValueError if a parameter is not positive or, where it may have either sign, not finite."""
+        """Raise ValueError if a parameter is not finite, or is negative or 0 where it may not be."""
         itself: Any = self
         for field in fields(itself):
-            value = getattr(self, field.name)
-            least = 0.0 if field.name in may_be_zero else torch.finfo(torch.float32).tiny
-            if not holds(abs(value) < math.inf if field.name in either_sign else value >= least):
-                right = "finite" if field.name in either_sign else "positive"
+            value, right = getattr(self, field.name), "positive"
+            least = torch.finfo(torch.float32).tiny
+            if field.name in either_sign:
+                right, least = "finite", -math.inf
+            elif field.name in may_be_zero:
+                right, least = "0 or positive", 0.0
+            if not holds(value >= least):
                 raise ValueError(f"{self.name}: {field.name} must be {right}, got {value!r}")
+            if not holds(abs(value) < math.inf):
+                raise ValueError(f"{self.name}: {field.name} must be finite, got {value!r}")
 
     def __init_subclass__(cls, **kwargs: object) -> None:
         super().__init_subclass__(**kwargs)
