@@ -15,11 +15,9 @@ from pathlib import Path
 
 import torch
 import tyro
-from stable_baselines3 import PPO
 
 from benchmarks.baselines.courses import SwingingUp
-from benchmarks.baselines.machines import Machines
-from benchmarks.baselines.ppo import settings_of, trained
+from benchmarks.baselines.table import module_of
 from experiments.result_tables import Row, write_rows
 from experiments.swing_up import score
 from visadapt.targets.synthetic import no_effects
@@ -42,13 +40,13 @@ class Settings:
 def main(settings: Settings) -> None:
     """Train, score, and write the table."""
     torch.set_num_threads(1)
-    course = SwingingUp()
-    machines = Machines(course, no_effects, World(course.system, period=course.period), settings.seed)
-    model = PPO("MlpPolicy", machines, **settings_of(settings.seed))
+    ppo, course = module_of("ppo"), SwingingUp()
+    machines = ppo.Machines(course, no_effects, World(course.system, period=course.period), settings.seed)
+    model = ppo.PPO("MlpPolicy", machines, **ppo.settings_of(settings.seed))
     rows: list[Row] = []
     while model.num_timesteps < settings.most and (not rows or rows[-1].failed):
         model.learn(settings.every, reset_num_timesteps=False)
-        found = score(trained(model, course), settings.episodes)
+        found = score(ppo.trained(model, course), settings.episodes)
         rows.append(
             Row(
                 experiment="CartPole, swing-up",

@@ -18,7 +18,6 @@ import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +77,7 @@ class Settings:
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
     for name in settings.baselines:
-        _module(name)
+        module_of(name)
     if unknown := sorted(set(settings.experiments) - set(PROBLEMS)):
         raise SystemExit(f"no such experiment: {', '.join(unknown)}; there are {'; '.join(PROBLEMS)}")
     seeds = range(settings.seeds)
@@ -155,7 +154,7 @@ def _scores(settings: Settings, name: str, experiment: str, seed: int) -> None:
     open_run(folder, {"seed": seed, **asdict(sizes)})
     if (folder / DONE).exists():
         return
-    for stage in _module(name).stages(problem, sizes, folder, seed):
+    for stage in module_of(name).stages(problem, sizes, folder, seed):
         path, where = score_path(folder, stage), problem.scored(stage.domain)
         found = kept_score(path, stage.policy, where, sizes.episodes, steps)
         about = {"domain": stage.domain, "samples": stage.samples}
@@ -191,7 +190,7 @@ def _folder(settings: Settings, name: str, experiment: str, seed: int) -> Path:
     return settings.work / name / "".join(c if c.isalnum() else "-" for c in experiment) / f"seed-{seed}"
 
 
-def _module(name: str) -> Any:
+def module_of(name: str) -> Any:
     """The module of a baseline; ends with one line where it, or its library, is missing."""
     if name not in BASELINES:
         raise SystemExit(f"no such baseline: {name}; there are {', '.join(BASELINES)}")
