@@ -42,9 +42,16 @@ def is_proportional(effect: type[Effect]) -> bool:
     return bool(columns) and all(effect.table[k].linear for k in columns)
 
 
-def grid(effect: type[Effect], spans: Spans) -> Tensor:
-    """Parameter values (G, P) of an effect that is proportional to its strengths, which are neutral."""
-    axes = [_edges(p, spans, EDGE_POINTS) if p.is_edge else values_of(p) for p in effect.table]
+def grid(effect: type[Effect], spans: Spans, frequencies: Tensor | None = None) -> Tensor:
+    """Parameter values (G, P) of an effect that is proportional to its strengths, which are neutral; with `frequencies`
+    those are the frequencies."""
+
+    def axis(parameter: Parameter) -> Tensor:
+        if frequencies is not None and parameter.role is Role.FREQUENCY:
+            return frequencies
+        return _edges(parameter, spans, EDGE_POINTS) if parameter.is_edge else values_of(parameter)
+
+    axes = [axis(parameter) for parameter in effect.table]
     points = torch.cartesian_prod(*axes).reshape(-1, len(effect.table))
     if (region := effect.region()) is not None:
         start, end = (effect.table.index(edge) for edge in region)

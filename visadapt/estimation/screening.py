@@ -17,7 +17,9 @@ from torch import Tensor
 
 from visadapt.effects import Effect, Role
 from visadapt.estimation.episode_phases import has_episode_phases, in_step
+from visadapt.estimation.frequencies import comes_and_goes, likeliest
 from visadapt.estimation.grids import (
+    FREQUENCY_POINTS,
     SMALL_SHARE,
     grid,
     inside,
@@ -83,9 +85,13 @@ def screen(
     def best(effect: type[Effect]) -> Candidate | None:
         if has_episode_phases(effect):
             return _with_episode_phases(sensitivity(1), effect)
-        proportional, columns = is_proportional(effect), strengths(effect)
-        points = grid(effect, covered) if proportional else starts(effect, covered)
-        stride = _window_stride(profile_of(system).screening_rows, rows, len(points) * (1 + len(columns)))
+        proportional, columns, most = is_proportional(effect), strengths(effect), profile_of(system).screening_rows
+        if proportional and comes_and_goes(effect):
+            few = sensitivity(_window_stride(most, rows, 2 * FREQUENCY_POINTS))
+            points = grid(effect, covered, likeliest(sensitivity(1), few, effect))
+        else:
+            points = grid(effect, covered) if proportional else starts(effect, covered)
+        stride = _window_stride(most, rows, len(points) * (1 + len(columns)))
         some = sensitivity(stride)
         if not proportional:
             promising = _promising(some, effect, points, columns)

@@ -103,26 +103,36 @@ class Sensitivity:
         changes = self._changes(effect, tried.flatten(0, 1)).unflatten(1, (len(points), -1))
         return changes[..., 0], (changes[..., 1:] - changes[..., :1]) / steps
 
+    def pull(self, effect: type[Effect], point: Tensor, column: int) -> Tensor:
+        """(W, T - 1) what a unit of the strength `column` in each period alone lowers half the squared innovations by.
+
+        The effect must be proportional to the strength, which is neutral at the point (P,), and act on the motion.
+        """
+        tried, step = point.clone(), PROBE_SHARE * (effect.table[column].high - point[column])
+        tried[column] += step
+        drive = self._drive(effect, tried[None]) / step
+        each = torch.zeros_like(drive, requires_grad=True)
+        change = self.innovations.response(each, torch.zeros_like(self.rows.measured[..., None]))
+        (slope,) = torch.autograd.grad(change[:, 0] @ self.innovations.error, each)
+        return -(slope * drive).sum((2, 3))
+
     def _changes(self, effect: type[Effect], tried: Tensor) -> Tensor:
-        """Change (N, M) of the innovations with the effect at parameters (M, P).
+        """Change (N, M) of the innovations with the effect at parameters (M, P)."""
+        if not issubclass(effect, SensingEffect):
+            return self.innovations.response(
+                self._drive(effect, tried), torch.zeros_like(self.rows.measured[..., None])
+            )
+        read = self._read(*self._with(effect, tried))
+        reading = (read[:1] - read[1:]).movedim(0, -1).nan_to_num()
+        return self.innovations.response(torch.zeros_like(self.fits.state[0, :, 1:, :, None]), reading)
+
+    def _drive(self, effect: type[Effect], tried: Tensor) -> Tensor:
+        """Change (W, T - 1, n, M) of the states a period after each row with an effect that is not on the sensors.
 
         Over short periods loads and commands change a step linearly, which takes no integration.
         """
-        rows, fits = self.rows, self.fits
-        model = CandidateModel(self.system, [*self.effects, effect], rows, COARSEST)
-        count = tried.shape[1]
-        neutral = torch.tensor([0.0 if p.neutral is None else p.neutral for p in effect.table], dtype=torch.float64)
-        tried = torch.cat((neutral[None], tried))
-        theta = torch.cat((fits.theta[0].expand(len(tried), -1), tried), 1)
-        # Row 0 is the model without the effect: strengths at neutral; shapes do not matter there.
-        for j, parameter in enumerate(effect.table):
-            if parameter.neutral is None:
-                theta[0, j - count] = tried[1, j]
-        if issubclass(effect, SensingEffect):
-            read = self._read(model, theta)
-            reading = (read[:1] - read[1:]).movedim(0, -1).nan_to_num()
-            return self.innovations.response(torch.zeros_like(fits.state[0, :, 1:, :, None]), reading)
-        linear = rows.period <= SHORT_PERIOD
+        model, theta = self._with(effect, tried)
+        linear = self.rows.period <= SHORT_PERIOD
         if linear and issubclass(effect, ActuationEffect):
             mean = self._acted(model, theta).mean(3)
             drive = torch.einsum("wtna,mwta->wtnm", self._slopes[0], mean[1:] - mean[:1])
@@ -132,8 +142,20 @@ class Sensitivity:
         else:
             after = self._after(model, theta)
             drive = (after[1:] - after[:1]).movedim(0, -1)
-        drive = drive * rows.inside[:, 1:, None, None]
-        return self.innovations.response(drive, torch.zeros_like(rows.measured[..., None]))
+        return drive * self.rows.inside[:, 1:, None, None]
+
+    def _with(self, effect: type[Effect], tried: Tensor) -> tuple[CandidateModel, Tensor]:
+        """The set with the effect, and its parameters (1 + M, P): first without the effect, then at `tried` (M, P)."""
+        model = CandidateModel(self.system, [*self.effects, effect], self.rows, COARSEST)
+        count = tried.shape[1]
+        neutral = torch.tensor([0.0 if p.neutral is None else p.neutral for p in effect.table], dtype=torch.float64)
+        tried = torch.cat((neutral[None], tried))
+        theta = torch.cat((self.fits.theta[0].expand(len(tried), -1), tried), 1)
+        # In row 0 strengths are at neutral; shapes do not matter there.
+        for j, parameter in enumerate(effect.table):
+            if parameter.neutral is None:
+                theta[0, j - count] = tried[1, j]
+        return model, theta
 
     def _read(self, model: CandidateModel, theta: Tensor) -> Tensor:
         """(M, W, T, m) the readings with parameters (M, P), each in the row in which the innovations have the reading;
