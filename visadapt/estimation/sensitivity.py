@@ -111,9 +111,10 @@ class Sensitivity:
         tried, step = point.clone(), PROBE_SHARE * (effect.table[column].high - point[column])
         tried[column] += step
         drive = self._drive(effect, tried[None]) / step
-        each = torch.zeros_like(drive, requires_grad=True)
-        change = self.innovations.response(each, torch.zeros_like(self.rows.measured[..., None]))
-        (slope,) = torch.autograd.grad(change[:, 0] @ self.innovations.error, each)
+        with torch.enable_grad():  # a diagnosis as a whole takes no gradients
+            each = torch.zeros_like(drive, requires_grad=True)
+            change = self.innovations.response(each, torch.zeros_like(self.rows.measured[..., None]))
+            (slope,) = torch.autograd.grad(change[:, 0] @ self.innovations.error, each)
         return -(slope * drive).sum((2, 3))
 
     def _changes(self, effect: type[Effect], tried: Tensor) -> Tensor:
