@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from visadapt.estimation.colour import colour_of
+from visadapt.estimation.colour import colour_of, whitened, whitened_adjoint
 
 WINDOWS, ROWS, PERIOD = 8, 300, 0.01
 MIXING = torch.tensor([[1.0, 0.0], [0.5, 0.8]], dtype=torch.float64)
@@ -56,3 +56,10 @@ def test_padding_tells_nothing():
 @pytest.mark.parametrize("rows", [0, 1, 3])
 def test_a_recording_of_few_rows_has_no_colour(rows):
     assert colour(drawn(RESONANCE)[:, :rows]) is None
+
+
+def test_the_adjoint_of_whitening_is_its_transpose():
+    innovations = drawn(RESONANCE)
+    found, other = colour(innovations), torch.randn(*innovations.shape, 1).double()
+    forwards = (whitened(innovations[..., None], found) * other).sum()
+    assert float(forwards) == pytest.approx(float((innovations[..., None] * whitened_adjoint(other, found)).sum()))

@@ -6,7 +6,7 @@ import torch
 
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.search import Search
-from visadapt.effects import ActuationEffect, DynamicsEffect
+from visadapt.effects import ActuationEffect, DynamicsEffect, PeriodicForce
 from visadapt.effects.catalogue import catalogue
 from visadapt.estimation.candidate import FINE, SHORT_PERIOD, CandidateModel, linearise
 from visadapt.estimation.grids import grid, spans
@@ -60,3 +60,14 @@ def test_the_response_is_that_of_integrated_steps(source, effect):
     drive = (after - before)[..., None] * rows.inside[:, 1:, None, None]
     expected = sensitivity.innovations.response(drive, torch.zeros_like(rows.measured[..., None]))[:, 0]
     assert float((found - expected).norm()) < 0.1 * float(expected.norm())
+
+
+@pytest.mark.parametrize("frequency", [0.3, 1.1, 4.0])
+def test_the_pulls_of_all_rows_add_up_to_that_of_a_force_that_comes_and_goes(source, frequency):
+    rows, _, sensitivity = source
+    point = torch.tensor([[0.0, frequency, 0.4, 0.0]], dtype=torch.float64)
+    expected = -sensitivity.by_unit(PeriodicForce, point, [0])[:, 0, 0] @ sensitivity.innovations.error
+    pull = sensitivity.pull(PeriodicForce, torch.zeros(4, dtype=torch.float64), 0)
+    time = (rows.time[:, :-1] + rows.time[:, 1:]) / 2
+    found = (pull * (2 * torch.pi * frequency * time + 0.4).cos()).sum()
+    assert float(found) == pytest.approx(float(expected), rel=0.02)

@@ -44,6 +44,17 @@ class Colour:
         return self.whitening @ out
 
 
+def whitened_adjoint(slopes: Tensor, colour: Colour | None) -> Tensor:
+    """Derivatives by innovations (N, T, m, M), from those by the innovations that `whitened` makes of them."""
+    if colour is None:
+        return slopes
+    back = colour.whitening.mT @ slopes
+    out = back.clone()
+    for lag, matrix in enumerate(colour.coefficients, 1):
+        out[:, :-lag] -= matrix.mT @ back[:, lag:]
+    return out
+
+
 def whitened(innovations: Tensor, colour: Colour | None) -> Tensor:
     """Innovations (N, T, m, M) with their `colour` taken out; as they are where they have none."""
     return innovations if colour is None else colour.whitened(innovations)

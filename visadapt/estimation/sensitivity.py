@@ -11,8 +11,8 @@ from torch import Tensor
 
 from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, SensingEffect
 from visadapt.estimation.candidate import COARSEST, SHORT_PERIOD, CandidateModel, with_loads
-from visadapt.estimation.colour import whitened
-from visadapt.estimation.kalman import forward, respond
+from visadapt.estimation.colour import whitened, whitened_adjoint
+from visadapt.estimation.kalman import adjoints, forward, respond
 from visadapt.estimation.late_readings import earlier
 from visadapt.estimation.likelihood import FitState, linear_problem, variances
 from visadapt.estimation.linearise import integrate, linearise_step
@@ -38,6 +38,12 @@ class Innovations:
         """Change (N, M) of the innovations with M inputs: `drive` (W, T - 1, n, M) and `reading` (W, T, m, M), which is
         0 where nothing was measured."""
         return self._projected(self._white(respond(self._filtered, drive, reading)))
+
+    @cached_property
+    def slope(self) -> Tensor:
+        """(W, T - 1, n) derivative of half the squared innovations by a `drive`, which one pass backwards gives."""
+        coloured = whitened_adjoint(self.error.view(*self._filtered.white.shape[:3], 1), self.model.rows.colour)
+        return adjoints(self._filtered, coloured)[:, 1:, :, 0]
 
     def _white(self, innovations: Tensor) -> Tensor:
         """(N, M) of innovations (W, T, m, M)."""
@@ -111,11 +117,7 @@ class Sensitivity:
         tried, step = point.clone(), PROBE_SHARE * (effect.table[column].high - point[column])
         tried[column] += step
         drive = self._drive(effect, tried[None]) / step
-        with torch.enable_grad():  # a diagnosis as a whole takes no gradients
-            each = torch.zeros_like(drive, requires_grad=True)
-            change = self.innovations.response(each, torch.zeros_like(self.rows.measured[..., None]))
-            (slope,) = torch.autograd.grad(change[:, 0] @ self.innovations.error, each)
-        return -(slope * drive).sum((2, 3))
+        return -(self.innovations.slope[..., None] * drive).sum((2, 3))
 
     def _changes(self, effect: type[Effect], tried: Tensor) -> Tensor:
         """Change (N, M) of the innovations with the effect at parameters (M, P)."""
