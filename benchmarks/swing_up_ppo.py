@@ -46,7 +46,7 @@ def main(settings: Settings) -> None:
     rows: list[Row] = []
     while model.num_timesteps < settings.most and (not rows or rows[-1].failed):
         model.learn(settings.every, reset_num_timesteps=False)
-        found = score(ppo.trained(model, course), settings.episodes)
+        found = score(ppo.Trained(model, course), settings.episodes)
         rows.append(
             Row(
                 experiment="CartPole, swing-up",

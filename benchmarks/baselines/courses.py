@@ -20,7 +20,7 @@ from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.policies.flight import FlightPolicy
 from visadapt.systems import CartPole, FixedWing, Quadrotor, System
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, VELOCITY, rotation
-from visadapt.targets import Start, SyntheticTarget
+from visadapt.targets import Start
 from visadapt.tasks.balance import EPISODE_STEPS
 from visadapt.tasks.base import FlightTask
 from visadapt.tasks.follow import Follow
@@ -41,6 +41,8 @@ class Course(ABC):
     steps: int
     """in the longest episode"""
     start: Begin
+    show = "state"
+    """what a policy is shown of it: `Policy.shown`"""
 
     @abstractmethod
     def shown(self, history: History) -> Tensor:
@@ -98,9 +100,8 @@ class SwingingUp(Course):
     FARTHEST = 8.0
     """m from the middle at which an episode fails, as ours starts anew"""
 
-    def start(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        state = Start(*ANYWHERE).draw(batch, generator)
-        return state, state[:, :0]
+    def __init__(self) -> None:
+        self.start = starting(Start(*ANYWHERE))
 
     def shown(self, history: History) -> Tensor:
         x, velocity, angle, turning = history.observations[:, -1].unbind(1)
@@ -118,6 +119,7 @@ class Flying(Course):
 
     task: FlightTask
     eyes: FlightPolicy
+    show = "state and goal"
     FARTHEST = 5.0
     """m off its course at which a flight fails"""
 
@@ -168,14 +170,14 @@ class Reaching(Flying):
         return reward, failed, passed
 
 
-def balancing(target: SyntheticTarget, with_history: bool) -> Balancing:
-    """The course of a cart-pole whose episodes start as the target's."""
+def starting(first: Start) -> Begin:
+    """Episodes of a cart-pole that start as `first` says; their task states are empty."""
 
     def begin(batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        state = target.initial.draw(batch, generator)
+        state = first.draw(batch, generator)
         return state, state[:, :0]
 
-    return Balancing(begin, with_history)
+    return begin
 
 
 def flying(task: FlightTask, system: System, begin: Begin) -> Flying:

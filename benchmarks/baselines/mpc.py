@@ -28,7 +28,7 @@ from visadapt.effects import Residual
 from visadapt.history import HORIZON, LENGTH, History
 from visadapt.policies import Policy
 from visadapt.setups.base import Setup
-from visadapt.systems import CartPole, FixedWing, Quadrotor, RigidBody, System
+from visadapt.systems import CartPole, FixedWing, Quadrotor, System
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
 from visadapt.tasks.follow import FollowCost
 from visadapt.tasks.reach import Reach
@@ -61,6 +61,7 @@ class ModelPredictive(Policy):
 
     def __init__(self, program: Program, residual: Residual | None = None) -> None:
         super().__init__(program.n_state, program.n_action)
+        self.shown = "state and goal" if program.n_goal else "state"
         self.program = program
         self.weights = weights(residual)
         self.warm: list[dict[str, Any] | None] = []
@@ -98,13 +99,7 @@ class ModelPredictive(Policy):
         return np.concatenate([np.concatenate((each[1:], each[-1:])).ravel() for each in (commands, states)])
 
 
-class FlightPredictive(ModelPredictive):
-    """The same, of a vehicle, which is shown its goal."""
-
-    shown = "state and goal"
-
-
-class GroundedPredictive(FlightPredictive):
+class GroundedPredictive(ModelPredictive):
     """Plans with the residual that another policy reads, as it is fitted round after round."""
 
     def __init__(self, program: Program, learner: Policy) -> None:
@@ -127,7 +122,7 @@ class Program:
     def __init__(self, source: World, errors: Errors, n_goal: int = 0, residual: Residual | None = None) -> None:
         self.system = source.system
         n_state, n_action = len(self.system.states), len(self.system.actions)
-        self.n_state, self.n_action = n_state, n_action
+        self.n_state, self.n_action, self.n_goal = n_state, n_action, n_goal
         model = step(source, residual)
         variables = ca.SX.sym("plan", (n_action + n_state) * HORIZON)
         commands = ca.reshape(variables[: n_action * HORIZON], n_action, HORIZON)
@@ -206,10 +201,8 @@ ERRORS: dict[type[System], tuple[Errors, int]] = {
 def planned(source: World, program: Program | None = None, residual: Residual | None = None) -> ModelPredictive:
     """The planner of a source, with a residual or without; `program` is made where none is given."""
     if program is None:
-        errors, n_goal = ERRORS[type(source.system)]
-        program = Program(source, errors, n_goal, residual)
-    kind = FlightPredictive if isinstance(source.system, RigidBody) else ModelPredictive
-    return kind(program, residual)
+        program = Program(source, *ERRORS[type(source.system)], residual)
+    return ModelPredictive(program, residual)
 
 
 def following(setup: Setup, learner: Policy) -> Policy:

@@ -23,7 +23,7 @@ from torch import Tensor
 from benchmarks.baselines.ensemble import MEMBERS, Ensemble, source_ensemble
 from benchmarks.baselines.mppi import carried
 from benchmarks.baselines.problem import Problem, Sizes, Stage, in_rounds
-from benchmarks.baselines.subjects import FlightSubject, Subject, subject_of
+from benchmarks.baselines.subjects import Subject, subject_of
 from visadapt.history import HORIZON, History
 from visadapt.learning.transitions import Transitions
 from visadapt.policies import Policy
@@ -40,6 +40,7 @@ class EnsemblePlanner(Policy):
 
     def __init__(self, ensemble: Ensemble, subject: Subject, n_action: int) -> None:
         super().__init__(len(ensemble.unit), n_action)
+        self.shown = subject.show
         self.ensemble = ensemble
         self.subject = subject
         self.generator = torch.Generator().manual_seed(0)
@@ -79,20 +80,13 @@ class EnsemblePlanner(Policy):
         return cost.nan_to_num(1e9, 1e9).unflatten(0, (MEMBERS, -1, PLANS)).mean(0)
 
 
-class FlightPlanner(EnsemblePlanner):
-    """The same, of a vehicle, which is shown its goal."""
-
-    shown = "state and goal"
-
-
 def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:
     """The ensemble of the source, then fitted to all samples of the target so far, round after round."""
     world, subject = problem.setup(sizes).source, subject_of(problem, sizes)
     source = source_ensemble(world, subject, sizes.updates, seed)
-    kind = FlightPlanner if isinstance(subject, FlightSubject) else EnsemblePlanner
 
     def planner(ensemble: Ensemble) -> Policy:
-        return kind(ensemble, subject, len(world.system.actions))
+        return EnsemblePlanner(ensemble, subject, len(world.system.actions))
 
     unfitted = partial(planner, source)
     yield Stage("source", 0, unfitted())

@@ -17,7 +17,7 @@ import torch
 from stable_baselines3 import PPO
 from torch import Tensor
 
-from benchmarks.baselines.courses import Balancing, Course, Flying, balancing, flying
+from benchmarks.baselines.courses import Balancing, Course, flying, starting
 from benchmarks.baselines.machines import MACHINES, Machines
 from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage, score_path
 from experiments.kept_scores import kept_score
@@ -44,6 +44,7 @@ class Trained(Policy):
 
     def __init__(self, model: PPO, course: Course) -> None:
         super().__init__(len(course.system.states), len(course.system.actions))
+        self.shown = course.show
         self.network = model.policy
         self.course = course
 
@@ -51,17 +52,6 @@ class Trained(Policy):
     def act(self, history: History) -> Tensor:
         out: Tensor = self.network.get_distribution(self.course.shown(history)).mode()
         return out.clamp(-1, 1)
-
-
-class TrainedFlight(Trained):
-    """The same, of a vehicle, which is shown its goal."""
-
-    shown = "state and goal"
-
-
-def trained(model: PPO, course: Course) -> Trained:
-    """The policy of a model on a course."""
-    return (TrainedFlight if isinstance(course, Flying) else Trained)(model, course)
 
 
 def settings_of(seed: int) -> dict[str, Any]:
@@ -81,7 +71,7 @@ def courses(problem: Problem, sizes: Sizes) -> tuple[Course, Course]:
         own = target.task
         return flying(own, target.system, wide), flying(own, target.system, own.evaluation_start)
     assert isinstance(target, SyntheticTarget)
-    return Balancing(wide, problem.with_history), balancing(target, problem.with_history)
+    return Balancing(wide, problem.with_history), Balancing(starting(target.initial), problem.with_history)
 
 
 def pretrained(problem: Problem, course: Course, sizes: Sizes, path: Path, seed: int) -> PPO:
@@ -94,7 +84,7 @@ def pretrained(problem: Problem, course: Course, sizes: Sizes, path: Path, seed:
     for look in range(LOOKS):
         model.learn(sizes.source_steps // LOOKS, reset_num_timesteps=False)
         kept = path.with_name(f"source-{look}.json")
-        found = kept_score(kept, trained(model, course), problem.scored("source"), sizes.episodes, seed=TUNING_SEED)
+        found = kept_score(kept, Trained(model, course), problem.scored("source"), sizes.episodes, seed=TUNING_SEED)
         print(f"PPO, {problem.name}, seed {seed}, source, {model.num_timesteps} steps: {found}", flush=True)
         row = problem.row("PPO", "source", 0, [kept])
         if (row.failed, row.mean) < best:
@@ -108,7 +98,7 @@ def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[
     folder.mkdir(parents=True, exist_ok=True)
     wide, course = courses(problem, sizes)
     model = pretrained(problem, wide, sizes, folder / "source.zip", seed)
-    policy = trained(model, course)
+    policy = Trained(model, course)
     yield Stage("source", 0, policy)
     yield Stage("target", 0, policy)
     target = problem.target()

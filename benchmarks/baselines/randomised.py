@@ -7,7 +7,8 @@ tell which draw it is in.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -15,6 +16,7 @@ import torch
 from benchmarks.baselines.cartpole import CartPoleProblem
 from benchmarks.baselines.problem import Sizes, Stage, drawn
 from visadapt.learning.policy import tune
+from visadapt.learning.training_state import train_or_load
 from visadapt.setups.cartpole import cartpole_states
 from visadapt.tasks.balance import EPISODE_STEPS
 
@@ -34,7 +36,10 @@ def stages(problem: CartPoleProblem, sizes: Sizes, folder: Path, seed: int) -> I
     torch.manual_seed(seed)
     policy = setup.policy()
     for number, how in enumerate((replace(settings.source, batch=DRAWS), refinement)):
-        tune(policy, world, None, how, torch.Generator().manual_seed(seed + number))
+        args = (policy, world, None, how, torch.Generator().manual_seed(seed + number), None, None)
+        train_or_load(
+            folder / f"policy-{number}.safetensors", policy, {"seed": seed, **asdict(how)}, partial(tune, *args)
+        )
     policy.eval()
     yield Stage("source", 0, policy)
     yield Stage("target", 0, policy)

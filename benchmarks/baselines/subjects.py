@@ -21,6 +21,8 @@ class Subject(ABC):
 
     with_history: bool
     """whether it reads 5 states and commands, or the last alone"""
+    show = "state"
+    """what a policy is shown of it: `Policy.shown`"""
     noise: float
     """standard deviation of the commands that the first iteration of a plan draws"""
 
@@ -62,6 +64,7 @@ class FlightSubject(Subject):
     """A vehicle, which reads its velocity, rotation matrix, rates and command, as the residual of ours does."""
 
     with_history = False
+    show = "state and goal"
     noise = 0.3
 
     def __init__(self, task: FlightTask) -> None:

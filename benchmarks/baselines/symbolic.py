@@ -52,9 +52,7 @@ def source_step(source: World, state: Any, command: Any) -> Any:
 
 def derivative(system: System, state: Any, command: Any) -> Any:
     """The equations of the system without loads."""
-    return next(equations for kind, equations in DERIVATIVES.items() if isinstance(system, kind))(
-        system, state, command
-    )
+    return DERIVATIVES[type(system)](system, state, command)
 
 
 def cartpole(system: Any, state: Any, command: Any) -> Any:

@@ -126,12 +126,12 @@ def test_a_baseline_that_is_not_there_is_told_in_one_line():
 
 def test_episodes_of_ppo_are_those_of_the_target():
     pytest.importorskip("stable_baselines3")
-    from benchmarks.baselines.courses import balancing
+    from benchmarks.baselines.courses import Balancing, starting
     from benchmarks.baselines.machines import MACHINES, Machines
 
     target = PROBLEMS[SINE].target()
     assert isinstance(target, SyntheticTarget)
-    machines = Machines(balancing(target, with_history=True), target.draw_effects, None, seed=0)
+    machines = Machines(Balancing(starting(target.initial), with_history=True), target.draw_effects, None, seed=0)
     machines.reset()
     seen, still = target.reset(MACHINES, torch.Generator().manual_seed(0)), torch.zeros(MACHINES, 1)
     standing = seen.alive

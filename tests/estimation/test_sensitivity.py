@@ -9,7 +9,7 @@ from visadapt.diagnosis.search.search import Search
 from visadapt.effects import ActuationEffect, DynamicsEffect, PeriodicForce
 from visadapt.effects.catalogue import catalogue
 from visadapt.estimation.candidate import FINE, SHORT_PERIOD, CandidateModel, linearise
-from visadapt.estimation.grids import grid, spans
+from visadapt.estimation.grids import grid, neutral_point, spans
 from visadapt.estimation.sensitivity import Sensitivity
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole
@@ -49,7 +49,7 @@ def test_the_response_is_that_of_integrated_steps(source, effect):
     rows, fits, sensitivity = source
     points = grid(effect, spans(SYSTEM, rows, fits.state[0]))
     point = points[len(points) // 2].clone()
-    neutral = torch.tensor([0.0 if p.neutral is None else p.neutral for p in effect.table], dtype=torch.float64)
+    neutral = neutral_point(effect)
     for k, parameter in enumerate(effect.table):
         if parameter.linear:
             point[k] = neutral[k] + 0.05 * (parameter.high - neutral[k])

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, Role
-from visadapt.estimation.grids import strengths, values_of
+from visadapt.estimation.grids import neutral_point, strengths, values_of
 from visadapt.estimation.sensitivity import Sensitivity
 
 BIN = 0.02
@@ -48,8 +48,7 @@ def likeliest(whole: Sensitivity, some: Sensitivity, effect: type[Effect]) -> Te
     column, strength = _column(effect, Role.FREQUENCY), strengths(effect)[0]
     low, high = effect.table[column].low, effect.table[column].high
     coarse = values_of(effect.table[column])
-    steady = torch.tensor([0.0 if p.neutral is None else p.neutral for p in effect.table], dtype=torch.float64)
-    pull = whole.pull(effect, steady, strength)
+    pull = whole.pull(effect, neutral_point(effect), strength)
     time = (whole.rows.time[:, :-1] + whole.rows.time[:, 1:]) / 2
     inside = whole.rows.inside[:, 1:] > 0
     first, last = float(time[inside].min()), float(time[inside].max())
@@ -75,8 +74,7 @@ def likeliest(whole: Sensitivity, some: Sensitivity, effect: type[Effect]) -> Te
 def _energy(some: Sensitivity, effect: type[Effect], frequencies: Tensor) -> Tensor:
     """(F,) E at frequencies (F,): the mean of that of a cosine and of a sine."""
     column, phase = _column(effect, Role.FREQUENCY), _column(effect, Role.PHASE)
-    neutral = torch.tensor([0.0 if p.neutral is None else p.neutral for p in effect.table], dtype=torch.float64)
-    points = neutral.repeat(2 * len(frequencies), 1)
+    points = neutral_point(effect).repeat(2 * len(frequencies), 1)
     points[:, column] = frequencies.repeat(2)
     points[len(frequencies) :, phase] = math.pi / 2
     response = some.by_unit(effect, points, strengths(effect)[:1])[..., 0]

@@ -42,6 +42,11 @@ def is_proportional(effect: type[Effect]) -> bool:
     return bool(columns) and all(effect.table[k].linear for k in columns)
 
 
+def neutral_point(effect: type[Effect]) -> Tensor:
+    """(P,) the neutral values of the effect's parameters; 0 for those that have none."""
+    return torch.tensor([0.0 if p.neutral is None else p.neutral for p in effect.table], dtype=torch.float64)
+
+
 def grid(effect: type[Effect], spans: Spans, frequencies: Tensor | None = None) -> Tensor:
     """Parameter values (G, P) of an effect that is proportional to its strengths, which are neutral; with `frequencies`
     those are the frequencies."""

@@ -12,6 +12,7 @@ from torch import Tensor
 from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, SensingEffect
 from visadapt.estimation.candidate import COARSEST, SHORT_PERIOD, CandidateModel, with_loads
 from visadapt.estimation.colour import whitened, whitened_adjoint
+from visadapt.estimation.grids import neutral_point
 from visadapt.estimation.kalman import adjoints, forward, respond
 from visadapt.estimation.late_readings import earlier
 from visadapt.estimation.likelihood import FitState, linear_problem, variances
@@ -151,8 +152,7 @@ class Sensitivity:
         """The set with the effect, and its parameters (1 + M, P): first without the effect, then at `tried` (M, P)."""
         model = CandidateModel(self.system, [*self.effects, effect], self.rows, COARSEST)
         count = tried.shape[1]
-        neutral = torch.tensor([0.0 if p.neutral is None else p.neutral for p in effect.table], dtype=torch.float64)
-        tried = torch.cat((neutral[None], tried))
+        tried = torch.cat((neutral_point(effect)[None], tried))
         theta = torch.cat((self.fits.theta[0].expand(len(tried), -1), tried), 1)
         # In row 0 strengths are at neutral; shapes do not matter there.
         for j, parameter in enumerate(effect.table):

@@ -8,7 +8,7 @@ what grounding has learnt, and adapts in far fewer iterations.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -31,7 +31,7 @@ class Policy(nn.Module):
     torch.Size([2, 1])
     """
 
-    shown: ClassVar[str] = "state"
+    shown: str = "state"
     """what it is shown of a target: state, frame, or state and goal (`targets.rollout.SHOWN`)"""
 
     def __init__(
