@@ -57,6 +57,28 @@ def test_a_late_sensor_reads_the_motion_as_it_was_also_through_stops(ticks, fric
         torch.testing.assert_close(seen[..., channel][there], shown[there], rtol=0, atol=2e-3)
 
 
+@pytest.mark.parametrize("sensor", LATE)
+@pytest.mark.parametrize("ticks", [STEADY, UNSTEADY], ids=["steady", "unsteady"])
+def test_between_rows_a_late_sensor_reads_what_is_interpolated(ticks, sensor):
+    """As the screening does, which tries many delays: each reading in its own row, or rows earlier."""
+    track, rows = motion(ticks)
+    model, delays = CandidateModel(CartPole(), [sensor], rows), torch.tensor([[0.0], [0.007], [0.086]]).double()
+    for later in ([0] * 4, [1, 1, 2, 2]):
+        seen = model.read_along(delays, at(track, rows.time), later)
+        for channel, by in enumerate(later):
+            read = rows.later(rows.time[..., None], [by])[..., 0]
+            shown = read - delays[:, :, None] * (channel in LATE[sensor])
+            first, last = (rows.time.where(rows.inside > 0, end).aminmax(dim=1)[k] for k, end in enumerate((9, -9)))
+            there = (shown >= first[:, None]) & (shown <= last[:, None]) & (read > 0) & (rows.inside > 0)
+            assert there.sum() > 40
+            assert not seen[..., channel][there].isnan().any()
+            error = (seen[..., channel] - at(track, shown)[..., channel])[there].abs()
+            # Of up to 7 rad and 8 rad/s, in rows up to 0.14 s apart.
+            mean, largest = (2e-3, 0.03) if channel in (0, 2) else (0.02, 0.3)
+            assert error.mean() < mean
+            assert error.max() < largest
+
+
 def read_at(model, theta):
     """(W, T, 4) when the readings are read that show each row's state; which rows (W, T) have one of each sensor."""
     rows = model.rows

@@ -36,7 +36,7 @@ from visadapt.diagnosis.search.causes import (
 )
 from visadapt.diagnosis.search.coloured import with_coloured_noise
 from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
-from visadapt.diagnosis.search.jumps import or_with_jumps
+from visadapt.diagnosis.search.jumps import with_jumps
 from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
 from visadapt.diagnosis.search.preparation import PreparedRecording, limited, prepare
 from visadapt.diagnosis.search.pushes import pushes
@@ -190,14 +190,14 @@ def _explore(
     search = Search(system, rows.select(prepared.searched), candidates, prepared.source, jobs)
     if announce is not None:
         announce(duration.announcement(rows, len(effects), duration.expected(search, rows), jobs))
+    if (jumping := with_jumps(search)) is not None:
+        search, rows = jumping, replace(rows, jumps=True)
     search.run(staged(progress, "search"))
     search = on_all_rows(search, rows)
     comparison = compare(search)
     repeats = repeated_reading_causes(prepared, search, comparison, repeating)
     again = staged(progress, "search with coloured noise")
-    found = with_coloured_noise(search, comparison, prepared.searched, again)
-    again = staged(progress, "search with jumps as noise")
-    search, comparison = or_with_jumps(search, found, rows, prepared.searched, candidates, again)
+    search, comparison = with_coloured_noise(search, comparison, prepared.searched, again)
     # Periodic effects may have got a phase for each episode.
     in_use = {effect.name: effect for effect in search.catalogue}
     named = [in_use.get(effect.name, effect) for effect in effects]

@@ -13,7 +13,7 @@ from torch import Tensor
 from visadapt.effects import ActuationEffect, DynamicsEffect, Effect
 from visadapt.effects.late_sensors import LateSensors
 from visadapt.estimation.episode_phases import phase_columns
-from visadapt.estimation.late_readings import Delays, Following, following, reading, rows_later
+from visadapt.estimation.late_readings import Delays, Following, following, interpolated, reading, rows_later
 from visadapt.estimation.linearise import (
     Tangent,
     linearise_reading,
@@ -141,15 +141,22 @@ class CandidateModel:
     def measure(self, theta: Tensor, state: Tensor, chosen: slice = slice(None)) -> Tensor:
         """Readings without noise (W, T', m), with parameters (P,), that show the states (W, T', n) of the `chosen` rows
         of every window: those of `shown`."""
-        return self.measure_each(theta[None], state, chosen)[0]
-
-    def measure_each(self, theta: Tensor, state: Tensor, chosen: slice = slice(None)) -> Tensor:
-        """The same for R parameter vectors (R, P), which have `rows_later` and what acts in common: (R, W, T', m)."""
-        # The shortest delays show what comes last.
-        after = self.following(theta.min(0).values, self.acting(theta[:1])[0], chosen) if self._late else None
+        after = self.following(theta, self.acting(theta[None])[0], chosen) if self._late else None
         world = self.at(self.by_row(theta, state.shape[1]))
-        seen = reading(world, state.flatten(0, 1).repeat(len(theta), 1), after and after.repeat(len(theta)))
-        return seen[:, list(self.rows.channels)].unflatten(0, (len(theta), *state.shape[:2]))
+        seen = reading(world, state.flatten(0, 1), after)
+        return seen[:, list(self.rows.channels)].unflatten(0, state.shape[:2])
+
+    def read_along(self, theta: Tensor, state: Tensor, later: Sequence[int]) -> Tensor:
+        """Readings without noise (R, W, T, m), with R parameter vectors (R, P), of the motion through states (W, T, n):
+        those that come `later` (n,) rows after the row in which they are put. Between rows the motion is interpolated,
+        not integrated; NaN where a reading shows what is outside the window."""
+        none = torch.zeros_like(theta[:, 0])
+        delays = [sum((theta[:, k] for k, late in self._late if c in late), none) for c in range(state.shape[2])]
+        seen = interpolated(self.rows, state, later, delays, self.profile.position_of)
+        instant = theta.clone()
+        instant[:, [k for k, _ in self._late]] = 0.0
+        read = self.at(self.by_row(instant, state.shape[1])).reading(seen.flatten(0, 2))
+        return read[:, list(self.rows.channels)].unflatten(0, seen.shape[:3])
 
     def shown(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """The recorded readings (W, T, m), each in the row whose state it shows with parameters (P,), and 1 where there
@@ -159,7 +166,12 @@ class CandidateModel:
 
     def rows_later(self, theta: Tensor) -> list[int]:
         """By how many rows the readings (m,) come after the row whose state they show, with parameters (P,)."""
-        return rows_later(self.rows, self._delays(theta), self.rows.channels)
+        every = self.columns_later(theta)
+        return [every[column] for column in self.rows.channels]
+
+    def columns_later(self, theta: Tensor) -> list[int]:
+        """The same of all states (n,), measured or not."""
+        return rows_later(self.rows, self._delays(theta), range(len(self.system.states)))
 
     def following(self, theta: Tensor, acting: Tensor, chosen: slice = slice(None)) -> Following | None:
         """What late sensors with parameters (P,) show of what follows the `chosen` rows of every window, where `acting`

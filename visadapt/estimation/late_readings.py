@@ -106,9 +106,35 @@ def _clock(rows: Segments) -> Tensor:
     return torch.cat((torch.zeros_like(rows.held[:, :1]), rows.held.cumsum(1)), 1)
 
 
-def earlier(values: Tensor, by: Sequence[int]) -> Tensor:
-    """The values (W, T, m) `by` (m,) rows earlier in the windows; NaN where there are none."""
-    index = torch.arange(values.shape[1])[:, None] - torch.tensor(by)
-    inside = (index >= 0) & (index < values.shape[1])
-    out = values[:, index.clamp(0, values.shape[1] - 1), torch.arange(values.shape[2])]
-    return torch.where(inside, out, torch.nan)
+def interpolated(
+    rows: Segments, state: Tensor, later: Sequence[int], delays: Sequence[Tensor], position_of: Mapping[int, int]
+) -> Tensor:
+    """What late sensors show of the motion through states (W, T, n), without integrating it: (M, W, T, n).
+
+    Between two rows velocities are linear, positions their integral, and other states linear. A reading of what was
+    before the window, or comes after it, is NaN.
+
+    Args:
+        later: (n,) by how many rows the reading of each state comes after the row in which it is put.
+        delays: (n,) of (M,) s, by which each state is read late.
+        position_of: columns of velocities to those of their positions.
+    """
+    clock, episode, last = _clock(rows), rows.episode[:, None], rows.inside.sum(1, dtype=torch.long)[:, None] - 1
+    velocity_of, window = {position: velocity for velocity, position in position_of.items()}, torch.arange(len(state))
+    out = state.expand(len(delays[0]), *state.shape).clone()
+    for column, (by, delay) in enumerate(zip(later, delays, strict=True)):
+        if not by and not bool(delay.any()):
+            continue
+        read = clock[episode, (rows.index + by).clamp(max=clock.shape[1] - 1)] - clock[episode, rows.index]
+        shown = rows.time + read - delay[:, None, None]
+        index = torch.searchsorted(rows.time, shown.movedim(0, 1).flatten(1)).unflatten(1, shown.shape[::2]) - 1
+        index = index.clamp(0, state.shape[1] - 2).movedim(1, 0)
+        first, second = (state[window[:, None], row].movedim(-1, 0) for row in (index, index + 1))
+        passed = shown - rows.time[window[:, None], index]
+        share = passed / rows.duration[window[:, None], index]
+        seen = first[column] + share * (second[column] - first[column])
+        if (rate := velocity_of.get(column)) is not None:
+            seen = first[column] + passed * (first[rate] + share * (second[rate] - first[rate]) / 2)
+        known = (shown > rows.time[:, :1] - ROUNDING_ERROR) & (shown < rows.time.gather(1, last) + ROUNDING_ERROR)
+        out[..., column] = torch.where(known, seen, torch.nan)
+    return out

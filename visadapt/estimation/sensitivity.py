@@ -14,7 +14,6 @@ from visadapt.estimation.candidate import COARSEST, SHORT_PERIOD, CandidateModel
 from visadapt.estimation.colour import whitened, whitened_adjoint
 from visadapt.estimation.grids import neutral_point
 from visadapt.estimation.kalman import adjoints, forward, respond
-from visadapt.estimation.late_readings import earlier
 from visadapt.estimation.likelihood import FitState, linear_problem, variances
 from visadapt.estimation.linearise import integrate, linearise_step
 from visadapt.estimation.segments import Segments
@@ -163,17 +162,9 @@ class Sensitivity:
     def _read(self, model: CandidateModel, theta: Tensor) -> Tensor:
         """(M, W, T, m) the readings with parameters (M, P), each in the row in which the innovations have the reading;
         NaN where they have none."""
-        fitted, state = self.innovations.model, self.fits.state[0]
-        rows_later, used = fitted.rows_later(self.fits.theta[0]), fitted.shown(self.fits.theta[0])[1]
-        out = torch.full((len(theta), *used.shape), torch.nan, dtype=torch.float64)
-        alike: dict[tuple[int, ...], list[int]] = {}
-        for k, one in enumerate(theta):
-            alike.setdefault(tuple(model.rows_later(one)), []).append(k)
-        for later, indices in alike.items():
-            by = [a - b for a, b in zip(later, rows_later, strict=True)]
-            for k, read in zip(indices, model.measure_each(theta[indices], state), strict=True):
-                out[k] = torch.where(used > 0, earlier(read, by), torch.nan)
-        return out
+        fitted = self.innovations.model
+        read = model.read_along(theta, self.fits.state[0], fitted.columns_later(self.fits.theta[0]))
+        return torch.where(fitted.shown(self.fits.theta[0])[1] > 0, read, torch.nan)
 
     def _acted(self, model: CandidateModel, theta: Tensor) -> Tensor:
         """What acts of the commands after each row with parameters (M, P): (M, W, T - 1, substeps, n_action), or one

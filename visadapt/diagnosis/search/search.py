@@ -1,8 +1,8 @@
 """The search over sets of effects: add, remove and exchange effects while that raises the posterior odds.
 
 Sets grow from the source and from every effect alone. Those near the best are then tried: with one effect fewer, with
-one exchanged, and with two exchanged for one, since two effects often imitate a third (a weaker motor and a lighter
-pole, a heavier cart).
+one exchanged, and, if they are small, with two exchanged for one, since two effects often imitate a third (a weaker
+motor and a lighter pole, a heavier cart).
 """
 
 from __future__ import annotations
@@ -26,6 +26,10 @@ MAX_EFFECTS = 6  # Effects in a set at most
 
 MAX_CANDIDATES, MAX_EXCHANGES = 8, 5
 """Most effects that are tried with a set: when sets grow, and in the place of those that are exchanged."""
+
+TWO_FOR_ONE_UP_TO = 4
+"""Effects at most in a set of which two are exchanged for one. In larger sets, which describe what no effect explains,
+the number of pairs would be most of the search; sets of one and of two effects are widened there instead."""
 
 LEADERS = 4  # Sets that are fitted before the others, where some fall far behind
 
@@ -63,7 +67,7 @@ class Search(FittedModels):
         for size in range(MAX_EFFECTS):
             self._report(progress, size)
             before = self.best
-            children = (size == 0 and self._alone()) or self.extend(beam)
+            children = self.extend(beam) if size else self.fit_singles()
             if not children:
                 break
             beam = sorted(children, key=lambda f: -f.log_odds)[: self.profile.beam_width]
@@ -79,6 +83,11 @@ class Search(FittedModels):
             self._settle(exchanged)
             self._phases_of_episodes()
         self._report(progress, MAX_EFFECTS)
+
+    def fit_singles(self) -> list[ScoredModel]:
+        """Every effect alone, where they are so large that the screening may mislead, else those that promise enough;
+        fitted unless any was."""
+        return [f for f in self.ranked if len(f.effects) == 1] or self._alone() or self.extend([self.source])
 
     def go_on_from(self, starts: Sequence[tuple[Effects, FitState]], progress: Progress | None = None) -> None:
         """Fit sets that were found with other noise, and every promising effect alone; then change the best of them
@@ -227,7 +236,8 @@ class Search(FittedModels):
         # Also sets that were fitted before: from the larger set's parameters a fit may reach a better optimum.
         self.fit([less(centre, [removed]) for removed in centre.effects], QUICK)
         exchanges = []
-        for removed in (*combinations(centre.effects, 1), *combinations(centre.effects, 2)):
+        pairs = combinations(centre.effects, 2) if len(centre.effects) <= TWO_FOR_ONE_UP_TO else ()
+        for removed in (*combinations(centre.effects, 1), *pairs):
             # Along the states of the whole set a removed effect shows as a disturbance, without a fit of the rest.
             kept, fits = less(centre, removed)
             if (exchange := (key_of(centre.effects), key_of(kept))) in exchanged:
