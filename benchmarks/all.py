@@ -196,6 +196,19 @@ COMMANDS = (
         extra="baselines",
     ),
     Command(
+        "baselines_frames",
+        "baselines_frames.csv",
+        (
+            "benchmarks.baselines",
+            *("--baselines", "mpc", "mpc_pixels"),
+            *("--experiments", "CartPole, pixels, 2(sin t + 1) N", "--episodes", "20"),
+            *("--out", "results/baselines_frames.csv", "--picture", "assets/baselines_frames.png"),
+        ),
+        40,
+        work="--work",
+        extra="baselines",
+    ),
+    Command(
         "rotorpy",
         "rotorpy.csv",
         ("train.rotorpy_quadrotor", "--seeds", "0", "1", "2"),

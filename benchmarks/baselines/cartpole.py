@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 
@@ -34,6 +35,8 @@ class CartPoleProblem(Problem):
 
     kind: type[Effect]
     """what is hidden: told to those alone that need it, and the table says which"""
+
+    baselines: ClassVar[tuple[str, ...]] = ("ours", "diagnosed", "mpc", "mppi", "pets", "ppo", "observer", "randomised")
 
     def setup(self, sizes: Sizes) -> Setup:
         settings = from_states(World(CartPole())).shortened(sizes.iterations)

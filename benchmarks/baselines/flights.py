@@ -27,6 +27,8 @@ class FlightProblem(Problem):
 
     experiment: FlightExperiment
 
+    baselines = ("mpc", "ppo", "pets")
+
     def setup(self, sizes: Sizes) -> Setup:
         return _setup(self.name)
 

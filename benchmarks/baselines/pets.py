@@ -22,7 +22,7 @@ from torch import Tensor
 
 from benchmarks.baselines.ensemble import MEMBERS, Ensemble, source_ensemble
 from benchmarks.baselines.mppi import carried
-from benchmarks.baselines.problem import Problem, Sizes, Stage, in_rounds
+from benchmarks.baselines.problem import Problem, Sizes, Stage, in_rounds, unadapted
 from benchmarks.baselines.subjects import Subject, subject_of
 from visadapt.history import HORIZON, History
 from visadapt.learning.transitions import Transitions
@@ -89,8 +89,7 @@ def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[
         return EnsemblePlanner(ensemble, subject, len(world.system.actions))
 
     unfitted = partial(planner, source)
-    yield Stage("source", 0, unfitted())
-    yield Stage("target", 0, unfitted())
+    yield from unadapted(problem, unfitted)
 
     def learn(transitions: Transitions, generator: torch.Generator) -> Callable[[], Policy]:
         history = transitions.history(torch.arange(len(transitions))).acting(transitions.action)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 
@@ -58,12 +59,15 @@ SMOKE = Sizes(2, ((20, 20),), (20,), 3, 2, 4096, 4096, 20)
 
 @dataclass(frozen=True)
 class Problem(ABC):
-    """A system under a hidden effect, from states."""
+    """A system under a hidden effect."""
 
     name: str
 
     with_history: bool
     """whether policies and models see 5 states and actions, or the last alone"""
+
+    baselines: ClassVar[tuple[str, ...]]
+    """those that are written for it"""
 
     @abstractmethod
     def setup(self, sizes: Sizes) -> Setup:
@@ -80,6 +84,14 @@ class Problem(ABC):
     @abstractmethod
     def row(self, method: str, domain: str, samples: int, scores: Sequence[Path]) -> Row:
         """The table's row of the scores that the seeds have kept."""
+
+    def watching(self, policy: Policy) -> Policy:
+        """A policy on states, as it runs on these targets."""
+        return policy
+
+    def transitions(self, episodes: Sequence[Episode]) -> Transitions:
+        """What is learnt from episodes of these targets."""
+        return Transitions.cut(episodes)
 
     @property
     def sizes(self) -> Sizes:
@@ -120,20 +132,27 @@ def in_rounds(
         made, learn = begin()
         episodes: list[Episode] = []
         while ledger.left:
-            new = collect(made(), problem.target(), min(round_samples, ledger.left), longest, generator)
+            new = collect(
+                problem.watching(made()), problem.target(), min(round_samples, ledger.left), longest, generator
+            )
             ledger.count("data", sum(episode.samples for episode in new))
             episodes += new
-            made = learn(Transitions.cut(episodes), generator)
+            made = learn(problem.transitions(episodes), generator)
             if ledger.used in sizes.scored:
-                yield Stage("adapted", ledger.used, made())
+                yield Stage("adapted", ledger.used, problem.watching(made()))
+
+
+def unadapted(problem: Problem, made: Callable[[], Policy]) -> Iterator[Stage]:
+    """A policy before it has seen the target: in the source and in the target, made anew for each."""
+    for domain in ("source", "target"):
+        yield Stage(domain, 0, problem.watching(made()))
 
 
 def grounded(
     problem: Problem, sizes: Sizes, seed: int, planner: Callable[[Residual | None], Policy]
 ) -> Iterator[Stage]:
     """Of a planner on the source: as it is, then with the residual network of ours, on data that it collects itself."""
-    yield Stage("source", 0, planner(None))
-    yield Stage("target", 0, planner(None))
+    yield from unadapted(problem, partial(planner, None))
     setup = problem.setup(sizes)
 
     def begin() -> tuple[Callable[[], Policy], Learn]:

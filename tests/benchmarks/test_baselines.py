@@ -6,12 +6,15 @@ from functools import partial
 import pytest
 import torch
 
+from benchmarks.baselines.frames import path_through
+from benchmarks.baselines.mpc_pixels import PixelPredictive
 from benchmarks.baselines.problem import drawn
 from benchmarks.baselines.table import BASELINES, PROBLEMS, Settings, main
+from benchmarks.cartpole_pixels import EXPERIMENT
 from benchmarks.cartpole_states import SINE
 from tests.flying import waves
 from visadapt.effects import ConstantForce, LinearDrag, PeriodicForce, Residual
-from visadapt.history import LENGTH, History
+from visadapt.history import HORIZON, LENGTH, History
 from visadapt.policies.networks import FlightResidualNetwork, StateResidualNetwork
 from visadapt.setups.policy_file import source_steps
 from visadapt.systems import CartPole, FixedWing, Quadrotor
@@ -117,6 +120,45 @@ def test_all_baselines_run_and_are_tabled(tmp_path):
     assert settings.picture.stat().st_size > 10_000
     main(settings)  # all is kept
     assert settings.out.read_text() == first
+
+
+def test_baselines_on_states_run_from_frames(tmp_path):
+    paths = {"work": tmp_path, "out": tmp_path / "table.csv", "picture": tmp_path / "picture.png"}
+    main(Settings(baselines=("mppi",), experiments=(EXPERIMENT,), smoke=True, jobs=1, **paths))
+    rows = list(csv.DictReader((tmp_path / "table.csv").read_text().splitlines()))
+    assert {row["experiment"] for row in rows} == {EXPERIMENT}
+    assert {(row["domain"], row["samples"]) for row in rows} == {("source", "0"), ("target", "0"), ("adapted", "20")}
+
+
+def test_frames_tell_where_the_cart_pole_is_and_how_it_moves_whatever_constant_force_acts():
+    generator = torch.Generator().manual_seed(0)
+    world = World(CartPole(), [ConstantForce(force=3.0)]).double()
+    at = world.start(0.1 * torch.randn(3, 4, generator=generator, dtype=torch.float64))
+    commands = torch.rand(3, LENGTH - 1, 1, generator=generator, dtype=torch.float64) - 0.5
+    path = [at.state]
+    for command in commands.unbind(1):
+        at = world.step(at, command)
+        path.append(at.state)
+    states = torch.stack(path, 1)
+    found = path_through(states[..., [0, 2]], commands)
+    torch.testing.assert_close(found, states, atol=5e-3, rtol=0)
+    nowhere = path_through(states[:, :1, [0, 2]], commands[:, :0])
+    torch.testing.assert_close(nowhere[..., [1, 3]], torch.zeros(3, 1, 2).double())
+
+
+def test_plans_in_image_space_bring_the_picture_nearer_to_that_of_rest():
+    planner = PixelPredictive(World(CartPole()))
+    still = torch.tensor([[0.1, 0.0, 0.02, 0.0], [-0.2, 0.0, 0.0, 0.0]])
+    history = History(still[:, None].expand(-1, LENGTH, -1), torch.zeros(2, LENGTH, 1))
+    nothing = planner.cost(history, torch.zeros(2, HORIZON, 1))
+    command = planner.act(history)
+    assert command.shape == (2, 1)
+    assert (planner.cost(history, planner.last) < 0.95 * nothing).all()
+
+
+def test_what_is_not_written_for_an_experiment_is_told_in_one_line():
+    with pytest.raises(SystemExit, match=r"pixels, 2\(sin t \+ 1\) N: the baselines are mpc, .*, not observer"):
+        main(Settings(baselines=("observer",), experiments=(EXPERIMENT,)))
 
 
 def test_a_baseline_that_is_not_there_is_told_in_one_line():
