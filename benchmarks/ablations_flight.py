@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -77,15 +76,13 @@ class Settings:
     """which of VARIANTS"""
     jobs: int = 2
     """adaptations at once, one core each"""
-    references: Path = Path("data/quadrotor_references.npz")
-    """made where it is not there"""
     work: Path = Path("runs/ablations_flight")
     out: Path = Path("results/ablations_flight.csv")
 
 
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
-    quadrotor_references.ready(settings.references)  # before the jobs, which share it
+    quadrotor_references.ready()  # before the jobs, which share it
     jobs = [(name, UNADAPTED, 0) for name in settings.experiments]
     jobs += [
         (name, variant, seed)
@@ -112,7 +109,7 @@ def _score(settings: Settings, name: str, variant: str, seed: int) -> FlightScor
     """The score of a policy after one round of an adaptation, or UNADAPTED."""
     torch.set_num_threads(1)
     experiment = replace(EXPERIMENTS[name], budget=EXPERIMENTS[name].round_samples)
-    setup = experiment.setup(partial(quadrotor_references.ready, settings.references))
+    setup = experiment.setup(quadrotor_references.ready)
     policy = setup.load(shipped(experiment.vehicle.name))
     target, work = flight_target(setup, experiment.effects(setup)), settings.work / variant
     folder = experiment.open(setup, work, seed, settings.flights)

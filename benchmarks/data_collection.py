@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -86,8 +85,6 @@ class Settings:
     """that each policy is scored on"""
     jobs: int = 2
     """seeds at once, one core each"""
-    references: Path = Path("data/quadrotor_references.npz")
-    """made where it is not there"""
     current: Path = Path("runs/flight")
     """where benchmarks.flight keeps its adaptations"""
     work: Path = Path("runs/data_collection")
@@ -163,14 +160,14 @@ def _rows(name: str, method: str, domain: str, samples: int, seeds: list[Stand])
     return [missed, mismatch]
 
 
-def _prepared(settings: Settings, name: str) -> tuple[Setup, Policy]:
-    setup = EXPERIMENTS[name].setup(partial(quadrotor_references.ready, settings.references))
+def _prepared(name: str) -> tuple[Setup, Policy]:
+    setup = EXPERIMENTS[name].setup(quadrotor_references.ready)
     return setup, setup.load(shipped(EXPERIMENTS[name].vehicle.name))
 
 
 def _before(settings: Settings, name: str) -> Stand:
     """The policy of the source, in the target."""
-    setup, policy = _prepared(settings, name)
+    setup, policy = _prepared(name)
     folder = EXPERIMENTS[name].open(setup, settings.current, 0, settings.flights)
     return _stand(settings, setup, name, folder, "target", policy)
 
@@ -179,7 +176,7 @@ def _stands(settings: Settings, name: str, by: str, seed: int) -> dict[int, Stan
     """One seed with data collected `by` one of the methods, by samples."""
     torch.set_num_threads(1)
     experiment = EXPERIMENTS[name]
-    setup, policy = _prepared(settings, name)
+    setup, policy = _prepared(name)
     explorer = EXPLORERS[by](setup, policy) if by in EXPLORERS else None
     work = settings.current if explorer is None else settings.work / by.replace(" ", "-")
     folder = experiment.open(setup, work, seed, settings.flights)

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -51,8 +50,6 @@ class Settings:
     """that each policy is scored on"""
     jobs: int = 2
     """seeds at once, one core each"""
-    references: Path = Path("data/quadrotor_references.npz")
-    """made where it is not there"""
     pictures: Path = Path("assets")
     work: Path = Path("runs/flight")
     out: Path = Path("results/flight.csv")
@@ -61,7 +58,7 @@ class Settings:
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
     for name in settings.experiments:
-        prepared(settings, name)  # before the jobs, which share the references
+        prepared(name)  # before the jobs, which share the references
     jobs = [(name, seed) for name in settings.experiments for seed in range(settings.seeds)]
     found = in_processes(_scores, settings, jobs)
     rows = []
@@ -89,14 +86,14 @@ def _draw(settings: Settings) -> None:
         panels.append(Chart(name, f"{EXPERIMENTS[name].measure}, m", own))
     plot_charts(settings.pictures / "curve_flight.png", panels, columns=min(2, len(panels)))
     if ALTERNATION in settings.experiments:
-        setup, policy = prepared(settings, ALTERNATION)
+        setup, policy = prepared(ALTERNATION)
         adapted = EXPERIMENTS[ALTERNATION].adapt(setup, settings.work, policy, seed=0)
         plot_losses(settings.pictures / "alternation.png", adapted.rounds)
 
 
-def prepared(settings: Settings, name: str) -> tuple[Setup, Policy]:
+def prepared(name: str) -> tuple[Setup, Policy]:
     """The setup of an experiment, and the vehicle's policy of the source, which all seeds share."""
-    setup = EXPERIMENTS[name].setup(partial(quadrotor_references.ready, settings.references))
+    setup = EXPERIMENTS[name].setup(quadrotor_references.ready)
     return setup, setup.load(shipped(EXPERIMENTS[name].vehicle.name))
 
 
@@ -104,7 +101,7 @@ def _scores(settings: Settings, name: str, seed: int) -> dict[str, FlightScore]:
     """Scores of one seed of an experiment, by samples; before adaptation by domain."""
     torch.set_num_threads(1)
     experiment = EXPERIMENTS[name]
-    setup, policy = prepared(settings, name)
+    setup, policy = prepared(name)
     folder = experiment.open(setup, settings.work, seed, settings.flights)
     adapting = copy.deepcopy(policy)
     adapted = experiment.adapt(setup, settings.work, adapting, seed)

@@ -49,7 +49,6 @@ class Settings:
     flights: int = 100
     jobs: int = 2
     """runs at once, one core each"""
-    references: Path = Path("data/quadrotor_references.npz")
     work: Path = Path("runs/named_effects")
     out: Path = Path("results/named_effects.csv")
 
@@ -71,7 +70,7 @@ def main(settings: Settings) -> None:
 
 def _scored(settings: Settings, name: str, budget: int, seed: int) -> FlightScore:
     torch.set_num_threads(1)
-    train, test = quadrotor_references.ready(settings.references)
+    train, test = quadrotor_references.ready()
     setup = quadrotor(train, test, World(Quadrotor(), NAMES[name](), train.period, substeps=2))
     folder = settings.work / name.replace(" ", "-").replace(",", "") / f"{budget}-{seed}"
     open_run(folder, {"seed": seed, "flights": settings.flights, "budget": budget, **setup.settings.numbers()})

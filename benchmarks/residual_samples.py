@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -49,14 +48,13 @@ class Settings:
     """What is run, and where."""
 
     seeds: int = 3
-    references: Path = Path("data/quadrotor_references.npz")
     picture: Path = Path("assets/residual_samples.png")
     out: Path = Path("results/residual_samples.csv")
 
 
 def main(settings: Settings) -> None:
     """Ground all residuals and write the table."""
-    setup = EXPERIMENT.setup(partial(quadrotor_references.ready, settings.references))
+    setup = EXPERIMENT.setup(quadrotor_references.ready)
     policy = setup.load(shipped("quadrotor"))
     shares: dict[tuple[str, int], list[float]] = {}
     for seed in range(settings.seeds):

@@ -86,8 +86,6 @@ class Settings:
     kinds: tuple[str, ...] = tuple(KINDS)
     seed: int = 7
     """of flights and noise"""
-    references: Path = Path("data/quadrotor_references.npz")
-    """made where it is not there"""
     out: Path = Path("runs/rotorpy_diagnosis")
     results: Path = Path("results/rotorpy_diagnosis.csv")
 
@@ -95,7 +93,7 @@ class Settings:
 def main(settings: Settings) -> None:
     """Fly, diagnose and write the table."""
     torch.set_num_threads(1)
-    task = Follow(quadrotor_references.ready(settings.references)[1])
+    task = Follow(quadrotor_references.ready()[1])
     policy = load_policy(shipped("quadrotor"))
     open_run(settings.out, {"seed": settings.seed, "flights": FLIGHTS})
     parameters = "".join(f"{name} = {value!r}\n" for name, value in asdict(SOURCE).items())

@@ -73,8 +73,6 @@ class Settings:
     """What is run, and where."""
 
     seeds: int = 3
-    references: Path = Path("data/quadrotor_references.npz")
-    """made where it is not there"""
     cartpole: Path = Path("runs/cartpole_states")
     """where benchmarks.cartpole_states keeps its adaptations"""
     flight: Path = Path("runs/flight")
@@ -160,7 +158,7 @@ def _rows(settings: Settings) -> Iterator[Row]:
         yield measure(policy, budget)
         for name in FLIGHTS:
             experiment = EXPERIMENTS[name]
-            setup = experiment.setup(partial(quadrotor_references.ready, settings.references))
+            setup = experiment.setup(quadrotor_references.ready)
             folder = experiment.open(setup, settings.flight, seed, FlightSettings.flights)
             hidden = flight_target(setup, experiment.effects(setup))
             measure = partial(_row, setup, hidden, folder, name, seed)

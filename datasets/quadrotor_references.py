@@ -33,6 +33,9 @@ from visadapt.systems import Quadrotor
 from visadapt.tasks.differential_flatness import commands
 from visadapt.tasks.references import Reference
 
+PATH = Path("data/quadrotor_references.npz")
+"""where they are kept, in the folder that a script is started in"""
+
 SPLINE_DEGREE = 5
 
 CHUNK_REFERENCES = 1000
@@ -46,7 +49,7 @@ FIELDS = ("positions", "velocities", "accelerations", "jerks")
 class Settings:
     """What is drawn, and where it is written."""
 
-    out: Path = Path("data/quadrotor_references.npz")
+    out: Path = PATH
     """file to write"""
     train: int = 9000
     """how many references to train on"""
@@ -192,11 +195,11 @@ def read(path: Path) -> tuple[Reference, Reference]:
     return Reference.of(rows[:, :train], period), Reference.of(rows[:, train:], period)
 
 
-def ready(path: Path) -> tuple[Reference, Reference]:
-    """Read the data set in `path`; if there is none, it is made with the default settings first."""
-    if not path.exists():
-        main(Settings(out=path))
-    return read(path)
+def ready() -> tuple[Reference, Reference]:
+    """Read the data set in `PATH`; if there is none, it is made with the default settings first."""
+    if not PATH.exists():
+        main(Settings())
+    return read(PATH)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -49,8 +48,6 @@ class Settings:
     """seed of what is to be flown, and of the force's phase: one that was not trained on"""
     still: float = 6.0
     """s at which the still is taken; 0.3 s after it passed its target, if it flies through one"""
-    references: Path = Path("data/quadrotor_references.npz")
-    """made where it is not there"""
     work: Path = Path("runs/flight")
     out: Path = Path("runs/films")
 
@@ -60,7 +57,7 @@ def main(settings: Settings) -> None:
     torch.set_num_threads(1)
     kind = settings.vehicle, settings.experiment
     experiment = next(each for each in EXPERIMENTS.values() if (each.vehicle.name, each.hidden) == kind)
-    setup = experiment.setup(partial(quadrotor_references.ready, settings.references))
+    setup = experiment.setup(quadrotor_references.ready)
     policy = setup.load(shipped(settings.vehicle))
     adapting = copy.deepcopy(policy)
     hidden = experiment.effects(setup)

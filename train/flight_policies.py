@@ -33,8 +33,6 @@ class Settings:
     vehicles: tuple[str, ...] = ("quadrotor", "fixed_wing")
     params: Path | None = None
     """a TOML file with the parameters of one's own vehicle, in its table [parameters]; give --out too"""
-    references: Path = Path("data/quadrotor_references.npz")
-    """made where it is not there"""
     seed: int = 0
     out: Path = Path("visadapt/weights")
 
@@ -56,7 +54,7 @@ def vehicle(name: str, settings: Settings) -> Setup:
     if name == "fixed_wing":
         wing = load_parameters(settings.params, FixedWing) if settings.params else FixedWing()
         return fixed_wing(World(wing))
-    train, test = quadrotor_references.ready(settings.references)
+    train, test = quadrotor_references.ready()
     own = load_parameters(settings.params, Quadrotor) if settings.params else Quadrotor()
     return quadrotor(train, test, World(own, period=train.period, substeps=2))
 

@@ -67,8 +67,6 @@ class Settings:
     """which of METHODS are run and tabled"""
     flights: int = 50
     """that each policy is scored on"""
-    references: Path = Path("data/quadrotor_references.npz")
-    """made where it is not there"""
     out: Path = Path("runs/rotorpy")
     results: Path = Path("results/rotorpy.csv")
 
@@ -76,7 +74,7 @@ class Settings:
 def main(settings: Settings) -> None:
     """Do the whole job in `settings.out`, going on from what is there."""
     torch.set_num_threads(1)
-    references = quadrotor_references.ready(settings.references)
+    references = quadrotor_references.ready()
     train, test = (Follow(part) for part in references)
     source = World(SOURCE, period=train.period, substeps=2)
     setups = {method: quadrotor(*references, source, with_history) for method, with_history in METHODS.items()}

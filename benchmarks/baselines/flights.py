@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 from benchmarks.baselines.problem import Problem, Sizes
@@ -16,9 +16,6 @@ from visadapt.evaluation import FlightScore
 from visadapt.setups.base import Setup
 from visadapt.targets import FlightTarget
 from visadapt.targets.synthetic import no_effects
-
-REFERENCES = Path("data/quadrotor_references.npz")
-"""made where it is not there"""
 
 
 @dataclass(frozen=True)
@@ -54,7 +51,7 @@ class FlightProblem(Problem):
 @cache
 def _setup(name: str) -> Setup:
     """Of one of EXPERIMENTS, whose references are read once."""
-    return EXPERIMENTS[name].setup(partial(quadrotor_references.ready, REFERENCES))
+    return EXPERIMENTS[name].setup(quadrotor_references.ready)
 
 
 FLIGHTS = tuple(FlightProblem(name, False, each) for name, each in EXPERIMENTS.items() if each.hidden == "drag")
