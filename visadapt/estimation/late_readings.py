@@ -127,8 +127,10 @@ def interpolated(
             continue
         read = clock[episode, (rows.index + by).clamp(max=clock.shape[1] - 1)] - clock[episode, rows.index]
         shown = rows.time + read - delay[:, None, None]
-        index = torch.searchsorted(rows.time, shown.movedim(0, 1).flatten(1)).unflatten(1, shown.shape[::2]) - 1
-        index = index.clamp(0, state.shape[1] - 2).movedim(1, 0)
+        # The row before each of the instants shown.
+        by_window = shown.movedim(0, 1).flatten(1)
+        index = torch.searchsorted(rows.time, by_window).unflatten(1, (len(delay), -1)).movedim(1, 0)
+        index = (index - 1).clamp(0, state.shape[1] - 2)
         first, second = (state[window[:, None], row].movedim(-1, 0) for row in (index, index + 1))
         passed = shown - rows.time[window[:, None], index]
         share = passed / rows.duration[window[:, None], index]
