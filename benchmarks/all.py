@@ -202,7 +202,7 @@ COMMANDS = (
             "benchmarks.baselines",
             *("--baselines", "mpc", "mpc_pixels"),
             *("--experiments", "CartPole, pixels, 2(sin t + 1) N", "--episodes", "20"),
-            *("--out", "results/baselines_frames.csv", "--picture", "assets/baselines_frames.png"),
+            *("--out", "results/baselines_frames.csv", "--picture", "runs/baselines_frames.png"),
         ),
         40,
         work="--work",

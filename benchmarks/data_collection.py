@@ -23,7 +23,7 @@ import numpy as np
 import torch
 import tyro
 
-from datasets import quadrotor_references
+from benchmarks.flight import prepared
 from experiments.curves import Chart, plot_charts
 from experiments.flights import EXPERIMENTS, flight_target
 from experiments.kept_scores import kept_score
@@ -40,7 +40,6 @@ from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import VELOCITY
 from visadapt.targets.rollout import run
 from visadapt.tasks.reach import Reach
-from visadapt.weights import shipped
 
 REACH = 5.0
 """m off its course at which a flight of another policy than the current one ends"""
@@ -160,14 +159,9 @@ def _rows(name: str, method: str, domain: str, samples: int, seeds: list[Stand])
     return [missed, mismatch]
 
 
-def _prepared(name: str) -> tuple[Setup, Policy]:
-    setup = EXPERIMENTS[name].setup(quadrotor_references.ready)
-    return setup, setup.load(shipped(EXPERIMENTS[name].vehicle.name))
-
-
 def _before(settings: Settings, name: str) -> Stand:
     """The policy of the source, in the target."""
-    setup, policy = _prepared(name)
+    setup, policy = prepared(name)
     folder = EXPERIMENTS[name].open(setup, settings.current, 0, settings.flights)
     return _stand(settings, setup, name, folder, "target", policy)
 
@@ -176,7 +170,7 @@ def _stands(settings: Settings, name: str, by: str, seed: int) -> dict[int, Stan
     """One seed with data collected `by` one of the methods, by samples."""
     torch.set_num_threads(1)
     experiment = EXPERIMENTS[name]
-    setup, policy = _prepared(name)
+    setup, policy = prepared(name)
     explorer = EXPLORERS[by](setup, policy) if by in EXPLORERS else None
     work = settings.current if explorer is None else settings.work / by.replace(" ", "-")
     folder = experiment.open(setup, work, seed, settings.flights)

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from benchmarks.baselines.cartpole import CartPoleProblem
 from benchmarks.baselines.problem import Sizes
 from benchmarks.cartpole_pixels import EXPERIMENT
-from renderers import DrawnCartPole, LayeredRenderer, load_renderer
+from renderers import DrawnCartPole, load_renderer
 from visadapt.effects import ConstantForce, PeriodicForce
 from visadapt.history import LENGTH, History
 from visadapt.learning.tracking import Tracker
@@ -41,13 +41,13 @@ class CartPoleFrames(CartPoleProblem):
         return SyntheticTarget(self.hidden, DrawnCartPole())
 
     def scored(self, domain: str) -> SyntheticTarget:
-        return SyntheticTarget(no_effects if domain == "source" else self.hidden, DrawnCartPole())
+        return SyntheticTarget(no_effects, DrawnCartPole()) if domain == "source" else self.target()
 
     def watching(self, policy: Policy) -> Policy:
         return Seeing(policy)
 
     def transitions(self, episodes: Sequence[Episode]) -> Transitions:
-        return Transitions.cut(tracker().track([episode for episode in episodes if len(episode.time) > 2]))
+        return Transitions.cut(tracker().label(episodes))
 
     @property
     def sizes(self) -> Sizes:
@@ -61,16 +61,19 @@ POSE = 1e-3
 """m and rad, deviation of the poses that frames show"""
 RATE, PUSH = 1.0, 5.0
 """m/s and rad/s, and N: deviations of the velocities and of the force before any frame is seen"""
+STEPS = 3
+"""of Gauss and Newton to the most probable path"""
+DIFFERENCE = 1e-6
+"""in SI units, finite difference of the first state and of the force"""
 
 
 class Seeing(Policy):
     """A policy on states, shown frames: the path of the source through the poses that the last five frames show.
 
-    The path is the most probable one, under a force that is constant over it, by STEPS of Gauss and Newton. So, as
-    ours, it reads five frames and the commands between them.
+    The path is the most probable one, under a force that is constant over it. So, as ours, it reads five frames and the
+    commands between them.
     """
 
-    STEPS = 3
     shown = "frame"
 
     def __init__(self, policy: Policy) -> None:
@@ -94,7 +97,10 @@ class Seeing(Policy):
 
 
 def path_through(places: Tensor, actions: Tensor) -> Tensor:
-    """States (B, n, 4) of the source on its way through poses (B, n, 2) under commands (B, n - 1, 1) and a force."""
+    """States (B, n, 4) of the source on its way through poses (B, n, 2) under commands (B, n - 1, 1) and a force.
+
+    Five numbers of each episode are unknown: its first state, and the force.
+    """
     batch, actions = len(places), actions.double()
 
     def path(unknown: Tensor) -> Tensor:
@@ -113,20 +119,18 @@ def path_through(places: Tensor, actions: Tensor) -> Tensor:
 
     found = torch.zeros(batch, 5, dtype=torch.float64)
     found[:, 0], found[:, 2] = places[:, 0].unbind(-1)
-    step = 1e-6 * torch.eye(5, dtype=torch.float64)
-    for _ in range(Seeing.STEPS):
-        here, *moved = errors(torch.cat([found, *(found + each for each in step)])).chunk(6)
-        slope = torch.stack([(each - here) / 1e-6 for each in moved], -1)
+    step = DIFFERENCE * torch.eye(5, dtype=torch.float64)
+    for _ in range(STEPS):
+        here, *moved = errors(torch.cat([found, *(found + each for each in step)])).split(batch)
+        slope = torch.stack([each - here for each in moved], -1) / DIFFERENCE
         found = found - torch.linalg.lstsq(slope, here[..., None]).solution[..., 0]
     return path(found)
 
 
 @cache
-def renderer() -> LayeredRenderer:
+def renderer() -> nn.Module:
     """The renderer of ours: x (B,) in m and theta (B,) in rad to frames (B, H, W) in [0, 1]."""
-    found = load_renderer(shipped("renderer"))
-    assert isinstance(found, LayeredRenderer)
-    return found.requires_grad_(False).eval()
+    return load_renderer(shipped("renderer")).requires_grad_(False).eval()
 
 
 @cache

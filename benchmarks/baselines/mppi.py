@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.baselines.cartpole import COST
-from benchmarks.baselines.problem import Problem, Sizes, Stage, grounded
-from visadapt.effects import Residual
+from benchmarks.baselines.problem import Problem, Sizes, Stage, grounded_in_world
 from visadapt.history import HORIZON, History
 from visadapt.learning.plans import imagine
 from visadapt.policies import Policy
@@ -64,9 +63,4 @@ def carried(last: Tensor, history: History) -> Tensor:
 
 def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:
     """On the source, then with the residual."""
-    source = problem.setup(sizes).source
-
-    def planner(residual: Residual | None) -> Policy:
-        return PathIntegral(source.with_effects([] if residual is None else [residual]))
-
-    yield from grounded(problem, sizes, seed, planner)
+    yield from grounded_in_world(problem, sizes, seed, PathIntegral)

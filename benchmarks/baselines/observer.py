@@ -11,13 +11,14 @@ so it is told the kind.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from benchmarks.baselines.cartpole import CartPoleProblem, source_policy
-from benchmarks.baselines.problem import TUNING_SEED, Sizes, Stage, drawn
+from benchmarks.baselines.problem import TUNING_SEED, Sizes, Stage, drawn, unadapted
 from visadapt.evaluation import score
 from visadapt.history import History
 from visadapt.policies import Policy
@@ -63,5 +64,4 @@ def stages(problem: CartPoleProblem, sizes: Sizes, folder: Path, seed: int) -> I
         return -found.survived, found.mean_speed or 0.0
 
     share = min(SHARES, key=badness)
-    yield Stage("source", 0, DisturbanceObserver(policy, source, share))
-    yield Stage("target", 0, DisturbanceObserver(policy, source, share))
+    yield from unadapted(problem, partial(DisturbanceObserver, policy, source, share))

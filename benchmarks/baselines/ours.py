@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchmarks.baselines.cartpole import CartPoleProblem, source_policy
-from benchmarks.baselines.problem import Sizes, Stage
+from benchmarks.baselines.problem import Sizes, Stage, unadapted
 
 
 def stages(problem: CartPoleProblem, sizes: Sizes, folder: Path, seed: int, diagnose: bool = False) -> Iterator[Stage]:
@@ -16,8 +16,7 @@ def stages(problem: CartPoleProblem, sizes: Sizes, folder: Path, seed: int, diag
     With `diagnose` each number of samples is one round, since a diagnosis takes the longer the more rounds there are.
     """
     source = source_policy(problem, sizes, folder.parents[2], seed)
-    yield Stage("source", 0, source)
-    yield Stage("target", 0, source)
+    yield from unadapted(problem, lambda: source)
     plans = [(samples, samples) for samples in sizes.scored] if diagnose else sizes.plans
     for budget, round_samples in plans:
         policy = copy.deepcopy(source)

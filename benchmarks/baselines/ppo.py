@@ -19,7 +19,7 @@ from torch import Tensor
 
 from benchmarks.baselines.courses import Balancing, Course, flying, starting
 from benchmarks.baselines.machines import MACHINES, Machines
-from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage, score_path
+from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage, score_path, unadapted
 from experiments.kept_scores import kept_score
 from visadapt.history import History
 from visadapt.policies import Policy
@@ -99,8 +99,7 @@ def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[
     wide, course = courses(problem, sizes)
     model = pretrained(problem, wide, sizes, folder / "source.zip", seed)
     policy = Trained(model, course)
-    yield Stage("source", 0, policy)
-    yield Stage("target", 0, policy)
+    yield from unadapted(problem, lambda: policy)
     target = problem.target()
     assert isinstance(target, WorldTarget)
     model.set_env(Machines(course, target.draw_effects, None, seed))

@@ -27,6 +27,7 @@ from visadapt.policies import Policy
 from visadapt.recordings import Episode
 from visadapt.setups.base import Setup
 from visadapt.targets import Target
+from visadapt.world import World
 
 TUNING_SEED = 100
 """Of whatever chooses a setting: neither that of a training, which counts from 0, nor that of the scores."""
@@ -132,9 +133,8 @@ def in_rounds(
         made, learn = begin()
         episodes: list[Episode] = []
         while ledger.left:
-            new = collect(
-                problem.watching(made()), problem.target(), min(round_samples, ledger.left), longest, generator
-            )
+            policy, samples = problem.watching(made()), min(round_samples, ledger.left)
+            new = collect(policy, problem.target(), samples, longest, generator)
             ledger.count("data", sum(episode.samples for episode in new))
             episodes += new
             made = learn(problem.transitions(episodes), generator)
@@ -143,7 +143,7 @@ def in_rounds(
 
 
 def unadapted(problem: Problem, made: Callable[[], Policy]) -> Iterator[Stage]:
-    """A policy before it has seen the target: in the source and in the target, made anew for each."""
+    """A policy before it has seen the target, in the source and in the target: what `made` gives for each."""
     for domain in ("source", "target"):
         yield Stage(domain, 0, problem.watching(made()))
 
@@ -171,6 +171,16 @@ def grounded(
         return partial(planner, None), learn
 
     yield from in_rounds(problem, sizes, seed, begin)
+
+
+def grounded_in_world(problem: Problem, sizes: Sizes, seed: int, planner: Callable[[World], Policy]) -> Iterator[Stage]:
+    """The same of a planner that carries its plans out in a world."""
+    source = problem.setup(sizes).source
+
+    def planned(residual: Residual | None) -> Policy:
+        return planner(source.with_effects([] if residual is None else [residual]))
+
+    yield from grounded(problem, sizes, seed, planned)
 
 
 def drawn(kind: type[Effect], batch: int, generator: torch.Generator) -> Effect:

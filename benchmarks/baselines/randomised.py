@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.baselines.cartpole import CartPoleProblem
-from benchmarks.baselines.problem import Sizes, Stage, drawn
+from benchmarks.baselines.problem import Sizes, Stage, drawn, unadapted
 from visadapt.learning.policy import tune
 from visadapt.learning.training_state import train_or_load
 from visadapt.setups.cartpole import cartpole_states
@@ -41,5 +41,4 @@ def stages(problem: CartPoleProblem, sizes: Sizes, folder: Path, seed: int) -> I
             folder / f"policy-{number}.safetensors", policy, {"seed": seed, **asdict(how)}, partial(tune, *args)
         )
     policy.eval()
-    yield Stage("source", 0, policy)
-    yield Stage("target", 0, policy)
+    yield from unadapted(problem, lambda: policy)

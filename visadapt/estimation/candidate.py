@@ -150,8 +150,8 @@ class CandidateModel:
         """Readings without noise (R, W, T, m), with R parameter vectors (R, P), of the motion through states (W, T, n):
         those that come `later` (n,) rows after the row in which they are put. Between rows the motion is interpolated,
         not integrated; NaN where a reading shows what is outside the window."""
-        none = torch.zeros_like(theta[:, 0])
-        delays = [sum((theta[:, k] for k, late in self._late if c in late), none) for c in range(state.shape[2])]
+        late, none = self._late_by(theta), torch.zeros_like(theta[:, 0])
+        delays = [late.get(column, none) for column in range(state.shape[2])]
         seen = interpolated(self.rows, state, later, delays, self.profile.position_of)
         instant = theta.clone()
         instant[:, [k for k, _ in self._late]] = 0.0
@@ -166,8 +166,7 @@ class CandidateModel:
 
     def rows_later(self, theta: Tensor) -> list[int]:
         """By how many rows the readings (m,) come after the row whose state they show, with parameters (P,)."""
-        every = self.columns_later(theta)
-        return [every[column] for column in self.rows.channels]
+        return rows_later(self.rows, self._delays(theta), self.rows.channels)
 
     def columns_later(self, theta: Tensor) -> list[int]:
         """The same of all states (n,), measured or not."""
@@ -182,8 +181,12 @@ class CandidateModel:
 
     def _delays(self, theta: Tensor) -> Delays:
         """s by which states are read late."""
-        columns = {column for _, late in self._late for column in late}
-        return {c: sum(float(theta[k]) for k, late in self._late if c in late) for c in sorted(columns)}
+        return {column: float(delay) for column, delay in self._late_by(theta).items()}
+
+    def _late_by(self, theta: Tensor) -> dict[int, Tensor]:
+        """s (...,) by which states are read late, by their columns, with parameters (..., P)."""
+        columns = sorted({column for _, late in self._late for column in late})
+        return {c: torch.stack([theta[..., k] for k, late in self._late if c in late]).sum(0) for c in columns}
 
 
 def with_loads(model: CandidateModel, accuracy: int) -> CandidateModel:

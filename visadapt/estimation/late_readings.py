@@ -81,8 +81,7 @@ def following(rows: Segments, delays: Delays, acting: Tensor, states: int, chose
     clock, episode, index = _clock(rows), rows.episode[:, None], rows.index[:, chosen]
 
     def passed(periods: int) -> Tensor:
-        """s from each row to the one `periods` later."""
-        return clock[episode, (index + periods).clamp(max=clock.shape[1] - 1)] - clock[episode, index]
+        return _passed(clock, rows, periods)[:, chosen]
 
     read = torch.zeros(*index.shape, states, dtype=torch.float64)
     farthest = read[..., 0]
@@ -106,6 +105,12 @@ def _clock(rows: Segments) -> Tensor:
     return torch.cat((torch.zeros_like(rows.held[:, :1]), rows.held.cumsum(1)), 1)
 
 
+def _passed(clock: Tensor, rows: Segments, periods: int) -> Tensor:
+    """(W, T) s on the `clock` from each row of the windows to the one `periods` later."""
+    episode, index = rows.episode[:, None], rows.index
+    return clock[episode, (index + periods).clamp(max=clock.shape[1] - 1)] - clock[episode, index]
+
+
 def interpolated(
     rows: Segments, state: Tensor, later: Sequence[int], delays: Sequence[Tensor], position_of: Mapping[int, int]
 ) -> Tensor:
@@ -119,14 +124,13 @@ def interpolated(
         delays: (n,) of (M,) s, by which each state is read late.
         position_of: columns of velocities to those of their positions.
     """
-    clock, episode, last = _clock(rows), rows.episode[:, None], rows.inside.sum(1, dtype=torch.long)[:, None] - 1
+    clock, last = _clock(rows), rows.inside.sum(1, dtype=torch.long)[:, None] - 1
     velocity_of, window = {position: velocity for velocity, position in position_of.items()}, torch.arange(len(state))
     out = state.expand(len(delays[0]), *state.shape).clone()
     for column, (by, delay) in enumerate(zip(later, delays, strict=True)):
         if not by and not bool(delay.any()):
             continue
-        read = clock[episode, (rows.index + by).clamp(max=clock.shape[1] - 1)] - clock[episode, rows.index]
-        shown = rows.time + read - delay[:, None, None]
+        shown = rows.time + _passed(clock, rows, by) - delay[:, None, None]
         # The row before each of the instants shown.
         by_window = shown.movedim(0, 1).flatten(1)
         index = torch.searchsorted(rows.time, by_window).unflatten(1, (len(delay), -1)).movedim(1, 0)

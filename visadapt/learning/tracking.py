@@ -102,6 +102,10 @@ class Tracker:
             for episode, path in zip(episodes, paths, strict=True)
         ]
 
+    def label(self, episodes: Sequence[Episode]) -> list[Episode]:
+        """The same episodes with states estimated from their frames; those of 1 or 2 rows are left out."""
+        return self.track([episode for episode in episodes if len(episode.time) > 2])
+
     def _see(self, number: int, episode: Episode) -> Poses:
         if episode.frame is None:
             raise TrackingError(f"episode {number} has no frames to estimate states from")

@@ -19,7 +19,6 @@ from visadapt.learning.tracking import Tracker
 from visadapt.learning.training_state import train_or_load
 from visadapt.policies import ImagePolicy, Policy, StatePolicy
 from visadapt.progress import Report, staged
-from visadapt.recordings import Episode
 from visadapt.setups.base import Setup
 from visadapt.setups.policy_file import residual_for
 from visadapt.systems import CartPole
@@ -154,10 +153,6 @@ def cartpole_frames(
     def observe(state: Tensor) -> Tensor:
         return render(state[:, 0], state[:, 2])
 
-    def label(episodes: list[Episode]) -> list[Episode]:
-        """The same episodes with states estimated from their frames; those of 1 or 2 rows are left out."""
-        return tracker.track([episode for episode in episodes if len(episode.time) > 2])
-
     def prepare(policy: Policy, path: Path, seed: int, report: Report | None) -> None:
         """Train the policy's frame encoder and keep it in `path`, or take the one that is there."""
         assert isinstance(policy, ImagePolicy)
@@ -181,7 +176,7 @@ def cartpole_frames(
         settings=settings,
         renderer=seen,
         observe=observe,
-        label=label,
+        label=tracker.label,
         prepare=prepare,
     )
 
