@@ -25,7 +25,7 @@ from visadapt.diagnosis.result import (
     without_slight,
 )
 from visadapt.diagnosis.search import duration
-from visadapt.diagnosis.search.all_rows import on_all_rows
+from visadapt.diagnosis.search.all_rows import best_on_all_rows, on_all_rows
 from visadapt.diagnosis.search.causes import (
     Alternative,
     alternatives,
@@ -191,9 +191,11 @@ def _explore(
     if announce is not None:
         announce(duration.announcement(rows, len(effects), duration.expected(search, rows), jobs))
     if (jumping := with_jumps(search)) is not None:
-        search, rows = jumping, replace(rows, jumps=True)
-    search.run(staged(progress, "search"))
-    search = on_all_rows(search, rows)
+        rows = replace(rows, jumps=True)
+        search = best_on_all_rows(jumping, rows)
+    else:
+        search.run(staged(progress, "search"))
+        search = on_all_rows(search, rows)
     comparison = compare(search)
     repeats = repeated_reading_causes(prepared, search, comparison, repeating)
     again = staged(progress, "search with coloured noise")

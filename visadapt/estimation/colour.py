@@ -14,9 +14,11 @@ Identification, section 4.2).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 LONGEST = 0.15  # s that the autoregression reaches back at most
 
@@ -25,6 +27,8 @@ ORDERS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # that are tried, in rows
 READINGS_PER_COEFFICIENT = 10  # At least
 
 MIN_GAIN = 10.0  # Log likelihood, less the number of coefficients, that an order must gain over white innovations
+
+BLOCK = 32  # Rows that are whitened by one product of matrices: faster than lag by lag
 
 
 @dataclass(frozen=True)
@@ -38,10 +42,22 @@ class Colour:
 
     def whitened(self, innovations: Tensor) -> Tensor:
         """n (N, T, m, M) of innovations (N, T, m, M); before the first row they are taken as 0."""
-        out = innovations.clone()
-        for lag, matrix in enumerate(self.coefficients, 1):
-            out[:, lag:] -= matrix @ innovations[:, :-lag]
-        return self.whitening @ out
+        length, lags = innovations.shape[1], len(self.coefficients)
+        padded = pad(innovations, (0, 0, 0, 0, lags, -length % BLOCK))
+        blocks = [
+            self._block @ padded[:, first : first + lags + BLOCK].flatten(1, 2) for first in range(0, length, BLOCK)
+        ]
+        return torch.cat(blocks, 1).unflatten(1, (-1, innovations.shape[2]))[:, :length]
+
+    @cached_property
+    def _block(self) -> Tensor:
+        """(BLOCK m, (p + BLOCK) m) what makes the n of BLOCK rows in a row of their innovations and the p before."""
+        lags, channels = self.coefficients.shape[:2]
+        taps = torch.cat((torch.eye(channels).to(self.coefficients)[None], -self.coefficients))
+        taps = torch.cat((self.whitening @ taps, taps.new_zeros(1, channels, channels)))  # the last is of other rows
+        lag = lags + torch.arange(BLOCK)[:, None] - torch.arange(lags + BLOCK)
+        lag = torch.where((lag >= 0) & (lag <= lags), lag, lags + 1)
+        return taps[lag].movedim(2, 1).flatten(2).flatten(0, 1)
 
 
 def whitened_adjoint(slopes: Tensor, colour: Colour | None) -> Tensor:

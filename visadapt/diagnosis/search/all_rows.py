@@ -16,6 +16,18 @@ MIN_GAIN = 6.0
 must promise: less would not outweigh the prior odds."""
 
 
+def best_on_all_rows(
+    search: Search, rows: Segments, effort: tuple[int, int] = CAREFUL, others: int = FINALISTS - 1
+) -> Search:
+    """The best set of a search, and at most `others` close to it, fitted to all rows."""
+    whole = Search(search.system, rows, search.catalogue, search.source.fits, search.jobs)
+    close = [each for each in search.close() if each.effects][: 1 + others]
+    for group, how in ((close[:1], effort), (close[1:], FINAL)):
+        # From the states of the best set so far, which a start from the readings would first have to find.
+        whole.fit([(each.effects, replace(each.fits, state=whole.best.fits.state)) for each in group], how)
+    return whole
+
+
 def on_all_rows(search: Search, rows: Segments) -> Search:
     """The best sets of a search, fitted to all rows, then with further effects; the search itself if it has all rows.
 
@@ -23,11 +35,7 @@ def on_all_rows(search: Search, rows: Segments) -> Search:
     """
     if search.rows.shape[0] == rows.shape[0]:
         return search
-    whole = Search(search.system, rows, search.catalogue, search.source.fits, search.jobs)
-    close = [each for each in search.close() if each.effects][:FINALISTS]
-    for group, effort in ((close[:1], CAREFUL), (close[1:], FINAL)):
-        # From the states of the best set so far, which a start from the readings would first have to find.
-        whole.fit([(each.effects, replace(each.fits, state=whole.best.fits.state)) for each in group], effort)
+    whole = best_on_all_rows(search, rows)
     for _ in range(MAX_ADDED):
         before = whole.best
         promising = [one for one in whole.candidates(before) if one.gain > MIN_GAIN]

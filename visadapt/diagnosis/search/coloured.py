@@ -11,17 +11,16 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from visadapt.diagnosis.search.all_rows import on_all_rows
+from visadapt.diagnosis.search.all_rows import best_on_all_rows, on_all_rows
 from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.model_comparison import MIN_LEFTOVER, ModelComparison, compare, compare_coloured
 from visadapt.diagnosis.search.search import Search
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.colour import Colour, colour_of
+from visadapt.estimation.fit_states import FINAL
 from visadapt.estimation.kalman import forward
 from visadapt.estimation.likelihood import linear_problem, variances
 from visadapt.progress import Progress
-
-ROUNDS = 2  # Searches with coloured noise at most; the last has the colour of what the best set of the first leaves
 
 START_FROM = 4  # Best sets of a search from which the next one begins
 
@@ -32,29 +31,33 @@ def with_coloured_noise(
     """The search and its comparison gone on with coloured noise, where something is unexplained that is not white; else
     as they are.
 
-    The best set that is found only so is tried with white noise too, where it may explain all. What is unexplained is
-    what the best set with white noise leaves. `searched` are the windows, by index, in which sets are looked for.
+    First the best sets only grow, with the colour of what the best one leaves; then, with the colour of what the set so
+    found leaves, sets near it are tried too. That set is tried with white noise as well, where it may explain all; what
+    is unexplained is what the best set with white noise leaves. `searched` are the windows, by index, in which sets are
+    looked for.
     """
-    found, other = comparison, search
-    for made in range(ROUNDS):
-        coloured_by = found.best
-        colour = colour_left_by(search, coloured_by) if comparison.leftover > MIN_LEFTOVER else None
-        if colour is None:
-            break
-        rows = replace(search.rows, colour=colour)
-        begin = [(each.effects, each.fits.on(searched)) for each in other.close()[:START_FROM]]
-        other = Search(search.system, rows.select(searched), search.catalogue, jobs=search.jobs)
-        other.go_on_from(begin, progress)
-        other = on_all_rows(other, rows)
-        found = compare_coloured(other, comparison)
-        # The source predicts as it was fitted, with noise of its own.
-        other.fitted[frozenset()] = search.source
-        if search.resume(found.best):
-            comparison = found = compare(search)
-            other = search
-        elif made and found.best.names == coloured_by.names:
-            break
-    return other, found
+    colour = colour_left_by(search, comparison.best) if comparison.leftover > MIN_LEFTOVER else None
+    if colour is None:
+        return search, comparison
+    begin = [(each.effects, each.fits.on(searched)) for each in search.close()[:START_FROM]]
+    rows = replace(search.rows, colour=colour)
+    grown = Search(search.system, rows.select(searched), search.catalogue, jobs=search.jobs)
+    grown.go_on_from(begin, False, progress)
+    begin = [(each.effects, each.fits) for each in grown.close()[:START_FROM]]
+    colour = colour_left_by(search, best_on_all_rows(grown, rows, FINAL, others=0).best) or colour
+    rows = replace(search.rows, colour=colour)
+    found = Search(search.system, rows.select(searched), search.catalogue, jobs=search.jobs)
+    found.go_on_from(begin, True, progress)
+    found = on_all_rows(found, rows)
+    compared = compare_coloured(found, comparison)
+    if search.resume(compared.best):
+        comparison = compare(search)
+        if comparison.leftover <= MIN_LEFTOVER:
+            return search, comparison
+        compared = compare_coloured(found, comparison)
+    # The source predicts as it was fitted, with noise of its own.
+    found.fitted[frozenset()] = search.source
+    return found, compared
 
 
 def colour_left_by(search: Search, best: ScoredModel) -> Colour | None:

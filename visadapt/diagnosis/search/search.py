@@ -54,8 +54,8 @@ POLISH_MODELS = 8
 parameters than the best may be farther behind, since a quick fit of the right set may keep too much process noise."""
 
 
-Exchanges = set[tuple[frozenset[str], frozenset[str]]]
-"""Sets of which effects were exchanged so far, by the names of their effects, each with those that were kept."""
+Exchanges = set[frozenset[str]]
+"""Sets, by the names of their effects, that were kept so far when others were exchanged."""
 
 
 class Search(FittedModels):
@@ -89,20 +89,30 @@ class Search(FittedModels):
         fitted unless any was."""
         return [f for f in self.ranked if len(f.effects) == 1] or self._alone() or self.extend([self.source])
 
-    def go_on_from(self, starts: Sequence[tuple[Effects, FitState]], progress: Progress | None = None) -> None:
-        """Fit sets that were found with other noise, and every promising effect alone; then change the best of them
-        while that raises the posterior odds."""
+    def go_on_from(
+        self, starts: Sequence[tuple[Effects, FitState]], exchange: bool, progress: Progress | None = None
+    ) -> None:
+        """Fit sets that were found with other noise, and every promising effect alone; then grow the best of them and,
+        with `exchange`, try sets near it, while that raises the posterior odds."""
         self.fit([each for each in starts if each[0]], QUICK)
         self.extend([self.source])
-        exchanged, before = Exchanges(), None
-        for size in range(MAX_EFFECTS):
-            self._report(progress, size)
-            self._settle(exchanged)
-            if self.best is before or len(self.best.effects) >= MAX_EFFECTS:
-                break
-            before = self.best
-            self.extend([before])
+        exchanged, settled = Exchanges(), None
+        while self.best.names != settled:
+            self._grow_best(progress)
+            settled = self.best.names
+            if exchange:
+                self._settle(exchanged)
+            else:
+                self._polish()
         self._report(progress, MAX_EFFECTS)
+
+    def _grow_best(self, progress: Progress | None) -> None:
+        """Add effects to the best set while that raises the posterior odds."""
+        before = None
+        while self.best is not before and len(self.best.effects) < MAX_EFFECTS:
+            before = self.best
+            self._report(progress, len(before.effects))
+            self.extend([before])
 
     def resume(self, found: ScoredModel) -> bool:
         """Fit a set that another search has found, and go on from it where it is the best; return whether it is."""
@@ -111,9 +121,10 @@ class Search(FittedModels):
         self.fit([(alone.effects, alone.fits)], CAREFUL)
         if self.best.names == before.names:
             return False
-        exchanged = Exchanges()
-        self._settle(exchanged)
-        self._improve_while_unexplained(exchanged)
+        if not self.rows.jumps:
+            exchanged = Exchanges()
+            self._settle(exchanged)
+            self._improve_while_unexplained(exchanged)
         return True
 
     def _report(self, progress: Progress | None, step: int) -> None:
@@ -240,9 +251,9 @@ class Search(FittedModels):
         for removed in (*combinations(centre.effects, 1), *pairs):
             # Along the states of the whole set a removed effect shows as a disturbance, without a fit of the rest.
             kept, fits = less(centre, removed)
-            if (exchange := (key_of(centre.effects), key_of(kept))) in exchanged:
+            if key_of(kept) in exchanged:
                 continue
-            exchanged.add(exchange)
+            exchanged.add(key_of(kept))
             rest = [e for e in self.catalogue if e not in centre.effects]
             screened = screen(self.system, kept, fits, self.rows, rest, self.jobs)
             for candidate in self._promising(screened)[:MAX_EXCHANGES]:
@@ -252,8 +263,11 @@ class Search(FittedModels):
         self.fit(exchanges, QUICK)
 
     def _polish(self) -> None:
-        """Fit carefully the sets close to the best, and the best set less each effect, with which it is compared."""
-        self.fit([(f.effects, f.fits) for f in self.close()], CAREFUL)
+        """Fit carefully the sets close to the best, and the best set less each effect, with which it is compared, but
+        for those whose best fit is a careful one already."""
+        rough = [f for f in self.close() if self._careful.get(key_of(f.effects)) is not f]
+        careful = self.fit([(f.effects, f.fits) for f in rough], CAREFUL)
+        self._careful |= {key_of(f.effects): f for f in careful}
 
     def close(self) -> list[ScoredModel]:
         """The sets close to the best, and the best set less each effect, where these were fitted."""
