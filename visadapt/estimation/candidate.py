@@ -142,8 +142,7 @@ class CandidateModel:
         """Readings without noise (W, T', m), with parameters (P,), that show the states (W, T', n) of the `chosen` rows
         of every window: those of `shown`."""
         after = self.following(theta, self.acting(theta[None])[0], chosen) if self._late else None
-        world = self.at(self.by_row(theta, state.shape[1]))
-        seen = reading(world, state.flatten(0, 1), after)
+        seen = reading(self._world, self.by_row(theta, state.shape[1]), state.flatten(0, 1), after)
         return seen[:, list(self.rows.channels)].unflatten(0, state.shape[:2])
 
     def read_along(self, theta: Tensor, state: Tensor, later: Sequence[int]) -> Tensor:

@@ -32,31 +32,39 @@ class Following(Batch):
     read: Tensor  # (N, n_state) s from each state to the row in which each of its sensors is read
 
 
-def reading(world: World, state: Tensor, following: Following | None) -> Tensor:
+def reading(world: World, values: Tensor, state: Tensor, following: Following | None) -> Tensor:
     """What sensors read (N, n_state), each in the row that `following` says, of the motion that goes through N states;
-    without it, no sensor is late."""
+    without it, no sensor is late. `values` (P,), or (N, P), are those of the effects' parameters."""
+    here = world.with_values(values)
     if following is None:
-        return world.reading(state)
-    sensors = [effect for effect in world.effects if isinstance(effect, LateSensors)]
+        return here.reading(state)
+    every = values.expand(len(state), -1)
+    sensors = [effect for effect in here.effects if isinstance(effect, LateSensors)]
     seen, shown = state.clone(), dict[tuple[int, ...], Tensor]()
     for column in range(state.shape[1]):
         of = tuple(k for k, sensor in enumerate(sensors) if column in sensor.late)
         if of and of not in shown:
             delay = sum(sensors[k].value("delay", state) for k in of)
-            shown[of] = _later(world, state, following, following.read[:, column] - delay)
+            shown[of] = _later(world, every, state, following, following.read[:, column] - delay)
         if of:
             seen[:, column] = shown[of][:, column]
-    return world.reading(seen)
+    return here.reading(seen)
 
 
-def _later(world: World, state: Tensor, following: Following, ahead: Tensor) -> Tensor:
-    """The states (N, n_state) `ahead` (N,) s later."""
+def _later(world: World, values: Tensor, state: Tensor, following: Following, ahead: Tensor) -> Tensor:
+    """The states (N, n_state) `ahead` (N,) s later, with parameters (N, P)."""
     time, last = following.time, following.command.shape[1] - 1
+    out, rows = state.clone(), torch.arange(len(state))
     for k in range(last + 1):
-        h = ahead if k == last else torch.minimum(ahead, following.duration[:, k])
-        state = world.integrate(time, state, following.command[:, k], h)
-        ahead, time = ahead - h, time + h
-    return state
+        h = ahead if k == last else torch.minimum(ahead, following.duration[rows, k])
+        state = world.with_values(values[rows]).integrate(time, state, following.command[rows, k], h)
+        out[rows] = state
+        # On an unsteady clock, few rows are further from what is shown than the others.
+        far = (ahead > h).nonzero()[:, 0]
+        rows, state, time, ahead = rows[far], state[far], (time + h)[far], (ahead - h)[far]
+        if not len(rows):
+            break
+    return out
 
 
 def rows_later(rows: Segments, delays: Delays, columns: Sequence[int]) -> list[int]:

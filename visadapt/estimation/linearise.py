@@ -127,7 +127,7 @@ def linearise_reading(
     def read(rows: Tensor, states: Tensor, moved: Sequence[int], pushed: Tensor) -> Tensor:
         after = [following[k] for k in moved] if following else []
         shown = after[0].map(lambda *each: torch.cat(each), *after[1:]) if after else None
-        return reading(world.with_values(rows), states, shown)
+        return reading(world, rows, states, shown)
 
     if not any(isinstance(effect, SensingEffect) for effect in world.effects):
         count, n = state.shape
