@@ -81,9 +81,11 @@ def untuned(setup: Setup, policy: Policy) -> Setup:
 
 def held_over_a_plan(setup: Setup, policy: Policy) -> Setup:
     """The residual's correction is constant over a plan, so that the gradient flows through the physics alone."""
-    plans = setup.settings.refinement
-    assert plans is not None
-    held = replace(plans, iterations=300, streams=32, recorded=0.8)
+    tuning, near_rest = setup.settings.tuning, setup.settings.refinement
+    assert near_rest is not None
+    noise = near_rest.observation_noise
+    plans = replace(tuning, closed_loop=False, streams=32, every=5, batch=512, observation_noise=noise, recorded=0.8)
+    held = replace(plans, iterations=300, learning_rate=1.5e-3)
     return replace(setup, settings=replace(setup.settings, tuning=held))
 
 

@@ -80,14 +80,15 @@ def from_states(source: World) -> SetupSettings:
 def from_frames(source: World) -> SetupSettings:
     """Settings for the cart-pole that is shown frames, with the cost-to-go of a source.
 
-    The policy is tuned in closed loop: each imagined step is rendered, and gradients flow through renderer, residual
-    and physics.
+    The policy is refined and tuned in closed loop: each imagined step is rendered, and gradients flow through renderer,
+    residual and physics.
     """
-    refinement = _near_rest(source)
-    rendered = replace(refinement, streams=None, every=1, batch=16, iterations=250, closed_loop=True)
+    rendered = replace(_near_rest(source), streams=None, every=1, batch=16, iterations=250, closed_loop=True)
     return SetupSettings(
         source=TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500),
-        refinement=refinement,
+        # After 250 iterations the source policy drives the cart at 0.022 m/s, after 1,000 at 0.019, after these at
+        # 0.018; without a refinement at 0.025.
+        refinement=replace(rendered, iterations=2500, learning_rate=1e-3),
         # An iteration takes 0.3 s of CPU; 60 are too few.
         tuning=replace(rendered, iterations=100, learning_rate=1e-3),
         named=rendered,
