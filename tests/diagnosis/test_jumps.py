@@ -1,0 +1,58 @@
+"""A machine whose velocities jump, each by itself."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.diagnosed import GAINS, record
+from visadapt import diagnose
+from visadapt.diagnosis.search.jumps import with_jumps
+from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.search import Search
+from visadapt.effects import ActuatorGain, CoulombFriction, PeriodicForce, ViscousFriction
+from visadapt.recordings import Episode, Recording
+from visadapt.systems import CartPole
+from visadapt.world import World
+
+CATALOGUE = [ViscousFriction, CoulombFriction, ActuatorGain]
+
+
+@pytest.fixture(scope="module")
+def jumping():
+    """Four episodes of 150 rows, with viscous friction of 0.7 N s/m."""
+    generator, world = torch.Generator().manual_seed(0), World(CartPole(), [ViscousFriction(coefficient=0.7)])
+    state, states, commands = torch.zeros(4, 4, dtype=torch.float64), [], []
+    for _ in range(150):
+        drawn = torch.randn(4, 3, generator=generator, dtype=torch.float64)
+        states.append(state)
+        commands.append((state @ GAINS[:, None] + 0.1 * drawn[:, 2:]).clamp(-1, 1))
+        with torch.no_grad():
+            state = world.step(world.start(state), commands[-1]).state
+        state[:, [1, 3]] += 0.1 * drawn[:, :2]
+    true = torch.stack(states, 1)[..., [0, 2]]
+    seen = (true + 1e-4 * torch.randn(true.shape, generator=generator, dtype=torch.float64)).numpy()
+    given, time = torch.stack(commands, 1).numpy(), 0.05 * np.arange(150)
+    return Recording(tuple(Episode(time, given[k], seen[k]) for k in range(4)), ("x", "theta"), 0.05, ("",) * 4)
+
+
+def search_of(recording):
+    return Search(CartPole(), prepare(recording, CartPole()).rows, CATALOGUE)
+
+
+def test_it_is_searched_with_jumps(jumping):
+    assert with_jumps(search_of(jumping)).rows.jumps
+
+
+def test_one_that_loads_disturb_is_not():
+    recording = record([PeriodicForce(amplitude=4.0, frequency=3.3, phase=0.3, offset=0.0)], rows=100)
+    assert with_jumps(search_of(recording)) is None
+
+
+def test_its_friction_is_found(jumping):
+    found = diagnose(jumping, World(CartPole()), catalogue=CATALOGUE)
+    assert found.verdict == "unexplained"
+    causes = {cause.effect: cause for cause in found.partial if not cause.slight}
+    assert list(causes) == ["viscous_friction"]
+    coefficient = causes["viscous_friction"].parameters["coefficient"]
+    assert coefficient.ci90[0] < 0.7 < coefficient.ci90[1]
+    assert coefficient.value == pytest.approx(0.7, rel=0.3)
