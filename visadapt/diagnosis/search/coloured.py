@@ -42,12 +42,12 @@ def with_coloured_noise(
     begin = [(each.effects, each.fits.on(searched)) for each in search.close()[:START_FROM]]
     rows = replace(search.rows, colour=colour)
     grown = Search(search.system, rows.select(searched), search.catalogue, jobs=search.jobs)
-    grown.go_on_from(begin, False, progress)
+    grown.go_on_from(begin, exchange=False, progress=progress)
     begin = [(each.effects, each.fits) for each in grown.close()[:START_FROM]]
     colour = colour_left_by(search, best_on_all_rows(grown, rows, FINAL, others=0).best) or colour
     rows = replace(search.rows, colour=colour)
     found = Search(search.system, rows.select(searched), search.catalogue, jobs=search.jobs)
-    found.go_on_from(begin, True, progress)
+    found.go_on_from(begin, exchange=True, progress=progress)
     found = on_all_rows(found, rows)
     compared = compare_coloured(found, comparison)
     if search.resume(compared.best):

@@ -87,7 +87,7 @@ class FittedModels:
         self.jobs = jobs
         self._rival = rival
         self.fitted: dict[frozenset[str], ScoredModel] = {}
-        self._careful: dict[frozenset[str], ScoredModel] = {}
+        self._careful: dict[frozenset[str], ScoredModel] = {}  # what the last careful fit of each set left
         self._slopes: tuple[Tensor, Tensor] | None = None
         self._screened: dict[tuple[str, ...], tuple[FitState, list[Candidate]]] = {}
         if source is None:

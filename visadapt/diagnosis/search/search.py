@@ -90,7 +90,7 @@ class Search(FittedModels):
         return [f for f in self.ranked if len(f.effects) == 1] or self._alone() or self.extend([self.source])
 
     def go_on_from(
-        self, starts: Sequence[tuple[Effects, FitState]], exchange: bool, progress: Progress | None = None
+        self, starts: Sequence[tuple[Effects, FitState]], *, exchange: bool, progress: Progress | None = None
     ) -> None:
         """Fit sets that were found with other noise, and every promising effect alone; then grow the best of them and,
         with `exchange`, try sets near it, while that raises the posterior odds."""
