@@ -1,4 +1,4 @@
-"""A machine whose velocities jump, each by itself."""
+"""A machine whose velocities jump, each by itself; a jump takes back a part of the one before."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,7 @@ import torch
 
 from tests.diagnosed import GAINS, record
 from visadapt import diagnose
+from visadapt.diagnosis.search.coloured import colour_left_by
 from visadapt.diagnosis.search.jumps import with_jumps
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.search import Search
@@ -21,14 +22,15 @@ CATALOGUE = [ViscousFriction, CoulombFriction, ActuatorGain]
 def jumping():
     """Four episodes of 150 rows, with viscous friction of 0.7 N s/m."""
     generator, world = torch.Generator().manual_seed(0), World(CartPole(), [ViscousFriction(coefficient=0.7)])
-    state, states, commands = torch.zeros(4, 4, dtype=torch.float64), [], []
+    state, jump, states, commands = torch.zeros(4, 4, dtype=torch.float64), torch.zeros(4, 2), [], []
     for _ in range(150):
         drawn = torch.randn(4, 3, generator=generator, dtype=torch.float64)
+        jump = 0.1 * drawn[:, :2] - 0.6 * jump
         states.append(state)
         commands.append((state @ GAINS[:, None] + 0.1 * drawn[:, 2:]).clamp(-1, 1))
         with torch.no_grad():
             state = world.step(world.start(state), commands[-1]).state
-        state[:, [1, 3]] += 0.1 * drawn[:, :2]
+        state[:, [1, 3]] += jump
     true = torch.stack(states, 1)[..., [0, 2]]
     seen = (true + 1e-4 * torch.randn(true.shape, generator=generator, dtype=torch.float64)).numpy()
     given, time = torch.stack(commands, 1).numpy(), 0.05 * np.arange(150)
@@ -39,8 +41,10 @@ def search_of(recording):
     return Search(CartPole(), prepare(recording, CartPole()).rows, CATALOGUE)
 
 
-def test_it_is_searched_with_jumps(jumping):
-    assert with_jumps(search_of(jumping)).rows.jumps
+def test_it_is_searched_with_jumps_that_are_not_white(jumping):
+    search = with_jumps(search_of(jumping))
+    assert search.rows.jumps
+    assert colour_left_by(search, search.best) is not None
 
 
 def test_one_that_loads_disturb_is_not():

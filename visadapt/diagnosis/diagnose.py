@@ -34,7 +34,7 @@ from visadapt.diagnosis.search.causes import (
     ranking,
     stage_shares,
 )
-from visadapt.diagnosis.search.coloured import with_coloured_noise
+from visadapt.diagnosis.search.coloured import colour_left_by, with_coloured_noise
 from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
 from visadapt.diagnosis.search.jumps import with_jumps
 from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
@@ -190,9 +190,12 @@ def _explore(
     search = Search(system, rows.select(prepared.searched), candidates, prepared.source, jobs)
     if announce is not None:
         announce(duration.announcement(rows, len(effects), duration.expected(search, rows), jobs))
-    if (jumping := with_jumps(search)) is not None:
-        rows = replace(rows, jumps=True)
-        search = best_on_all_rows(jumping, rows)
+    jumping = with_jumps(search)
+    if jumping is not None:
+        search, rows = jumping, replace(rows, jumps=True)
+    if jumping is not None and colour_left_by(search, search.best) is not None:
+        # A machine that resonates: its larger sets are looked for with coloured noise alone.
+        search = best_on_all_rows(search, rows)
     else:
         search.run(staged(progress, "search"))
         search = on_all_rows(search, rows)

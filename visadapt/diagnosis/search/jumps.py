@@ -21,9 +21,10 @@ def with_jumps(search: Search) -> Search | None:
     """The same search with jumps of the velocities as process noise, of sets of one and of two effects, where with
     them the source alone is clearly likelier than every effect without them; else None.
 
-    Larger sets are looked for with coloured noise only (`coloured.py`). What jumps describe is the resonance of the
-    machine, with the power of the whole of it at every frequency, against which a third effect hardly counts: of a
-    real double pendulum six effects gained 390 in log odds, none of them the truth, and the colour 1,200.
+    Where what these leave is not white, larger sets are looked for with coloured noise only (`coloured.py`). Jumps
+    describe a resonance of the machine with the power of the whole of it at every frequency, against which a third
+    effect hardly counts: of a real double pendulum six effects gained 390 in log odds, none of them the truth, and the
+    colour 1,200.
     """
     search.fit_singles()
     other = Search(search.system, replace(search.rows, jumps=True), search.catalogue, jobs=search.jobs)
