@@ -12,9 +12,9 @@ Writes results/vibrations.csv. Interrupt it anywhere; started again, it goes on.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -89,7 +89,7 @@ def _judged(settings: Settings, name: str, method: str, seed: int) -> dict[str, 
     folder = settings.work / f"{name} {method}".replace(" ", "-").replace("/", "-") / str(seed)
     open_run(folder, {"hidden": name, "seed": seed, "noise": NOISE, "rows": EPISODES * ROWS})
     if method == WHITE:
-        diagnosing = sys.modules["visadapt.diagnosis.diagnose"]  # the package gives the function of that name
+        diagnosing = import_module("visadapt.diagnosis.diagnose")  # an attribute of that name is the function
         with patch.object(diagnosing, "with_coloured_noise", lambda search, comparison, *_: (search, comparison)):
             return once(folder / "outcome.json", lambda: _outcome(HIDDEN[name](), seed))
     return once(folder / "outcome.json", lambda: _outcome(HIDDEN[name](), seed))
