@@ -30,6 +30,7 @@ from visadapt.history import History
 from visadapt.policies import ImagePolicy, Policy, StatePolicy
 from visadapt.policies.networks import ImageResidualNetwork, ResidualNetwork, StateResidualNetwork, mlp
 from visadapt.setups.base import Setup
+from visadapt.setups.cartpole import from_states
 from visadapt.storage.run_folder import open_run
 from visadapt.targets import SyntheticTarget
 from visadapt.world import World
@@ -81,11 +82,10 @@ def untuned(setup: Setup, policy: Policy) -> Setup:
 
 def held_over_a_plan(setup: Setup, policy: Policy) -> Setup:
     """The residual's correction is constant over a plan, so that the gradient flows through the physics alone."""
-    tuning, near_rest = setup.settings.tuning, setup.settings.refinement
-    assert near_rest is not None
-    noise = near_rest.observation_noise
-    plans = replace(tuning, closed_loop=False, streams=32, every=5, batch=512, observation_noise=noise, recorded=0.8)
-    held = replace(plans, iterations=300, learning_rate=1.5e-3)
+    plans, own = from_states(setup.source).refinement, setup.settings.refinement
+    assert plans is not None
+    assert own is not None
+    held = replace(plans, iterations=300, streams=32, recorded=0.8, observation_noise=own.observation_noise)
     return replace(setup, settings=replace(setup.settings, tuning=held))
 
 

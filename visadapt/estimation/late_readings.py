@@ -54,7 +54,7 @@ def reading(world: World, values: Tensor, state: Tensor, following: Following | 
 def _later(world: World, values: Tensor, state: Tensor, following: Following, ahead: Tensor) -> Tensor:
     """The states (N, n_state) `ahead` (N,) s later, with parameters (N, P)."""
     time, last = following.time, following.command.shape[1] - 1
-    out, rows = state.clone(), torch.arange(len(state))
+    out, rows = state.clone(), torch.arange(len(state), device=state.device)
     for k in range(last + 1):
         h = ahead if k == last else torch.minimum(ahead, following.duration[rows, k])
         state = world.with_values(values[rows]).integrate(time, state, following.command[rows, k], h)

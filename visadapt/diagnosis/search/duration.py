@@ -22,8 +22,8 @@ def expected(search: Search, rows: Segments) -> float:
     """Expected duration in s, from a step of a fit that is timed here, and from what the best effect promises.
 
     Within a factor of about two where one effect or two explain the gap. Recordings of real machines that several
-    effects separate from their simulator, and of which much stays unexplained, took three to five times as long (a
-    cart-pole, 238 rows; a double pendulum, 3,990 and 3,748 rows).
+    effects separate from their simulator, and of which much stays unexplained, took two to five times as long (a
+    cart-pole, 302 rows; a double pendulum, 3,990 and 3,748 rows).
 
     Args:
         search: before it has run; it may be on some of the rows.
