@@ -132,6 +132,12 @@ def with_an_mlp_renderer(setup: Setup, policy: Policy) -> Setup:
     return replace(setup, observe=lambda states: renderer(states[:, 0], states[:, 2]))
 
 
+def with_smallest_ridge(setup: Setup, policy: Policy) -> Setup:
+    """The residual is fitted with the smallest ridge, however it predicts, and whether or not the policy holds."""
+    ground = setup.settings.ground
+    return replace(setup, settings=replace(setup.settings, ground=replace(ground, ridges=ground.ridges[:1])))
+
+
 def _with(**changed: object) -> Variant:
     return lambda setup, policy: replace(setup, settings=replace(setup.settings, **changed))  # type: ignore[arg-type]
 
@@ -141,6 +147,7 @@ VARIANTS: dict[str, Variant] = {
     "no tuning": untuned,
     "no feed-forward": _with(feedforward=False),
     "each round tunes on": _with(tunes_on=True),
+    "smallest ridge": with_smallest_ridge,
     "output layer alone": output_layer_alone,
     "gradient past the renderer": past_the_renderer,
     "gradient past the residual": past_the_residual,

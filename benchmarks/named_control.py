@@ -108,20 +108,23 @@ class Settings:
     iterations: int = 400
     """of the tuning with a residual, from states"""
     jobs: int = 2
-    """seeds at once, one core each"""
+    """of what is hidden and seeds at once, one core each"""
     work: Path = Path("runs/named_control")
     out: Path = Path("results/named_control.csv")
 
 
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
-    found = list(in_processes(_scores, settings, [(seed,) for seed in range(settings.seeds)]).values())
+    if settings.shown == "states":
+        in_processes(_source, settings, [(seed,) for seed in range(settings.seeds)])
+    kinds = settings.kinds or tuple(_every(settings))
+    found = in_processes(_scores, settings, [(kind, seed) for kind in kinds for seed in range(settings.seeds)])
     rows = []
-    for kind in _hidden(settings):
+    for kind in kinds:
         for method in METHODS:
             samples = settings.samples if method in (RESIDUAL, DIAGNOSED) else 0
             domain = "target" if method == NONE else "adapted"
-            scores = [each[kind, method] for each in found]
+            scores = [found[kind, seed][method] for seed in range(settings.seeds)]
             rows.append(speed_row(f"CartPole, {settings.shown}, {kind}", method, domain, samples, scores))
     write_rows(settings.out, rows)
     for row in rows:
@@ -129,9 +132,9 @@ def main(settings: Settings) -> None:
         print_speed(row)
 
 
-def _hidden(settings: Settings) -> Hidden:
-    every = HIDDEN if settings.shown == "states" else HIDDEN_FROM_FRAMES
-    return {kind: every[kind] for kind in settings.kinds or every}
+def _every(settings: Settings) -> Hidden:
+    """All that may be hidden from policies that are shown this."""
+    return HIDDEN if settings.shown == "states" else HIDDEN_FROM_FRAMES
 
 
 def _setup(settings: Settings) -> Setup:
@@ -142,27 +145,32 @@ def _setup(settings: Settings) -> Setup:
     return cartpole_states(with_history=True, settings=own)
 
 
-def _scores(settings: Settings, seed: int) -> dict[tuple[str, str], CartPoleScore]:
-    """Scores of one seed, by what is hidden and method."""
+def _source(settings: Settings, seed: int) -> Policy:
+    """The source policy of a seed; from states it is trained where it is not kept yet."""
     torch.set_num_threads(1)
-    folder = settings.work / settings.shown / f"seed-{seed}"
     setup = _setup(settings)
+    if settings.shown == "frames":
+        return setup.load(shipped("cartpole_frames"))
+    return setup.pretrain(settings.work / "states" / f"seed-{seed}.safetensors", seed)
+
+
+def _scores(settings: Settings, kind: str, seed: int) -> dict[str, CartPoleScore]:
+    """Scores of one seed under what is hidden, by method."""
+    setup, source = _setup(settings), _source(settings, seed)
+    folder = settings.work / settings.shown / kind / f"seed-{seed}"
     numbers = {name: getattr(settings, name) for name in ("episodes", "samples")}
     open_run(folder, {"seed": seed, **numbers, **setup.settings.numbers()})
-    frames = settings.shown == "frames"
-    source = setup.load(shipped("cartpole_frames")) if frames else setup.pretrain(folder / "policy.safetensors", seed)
-    camera = DrawnCartPole() if frames else None
+    effects = _every(settings)[kind]()
+    camera = DrawnCartPole() if settings.shown == "frames" else None
+    target = SyntheticTarget(lambda batch, generator: effects, camera)
     scores = {}
-    for kind, hidden in _hidden(settings).items():
-        effects = hidden()
-        target = SyntheticTarget(lambda batch, generator, effects=effects: effects, camera)  # type: ignore[misc]
-        for method in METHODS:
-            work = folder / f"{kind} {method}".replace(" ", "-")
-            path = work.with_name(f"{work.name}.json")
-            policy = source
-            if method != NONE and not path.exists():
-                policy = _adapted(setup, source, effects, target, method, work, settings, seed)
-            scores[kind, method] = kept_score(path, policy, target, settings.episodes)
+    for method in METHODS:
+        work = folder / method.replace(" ", "-")
+        path = work.with_name(f"{work.name}.json")
+        policy = source
+        if method != NONE and not path.exists():
+            policy = _adapted(setup, source, effects, target, method, work, settings, seed)
+        scores[method] = kept_score(path, policy, target, settings.episodes)
     return scores
 
 

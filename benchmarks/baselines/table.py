@@ -163,13 +163,13 @@ def _scores(settings: Settings, name: str, experiment: str, seed: int) -> None:
         path, where = score_path(folder, stage), problem.scored(stage.domain)
         found = kept_score(path, stage.policy, where, sizes.episodes, steps)
         about = {"domain": stage.domain, "samples": stage.samples}
-        write_json(folder / ACTION, {**about, "ms": action_time(stage.policy, problem.target())})
+        write_json(folder / ACTION, {**about, "ms": action_time(stage.policy, problem.target(), steps or 50)})
         print(f"{name}, {problem.name}, seed {seed}, {stage.domain} {stage.samples}: {found}", flush=True)
     write_json(folder / DONE, {"done": True})
 
 
-def action_time(policy: Policy, target: Target, steps: int = 50) -> float:
-    """Median CPU time in ms of one action of `policy`, one machine at a time, on this thread."""
+def action_time(policy: Policy, target: Target, steps: int) -> float:
+    """Median CPU time in ms of one of `steps` actions of `policy`, one machine at a time, on this thread."""
     times, act = [], policy.act
 
     def timed(history: Any) -> torch.Tensor:

@@ -1,5 +1,7 @@
 """Which effects the screening proposes, and with which parameters, where an effect is not proportional to them."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -47,11 +49,22 @@ def test_a_limit_that_only_the_largest_commands_reach_is_found():
     assert screened(EFFECTS["actuator_saturation"], limit) == pytest.approx(limit, rel=0.06)
 
 
+FREQUENCIES = (0.06, 0.31, 1.03, 1.6, 2.3, 4.7)  # Hz
+
+
+@pytest.fixture(scope="module")
+def shaken():
+    """Three episodes at each of FREQUENCIES, simulated side by side."""
+    each = torch.tensor(FREQUENCIES, dtype=torch.float64).repeat_interleave(3)
+    return record([PeriodicForce(amplitude=0.8, frequency=each, phase=2.0, offset=0.0)], len(each), 400)
+
+
 @pytest.mark.parametrize("episodes", [1, 3])
-@pytest.mark.parametrize("frequency", [0.06, 0.31, 1.03, 1.6, 2.3, 4.7])
-def test_a_frequency_between_the_points_of_any_coarse_grid_is_found(frequency, episodes):
-    force = PeriodicForce(amplitude=0.8, frequency=frequency, phase=2.0, offset=0.0)
-    recording = record([force], episodes, 400)
+@pytest.mark.parametrize("frequency", FREQUENCIES)
+def test_a_frequency_between_the_points_of_any_coarse_grid_is_found(frequency, episodes, shaken):
+    first = 3 * FREQUENCIES.index(frequency)
+    own = slice(first, first + episodes)
+    recording = dataclasses.replace(shaken, episodes=shaken.episodes[own], sources=shaken.sources[own])
     search = Search(SYSTEM, prepare(recording, SYSTEM).rows, ())
     found = screen(SYSTEM, (), search.source.fits, search.rows, [PeriodicForce])[0].values[1]
     assert found == pytest.approx(frequency, abs=0.25 / 20)  # of 20 s

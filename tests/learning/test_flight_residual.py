@@ -55,7 +55,7 @@ def swaying(count, seed):
 def fitted(network, transitions):
     residual = Residual(network, torch.ones(13))
     rescale(residual, SOURCE, transitions)
-    ground(residual, SOURCE, transitions, GroundSettings(ridge=0.1), seeded())
+    ground(residual, SOURCE, transitions, GroundSettings(ridges=(0.1,)), seeded())
     return residual
 
 

@@ -194,7 +194,7 @@ class TestOnFrames:
     def test_a_linear_head_solves_the_ridge_equations_on_all_samples(self, seen):
         residual, transitions = seen
         ridge = 3.0
-        fit(residual, SOURCE, transitions, GroundSettings(ridge=ridge), torch.Generator().manual_seed(0))
+        fit(residual, SOURCE, transitions, GroundSettings(ridges=(ridge,)), torch.Generator().manual_seed(0))
         head = residual.network.head
         with torch.no_grad():
             history = transitions.history(torch.arange(len(transitions))).acting(transitions.action)
@@ -204,6 +204,30 @@ class TestOnFrames:
         # The gradient of the squared errors and the penalty vanishes.
         penalty = ridge * residual.network.penalties(inputs)
         np.testing.assert_allclose((left.T @ inputs).numpy(), (penalty * weight).numpy(), atol=1e-3)
+
+    def test_of_several_ridges_it_takes_that_which_predicts_held_out_stretches_best(self, seen):
+        residual, transitions = seen
+        ridges = (1e-4, 1.0, 1e4)
+        every = torch.arange(len(transitions))
+        with torch.no_grad():
+            inputs = residual.network.embed(transitions.history(every).acting(transitions.action)).double().numpy()
+        wanted = (gap(SOURCE, transitions).double() / residual.scale).numpy()
+        penalties = residual.network.penalties(torch.from_numpy(inputs)).numpy()
+
+        def error(ridge, held):
+            rest = np.setdiff1d(np.arange(len(inputs)), held)
+            normal = inputs[rest].T @ inputs[rest] + np.diag(ridge * penalties)
+            weight = np.linalg.solve(normal, inputs[rest].T @ wanted[rest])
+            return np.square(inputs[held] @ weight - wanted[held]).sum()
+
+        assert len(transitions) == 40
+        errors = [sum(error(ridge, np.arange(k, k + 10)) for k in range(0, 40, 10)) for ridge in ridges]
+        heads = []
+        for choice in (ridges, (ridges[int(np.argmin(errors))],)):
+            fit(residual, SOURCE, transitions, GroundSettings(ridges=choice), torch.Generator().manual_seed(0))
+            heads.append(residual.network.head.weight.detach().clone())
+        assert 1.5 * min(errors) < max(errors)
+        assert torch.equal(*heads)
 
     def test_what_it_says_of_held_out_samples_comes_from_the_others_alone(self, seen):
         residual, transitions = seen

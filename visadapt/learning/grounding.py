@@ -8,6 +8,7 @@ one by ridge regression, an MLP by gradient descent from its weights of the last
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -22,16 +23,18 @@ from visadapt.policies.networks import ResidualNetwork
 from visadapt.progress import Progress
 from visadapt.world import World
 
+STRETCH = 10  # Samples in a row that are held out together
+
+FOLDS = 5  # Parts of the samples that are held out in turn where a ridge is chosen
+
 
 @dataclass(frozen=True)
 class GroundSettings:
-    """How a residual is fitted. A linear head uses `ridge`, `larger`, `negligible` and, for its losses, `held_out`."""
+    """How a residual is fitted. A linear head uses `ridges`, `negligible` and, for its losses, `held_out`."""
 
-    ridge: float = 1.0
-    """weight of the squared coefficients of a linear head (times the network's `penalties`), where a sample's squared
-    error has weight 1"""
-    larger: tuple[float, ...] = ()
-    """values of `ridge` to try in turn where the world with the residual is unstable (`learning.stability`)"""
+    ridges: tuple[float, ...] = (1.0,)
+    """weights, from small to large, of the squared coefficients of a linear head (times the network's `penalties`),
+    where a sample's squared error has weight 1; of several, that which predicts held-out samples best"""
     negligible: float = 0.0
     """least scale of the residual, as a share of the root mean square change of a state in a period"""
     steps: int = 2000  # optimisation steps at most
@@ -110,10 +113,12 @@ def ground(
     settings: GroundSettings,
     generator: torch.Generator,
     progress: Progress | None = None,
+    accept: Callable[[], bool] = lambda: True,
 ) -> list[GroundLoss]:
     """Fit the head of the residual's network, in place, to the transitions; returns losses in units of its scale.
 
-    Transitions whose history the network says is incomplete are left out, unless all are.
+    Transitions whose history the network says is incomplete are left out, unless all are. Where `accept` says no to a
+    linear head, it is fitted again with the next larger of the `ridges`; the last is accepted without being asked for.
     """
     target = gap(source, transitions) / residual.scale
     network = residual.network
@@ -126,16 +131,36 @@ def ground(
     if bool(informed.any()):
         seen, target = seen[informed], target[informed]
     train, held_out = split(len(seen), settings.held_out, generator)
-    if isinstance(network.head, nn.Linear):
-        penalty = settings.ridge * network.penalties(seen)
-        return _solve(network.head, seen, target, train, held_out, penalty)
-    return _descend(network.head, seen, target, train, held_out, settings, generator, progress)
+    if not isinstance(network.head, nn.Linear):
+        return _descend(network.head, seen, target, train, held_out, settings, generator, progress)
+    penalties = [ridge * network.penalties(seen) for ridge in settings.ridges]
+    for number in range(_best(seen, target, penalties), len(penalties)):
+        losses = _solve(network.head, seen, target, train, held_out, penalties[number])
+        if number == len(penalties) - 1 or accept():
+            break
+    return losses
 
 
-def attempts(residual: Residual, settings: GroundSettings) -> list[GroundSettings]:
-    """The settings to fit with in turn until the world is stable: with each larger ridge, where the head is linear."""
-    linear = isinstance(getattr(residual.network, "head", None), nn.Linear)
-    return [settings, *(replace(settings, ridge=ridge) for ridge in settings.larger if linear)]
+@torch.no_grad()
+def _best(inputs: Tensor, targets: Tensor, penalties: Sequence[Tensor]) -> int:
+    """The index of the penalty (inputs,) with which a linear head errs least on FOLDS parts held out in turn.
+
+    A part is of stretches of STRETCH samples, as in `split`. Where there is one stretch alone, the last.
+    """
+    stretch = torch.arange(len(inputs)) // STRETCH
+    if len(penalties) == 1 or not bool(stretch.any()):
+        return len(penalties) - 1
+    part = stretch % FOLDS
+
+    def error(penalty: Tensor) -> float:
+        squares = inputs.new_zeros(())
+        for own in part.unique():
+            weight = _ridge(inputs[part != own], targets[part != own], penalty)
+            squares = squares + (inputs[part == own] @ weight - targets[part == own]).square().sum()
+        return float(squares)
+
+    errors = [error(penalty) for penalty in penalties]
+    return errors.index(min(errors))
 
 
 @torch.no_grad()
@@ -205,11 +230,11 @@ def _descend(
 
 
 def split(count: int, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Rows to train on and rows held out: stretches of 10 samples, since neighbouring ones are correlated.
+    """Rows to train on and rows held out: stretches of STRETCH samples, since neighbouring ones are correlated.
 
     Where no stretch would be left to train on, both are all rows.
     """
-    stretches = torch.arange(count).split(10)
+    stretches = torch.arange(count).split(STRETCH)
     order = torch.randperm(len(stretches), generator=generator).tolist()
     held = max(1, round(share * len(stretches)))
     if held >= len(stretches):

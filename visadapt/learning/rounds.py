@@ -16,7 +16,7 @@ from torch import Tensor
 
 from visadapt.effects import Residual
 from visadapt.learning.explanation import NOT_DIAGNOSED, Explain, Explanation
-from visadapt.learning.grounding import GroundLoss, attempts, fit_named, ground, rescale
+from visadapt.learning.grounding import GroundLoss, fit_named, ground, rescale
 from visadapt.learning.ledger import Ledger
 from visadapt.learning.policy import initialise_feedforward, tune
 from visadapt.learning.setup_settings import SetupSettings
@@ -171,7 +171,7 @@ class JointLearning:
             placed = true.to(self.residual.scale)
             if not self.grounded:
                 rescale(self.residual, known, placed, self.settings.ground.negligible)
-            losses = self._fit_until_stable(folder, placed)
+            losses = self._fit(folder, placed)
             changed = {} if true is transitions else {"states": true.states, "times": true.times}
             save_tree(folder.residual, {"weights": world.state_dict(), "losses": losses, "windows": changed})
         tree = load_tree(folder.residual)
@@ -180,17 +180,16 @@ class JointLearning:
             transitions = replace(transitions, **tree["windows"])
             return [GroundLoss(*each) for each in tree["losses"]], transitions
 
-    def _fit_until_stable(self, folder: RoundFolder, transitions: Transitions) -> list[GroundLoss]:
+    def _fit(self, folder: RoundFolder, transitions: Transitions) -> list[GroundLoss]:
         """Fit the residual, again with the next larger ridge where the policy is unstable in the world with it."""
-        known, world = self.known, self._learnt
         self._begin_tuning()
-        left = attempts(self.residual, self.settings.ground)
-        while True:
-            about = left.pop(0), folder.generator(1), self._progress(folder, "ground")
-            losses = ground(self.residual, known, transitions, *about)
-            imagined = self.settings.tuning, folder.generator(3), transitions
-            if not left or stable(self.policy, world, self.observe, *imagined):
-                return losses
+        world, tuning = self._learnt, self.settings.tuning
+
+        def accept() -> bool:
+            return stable(self.policy, world, self.observe, tuning, folder.generator(3), transitions)
+
+        about = self.settings.ground, folder.generator(1), self._progress(folder, "ground")
+        return ground(self.residual, self.known, transitions, *about, accept)
 
     def _begin_tuning(self) -> None:
         """Give the policy the weights that tuning with the residual begins with."""

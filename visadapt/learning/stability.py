@@ -17,9 +17,9 @@ PLANS = 15
 """Plans of 10 steps that are imagined one after the other. Where a cart-pole's motion grew until a plan cost 1,000
 times the first, the first 3 plans showed nothing, the fourth 5 times, the seventh 700 times."""
 
-GROWTH = 10.0
-"""Ratio of a plan's mean cost to that of the first beyond which a world counts as unstable. In those that are not, it
-was at most 1.2."""
+GROWTH = 3.0
+"""Ratio of a plan's mean cost to that of the first beyond which a world counts as unstable. A policy that was tuned in
+a world with 5.5 lost 35 of 40 episodes, with 1.6 none; in most worlds it is below 1."""
 
 
 @torch.no_grad()

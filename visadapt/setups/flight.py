@@ -17,7 +17,7 @@ from visadapt.tasks.reach import Reach
 from visadapt.tasks.references import Reference
 from visadapt.world import World
 
-GROUND = GroundSettings(ridge=0.1, negligible=0.1)
+GROUND = GroundSettings(ridges=(0.1,), negligible=0.1)
 RECORDED = 0.8
 """Share of the streams that start in a recorded flight, with its history, where the residual reads the history: in
 other starts it shows no changing force, or only the residual's own."""
