@@ -235,11 +235,13 @@ def _after(settings: Settings, name: str, variant: str, seed: int) -> CartPoleSc
     setup = _in_the_true_physics(setup, machine, seed) if variant in KNOWING else VARIANTS[variant](setup, policy)
     about = {"shown": settings.shown, "seed": seed, "episodes": settings.episodes}
     open_run(folder, {**about, **setup.settings.numbers()})
-    if variant in KNOWING:
-        policy = KNOWING[variant](setup, policy, folder, seed)
-    else:
-        setup.adapt(policy, machine, folder, SAMPLES, ROUND_SAMPLES, seed)
-    return kept_score(folder / "score.json", policy, machine, settings.episodes)
+    path = folder / "score.json"
+    if not path.exists():
+        if variant in KNOWING:
+            policy = KNOWING[variant](setup, policy, folder, seed)
+        else:
+            setup.adapt(policy, machine, folder, SAMPLES, ROUND_SAMPLES, seed)
+    return kept_score(path, policy, machine, settings.episodes)
 
 
 if __name__ == "__main__":

@@ -107,12 +107,13 @@ def _scores(settings: Settings, number: int | None, seed: int) -> dict[str, Cart
     folder = settings.work / f"variant-{number}" / f"seed-{seed}"
     about = {"seed": seed, "episodes": settings.episodes, **asdict(variant), **setup.settings.numbers()}
     open_run(folder, about)
-    adapted = setup.adapt(policy, target, folder, variant.budget, variant.round_samples, seed)
-    scores = {}
-    for samples in variant.scored:
-        adapted.restore(policy, samples)
-        scores[str(samples)] = scored(target, folder / f"score-{samples}.json")
-    return scores
+    paths = {samples: folder / f"score-{samples}.json" for samples in variant.scored}
+    if not all(path.exists() for path in paths.values()):
+        adapted = setup.adapt(policy, target, folder, variant.budget, variant.round_samples, seed)
+        for samples, path in paths.items():
+            adapted.restore(policy, samples)
+            scored(target, path)
+    return {str(samples): scored(target, path) for samples, path in paths.items()}
 
 
 if __name__ == "__main__":
