@@ -162,8 +162,8 @@ COMMANDS = (
     Command(
         "named_control_frames",
         "named_control_frames.csv",
-        ("benchmarks.named_control", "--shown", "frames", "--out", "results/named_control_frames.csv"),
-        60,
+        ("benchmarks.named_control", "--shown", "frames", "--seeds", "2", "--out", "results/named_control_frames.csv"),
+        40,
         work="--work",
     ),
     Command(

@@ -127,7 +127,8 @@ def diagnose(
     prepared, search, comparison = explored.prepared, explored.search, explored.comparison
     groups, rows = explored.groups, prepared.rows
     repeats = [cause for cause, _ in explored.repeats]
-    measured = measure(search, comparison, groups, errors_with_repeats(prepared, search) if repeats else None, jobs)
+    with_repeats = errors_with_repeats(prepared, search) if repeats else None
+    measured = measure(search, comparison, groups, with_repeats, jobs, staged(progress, "predictions"))
     verdict, found, partial = _judge(explored, measured)
     before, after = disturbances(search, comparison)
     regions = _regions(found, before if found else after, explored.effects, profile.region_variables, seed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -16,8 +17,11 @@ from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.verdict import MIN_GAP_CLOSED
 from visadapt.estimation.fit_states import Effects
 from visadapt.estimation.likelihood import FitState
+from visadapt.progress import Progress
 
 RUNNERS_UP = 2  # Sets after the best for which the share of the gap that they close is computed
+
+PARTS = 3  # Of the progress: source and best set, all other sets, the black box
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,7 @@ def measure(
     groups: Sequence[Sequence[Alternative]],
     with_repeats: RolloutErrors | None,
     jobs: int = 1,
+    progress: Progress | None = None,
 ) -> MeasuredGap:
     """Predict with the source, the best set, the set less each effect, each cause alone and the runners-up.
 
@@ -51,6 +56,11 @@ def measure(
         with_repeats: the source's predictions against readings that include the repeated ones, where there are any.
         jobs: processes that share the work.
     """
+
+    def done(parts: int) -> None:
+        if progress is not None:
+            progress(parts, PARTS, math.nan)
+
     rows, best = search.rows, comparison.best
     alone = [search.single(effect) for effect in dict.fromkeys(one.canonical for group in groups for one in group)]
     runners_up = [compared.model for compared in comparison.models[1 : 1 + RUNNERS_UP]]
@@ -59,10 +69,12 @@ def measure(
     shown = {frozenset(f.names): f for f in [search.source, replace(best, fits=comparison.predicting)]}
     sets = {names: f for f in [*alone, *without, *runners_up] if (names := frozenset(f.names)) not in shown}
     rollouts = heldout.held_out(search.system, rows, _fitted(shown), lambda errors: errors, jobs)
+    done(1)
     source, corrected = rollouts[0], rollouts[-1]
     rms = [errors.rms(noise) for errors in rollouts]
     reached = rms[-1]
     rms += heldout.held_out(search.system, rows, _fitted(sets), lambda errors: errors.rms(noise), jobs)
+    done(2)
     source = with_repeats or source
     errors = PredictionErrors(source.rms(noise), reached, corrected.floor(noise), reached, noise)
     improvable, is_held_out = False, rows.shape[0] > 1
@@ -73,6 +85,7 @@ def measure(
         gap = errors.gap()
         left = heldout.closed(gap.before, gap.black_box, gap.floor) - gap.closed
         improvable = left > 1 - MIN_GAP_CLOSED and heldout.predicts_better(black_box, corrected, noise)
+    done(PARTS)
     closed = {names: errors.closed_by(each) for names, each in zip([*shown, *sets], rms, strict=True)}
     return MeasuredGap(source, corrected, errors, closed, improvable, is_held_out)
 
