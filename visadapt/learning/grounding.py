@@ -134,7 +134,7 @@ def ground(
     if not isinstance(network.head, nn.Linear):
         return _descend(network.head, seen, target, train, held_out, settings, generator, progress)
     penalties = [ridge * network.penalties(seen) for ridge in settings.ridges]
-    for number in range(_best(seen, target, penalties), len(penalties)):
+    for number in range(_best_penalty(seen, target, penalties), len(penalties)):
         losses = _solve(network.head, seen, target, train, held_out, penalties[number])
         if number == len(penalties) - 1 or accept():
             break
@@ -142,7 +142,7 @@ def ground(
 
 
 @torch.no_grad()
-def _best(inputs: Tensor, targets: Tensor, penalties: Sequence[Tensor]) -> int:
+def _best_penalty(inputs: Tensor, targets: Tensor, penalties: Sequence[Tensor]) -> int:
     """The index of the penalty (inputs,) with which a linear head errs least on FOLDS parts held out in turn.
 
     A part is of stretches of STRETCH samples, as in `split`. Where there is one stretch alone, the last.
