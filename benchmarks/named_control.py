@@ -166,7 +166,7 @@ def _scores(settings: Settings, kind: str, seed: int) -> dict[str, CartPoleScore
     scores = {}
     for method in METHODS:
         work = folder / method.replace(" ", "-")
-        path = work.with_name(f"{work.name}.json")
+        path = work.with_suffix(".json")
         policy = source
         if method != NONE and not path.exists():
             policy = _adapted(setup, source, effects, target, method, work, settings, seed)
