@@ -5,11 +5,19 @@
 
 The CartPole under hidden effects of each kind, among them one that no effect of the library describes and none at all;
 from frames, a camera that was turned too. For each method the source policy collects the samples, in one round and
-from the same seed. "diagnosed" is `visadapt adapt --diagnose`: what is named is put into the simulator, and a residual
-learns the gap only where nothing is; "residual" is the paper's; "true effect" has the hidden effect in the simulator,
-and takes no samples. From states each seed has its own source policy, from frames all have the shipped one. Scores are
-of 100 episodes of 12.5 s. Where a residual cannot be learnt, since no states are seen in a faulty camera's frames, the
-source policy is scored.
+from the same seed:
+
+    residual                 the paper's
+    diagnosed                `visadapt adapt --diagnose`: what is named is put into the simulator, and a residual learns
+                             the gap only where nothing is named
+    diagnosed early          the same after fewer samples
+    diagnosed and residual   a residual learns beside what is named, whose parameters are fitted to the samples again
+    true effect              the hidden effect is in the simulator; takes no samples, and is tuned with the same random
+                             numbers as "diagnosed"
+
+From states each seed has its own source policy, from frames all have the shipped one. Scores are of 100 episodes of
+12.5 s. Where a residual cannot be learnt, since no states are seen in a faulty camera's frames, the source policy is
+scored.
 
 Interrupt it anywhere; started again, it goes on.
 """
@@ -44,6 +52,7 @@ from visadapt.effects import (
     ViscousFriction,
 )
 from visadapt.evaluation import CartPoleScore
+from visadapt.learning.rounds import TUNING, RoundFolder
 from visadapt.learning.tracking import TrackingError
 from visadapt.policies import Policy
 from visadapt.setups.base import Setup
@@ -87,8 +96,14 @@ HIDDEN_FROM_FRAMES: Hidden = {
 }
 """What is hidden from policies that are shown frames."""
 
-NONE, RESIDUAL, DIAGNOSED, TRUE = "source policy", "residual", "diagnosed", "true effect"
-METHODS = (NONE, RESIDUAL, DIAGNOSED, TRUE)
+NONE, RESIDUAL, EARLY, DIAGNOSED, BOTH, TRUE = METHODS = (
+    "source policy",
+    "residual",
+    "diagnosed early",
+    "diagnosed",
+    "diagnosed and residual",
+    "true effect",
+)
 
 
 @dataclass(frozen=True)
@@ -103,6 +118,8 @@ class Settings:
     episodes: int = 100
     samples: int = 300
     """counted, in one round"""
+    early: int = 50
+    """counted by the diagnosis that is made early"""
     source_iterations: int = 3000
     """of the source policy, from states"""
     iterations: int = 400
@@ -122,9 +139,9 @@ def main(settings: Settings) -> None:
     rows = []
     for kind in kinds:
         for method in METHODS:
-            samples = settings.samples if method in (RESIDUAL, DIAGNOSED) else 0
             domain = "target" if method == NONE else "adapted"
             scores = [found[kind, seed][method] for seed in range(settings.seeds)]
+            samples = _samples(settings, method)
             rows.append(speed_row(f"CartPole, {settings.shown}, {kind}", method, domain, samples, scores))
     write_rows(settings.out, rows)
     for row in rows:
@@ -132,17 +149,23 @@ def main(settings: Settings) -> None:
         print_speed(row)
 
 
+def _samples(settings: Settings, method: str) -> int:
+    """Samples of the target that a method counts."""
+    return {NONE: 0, TRUE: 0, EARLY: settings.early}.get(method, settings.samples)
+
+
 def _every(settings: Settings) -> Hidden:
     """All that may be hidden from policies that are shown this."""
     return HIDDEN if settings.shown == "states" else HIDDEN_FROM_FRAMES
 
 
-def _setup(settings: Settings) -> Setup:
+def _setup(settings: Settings, source: World | None = None) -> Setup:
+    """The setup, with a source that differs from the bare cart-pole by effects that a diagnosis named."""
     if settings.shown == "frames":
-        return cartpole_frames()
+        return cartpole_frames(source)
     own = from_states(World(CartPole())).shortened(settings.source_iterations)
     own = replace(own, tuning=replace(own.tuning, iterations=settings.iterations))
-    return cartpole_states(with_history=True, settings=own)
+    return cartpole_states(source, with_history=True, settings=own)
 
 
 def _source(settings: Settings, seed: int) -> Policy:
@@ -158,7 +181,7 @@ def _scores(settings: Settings, kind: str, seed: int) -> dict[str, CartPoleScore
     """Scores of one seed under what is hidden, by method."""
     setup, source = _setup(settings), _source(settings, seed)
     folder = settings.work / settings.shown / kind / f"seed-{seed}"
-    numbers = {name: getattr(settings, name) for name in ("episodes", "samples")}
+    numbers = {name: getattr(settings, name) for name in ("episodes", "samples", "early")}
     open_run(folder, {"seed": seed, **numbers, **setup.settings.numbers()})
     effects = _every(settings)[kind]()
     camera = DrawnCartPole() if settings.shown == "frames" else None
@@ -185,13 +208,21 @@ def _adapted(
     seed: int,
 ) -> Policy:
     """The source policy, adapted by a method."""
-    policy = copy.deepcopy(source)
+    policy, samples = copy.deepcopy(source), _samples(settings, method)
     if method == TRUE:
         if effects:
-            replace(setup, source=World(CartPole(), effects)).tune(policy, seed)
+            as_diagnosed = RoundFolder.of(work, 0, 1, seed).generator(TUNING).initial_seed()
+            replace(setup, source=World(CartPole(), effects)).tune(policy, as_diagnosed)
         return policy
+    diagnose = method in (EARLY, DIAGNOSED)
     try:
-        setup.adapt(policy, target, work, settings.samples, settings.samples, seed, diagnose=method == DIAGNOSED)
+        if method == BOTH:
+            work_before, again = work.with_name(DIAGNOSED), copy.deepcopy(source)
+            named = setup.adapt(again, target, work_before, samples, samples, seed, diagnose=True).source
+            setup = _setup(settings, named)
+            if not len(named.effects):  # then this is the run with a residual alone
+                work = work.with_name(RESIDUAL)
+        setup.adapt(policy, target, work, samples, samples, seed, diagnose=diagnose)
     except TrackingError as error:
         print(f"{work}: {error}", flush=True)
         return source

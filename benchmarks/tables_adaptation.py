@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable
 
 from benchmarks.cartpole_pixels import EXPERIMENT as PIXELS, OURS as FRAMES_ALONE
 from benchmarks.cartpole_states import CONSTANT, OURS, SINE
-from benchmarks.named_control import METHODS
 from benchmarks.other_targets import METHOD
 
 Row = dict[str, str]
@@ -177,10 +176,11 @@ def named(rows: Rows) -> Lines:
 
 def named_control(rows: Rows) -> Lines:
     """Policies adapted by a residual, by what a diagnosis names, and with the true effect, in m/s."""
-    lines = [["mean cart speed in m/s (episodes up)", *METHODS]]
+    samples = {row["method"]: int(row["samples"]) for row in rows}
+    lines = [["mean cart speed in m/s (episodes up)", *(f"{m}, {n} samples" if n else m for m, n in samples.items())]]
     for experiment in dict.fromkeys(row["experiment"] for row in rows):
         own = {row["method"]: _speed_cells(row) for row in rows if row["experiment"] == experiment}
-        cells = [f"{own[method][0]} ({own[method][1]})" for method in METHODS]
+        cells = [f"{own[method][0]} ({own[method][1]})" for method in samples]
         lines.append([experiment.split(", ", 2)[2], *cells])
     return lines
 

@@ -6,10 +6,11 @@ import torch
 
 from renderers import Camera, DrawnCartPole
 from renderers.drawn import AXLE_GREY, CART_GREY, POLE_GREY, SKY_GREY, TRACK_GREY
-from visadapt.effects import EFFECTS, ConstantForce
+from visadapt.effects import EFFECTS, CameraRotation, ConstantForce
 from visadapt.estimation.poses import PoseFinder
 from visadapt.learning.tracking import Tracker, TrackingError, TrackingWarning
 from visadapt.recordings import Episode
+from visadapt.setups.cartpole import cartpole_frames
 from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget, constant_force, no_effects, sine_force
 from visadapt.world import World
@@ -148,6 +149,12 @@ class TestTracks:
         found = gap(tracker.track([blind(record(no_effects, 60))])[0])
         # 2 N would change the velocities by 0.09 m/s and 0.13 rad/s.
         assert (rms(found)[[1, 3]] < [2e-3, 1e-2]).all()
+
+    def test_frames_of_a_camera_that_is_known_to_be_turned_show_the_same_states(self):
+        turned = [CameraRotation(angle=0.06)]
+        episode = record(lambda batch, generator: turned, 40)
+        (track,) = cartpole_frames(World(CartPole(), turned)).label([blind(episode)])
+        assert (rms(track.state - episode.state) < [2e-3, 1e-2, 5e-3, 2e-2]).all()
 
     @pytest.mark.parametrize("steps", [1, 2, 4])
     def test_short_episodes_have_sensible_states(self, tracker, steps):

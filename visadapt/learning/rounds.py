@@ -30,6 +30,8 @@ from visadapt.targets import Target, TargetError
 from visadapt.targets.rollout import run
 from visadapt.world import World
 
+COLLECTING, GROUNDING, TUNING, ACCEPTING = range(4)  # Stages of a round, each with random numbers of its own
+
 EXPLORATION = 0.05  # Standard deviation of white noise on the commands while data are collected
 
 Label = Callable[[list[Episode]], list[Episode]]  # Gives the episodes of a round the states that grounding learns from
@@ -80,7 +82,7 @@ class RoundFolder:
         return self.path / "policy.safetensors"
 
     def generator(self, stage: int) -> torch.Generator:
-        """Random numbers of a stage: each has its own, so that a resumed run draws the same."""
+        """Random numbers of a stage, which a resumed run draws again."""
         return torch.Generator().manual_seed(self.seed + stage)
 
 
@@ -148,7 +150,7 @@ class JointLearning:
             collector, longest = self.explorer or self.policy, self.settings.longest_episode
             wanted = min(samples, self.ledger.left)
             added = self.found.experiment(collector, min(wanted, longest)) if self.found.experiment else None
-            episodes = collect(collector, self.target, wanted, longest, folder.generator(0), added)
+            episodes = collect(collector, self.target, wanted, longest, folder.generator(COLLECTING), added)
             write_recording(folder.recording, episodes)
         for episode in read_recording(folder.recording):
             self.ledger.count(f"{folder.name}: data", episode.samples)
@@ -186,9 +188,9 @@ class JointLearning:
         world, tuning = self._learnt, self.settings.tuning
 
         def accept() -> bool:
-            return stable(self.policy, world, self.observe, tuning, folder.generator(3), transitions)
+            return stable(self.policy, world, self.observe, tuning, folder.generator(ACCEPTING), transitions)
 
-        about = self.settings.ground, folder.generator(1), self._progress(folder, "ground")
+        about = self.settings.ground, folder.generator(GROUNDING), self._progress(folder, "ground")
         return ground(self.residual, self.known, transitions, *about, accept)
 
     def _begin_tuning(self) -> None:
@@ -206,7 +208,7 @@ class JointLearning:
         world = self._learnt
 
         def tuned(partial: Path) -> list[float]:
-            about = self.settings.tuning, folder.generator(2), transitions, self._progress(folder, "tune"), partial
+            about = self.settings.tuning, folder.generator(TUNING), transitions, self._progress(folder, "tune"), partial
             return tune(self.policy, world, self.observe, *about)
 
         return self._kept(folder.policy, tuned)
@@ -223,7 +225,7 @@ class JointLearning:
             if no_gap:
                 return []
             how, progress = self.settings.with_names, self._progress(folder, "tune")
-            return tune(self.policy, world, self.observe, how, folder.generator(2), None, progress, partial)
+            return tune(self.policy, world, self.observe, how, folder.generator(TUNING), None, progress, partial)
 
         return self._kept(folder.policy, tuned)
 

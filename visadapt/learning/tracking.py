@@ -25,6 +25,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from visadapt.effects.camera import CameraEffect
+from visadapt.estimation.camera_fit import SeenBy, within_frame
 from visadapt.estimation.kalman import Linear, backward
 from visadapt.estimation.linearise import linearise_step, load_effect
 from visadapt.estimation.noise import Noise, UnknownNoise, most_probable_noise
@@ -57,12 +59,13 @@ class Tracker:
     Args:
         renderer: learnt, of x (B,) in m and theta (B,) in rad to frames (B, H, W) in [0, 1].
         world: the source physics, without effects; the cart is looked for within the range of its system's table.
+        camera: known faults of the camera that single frames show, through which the renderer's pictures are seen.
 
     Raises:
         TrackingError: a world with effects, which would hide the gap that is looked for.
     """
 
-    def __init__(self, renderer: nn.Module, world: World) -> None:
+    def __init__(self, renderer: nn.Module, world: World, camera: Sequence[CameraEffect] = ()) -> None:
         if len(world.effects):
             raise TrackingError(f"tracking needs the source physics alone, not {len(world.effects)} effects")
         system = world.system
@@ -73,7 +76,9 @@ class Tracker:
         load = load_effect(type(system))
         nothing = load(**{parameter.name: 0.0 for parameter in load.table})
         self._pushed = world.with_effects((nothing,))
-        self.poses = PoseFinder(renderer, across.largest)
+        self.poses = PoseFinder(SeenBy(renderer, camera) if camera else renderer, across.largest)
+        self._known = within_frame(camera, torch.zeros(self.poses.size)).to(torch.uint8)
+        """(H, W) 1 where the renderer draws what is seen, else 0"""
 
     def track(self, episodes: Sequence[Episode]) -> list[Episode]:
         """The episodes with states estimated from their frames and actions alone; one noise model is fitted to all.
@@ -119,7 +124,7 @@ class Tracker:
         if len(periods) and np.abs(periods - self.world.period).max() > 0.01 * self.world.period:
             worst = float(periods[np.abs(periods - self.world.period).argmax()])
             raise TrackingError(f"episode {number} has rows {worst:g} s apart; the period is {self.world.period:g} s")
-        poses = self.poses(torch.from_numpy(np.ascontiguousarray(episode.frame)))
+        poses = self.poses(self._known * torch.from_numpy(np.ascontiguousarray(episode.frame)))
         missed = (~poses.explained).nonzero()[:, 0]
         if len(missed):
             first = int(missed[0])

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from renderers import LayeredRenderer, RendererError, load_renderer
+from visadapt.effects import CameraEffect
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.perception import PerceptionSettings, learn_to_see
 from visadapt.learning.policy import TuneSettings
@@ -124,8 +125,8 @@ def cartpole_frames(
     """The cart-pole that is shown a camera's frames, and learns from these alone.
 
     Args:
-        source: the physics known beforehand, whose states begin with x, x_dot, theta, theta_dot; without it, the
-            paper's CartPole, 0.05 s between commands.
+        source: the physics known beforehand, whose states begin with x, x_dot, theta, theta_dot, and what is known of
+            the camera's faults; without it, the paper's CartPole, 0.05 s between commands.
         renderer: states to frames, trained, or the file of one; without it, that of the drawn cart-pole.
         settings: how the policy learns; without it, `from_frames`, narrowed to what the renderer's camera sees.
 
@@ -135,7 +136,8 @@ def cartpole_frames(
     source = source or World(CartPole())
     seen = renderer if isinstance(renderer, LayeredRenderer) else _load(Path(renderer or shipped("renderer")))
     seen.requires_grad_(False).eval()
-    tracker = Tracker(seen, source.with_effects(()))
+    camera = [each for each in source.effects if isinstance(each, CameraEffect) and each.in_one_frame]
+    tracker = Tracker(seen, source.with_effects(()), camera)
     settings = settings or _narrowed(from_frames(source), seen)
     perception = settings.perception or PerceptionSettings()
 
