@@ -54,6 +54,27 @@ def furuta() -> Any:
 
 
 @dataclass(frozen=True)
+class Winch(System):
+    """A drum on a spring of several turns, which lifts faster than it lowers: its angle is no angle modulo a turn."""
+
+    inertia: float | torch.Tensor = 0.01  # kg m2
+    stiffness: float | torch.Tensor = 0.05  # N m/rad
+
+    name = "winch"
+    states: ClassVar[tuple[Variable, ...]] = (
+        Variable("drum", "rad", 0.0, 40.0),
+        Variable("speed", "rad/s", -40.0, 4.0),
+    )
+    actions: ClassVar[tuple[Variable, ...]] = (Variable("torque", "N m", -2.0, 2.0),)
+    loads = (Variable("axis", "N m", -1.0, 1.0),)
+    coordinates = ((0, 1),)
+
+    def derivative(self, state, command, load):
+        drum, speed = state.unbind(-1)
+        return torch.stack((speed, (command[:, 0] + load[:, 0] - self.stiffness * drum) / self.inertia), -1)
+
+
+@dataclass(frozen=True)
 class DoublePendulum(System):
     """Two uniform links on motors at shoulder and elbow; 0 hangs down, the second angle is relative to the first."""
 

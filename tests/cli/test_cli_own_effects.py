@@ -1,10 +1,12 @@
 """A file of effects of the user's own is tried before anything is searched: one line says what is wrong."""
 
+import inspect
 import sys
 
 import pytest
 
 from tests.cli.commands import refused, run
+from tests.own_systems import Winch
 from tests.recorded import a_run, write
 from visadapt.effects import EFFECTS
 
@@ -25,15 +27,20 @@ class Mine(va.DynamicsEffect):
         force = self.value("strength", state).expand_as(time)
         return torch.stack((force, torch.zeros_like(force)), 1)
 """
+RIGID = "import sys\nfrom visadapt.systems.rigid_body import RigidBody"
+WRENCH = "return torch.zeros(len(state), len(system.loads), dtype=state.dtype) + force[:, None]"
 RETURN = "return torch.stack((force, torch.zeros_like(force)), 1)"
 
 
 @pytest.fixture(autouse=True)
-def forgotten():
+def forgotten(tmp_path):
     before = dict(EFFECTS)
     yield
     EFFECTS.clear()
     EFFECTS.update(before)
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", "")).startswith(str(tmp_path)):
+            del sys.modules[name]
 
 
 @pytest.mark.parametrize(
@@ -79,6 +86,26 @@ def test_a_right_one_is_listed(here, capsys):
     (here / "mine.py").write_text(EFFECT)
     assert run("effects", "--system", "cartpole", "--effects", "mine.py") == 0
     assert "F = strength" in capsys.readouterr().out
+
+
+def test_one_for_every_vehicle_and_the_cart_pole(here, capsys):
+    systems = "systems = (va.CartPole, RigidBody)"
+    text = EFFECT.replace("systems = (va.CartPole,)", systems).replace("import sys", RIGID).replace(RETURN, WRENCH)
+    (here / "mine.py").write_text(text)
+    assert run("effects", "--effects", "mine.py") == 0
+    assert "F = strength" in capsys.readouterr().out
+
+
+def test_one_for_the_system_of_its_own_file_or_of_another(here, capsys):
+    body = inspect.getsource(Winch).replace("(System)", "(va.System)").replace("Variable", "va.Variable")
+    head = "from dataclasses import dataclass\nfrom typing import ClassVar\n"
+    text = EFFECT.replace("va.CartPole", "Winch").replace(RETURN, "return force[:, None]")
+    (here / "winch.py").write_text(head + "import torch\nimport visadapt as va\n" + body)
+    (here / "mine.py").write_text("from winch import Winch\n" + text)
+    (here / "both.py").write_text(head + text.replace("class Mine", body + "\n\nclass Mine", 1))
+    for system, effects in (("winch.py", "mine.py"), ("both.py", "both.py")):
+        assert run("effects", "--system", f"{system}:Winch", "--effects", effects) == 0
+        assert "F = strength" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("ended", ["raise SystemExit(0)", "class E(BaseException): pass\n    raise E"])

@@ -13,6 +13,7 @@ from visadapt.cli import main as cli
 def rig(tmp_path, monkeypatch):
     """The page's class in a file, in the current directory."""
     (tmp_path / "furuta.py").write_text(page_code()[0])
+    monkeypatch.delitem(sys.modules, "furuta", raising=False)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -81,6 +81,23 @@ def test_effects_of_one_s_own(here, diagnosis):
         EFFECTS.pop("test_cli_own", None)
 
 
+def test_interrupted_it_does_not_go_on_with_other_code_of_an_effect(here, capsys, monkeypatch):
+    def stopped(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    text = OWN_EFFECT.format(name="Own", effect="test_cli_own")
+    (here / "mine.py").write_text(text)
+    own = (*TINY, "--effects", "mine.py", "--effect", "test_cli_own:strength=0.5")
+    try:
+        with monkeypatch.context() as patched:
+            patched.setattr(va.Setup, "pretrain", stopped)
+            assert run(*own) == 130
+        (here / "mine.py").write_text(text + "\n")
+        assert "effects" in refused(capsys, *own)
+    finally:
+        EFFECTS.pop("test_cli_own", None)
+
+
 def test_interrupted_it_goes_on_to_the_same_policy(here, monkeypatch):
     """Once while it is trained and once while it is refined: both go on from the last checkpoint."""
     monkeypatch.setattr("visadapt.learning.training_state.CHECKPOINT_ITERATIONS", 4)

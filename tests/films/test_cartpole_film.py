@@ -67,7 +67,12 @@ def test_the_end_of_an_episode_is_marked_and_the_scene_stands_still():
 
 @pytest.mark.parametrize(
     ("survived", "angle", "place", "failure"),
-    [(True, 0.0, 0.1, ""), (False, -0.35, 0.1, "FELL"), (False, 0.1, 1.6, "LEFT THE FRAME")],
+    [
+        (True, 0.0, 0.1, ""),
+        (False, -0.35, 0.1, "FELL"),
+        (False, 0.1, 1.6, "LEFT THE FRAME"),
+        (False, 0.25, 0.1, "ENDED"),
+    ],
 )
 def test_the_panel_says_how_an_episode_ended(survived: bool, angle: float, place: float, failure: str):
     panel = CartPolePanel("target", make_run(9, survived, angle, place))

@@ -73,6 +73,17 @@ class TestColumns:
         table["angle"] = table["pole_angle"] = table.pop("theta")
         refuses("'angle', 'pole_angle' could each be theta; say which: --columns theta=", write(file, table))
 
+    def test_names_that_differ_in_case_alone(self, file):
+        table = a_table()
+        table["X"] = table.pop("x_dot")
+        assert load(write(file, table), columns={"x": "x", "x_dot": "X"}).measured == STATES
+
+    def test_two_columns_of_one_name(self, file):
+        write(file, a_table())
+        header, *rows = file.read_text().splitlines()
+        file.write_text("\n".join([f"{header},theta", *(f"{row},0" for row in rows)]))
+        refuses("'theta', 'theta' could each be theta; give them different names", file)
+
     def test_velocities_may_be_missing(self, file):
         table = a_table()
         del table["x_dot"], table["theta_dot"]

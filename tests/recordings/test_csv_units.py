@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
 
+from tests.own_systems import Winch
 from tests.recorded import a_run, a_table, load, refuses, write
+from visadapt.recordings import load_recording
 
 
 class TestUnits:
@@ -54,6 +56,19 @@ class TestUnits:
         del table["theta_dot"]
         state = load(write(file, table)).episodes[0].state[:, 2]
         assert abs(state[-1]) < 0.1
+
+    def test_turns_that_the_physics_tell_apart_and_a_range_that_is_wider_downwards(self, file):
+        time = np.arange(100) * 0.02
+        drum = 30 - 20 * np.sin(time) ** 2
+        table = {"time": time, "drum": drum, "speed": -20 * np.sin(2 * time), "torque": 0.1 * np.sin(9 * time)}
+        state = load_recording(write(file, table), Winch()).episodes[0].state
+        np.testing.assert_allclose(state[:, 0], drum, atol=1e-9)
+
+    def test_a_joint_turns_on_while_rows_are_missing(self, file):
+        table = a_table(rows=300, period=0.02)
+        table["theta"], table["theta_dot"] = 9 * table["time"], np.full(300, 9.0)
+        kept = (table["time"] < 2) | (table["time"] > 3)
+        assert len(load(write(file, {name: values[kept] for name, values in table.items()})).episodes) == 2
 
     def test_an_angle_that_goes_round_several_times(self, file):
         table = a_table(rows=200)

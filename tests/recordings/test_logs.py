@@ -34,25 +34,42 @@ def test_readings_are_rows_and_commands_are_what_was_held_between_them(kind, tmp
     assert "rows are the readings of " in " ".join(found.warnings)
 
 
-def test_a_slower_topic_gives_the_rows_and_the_others_are_interpolated(tmp_path):
+FIELDS = {"x": "/x.data", "theta": "/theta.data", "command": "/u.data"}
+
+
+def numbers(path, stamps):
+    """A bag of ROS 2 with a number at each of a topic's stamps, in s."""
     store = get_typestore(Stores.LATEST)
     number = store.types["std_msgs/msg/Float64"]
-    rates = {"/x": 0.05, "/theta": 0.005, "/u": 0.05}
-    with rosbag2.Writer(tmp_path / "run", version=9) as writer:
-        for topic, period in rates.items():
+    with rosbag2.Writer(path, version=9) as writer:
+        for topic, times in stamps.items():
             connection = writer.add_connection(topic, "std_msgs/msg/Float64", typestore=store)
-            for time in np.arange(0, 3, period):
+            for time in times:
                 # The angle passes the turn at 3 rad, as an encoder's does.
                 angle = (2 * time + 3 + np.pi) % (2 * np.pi) - np.pi
                 value = {"/x": time, "/theta": angle, "/u": 0.5}[topic]
                 raw = store.serialize_cdr(number(value), "std_msgs/msg/Float64")
                 writer.write(connection, int(1e9 * (START + time)), raw)
-    found = load_recording(tmp_path / "run", CartPole(), {"x": "/x.data", "theta": "/theta.data", "command": "/u.data"})
+    return path
+
+
+def test_a_slower_topic_gives_the_rows_and_the_others_are_interpolated(tmp_path):
+    stamps = {"/x": np.arange(0, 3, 0.05), "/theta": np.arange(0, 3, 0.005), "/u": np.arange(0, 3, 0.05)}
+    found = load_recording(numbers(tmp_path / "run", stamps), CartPole(), FIELDS)
     (episode,) = found.episodes
     turned = episode.state[:, 1] - 2 * episode.state[:, 0]
     np.testing.assert_allclose(turned, turned[0], atol=1e-5)
     np.testing.assert_allclose(episode.action, 0.5)
     assert "/theta is interpolated" in " ".join(found.warnings)
+
+
+def test_the_slower_topic_is_not_the_one_that_ends_first_and_what_is_cut_off_is_said(tmp_path):
+    stamps = {"/x": np.arange(0, 10, 0.05), "/theta": np.arange(0, 1.5, 0.01), "/u": np.arange(0.5, 10, 0.05)}
+    found = load_recording(numbers(tmp_path / "run", stamps), CartPole(), FIELDS)
+    assert found.period == pytest.approx(0.05)
+    said = " ".join(found.warnings)
+    assert "10 rows before the first message of /u are left out" in said
+    assert "170 rows after the last message of /theta are left out" in said
 
 
 @pytest.mark.parametrize(

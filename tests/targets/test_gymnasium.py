@@ -15,6 +15,7 @@ from visadapt.systems import CartPole
 from visadapt.targets.base import TargetError
 from visadapt.targets.env_map import Entry, EnvMap
 from visadapt.targets.gymnasium import GymnasiumTarget
+from visadapt.targets.inverted_pendulum import MAP as PENDULUM
 from visadapt.world import World
 
 pytest.importorskip("gymnasium")
@@ -86,6 +87,7 @@ def test_maps_states_actions_and_frames():
         ({"cut_at": 2}, "toy: cut the episode short after 2 steps; make it without a time limit"),
         ({"size": (90, 120, 3)}, "toy: its frames are 120 x 90 px, but the crop reaches to column 120 and row 100"),
         ({"size": (100,)}, r"toy: render\(\) gave uint8 \(100,\); a picture"),
+        ({"size": (100, 120, 4)}, r"toy: render\(\) gave uint8 \(100, 120, 4\); a picture"),
         ({"render_mode": None}, 'toy: its render_mode is None .* made with render_mode="rgb_array"'),
         ({"render_mode": "human"}, "toy: its render_mode is 'human'"),
     ],
@@ -130,6 +132,9 @@ def test_a_map_that_does_not_fit_the_environment(change, says):
         ({"start": {"x": 0.0}}, "start: x must be positive, got 0.0"),
         ({"period": -0.05}, "period must be a positive number of seconds, got -0.05"),
         ({"contrast": (5.0, 5.0)}, "two rising grey levels"),
+        ({"contrast": ("a", "b")}, "two rising grey levels"),
+        ({"height": 100.0}, "height must be a positive whole number of px, got 100.0"),
+        ({"crop": None, "width": 0}, "width must be a positive whole number of px, got 0"),
         ({"limits": {"x": -1.0}}, "x must be positive"),
         ({"actions": ()}, "actions is empty"),
     ],
@@ -177,12 +182,28 @@ def test_a_crop_of_any_shape_and_none():
     for crop, height, shape in (((0, 0, 60, 90), 30, (30, 20)), (None, 50, (50, 60))):
         toy = target(dataclasses.replace(MAP, crop=crop, height=height))
         assert toy.reset(1, generator()).frame.shape == (1, *shape)
+    squeezed = target(dataclasses.replace(MAP, crop=None, width=50))
+    with pytest.raises(TargetError, match=r"its frame is 120 x 100 px, 1\.200 wide for 1 high; .* need 0\.500"):
+        squeezed.reset(1, generator())
 
 
 class Clocked(Toy):
     """A toy that says how long its step is."""
 
     tau = 0.02
+
+
+def test_an_environment_of_an_id_holds_each_action_for_all_steps_of_the_period():
+    own, slow = (
+        GymnasiumTarget("InvertedPendulum-v5", dataclasses.replace(PENDULUM, period=period), frames=False)
+        for period in (None, 0.08)
+    )
+    push = torch.full((1, 1), 0.2)
+    for target in (own, slow):
+        target.reset(1, generator())
+    own.step(push)
+    torch.testing.assert_close(slow.step(push).state, own.step(push).state)
+    assert (own.period, slow.period) == (0.04, 0.08)
 
 
 def clocked(period=None):

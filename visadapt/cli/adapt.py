@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(f"--round {options.round} is more than --samples {options.samples}: lower it, or raise those")
     folder = Path(options.out)
     settings = {name: value for name, value in vars(options).items() if name != "out"}
-    for name in ("policy", "renderer", "references", "diagnosis", "map"):
+    for name in ("policy", "renderer", "references", "diagnosis", "map", "effects"):
         settings[f"{name} SHA-256"] = fingerprint(settings[name])
     open_run(folder, settings)
     with progress() as report:

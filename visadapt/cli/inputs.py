@@ -27,13 +27,16 @@ from visadapt.effects.base import require_system
 from visadapt.effects.catalogue import catalogue, sized
 from visadapt.progress import Report, reporting
 from visadapt.storage.run_folder import open_run
-from visadapt.systems import SYSTEMS, CartPole, System
+from visadapt.systems import SYSTEMS, System
 from visadapt.systems.contract import complaints
 from visadapt.systems.parameter_file import load_parameters
 from visadapt.world import World
 
 OWN_FILES: set[str] = set()
 """Files of the user's whose code is run."""
+
+IMPORTED: dict[str | None, ModuleType] = {}
+"""Modules of the user's that were imported, by the fingerprint of their file."""
 
 
 class InputError(ValueError):
@@ -153,8 +156,7 @@ def import_effects(options: argparse.Namespace) -> None:
     if not own:
         raise InputError(f"{options.effects}: defines no effect: a class with a name that derives from visadapt.Effect")
     for effect in own:
-        kinds = [options.system] if getattr(options, "system", None) else list(effect.systems)
-        for kind in [CartPole if kind is System else kind for kind in kinds]:
+        for kind in [options.system] if getattr(options, "system", None) else SYSTEMS.values():
             if issubclass(kind, effect.systems) and (wrong := complaints_of_effect(effect, kind())):
                 raise InputError(f"{options.effects}: {effect.__name__}: {wrong[0]}")
     if getattr(options, "system", None) and not any(issubclass(options.system, effect.systems) for effect in own):
@@ -162,7 +164,7 @@ def import_effects(options: argparse.Namespace) -> None:
 
 
 def import_file(given: str) -> ModuleType:
-    """The module in a file of the user's.
+    """The module in a file of the user's; one that was imported before is not run again.
 
     Raises:
         InputError: the file is missing, no Python, or raises; names its line.
@@ -170,6 +172,9 @@ def import_file(given: str) -> ModuleType:
     path = Path(given).absolute()  # as Python's own messages name it
     if not path.is_file():
         raise InputError(f"{path}: there is no such file")
+    content = fingerprint(path)
+    if content in IMPORTED and IMPORTED[content].__file__ == str(path):
+        return IMPORTED[content]
     # Under a name of its own, by which worker processes find its classes.
     name = f"visadapt_own_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
@@ -180,6 +185,8 @@ def import_file(given: str) -> ModuleType:
     OWN_FILES.add(str(path))
     with own_code(lambda error: f"{path}: {describe(error, str(path))}"):
         spec.loader.exec_module(module)
+    sys.modules.setdefault(path.stem, module)  # so that another file of the user's that imports it gets these classes
+    IMPORTED[content] = module
     return module
 
 

@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> None:
     out = Path(options.out)
     setup = _setup(options)
     settings = {name: value for name, value in vars(options).items() if name not in ("out", "system")}
-    for name in ("renderer", "references", "diagnosis", "params"):
+    for name in ("renderer", "references", "diagnosis", "params", "effects"):
         settings[name] = fingerprint(settings[name])
     with unfinished(out, {"system": options.system.name, **settings}) as folder, progress() as report:
         made = folder / "policy.safetensors"

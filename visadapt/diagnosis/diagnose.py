@@ -137,7 +137,9 @@ def diagnose(
         found_before.append((Stage.CAMERA, film.camera.lost))
     found_in_motion = Diagnosis(
         system=system.name,
-        recording=RecordingSummary(len(recording.episodes), recording.samples, float(f"{recording.period:.9g}")),
+        recording=RecordingSummary(
+            len(recording.episodes), recording.samples, float(f"{recording.period:.9g}"), used.sources
+        ),
         verdict=verdict,
         where=Where(
             stage_shares(search, comparison, groups, found_before),

@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from numbers import Integral
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -154,6 +155,12 @@ class RecordingSummary:
     episodes: int
     samples: int  # actions that were executed
     period: float  # s between rows
+    sources: tuple[str, ...] = ()  # file, and number there, of each episode
+
+    def episode(self, number: int) -> str:
+        """An episode in words: its number, from 0, and where it comes from if there are several."""
+        several = len(set(self.sources)) > 1
+        return f"episode {number}" + (f" ({PurePath(self.sources[number]).name})" if several else "")
 
 
 @dataclass(frozen=True)

@@ -48,8 +48,10 @@ class CartPolePanel:
     drawn: DrawnCartPole = field(default_factory=DrawnCartPole)
     """sizes of what is drawn, and the part of the track that is shown"""
     angle_limit: float = 0.3
-    """rad; an episode that ended early fell if its last angle is beyond this, else the cart left the frame; the pole
-    is to swing up where this is infinite, and the track is shown as far as the carts go"""
+    """rad; an episode that ended early fell if its last angle is beyond this; the pole is to swing up where this is
+    infinite, and the track is shown as far as the carts go"""
+    position_limit: float | None = None
+    """m; else the cart left the frame if its last position is beyond this; None: as far as `drawn` shows"""
 
     def __post_init__(self) -> None:
         if self.run.episode.state is None:
@@ -95,8 +97,10 @@ class CartPolePanel:
         """How the episode ended early, or that the pole is not up when it is due, s; empty up to that row."""
         time = self.run.episode.time
         if not self.run.survived and row == len(time) - 1:
-            fell = abs(self.state[-1, 2]) > self.angle_limit
-            return f"{'FELL' if fell else 'LEFT THE FRAME'} at t = {self.end:.2f} s"
+            x, _, theta, _ = abs(self.state[-1])
+            reach = self.drawn.camera.reach if self.position_limit is None else self.position_limit
+            how = "FELL" if theta > self.angle_limit else "LEFT THE FRAME" if x > reach else "ENDED"
+            return f"{how} at t = {self.end:.2f} s"
         late = self.swings_up and time[row] >= due and self.up_from > widgets.last_row(time, due)
         return f"not up at {due:g} s" if late else ""
 

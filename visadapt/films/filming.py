@@ -38,7 +38,7 @@ def film(
         film({"before": old_policy, "after": new_policy}, target, "film.mp4")
 
     A vehicle is shown in three dimensions with its course; a cart-pole in the target's own frames, or drawn from its
-    states where the target is synthetic or shows none; as a swing-up where the target has no angle limit.
+    states where the target is synthetic or shows none; as a swing-up where a synthetic target has no angle limit.
 
     Args:
         shown: a policy, a run, or several of them by the title of their panel. All policies start alike.
@@ -89,16 +89,16 @@ def _film(runs: Mapping[str, Run], target: Target, due: float) -> Film:
     if isinstance(target, FlightTarget):
         return FlightFilm([_flight_panel(title, each, target) for title, each in runs.items()])
     drawn = target.camera if isinstance(target, SyntheticTarget) and target.camera is not None else DrawnCartPole()
-    limit = target.angle_limit if isinstance(target, SyntheticTarget) else 0.3
+    limit, reach = target.angle_limit if isinstance(target, SyntheticTarget) else 0.3, None
     if isinstance(target, GymnasiumTarget):
-        limit = target.mapping.limits.get("theta", limit)
+        limit, reach = target.mapping.limits.get("theta", limit), target.mapping.limits.get("x")
     panels = []
     for title, each in runs.items():
         state = each.episode.state
         if state is None or state.shape[1] != len(CartPole.states):
             raise ValueError(f"panel {title!r}: a cart-pole's states (rows, 4) are needed to film {target.name}")
         pictures = None if isinstance(target, SyntheticTarget) else each.episode.frame
-        panels.append(CartPolePanel(title, each, pictures, drawn, limit))
+        panels.append(CartPolePanel(title, each, pictures, drawn, limit, reach))
     return CartPoleFilm(panels, target.period, due)
 
 

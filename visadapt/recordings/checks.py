@@ -11,7 +11,7 @@ from itertools import combinations, product
 import numpy as np
 from numpy.typing import NDArray
 
-from visadapt.recordings.clock import UNITS_S, Note, RawEpisode
+from visadapt.recordings.clock import GAP_PERIODS, UNITS_S, Note, RawEpisode
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.physics import DEGREE, DIFFERENCE_S, are_degrees, correlation, exchanged
 from visadapt.recordings.sensors import TURN, differences
@@ -85,6 +85,8 @@ def check_units(episodes: Sequence[RawEpisode], system: System) -> None:
     for raw in judged:
         for name in angles:
             steps = np.abs(np.diff(raw.states[name]))
+            lasting = np.diff(raw.time)
+            steps[lasting > GAP_PERIODS * np.median(lasting)] = 0.0  # a joint turns on while rows are missing
             row = int(steps.argmax()) + 1
             if steps.max() > 1.25 * TURN:
                 raise RecordingError(
@@ -146,9 +148,9 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable) -> None:
     stride = max(1, round(DIFFERENCE_S / float(np.median(np.diff(raw.time)))))
     coarse = np.convolve(change, np.ones(stride) / stride, "valid")
     fast = float(np.quantile(np.abs(coarse), 0.9))
-    limit = MOST_RATE_RANGES * rate.high
+    limit = MOST_RATE_RANGES * rate.largest
     beyond = angle and float(np.abs(values).max()) > TURN
-    if fast > (rate.high if beyond else limit):
+    if fast > (rate.largest if beyond else limit):
         row = int(np.abs(values).argmax())
         raise RecordingError(
             f"{raw.cell(row, variable.name)} is {values[row]:g} {variable.unit}, and it changes by up to "

@@ -277,10 +277,15 @@ def match(
         candidates: list[int] = []
         for names in ([given[name]],) if name in given else ([name], others.get(name, ())):
             lower = [wanted.lower() for wanted in names]
-            candidates = candidates or [index for index, there in enumerate(header) if there.lower() in lower]
+            alike = [index for index, there in enumerate(header) if there.lower() in lower]
+            exact = [index for index in alike if name in given and header[index] == given[name]]
+            candidates = candidates or exact or alike
         if len(candidates) > 1:
             which = ", ".join(repr(header[index]) for index in candidates)
-            raise RecordingError(f"{path}: the columns {which} could each be {name}; say which: --columns {name}=...")
+            ask = f"say which: --columns {name}=..."
+            if len({header[index] for index in candidates}) < len(candidates):
+                ask = "give them different names"
+            raise RecordingError(f"{path}: the columns {which} could each be {name}; {ask}")
         if candidates:
             taken = next((other for other, index in found.items() if index == candidates[0]), None)
             if taken is not None:

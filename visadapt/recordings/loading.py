@@ -20,6 +20,7 @@ from visadapt.recordings.csv import match, read_rows
 from visadapt.recordings.episode import Episode, Recording, RecordingError
 from visadapt.recordings.hdf5 import read_names, read_stretches
 from visadapt.recordings.logs import read_log
+from visadapt.recordings.physics import turns
 from visadapt.recordings.sensors import check_sensors, without_outliers
 from visadapt.recordings.thinning import thinned
 from visadapt.recordings.topics import reader
@@ -29,7 +30,7 @@ SHORTEST_EPISODE_S = 0.5
 """s; shorter episodes hold too few predictions several steps ahead and are left out."""
 MOST_BYTES = 2**28
 """Most bytes of the values of all files: 4.8 million rows of a cart-pole. The checks make a few copies of them."""
-SUFFIXES = (".csv", ".h5", ".hdf5", ".bag", ".mcap", ".ulg")
+SUFFIXES = (".csv", ".h5", ".hdf5", ".bag", ".mcap", ".db3", ".ulg")
 """Suffixes of the files that are read from a folder."""
 UPRIGHT_RAD = 1.0
 """rad from 0 up to which an angle counts as upright when it is unwrapped."""
@@ -46,8 +47,9 @@ def load_recording(
     """Read states and actions from CSV and HDF5 files and logs, or frames and actions from HDF5 files.
 
     Names are matched by `csv.py`; those of logs, bags of ROS and ULog, are TOPIC.FIELD (`logs.py`). Clocks are checked
-    by `clock.py`; rows of an unsteady one keep their stamps. Angles are unwrapped within an episode so that upright is
-    0 (if the pole turns over, in the turn in which it is upright most often). A command in N (a column `force` that
+    by `clock.py`; rows of an unsteady one keep their stamps. Angles after whose whole turns the physics repeat are
+    unwrapped within an episode so that upright is 0 (if the pole turns over, in the turn in which it is upright most
+    often). A command in N (a column `force` that
     exceeds 1) is divided by the system's `max_force`. Where files are too long for memory, stretches of rows are left
     out (`thinning.py`). The recording's warnings say what was changed or left out.
 
@@ -216,7 +218,7 @@ def _shared(episodes: Sequence[RawEpisode], system: System, note: Note) -> list[
 def _commands(episodes: list[RawEpisode], system: System, note: Note) -> list[RawEpisode]:
     """The episodes with commands in [-1, 1]: a command column 'force' may be in N."""
     forces = [
-        any(raw.names.get(one.name, "").lower() == "force" for one in system.actions if one.unit == "1")
+        any(raw.names.get(one.name, "").lower().split(".")[-1] == "force" for one in system.actions if one.unit == "1")
         for raw in episodes
     ]
     largest = max((np.abs(raw.action).max() for raw, force in zip(episodes, forces, strict=True) if force), default=0)
@@ -230,14 +232,15 @@ def _commands(episodes: list[RawEpisode], system: System, note: Note) -> list[Ra
 
 
 def _unwrapped(raw: RawEpisode, system: System) -> RawEpisode:
-    """The episode with its angles unwrapped, in the turn in which they are upright most often."""
+    """The episode with its angles unwrapped, in the turn in which they are upright most often; angles of which the
+    physics tell one turn from the next stay as they are."""
     state = raw.state.copy()
     for column, name in enumerate(raw.measured):
-        if system.states[system.index(name)].unit == "rad":
+        if system.states[system.index(name)].unit == "rad" and turns(system, name):
             angle = np.unwrap(state[:, column])
-            turns = np.round(angle / (2 * np.pi))
-            upright = np.abs(angle - 2 * np.pi * turns) < UPRIGHT_RAD
-            state[:, column] = angle - 2 * np.pi * np.round(np.median(turns[upright] if upright.any() else turns))
+            turn = np.round(angle / (2 * np.pi))
+            upright = np.abs(angle - 2 * np.pi * turn) < UPRIGHT_RAD
+            state[:, column] = angle - 2 * np.pi * np.round(np.median(turn[upright] if upright.any() else turn))
     return replace(raw, state=state)
 
 

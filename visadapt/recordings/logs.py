@@ -1,8 +1,8 @@
 """Recordings from a robot's own logs: bags of ROS 1 and 2, and PX4's ULog.
 
-The topics of a log have stamps of their own, a recording has rows. A row is one reading of the slowest topic that has
-states. Readings of other topics are interpolated to its stamp, and its command is the mean of what was commanded until
-the next row, each command being held until the next one.
+The topics of a log have stamps of their own, a recording has rows. A row is one reading of the topic with states whose
+messages are furthest apart. Readings of other topics are interpolated to its stamp, and its command is the mean of what
+was commanded until the next row, each command being held until the next one.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def _rows(
             raise RecordingError(f"{path}: the clock of {name} runs backwards after its message {back[0] + 1}")
     read = list(dict.fromkeys(places[name][0] for name in measured))
     commanded = list(dict.fromkeys(places[action.name][0] for action in system.actions))
-    slowest = min(read, key=lambda name: len(topics[name].time))
+    slowest = max(read, key=lambda name: _interval(topics[name].time))
     first = max(topics[name].time[0] for name in (*read, *commanded))
     last = min(topics[name].time[-1] for name in (*read, *commanded))
     time = topics[slowest].time
@@ -80,8 +80,13 @@ def _rows(
         raise RecordingError(f"{path}: {', '.join((*read, *commanded))} have no time in common")
     time = time[rows]
 
-    if (dropped := int((topics[slowest].time > last).sum())) and last == min(topics[c].time[-1] for c in commanded):
-        note(f"the last {dropped} rows, after the last message of {', '.join(commanded)}, are left out", str(path))
+    every = (*read, *commanded)
+    for when, edge, outside in (
+        ("before the first", [topics[name].time[0] for name in every], topics[slowest].time < first),
+        ("after the last", [-topics[name].time[-1] for name in every], topics[slowest].time > last),
+    ):
+        if dropped := int(outside.sum()):
+            note(f"{dropped} rows {when} message of {every[int(np.argmax(edge))]} are left out", str(path))
     quaternion = [state.name for state in system.states[ATTITUDE]] if isinstance(system, RigidBody) else []
 
     def state(name: str) -> NDArray[np.float64]:
@@ -111,6 +116,11 @@ def _rows(
         lambda row: f"message {rows[row] + 1} of {slowest}",
         {name: ".".join(place) for name, place in places.items()},
     )
+
+
+def _interval(stamps: NDArray[np.float64]) -> float:
+    """The median interval in s between a topic's messages; infinite for a single one."""
+    return float(np.median(np.diff(stamps))) if len(stamps) > 1 else float("inf")
 
 
 def _between_readings(time: NDArray[np.float64], stamps: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -32,6 +32,19 @@ EXPLAINED_CORRELATION = 0.5
 Columns = Mapping[str, NDArray[np.float64]]
 
 
+def turns(system: System, name: str) -> bool:
+    """Whether the source's physics are the same a whole turn further in an angle: not so for a drum on a spring."""
+    generator = torch.Generator().manual_seed(0)
+    low, high = (torch.tensor([getattr(state, end) for state in system.states]).double() for end in ("low", "high"))
+    state = low + (high - low) * torch.rand(8, len(low), generator=generator, dtype=torch.float64)
+    action = state.new_zeros(len(state), len(system.actions))
+    load = state.new_zeros(len(state), len(system.loads))
+    further = state.clone()
+    further[:, system.index(name)] += 2 * math.pi
+    here, there = (system.derivative(each, action, load) for each in (state, further))
+    return torch.allclose(here, there, rtol=1e-6, atol=1e-9)
+
+
 def are_degrees(episodes: Sequence[RawEpisode], system: System) -> bool:
     """Whether the source explains the angle's acceleration if the angle is in degrees, and does not if in radians.
 

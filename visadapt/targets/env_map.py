@@ -81,11 +81,15 @@ class EnvMap:
     """px"""
 
     def __post_init__(self) -> None:
+        for name, side in (("height", self.height), ("width", self.width)):
+            if side is not None and not (_is_positive(side) and isinstance(side, int)):
+                raise TargetError(f"{name} must be a positive whole number of px, got {side!r}")
         if self.crop is not None:
             self._check_crop(*self.crop)
         if self.period is not None and not _is_positive(self.period):
             raise TargetError(f"period must be a positive number of seconds, got {self.period!r}")
-        if len(self.contrast) != 2 or not self.contrast[0] < self.contrast[1]:
+        greys = [grey for grey in self.contrast if isinstance(grey, int | float)]
+        if len(greys) != len(self.contrast) or len(greys) != 2 or not greys[0] < greys[1]:
             raise TargetError(f"contrast must be two rising grey levels, got {self.contrast!r}")
         if not self.actions:
             raise TargetError("actions is empty: say which entry of the environment's action our command sets")
@@ -100,11 +104,13 @@ class EnvMap:
         left, top, right, bottom = crop
         if not (0 <= left < right and 0 <= top < bottom):
             raise TargetError(f"crop {crop} holds no pixel: left < right and top < bottom, all from 0 on")
-        columns, rows = right - left, bottom - top
+        self._check_aspect(f"crop {crop}", right - left, bottom - top)
+
+    def _check_aspect(self, part: str, columns: int, rows: int) -> None:
         wanted, got = self._width(columns, rows) / self.height, columns / rows
         if self.width is not None and abs(got / wanted - 1) > ASPECT_TOLERANCE:
             raise TargetError(
-                f"crop {crop} is {columns} x {rows} px, {got:.3f} wide for 1 high; "
+                f"{part} is {columns} x {rows} px, {got:.3f} wide for 1 high; "
                 f"frames of {self.width} x {self.height} px need {wanted:.3f}"
             )
 
@@ -182,10 +188,13 @@ class EnvMap:
 
     def frame(self, name: str, picture: object) -> NDArray[np.uint8]:
         """Our frame (height, width) of a picture (rows, columns, 3) or (rows, columns) uint8 of the environment."""
-        if not isinstance(picture, np.ndarray) or picture.dtype != np.uint8 or picture.ndim not in (2, 3):
+        sound = isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.ndim in (2, 3)
+        if not sound or picture.shape[2:] not in ((), (3,)):
             got = f"{picture.dtype} {picture.shape}" if isinstance(picture, np.ndarray) else type(picture).__name__
             raise TargetError(f"{name}: render() gave {got}; a picture (rows, columns, 3) of uint8 is needed")
         left, top, right, bottom = self.crop or (0, 0, picture.shape[1], picture.shape[0])
+        if self.crop is None:
+            self._check_aspect(f"{name}: its frame", right, bottom)
         if right > picture.shape[1] or bottom > picture.shape[0]:
             raise TargetError(
                 f"{name}: its frames are {picture.shape[1]} x {picture.shape[0]} px, "
@@ -193,7 +202,7 @@ class EnvMap:
             )
         # In floating point, so that stretching the contrast of a dark picture does not leave gaps between grey levels.
         part = picture[top:bottom, left:right].astype(np.float32)
-        grey = cv2.cvtColor(part, cv2.COLOR_RGB2GRAY) if part.ndim == 3 and part.shape[2] == 3 else part
+        grey = cv2.cvtColor(part, cv2.COLOR_RGB2GRAY) if part.ndim == 3 else part
         width = self._width(right - left, bottom - top)
         small = cv2.resize(grey, (width, self.height), interpolation=cv2.INTER_AREA)
         low, high = self.contrast

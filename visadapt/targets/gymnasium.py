@@ -8,6 +8,7 @@ import traceback
 import warnings
 import weakref
 from collections.abc import Callable
+from numbers import Real
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -39,7 +40,8 @@ class GymnasiumTarget(Target):
         env: the environment's id, or a function that makes one (with `render_mode="rgb_array"` and no time limit).
         mapping: the map between its numbers and frames and ours; `mapping.options` are for gymnasium.make alone. Where
             it gives no period, that is the environment's `tau` or `dt`, or else 1 / `render_fps` of its metadata, with
-            a warning, since that may be the speed of its films alone. Only environments that `show` can put into a
+            a warning, since that may be the speed of its films alone. Where it gives several steps of an environment
+            that is named by its id, each action is held for so many. Only environments that `show` can put into a
             state can begin where it says by `start`.
         system: the system whose states and actions the mapping gives.
         frames: whether frames are drawn.
@@ -73,7 +75,7 @@ class GymnasiumTarget(Target):
         self.name = name or (first.spec.id if first.spec is not None else type(first.unwrapped).__name__)
         self.n_action = len(mapping.actions)
         self._n_env_action = self._check(first)
-        self.period, self.period_origin = self._period(first)
+        self.period, self.period_origin, self._held = self._period(first)
         self._mujoco = frames and mujoco_frames.is_mujoco(first)
         if self._mujoco:
             mujoco_frames.probe(self.name)
@@ -120,7 +122,10 @@ class GymnasiumTarget(Target):
             if not self._shown[b].alive:
                 continue
             ours = self.mapping.action(commands[b], self._n_env_action)
-            seen, _, terminated, truncated, _ = env.step(ours.astype(env.action_space.dtype))
+            for _ in range(self._held):
+                seen, _, terminated, truncated, _ = env.step(ours.astype(env.action_space.dtype))
+                if terminated or truncated:
+                    break
             if truncated and not terminated:
                 raise TargetError(
                     f"{self.name}: cut the episode short after {self._steps} steps; make it without a time limit "
@@ -194,28 +199,31 @@ class GymnasiumTarget(Target):
         self.mapping.check(self.name, self.system, int(env.observation_space.shape[0]), n_action)
         return n_action
 
-    def _period(self, env: Any) -> tuple[float, str]:
-        """s between actions, and where that number comes from."""
+    def _period(self, env: Any) -> tuple[float, str, int]:
+        """s between actions, where that number comes from, and for how many of the environment's steps each is held."""
         given, body, rate = self.mapping.period, env.unwrapped, env.metadata.get("render_fps")
-        own = next((name for name in ("tau", "dt") if isinstance(getattr(body, name, None), int | float)), None)
+        own = next((name for name in ("tau", "dt") if isinstance(getattr(body, name, None), Real)), None)
         step = None if own is None else float(getattr(body, own))
         if given is not None:
-            # A wrapper may repeat actions, but no environment is stepped for a part of its step.
-            if step is not None and (given < 0.99 * step or abs(given / step - round(given / step)) > 0.01):
+            if step is None:
+                return float(given), "as given", 1
+            # No environment is stepped for a part of its step.
+            if given < 0.99 * step or abs(given / step - round(given / step)) > 0.01:
                 raise TargetError(
                     f"{self.name}: its {own} says {step:g} s a step, so that the period given, {given:g} s, is no "
                     "whole number of steps"
                 )
-            return float(given), "as given"
+            # One that a function makes may be wrapped so that it repeats actions by itself.
+            return float(given), "as given", round(given / step) if isinstance(self._source, str) else 1
         if step is not None:
-            return step, f"its {own}"
+            return step, f"its {own}", 1
         if not rate:
             raise TargetError(
                 f"{self.name}: the environment states no step length (tau, dt or render_fps); give `period` in s"
             )
         origin = f"render_fps = {rate:g} of its metadata, which may be the speed of a film alone: give `period` in s"
         warnings.warn(f"{self.name}: the period, {1 / rate:g} s, is taken from {origin}", stacklevel=3)
-        return 1 / float(rate), origin
+        return 1 / float(rate), origin, 1
 
     def _place(self, env: Any, seen: NDArray[np.floating], state: NDArray[np.floating]) -> NDArray[np.floating]:
         """Put an environment that observes `seen` and has not been stepped into our state; its observation there."""

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from visadapt.diagnosis.result import Chart, Prediction, Region
+from visadapt.diagnosis.result import Chart, Prediction, RecordingSummary, Region
 from visadapt.diagnosis.words import plain
 from visadapt.systems import System
 
@@ -50,7 +50,7 @@ STYLE: dict[Any, Any] = {
 }
 
 
-def prediction(one: Prediction, system: type[System], corrected: bool) -> str:
+def prediction(one: Prediction, recording: RecordingSummary, system: type[System], corrected: bool) -> str:
     """A held-out window: its states as measured, and as predicted from its start."""
     shown = _most_wrong(
         one, [index for index in range(len(system.states)) if np.isfinite(one.measured[:, index]).any()]
@@ -66,9 +66,10 @@ def prediction(one: Prediction, system: type[System], corrected: bool) -> str:
             axes.plot(one.time, one.measured[:, index], ".", color=INK, markersize=4, label="measured")
             axes.set_ylabel(f"{variable.name} [{variable.unit}]")
             axes.yaxis.set_major_locator(MaxNLocator(4))
-        rows[-1].set_xlabel(f"time in episode {one.episode} [s]")
+        episode = recording.episode(one.episode)
+        rows[-1].set_xlabel(f"time in {episode} [s]", parse_math=False)  # a file's name may hold dollar signs
         _legend(figure, rows[0])
-        return _svg(figure, f"measured and predicted states, episode {one.episode}")
+        return _svg(figure, f"measured and predicted states, {episode}")
 
 
 def _most_wrong(one: Prediction, measured: Sequence[int]) -> list[int]:

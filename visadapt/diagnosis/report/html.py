@@ -54,7 +54,7 @@ def _figures(diagnosis: Diagnosis) -> dict[str, Any]:
     data, system = diagnosis.figures, NAMED[diagnosis.system]
     corrected = bool(diagnosis.causes)
     return {
-        "predictions": [figures.prediction(one, system, corrected) for one in data.predictions],
+        "predictions": [figures.prediction(one, diagnosis.recording, system, corrected) for one in data.predictions],
         "profiles": [figures.profile(one, diagnosis.where.regions, corrected) for one in data.profiles],
         "growth": figures.growth(data.growth, corrected) if data.growth else "",
         "spectrum": figures.spectrum(data.spectrum, corrected) if data.spectrum else "",

@@ -18,6 +18,7 @@ from visadapt.diagnosis.result import (
     Diagnosis,
     Estimate,
     Push,
+    RecordingSummary,
     Region,
     without_slight,
 )
@@ -39,11 +40,11 @@ def region(one: Region, system: str) -> str:
     return f"{one.variable} from {span}"
 
 
-def push(one: Push) -> str:
-    """A push in words: "shoulder pushed from 0.91 to 1.20 s, up to 0.46 N m, impulse 0.069 N m s (...)"."""
+def push(one: Push, recording: RecordingSummary) -> str:
+    """A push in words: "shoulder pushed from 0.91 to 1.20 s of episode 0, up to 0.46 N m, impulse ..."."""
     impulse = Estimate(one.impulse, f"{one.unit} s", one.ci90)
     return (
-        f"{plain(one.load)} pushed from {one.start:.2f} to {one.end:.2f} s of episode {one.episode}, up to "
+        f"{plain(one.load)} pushed from {one.start:.2f} to {one.end:.2f} s of {recording.episode(one.episode)}, up to "
         f"{with_unit(number(one.size, 2), one.unit)}, impulse {estimate(impulse)} (90 %: {interval(impulse)})"
     )
 
@@ -172,9 +173,10 @@ def rendered(template: str, diagnosis: Diagnosis, **values: Any) -> str:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    for function in (plain, number, percent, estimate, interval, effects, shares, push):
+    for function in (plain, number, percent, estimate, interval, effects, shares):
         environment.filters[function.__name__] = function
     environment.filters["either"] = lambda names: listed(names, "or")
+    environment.filters["push"] = lambda one: push(one, diagnosis.recording)
     environment.filters["region"] = lambda one: region(one, diagnosis.system)
     common = {"sentence": sentence(diagnosis), "corrected": corrected(diagnosis), "policy": policy_terms(diagnosis)}
     return environment.get_template(template).render(diagnosis=diagnosis, **common, **values)
