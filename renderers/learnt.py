@@ -150,6 +150,8 @@ class LayeredRenderer(nn.Module):
 
     def _rows(self, layer: Layer, hinge: Tensor, moved: Tensor) -> tuple[int, int]:
         """The first row that a layer can cover and the one after the last; the others need not be computed."""
-        row, radius = hinge.detach()[:, 1], layer.radius + float(moved.detach().norm())
+        # A cart that is not in the world any more is drawn anywhere.
+        row = hinge.detach()[:, 1].nan_to_num().clamp(-1e6, 1e6)
+        radius = layer.radius + float(moved.detach().norm())
         first = max(0, math.floor(float(row.min()) - radius))
         return first, max(first, min(self.size[0], math.ceil(float(row.max()) + radius) + 1))

@@ -127,6 +127,17 @@ class TestActuatorDelay:
         expected = [self.displacement(delay, (k + 1) * PERIOD) / 2.0 for k in range(len(self.ACTIONS))]
         assert self.states(delay, substeps)[:, 0].tolist() == pytest.approx(expected, abs=1e-8)
 
+    @pytest.mark.parametrize(
+        ("other", "acts"),
+        [(ActuatorBacklash(width=0.1), 0.35), (ActuatorSaturation(limit=0.3), 0.3), (ActuatorDeadzone(width=0.1), 0.3)],
+        ids=lambda value: value.name if isinstance(value, ActuationEffect) else "",
+    )
+    def test_nothing_ratchets_on_a_delay_of_a_part_of_a_substep(self, other, acts):
+        world = World(CartPole(), [ActuatorDelay(delay=0.0025).double(), other.double()], substeps=10)
+        acting = world.actuate(torch.tensor([0.0, 0.4, 0.4]).double()[None, :, None])[0, :, :, 0].detach()
+        assert float(acting[1].mean()) == pytest.approx(0.95 * acts)
+        torch.testing.assert_close(acting[2], torch.full((10,), acts, dtype=torch.float64))
+
     def test_a_delay_of_whole_periods_is_the_same_commands_later(self):
         state, actions = inputs(2)
         late = torch.cat((torch.zeros_like(actions[:2]), actions[:1]))

@@ -50,6 +50,13 @@ def test_a_shift_moves_what_was_at_a_pixel_and_repeats_the_edge(picture):
     torch.testing.assert_close(out[:-2, 0], picture[2:, 0], rtol=0, atol=1e-12)
 
 
+def test_frames_saturate_as_those_of_a_target_do(picture):
+    out = shown(picture, Brightness(gain=1.6, offset=-0.2))
+    torch.testing.assert_close(out, (1.6 * picture - 0.2).clamp(0, 1))
+    assert out.min() == 0
+    assert out.max() == 1
+
+
 def test_a_quarter_turn_takes_right_to_below():
     assert shown(dot(19, 10), CameraRotation(angle=np.pi / 2))[14, 15] == pytest.approx(1.0)
 
@@ -105,9 +112,9 @@ def test_a_lost_frame_is_the_one_before_it_and_the_first_is_never_lost():
     generator, at = torch.Generator().manual_seed(0), World(CartPole(), [FrameDrop(rate=0.5)]).start(torch.zeros(1, 4))
     numbers = []
     for number in range(200):
-        picture = torch.full((1, 2, 3), float(number))
+        picture = torch.full((1, 2, 3), number / 200)
         frame, at = world.show(at, partial(lambda shown, state: shown, picture), generator)
-        numbers.append(int(frame[0, 0, 0]))
+        numbers.append(round(200 * frame[0, 0, 0].item()))
     repeated = np.diff(numbers, prepend=-1) == 0
     assert numbers[0] == 0
     assert 70 < repeated.sum() < 130

@@ -91,6 +91,12 @@ def test_sensors_of_an_angle_scale_its_rate_too_and_an_offset_does_not():
     assert world.reading(STATE)[0].tolist() == pytest.approx([0.6, 1.3, 4.0, -3.0])
 
 
+@pytest.mark.parametrize("turned", [1, -1])
+def test_a_scale_acts_before_an_offset_whichever_is_named_first(turned):
+    effects = [BY_NAME["arm.sensor_scale"](scale=2.0), BY_NAME["arm.sensor_offset"](offset=0.1)]
+    assert World(FURUTA, effects[::turned]).reading(STATE)[0, 0].item() == pytest.approx(0.7)
+
+
 def test_a_late_measurement_is_a_late_command():
     torch.manual_seed(0)
     commands = torch.randn(20, 1, 1, dtype=torch.float64)

@@ -12,7 +12,7 @@ from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.search import Search
 from visadapt.effects import ActuatorDelay, CartMass, ConstantForce, SensorScale, ViscousFriction
 from visadapt.estimation.candidate import CandidateModel, linearise
-from visadapt.estimation.fit_states import CAREFUL
+from visadapt.estimation.fit_states import CAREFUL, initial_fit, with_effect
 from visadapt.estimation.fitting import LEAST_NOISE, fit, refitted
 from visadapt.estimation.segments import initial_states
 from visadapt.recordings import Episode, Recording
@@ -23,6 +23,18 @@ from visadapt.world import World
 @pytest.fixture(scope="module")
 def viscous():
     return prepare(record([ViscousFriction(coefficient=0.8)]), CartPole()).rows
+
+
+@pytest.mark.parametrize("row", [0, 30])
+def test_a_reading_that_may_not_be_used_does_not_matter(viscous, row):
+    likelihoods = []
+    for value in (0.0, 5.0):
+        used, measured = viscous.used.clone(), viscous.measured.clone()
+        used[:, row], measured[:, row] = 0, value
+        rows = replace(viscous, used=used, measured=measured)
+        start = with_effect(initial_fit(CartPole(), rows), [0.8])
+        likelihoods.append(float(fit([CandidateModel(CartPole(), [ViscousFriction], rows)], start, 3).likelihood))
+    assert likelihoods[0] == likelihoods[1]
 
 
 def test_linearisation_predicts_small_steps(viscous):

@@ -6,7 +6,7 @@ import torch
 
 from renderers import Camera, DrawnCartPole
 from renderers.drawn import AXLE_GREY, CART_GREY, POLE_GREY, SKY_GREY, TRACK_GREY
-from visadapt.effects import EFFECTS, CameraRotation, ConstantForce
+from visadapt.effects import EFFECTS, CameraDelay, CameraRotation, ConstantForce
 from visadapt.estimation.poses import PoseFinder
 from visadapt.learning.tracking import Tracker, TrackingError, TrackingWarning
 from visadapt.recordings import Episode
@@ -214,6 +214,11 @@ class TestWhatCannotBeTracked:
             tracker.track([replace(episode, frame=episode.frame[:, :50])])
         with pytest.raises(TrackingError, match=r"0.1 s apart; the period is 0.05 s"):
             tracker.track([replace(episode, time=2 * episode.time)])
+
+    def test_a_camera_that_is_known_to_be_late_is_refused(self):
+        setup = cartpole_frames(World(CartPole(), [CameraDelay(delay=0.05)]))
+        with pytest.raises(TrackingError, match="states are not estimated from frames with camera_delay"):
+            setup.label([blind(record(no_effects, 3))])
 
     def test_a_world_with_effects_is_refused(self):
         with pytest.raises(TrackingError, match="source physics alone"):

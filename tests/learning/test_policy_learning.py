@@ -11,7 +11,7 @@ from tests.scenes import (
     small_renderer,
     stir,
 )
-from visadapt.effects import ActuatorDelay, ConstantForce, DynamicsEffect, Residual
+from visadapt.effects import ActuatorDelay, ActuatorGain, ConstantForce, DynamicsEffect, Residual
 from visadapt.evaluation import score
 from visadapt.history import HORIZON, History
 from visadapt.learning.plans import ClosedLoop, imagine
@@ -194,11 +194,11 @@ class TestOnStates:
 class TestOpposing:
     """A residual that expects what a force does is answered by the opposite force, without any training."""
 
-    def answered(self, newtons, scale, reads):
+    def answered(self, newtons, scale, reads, known=()):
         network = StateResidualNetwork(4)
         policy = StatePolicy(4)
         policy.residual = Residual(network, scale)
-        source = World(CartPole(), integrator="euler")
+        source = World(CartPole(), known, integrator="euler").requires_grad_(False)
         state = torch.tensor([[0.3, 0.1, 0.05, -0.2]])
         seen = History.start(state, 1)
         quiet = policy(seen)
@@ -216,6 +216,11 @@ class TestOpposing:
     def test_a_force_is_undone_over_the_whole_plan_whatever_the_scale(self, newtons, scale):
         found = self.answered(newtons, scale, torch.ones(4))
         torch.testing.assert_close(found, torch.full((10,), -newtons), rtol=1e-3, atol=1e-3)
+
+    def test_a_motor_that_is_known_to_be_weak_and_late_is_asked_for_more(self):
+        known = [ActuatorGain(scale=0.5), ActuatorDelay(delay=0.1)]
+        found = self.answered(2.0, torch.ones(4), torch.ones(4), known)
+        torch.testing.assert_close(found, torch.full((10,), -4.0), rtol=1e-3, atol=1e-3)
 
     def test_what_no_command_can_do_is_met_by_the_nearest_that_one_can(self):
         scale = torch.tensor([0.003, 0.1, 0.004, 0.15])

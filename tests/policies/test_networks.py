@@ -3,6 +3,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from tests.own_systems import DoublePendulum, furuta
 from tests.scenes import (
     CONTRAST,
     HEIGHT,
@@ -14,6 +15,7 @@ from tests.scenes import (
     stir,
 )
 from visadapt.effects import ConstantForce, Residual
+from visadapt.effects.catalogue import catalogue
 from visadapt.history import LENGTH, History
 from visadapt.policies import StatePolicy
 from visadapt.policies.networks import FrameEncoder, StateResidualNetwork
@@ -191,6 +193,26 @@ def test_on_states_a_force_is_left_and_without_one_nothing():
         )
         cart = newtons / (1.1 - 0.75 * 0.1)
         torch.testing.assert_close(left.mean((0, 1)), torch.tensor([cart, -0.75 * cart / 0.5]), rtol=0.02, atol=0.02)
+
+
+@pytest.mark.parametrize(("system", "load"), [(DoublePendulum, "shoulder"), (furuta(), "hinge")])
+def test_on_states_of_ones_own_system_a_load_is_left_as_the_accelerations_it_gives(system, load):
+    constant = {effect.name: effect for effect in catalogue(system())}[f"{load}.constant_load"]
+    machine = World(system(), [constant(torque=0.02)], 0.002).requires_grad_(False)
+    network = StateResidualNetwork(4, len(system.actions), system(), machine.period)
+    at = machine.start(torch.tensor([[0.1, 0.3, 0.5, -0.4]]))
+    rows = [at.state]
+    for _ in range(LENGTH - 1):
+        at = machine.step(at, torch.zeros(1, len(system.actions)))
+        rows.append(at.state)
+    history = History(torch.stack(rows, 1), torch.zeros(1, LENGTH, len(system.actions)))
+    left = network.unexplained(network.system, history.observations, history.actions)[0, -1]
+    none, given = torch.zeros(1, len(system.loads)), torch.zeros(1, len(system.actions))
+    one = none.clone()
+    one[0, [each.name for each in system.loads].index(load)] = 0.02
+    expected = system().accelerations(at.state, given, one) - system().accelerations(at.state, given, none)
+    torch.testing.assert_close(left, expected[0], rtol=0.05, atol=0.01 * float(expected.abs().max()))
+    assert network(history).shape == (1, 4)
 
 
 def test_a_policy_pushes_against_what_its_residual_expects_once_the_feedforward_has_weight():

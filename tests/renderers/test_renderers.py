@@ -136,6 +136,12 @@ class TestLearnt:
         assert renderer.to(dtype)(*(p.to(dtype) for p in PLACES)).dtype == dtype
 
 
+@pytest.mark.parametrize("place", [float("nan"), float("inf"), -1e30])
+def test_a_cart_that_is_nowhere_is_drawn_anywhere(place):
+    drawn = randomised(LayeredRenderer(24, 30, column=14.5, row=17.5, scale=10.0, reach=1.0))
+    assert drawn(torch.tensor([0.0, place]).double(), torch.zeros(2).double()).shape == (2, 24, 30)
+
+
 def test_the_layered_renderer_moves_by_a_pixel_for_a_pixels_worth_of_metres():
     renderer = randomised(LayeredRenderer(24, 30, column=14.5, row=17.5, scale=10.0, reach=1.0, detail=1.0))
     with torch.no_grad():

@@ -2,9 +2,11 @@ import numpy as np
 import torch
 
 import visadapt as va
+from tests.own_systems import Pendulum
 from visadapt.diagnosis import planning
 from visadapt.effects import EFFECTS
 from visadapt.recordings import read_recording
+from visadapt.setups.explained import explained
 from visadapt.storage.run_folder import read_json
 from visadapt.targets import synthetic
 
@@ -28,6 +30,16 @@ def rivals(folder):
     """What each cause that a diagnosis named cannot be told from."""
     causes = read_json(folder / "diagnosis.json")["causes"]
     return {cause["effect"]: cause["indistinguishable_from"] for cause in causes}
+
+
+class Knee(Pendulum):
+    name, loads = "knee_of_a_test", (va.Variable("knee", "N m", -1.0, 1.0),)
+
+
+def test_what_a_file_names_on_a_system_of_ones_own_is_known_before_it_is_read():
+    assert "knee.viscous_friction" not in EFFECTS
+    explained(va.World(Knee()))
+    assert "knee.viscous_friction" in EFFECTS
 
 
 def test_what_two_causes_explain_is_settled_by_an_experiment_in_the_next_round(tmp_path, monkeypatch, only_effects):

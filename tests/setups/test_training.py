@@ -7,6 +7,7 @@ import torch
 
 import visadapt as va
 from tests.flying import waves
+from visadapt.policies.networks import StateResidualNetwork
 from visadapt.tasks.follow import Follow
 
 
@@ -38,6 +39,26 @@ def test_a_run_that_was_not_kept_says_so(policy):
     found = va.adapt(policy, va.World(va.CartPole()), va.SyntheticTarget(), samples=20, iterations=1)
     with pytest.raises(ValueError, match="this run was not kept: give adapt a folder"):
         found.restore(found.policy, 20)
+
+
+def test_a_run_does_not_go_on_with_what_was_not_asked_for(policy, tmp_path):
+    source, target = va.World(va.CartPole()), va.SyntheticTarget()
+    va.adapt(policy, source, target, samples=20, folder=tmp_path, iterations=1)
+    with pytest.raises(ValueError, match=r"holds a run with other settings \(samples, seed\)"):
+        va.adapt(policy, source, target, samples=60, folder=tmp_path, iterations=1, seed=7)
+
+
+def test_an_episode_of_one_sample_shows_no_frequency(policy):
+    force = va.effects.PeriodicForce(amplitude=0.0, frequency=0.2, phase=0.0, offset=0.0)
+    target = va.SyntheticTarget(va.sine_force)
+    run = va.adapt(policy, va.World(va.CartPole(), [force]), target, samples=81, round_samples=80, iterations=1)
+    assert run.ledger.used == 81
+
+
+def test_a_residual_is_no_part_of_a_source(policy):
+    residual = va.Residual(StateResidualNetwork(4), torch.ones(4))
+    with pytest.raises(ValueError, match="the source has a residual, which is learnt for a target"):
+        va.adapt(policy, va.World(va.CartPole(), [residual]))
 
 
 def test_a_flight_is_scored_over_fewer_steps_than_its_task_has_but_not_over_more():

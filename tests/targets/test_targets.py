@@ -8,7 +8,7 @@ from torch import nn
 from renderers import DrawnCartPole
 from visadapt.effects import AngleOffset, Dropout
 from visadapt.history import HORIZON
-from visadapt.policies import Policy
+from visadapt.policies import Policy, StatePolicy
 from visadapt.systems import CartPole
 from visadapt.targets import Start, SyntheticTarget, TargetError, constant_force, no_effects, sine_force
 from visadapt.targets.rollout import run, see_frames
@@ -207,6 +207,10 @@ class TestRun:
 
         with pytest.raises(TargetError, match=r"state after step 1 is not finite \(episode 1\)"):
             run(Broken(), Scripted(), 3, 10, seeded())
+
+    def test_a_target_with_other_states_than_the_policy_s(self):
+        with pytest.raises(ValueError, match="the policy was trained on 13 numbers of state, got 4"):
+            run(SyntheticTarget(), StatePolicy(13), 1, 3, seeded())
 
     def test_frames_asked_of_a_target_without_a_camera(self):
         with pytest.raises(TargetError, match="has none: give it a camera"):

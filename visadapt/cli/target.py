@@ -87,9 +87,14 @@ def _check(path: str, policy: Policy, source: World, target: Target) -> None:
     own = getattr(target, "system", system)
     if own.name != system.name:
         raise InputError(f"{path}: a policy of a {system.name}; {target.name} is a {own.name}")
+    # Only what is observed says how large it is. A reset is no step: it is not counted.
+    observed = target.reset(1, torch.Generator().manual_seed(0))
+    if policy.shown == "state" and observed.state.shape[1] != policy.n_state:
+        raise InputError(
+            f"{target.name} shows {observed.state.shape[1]} numbers of state; {path} was trained on {policy.n_state}"
+        )
     if policy.shown == "frame":
-        # Only a picture says how large it is. A reset is no step: it is not counted.
-        shown = see_frames(target.reset(1, torch.Generator().manual_seed(0)))[0].shape
+        shown = see_frames(observed)[0].shape
         height, width = policy.observation_shape
         if shown != (height, width):
             raise InputError(

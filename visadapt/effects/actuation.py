@@ -36,12 +36,14 @@ class ActuatorDelay(ActuationEffect):
 
     A delayed command can change inside a substep. What acts instead is constant over a substep and moves a mass just as
     far and as fast by the end of the period: the mean over the substep, and a little of the impulse of the substep
-    after or before it. That is differentiable in the delay. Only the start of an episode could separate it from
-    measurement_delay, and only if the first state were known without noise and not at rest.
+    after or before it. That is differentiable in the delay. Backlash, dead zone and saturation make the same of a
+    command before a delay as after it, but would ratchet on that impulse, so the delay is computed after them. Only the
+    start of an episode could separate it from measurement_delay, and only if the first state were known without noise
+    and not at rest.
     """
 
     name = "actuator_delay"
-    order = 10
+    order = 45
     equation = "u(t) = command(t - delay)"
     source = "Franklin, Powell and Workman (1998), Digital Control of Dynamic Systems, section 4.3.3"
     table = (Parameter("delay", "s", 0.0, 0.2, 0.0),)

@@ -105,13 +105,15 @@ def moved(frame: Tensor, motions: Sequence[Tensor]) -> Tensor:
 def seen_by(
     camera: Sequence[CameraEffect], frame: Tensor, memory: Sequence[Tensor], generator: torch.Generator | None
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """Frames (B, H, W) after all effects, in their order, and the effects' new memories."""
+    """Frames (B, H, W) after all effects, in their order, limited to [0, 1], and the new memories."""
+    if not camera:
+        return frame, ()
     frame = moved(frame, [motion for effect in camera if (motion := effect.motion(frame)) is not None])
     remembered = []
     for effect, own in zip(camera, memory, strict=True):
         frame, own = effect.apply_to(frame, own, generator)
         remembered.append(own)
-    return frame, tuple(remembered)
+    return frame.clamp(0, 1), tuple(remembered)
 
 
 class CameraRotation(CameraEffect):

@@ -53,9 +53,9 @@ class SeenBy(nn.Module):
 
 
 def through(frame: Tensor, effects: Sequence[CameraEffect]) -> Tensor:
-    """Frames (B, H, W) as a camera with effects without memory shows them, in [0, 1] as all recorded frames are."""
+    """Frames (B, H, W) as a camera with effects without memory shows them."""
     ordered = sorted(effects, key=lambda effect: effect.order)
-    return seen_by(ordered, frame, [frame[:, None, :0]] * len(ordered), None)[0].clamp(0, 1)
+    return seen_by(ordered, frame, [frame[:, None, :0]] * len(ordered), None)[0]
 
 
 def smoothed(frames: Tensor, camera: Sequence[CameraEffect]) -> Tensor:

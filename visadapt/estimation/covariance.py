@@ -13,11 +13,22 @@ from torch import Tensor
 
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.colour import whitened
-from visadapt.estimation.fit_states import posterior
+from visadapt.estimation.fit_states import Effects, posterior
 from visadapt.estimation.kalman import forward
 from visadapt.estimation.likelihood import FitState, linear_problem, variances
 
 CORRELATION_TIME = 0.5  # s; scores further apart are taken as independent
+
+
+VAGUE = 1e-4
+"""Share of the prior's precision that is added to the information, so that it can be inverted where data show nothing.
+More would belong to an estimate that the prior has drawn in, which the most likely one is not."""
+
+
+def inverse_information(effects: Effects, fits: FitState) -> Tensor:
+    """Covariance (K, K) of the parameters of a fit (C = 1), if the model is right."""
+    precision, _ = posterior(effects, fits)
+    return torch.linalg.inv(fits.information[0] + VAGUE * torch.diag(precision))
 
 
 def deviations(model: CandidateModel, fits: FitState) -> Tensor:
@@ -26,7 +37,7 @@ def deviations(model: CandidateModel, fits: FitState) -> Tensor:
     The long-run covariance is estimated from the recording, and too small where that is short.
     """
     rows = model.rows
-    covariance = torch.linalg.inv(posterior(model.effects, fits)[1])
+    covariance = inverse_information(model.effects, fits)
     problem = linear_problem([model], fits)
     filtered = forward(problem, *variances(model, fits, problem))
     white = whitened(filtered.white, rows.colour)

@@ -16,6 +16,7 @@ from torch import Tensor
 from visadapt.effects import Dropout, Effect, FrozenZone, LateSensors, Role, SensingEffect
 from visadapt.effects.catalogue import sized, twins
 from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.covariance import inverse_information
 from visadapt.estimation.episode_phases import has_episode_phases, in_step, with_episode_phases, with_own_phases
 from visadapt.estimation.fit_states import (
     CAREFUL,
@@ -23,7 +24,6 @@ from visadapt.estimation.fit_states import (
     Effects,
     initial_fit,
     neutral,
-    posterior,
     single_fit,
     stacked,
     with_effect,
@@ -92,7 +92,7 @@ def fit_effects(
         for value in with_own_phases(kind, [float(getattr(effect, p.name)) for p in in_step(kind).table])
     ]
     found = _fitted(system, fitted, rows, present)
-    covariance = torch.linalg.inv(posterior(fitted, found)[1]) if fitted else torch.zeros(0, 0)
+    covariance = inverse_information(fitted, found) if fitted else torch.zeros(0, 0)
     states = _by_episode(rows, found.state[0], measured)
     values, spreads = {}, {}
     for kind, span in columns.items():

@@ -52,6 +52,8 @@ def likeliest(whole: Sensitivity, some: Sensitivity, effect: type[Effect]) -> Te
     time = (whole.rows.time[:, :-1] + whole.rows.time[:, 1:]) / 2
     inside = whole.rows.inside[:, 1:] > 0
     first, last = float(time[inside].min()), float(time[inside].max())
+    if last <= first:
+        return coarse
     count = max(1, math.ceil((last - first) * high / BIN))
     width = max(last - first, 1e-9) / count
     bins = ((time[inside] - first) / width).long().clamp(max=count - 1)

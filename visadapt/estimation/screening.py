@@ -91,6 +91,8 @@ def screen(
             points = grid(effect, covered, likeliest(sensitivity(1), few, effect))
         else:
             points = grid(effect, covered) if proportional else starts(effect, covered)
+        if not len(points):
+            return None  # no region lies within readings that never change
         stride = _window_stride(most, rows, len(points) * (1 + len(columns)))
         some = sensitivity(stride)
         if not proportional:
@@ -191,6 +193,8 @@ def _descend(sensitivity: Sensitivity, effect: type[Effect], point: Tensor) -> C
         change, derivatives = sensitivity.around(effect, point[None], every)
         now = error + change[:, 0]
         gain = float(0.5 * (error.square().sum() - now.square().sum()))
+        if not (math.isfinite(gain) or best > -math.inf):
+            return None  # nothing to go on from
         if gain > best:
             damping, settled = damping / 5, gain - best < MIN_STEP_GAIN
             best, found, slopes, left = gain, point, derivatives[:, 0], now

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -55,6 +57,18 @@ class Segments:
         """(W, T, n_action) commands of the rows."""
         return self.command[self.episode[:, None], self.index]
 
+    @cached_property
+    def filled(self) -> Tensor:
+        """(W, T, m) readings; those that may not be used are interpolated between those of the window that may."""
+        missing = (self.used == 0) & (self.inside[..., None] > 0)
+        if not bool(missing.any()):
+            return self.measured
+        out = self.measured.clone()
+        for window in missing.any(2).any(1).nonzero()[:, 0].tolist():
+            own = self.inside[window] > 0
+            out[window, own] = interpolated(out[window, own], self.used[window, own], self.time[window, own])
+        return out
+
     @property
     def clock(self) -> tuple[Tensor, Tensor]:
         """Times, and durations, (W (T - 1),) s, of every row but the last of each window."""
@@ -93,11 +107,21 @@ class Segments:
         )
 
 
+def interpolated(values: Tensor, used: Tensor, stamps: Tensor) -> Tensor:
+    """Readings (T, m); those that are not `used` (T, m) are interpolated linearly between those that are."""
+    columns = [
+        np.interp(stamps, stamps[kept], column[kept]) if kept.any() else column
+        for column, kept in zip(values.numpy().T, used.numpy().T > 0, strict=True)
+    ]
+    return torch.tensor(np.stack(columns, 1))
+
+
 def initial_states(rows: Segments, system: System) -> Tensor:
-    """Initial guess (W, T, n) of the states: the measurements, and difference quotients for missing velocities."""
+    """Initial guess (W, T, n) of the states: the measurements that may be used, those in between interpolated, and
+    difference quotients for missing velocities."""
     out = torch.zeros(*rows.shape, len(system.states), dtype=torch.float64)
     for k, channel in enumerate(rows.channels):
-        out[..., channel] = rows.measured[..., k]
+        out[..., channel] = rows.filled[..., k]
     for channel, position_column in profile_of(system).position_of.items():
         if channel not in rows.channels:
             position = out[..., position_column]

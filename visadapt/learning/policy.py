@@ -29,6 +29,11 @@ from visadapt.progress import Progress
 from visadapt.tasks.base import Task
 from visadapt.world import World
 
+LASTING_COMMAND, LASTING_ROWS = 0.2, 40
+"""Command, and periods that it lasts, by which the gain of a chain of actuation effects is measured."""
+LEAST_GAIN = 0.05
+"""Gain below which a command counts as lost in a dead zone: dividing by it would ask for more than there is."""
+
 
 class DivergedError(RuntimeError):
     """The loss is not finite; the message says at which iteration."""
@@ -73,8 +78,19 @@ def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None
     still = rest.new_zeros(1, source.substeps, policy.n_action)
     with torch.no_grad():
         step = linearise_step(source, source.values.to(rest), rest[:, 0], rest, still, by_state=False, by_command=True)
-        undo = -torch.linalg.pinv(step.by_command[0] / scale.to(rest)[:, None])
+        by_command = step.by_command[0] * lasting_gain(source).to(rest)
+        undo = -torch.linalg.pinv(by_command / scale.to(rest)[:, None])
         policy.feedforward.weight.copy_(undo.repeat(HORIZON, 1))
+
+
+def lasting_gain(source: World) -> Tensor:
+    """(n_action,) what acts in the end of each unit of a command that lasts; 1 where next to nothing acts."""
+    with torch.no_grad():
+        given = LASTING_COMMAND * torch.ones(2, LASTING_ROWS, len(source.system.actions), dtype=torch.float64)
+        given[1] *= -1
+        acting = source.actuate(given)[:, -1, -1]
+    gain = (acting[0] - acting[1]) / (2 * LASTING_COMMAND)
+    return torch.where(gain.abs() > LEAST_GAIN, gain, 1.0)
 
 
 def plans_of(

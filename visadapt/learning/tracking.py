@@ -59,7 +59,7 @@ class Tracker:
     Args:
         renderer: learnt, of x (B,) in m and theta (B,) in rad to frames (B, H, W) in [0, 1].
         world: the source physics, without effects; the cart is looked for within the range of its system's table.
-        camera: known faults of the camera that single frames show, through which the renderer's pictures are seen.
+        camera: known faults of the camera, through which the renderer's pictures are seen.
 
     Raises:
         TrackingError: a world with effects, which would hide the gap that is looked for.
@@ -76,6 +76,8 @@ class Tracker:
         load = load_effect(type(system))
         nothing = load(**{parameter.name: 0.0 for parameter in load.table})
         self._pushed = world.with_effects((nothing,))
+        self._late = [effect.name for effect in camera if not effect.in_one_frame]
+        camera = [effect for effect in camera if effect.in_one_frame]
         self.poses = PoseFinder(SeenBy(renderer, camera) if camera else renderer, across.largest)
         self._known = within_frame(camera, torch.zeros(self.poses.size)).to(torch.uint8)
         """(H, W) 1 where the renderer draws what is seen, else 0"""
@@ -85,10 +87,16 @@ class Tracker:
 
         Raises:
             TrackingError: an episode without frames, with frames of another size or a clock of another period, or
-                whose frames the renderer does not explain, most of them or more than `BRIDGED` in a row.
+                whose frames the renderer does not explain, most of them or more than `BRIDGED` in a row; or a camera
+                that is known to be late or to lose frames.
 
         One or two rows cannot tell a load from a velocity: in so short an episode the estimated gap is 0.
         """
+        if self._late:
+            raise TrackingError(
+                f"states are not estimated from frames with {' and '.join(self._late)}: they would be of other rows; "
+                "without a residual (--diagnose) none are needed"
+            )
         if not episodes:
             return []
         found = [self._see(number, episode) for number, episode in enumerate(episodes)]

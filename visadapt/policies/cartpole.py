@@ -53,6 +53,8 @@ class StatePolicy(Policy):
 
     def embed(self, history: History) -> Tensor:
         states, actions = history.observations, history.actions
+        if states.shape[-1] != self.n_state:
+            raise ValueError(f"the policy was trained on {self.n_state} numbers of state, got {states.shape[-1]}")
         return torch.cat((states.flatten(1), actions.flatten(1)), 1) if self.with_history else states[:, -1]
 
     def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:

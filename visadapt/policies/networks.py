@@ -187,11 +187,10 @@ class ImageResidualNetwork(ResidualNetwork):
         positions = latest[:, None] - back[:, 1:]
         velocities = (changes[:, 1:] + changes[:, :-1]) / (2 * self.period)
         states = torch.stack((positions, velocities), -1).flatten(-2)
-        load = states.new_zeros(*states.shape[:-1], len(self.system.loads))
-        before = self.system.derivative(states, actions[:, : LENGTH - 2], load)
-        after = self.system.derivative(states, actions[:, 1 : LENGTH - 1], load)
+        before = accelerations(self.system, states, actions[:, : LENGTH - 2])
+        after = accelerations(self.system, states, actions[:, 1 : LENGTH - 1])
         measured = changes.diff(dim=1) / self.period**2
-        return measured - (before + after)[..., 1::2] / 2
+        return measured - (before + after) / 2
 
 
 class StateResidualNetwork(ResidualNetwork):
@@ -204,7 +203,7 @@ class StateResidualNetwork(ResidualNetwork):
     """
 
     def __init__(self, n_state: int, n_action: int = 1, system: System | None = None, period: float = 0.0) -> None:
-        inputs = LENGTH * (n_state + n_action) + (LENGTH - 1) * n_state // 2
+        inputs = LENGTH * (n_state + n_action) + (LENGTH - 1) * (len(system.coordinates) if system else 0)
         of_history = nn.Linear(inputs, n_state, bias=False)
         super().__init__(of_history if system else mlp(n_state + n_action, 64, 64, n_state))
         self.n_state = n_state
@@ -238,16 +237,22 @@ class StateResidualNetwork(ResidualNetwork):
         return every
 
     def unexplained(self, system: System, states: Tensor, actions: Tensor) -> Tensor:
-        """Mean accelerations minus the system's over the periods between states, (B, LENGTH - 1, n_state / 2).
+        """Mean accelerations minus the system's over the periods between states, (B, LENGTH - 1, J) of J joints.
 
         The system's is the mean of those at both ends of a period, under the action held in between. `held_back` fills
         the periods before an episode.
         """
-        load = states.new_zeros(*states.shape[:-1], len(system.loads))[:, 1:]
-        ends = [system.derivative(part, actions[:, :-1], load) for part in (states[:, :-1], states[:, 1:])]
-        measured = states.diff(dim=1) / self.period
-        left = (measured - (ends[0] + ends[1]) / 2)[..., 1::2]
+        ends = [accelerations(system, part, actions[:, :-1]) for part in (states[:, :-1], states[:, 1:])]
+        measured = states.diff(dim=1)[..., [velocity for _, velocity in system.coordinates]] / self.period
+        left = measured - (ends[0] + ends[1]) / 2
         return held_back(left, states.diff(dim=1).any(2, keepdim=True))
+
+
+def accelerations(system: System, states: Tensor, actions: Tensor) -> Tensor:
+    """The system's accelerations (B, T, J) of the joints in states (B, T, n) under actions (B, T, n_action)."""
+    flat = states.flatten(0, 1)
+    loads = flat.new_zeros(len(flat), len(system.loads))
+    return system.accelerations(flat, actions.flatten(0, 1), loads).unflatten(0, states.shape[:2])
 
 
 def held_back(values: Tensor, known: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from visadapt.effects import Effect, Residual
+from visadapt.effects import Residual
 from visadapt.learning.joint import Adapted, adapt
 from visadapt.learning.policy import tune
 from visadapt.learning.rounds import Label
@@ -21,6 +21,7 @@ from visadapt.policies import Policy
 from visadapt.progress import Report, staged
 from visadapt.setups.explained import explained
 from visadapt.setups.policy_file import describe, load_into
+from visadapt.storage.run_folder import open_run
 from visadapt.targets import Target
 from visadapt.tasks.base import Task
 from visadapt.world import World
@@ -66,7 +67,9 @@ class Setup:
 
     def __post_init__(self) -> None:
         for effect in self.source.effects:
-            rows = max((p.numel() for p in effect.parameters()), default=1) if isinstance(effect, Effect) else 1
+            if isinstance(effect, Residual):
+                raise ValueError("the source has a residual, which is learnt for a target: give the source without it")
+            rows = max((p.numel() for p in effect.parameters()), default=1)
             if rows > 1:
                 raise ValueError(
                     f"the source's {effect.name} has {rows} values of a parameter, one for each row of a batch; a "
@@ -146,9 +149,12 @@ class Setup:
             ValueError: a policy of another kind, a target of another period or with other actions, or a budget that
                 is smaller than a round.
             TargetError: the target misbehaves. CheckpointError: `folder` holds a run of other networks.
+            RunError: it holds one that was asked for otherwise.
         """
         self.check_policy(policy)
         self.check_target(target)
+        asked = {"target": target.name, "samples": budget, "round": round_samples, "seed": seed, "diagnose": diagnose}
+        open_run(folder, {**asked, "source": describe(self.source), **self.settings.numbers()}, "adaptation.json")
         torch.manual_seed(seed)
         residual = self.residual(policy, self.source).to(next(policy.parameters()))
         args = (policy, residual, self.source, target, self.settings, folder, budget, round_samples, seed)

@@ -136,7 +136,7 @@ def cartpole_frames(
     source = source or World(CartPole())
     seen = renderer if isinstance(renderer, LayeredRenderer) else _load(Path(renderer or shipped("renderer")))
     seen.requires_grad_(False).eval()
-    camera = [each for each in source.effects if isinstance(each, CameraEffect) and each.in_one_frame]
+    camera = [effect for effect in source.effects if isinstance(effect, CameraEffect)]
     tracker = Tracker(seen, source.with_effects(()), camera)
     settings = settings or _narrowed(from_frames(source), seen)
     perception = settings.perception or PerceptionSettings()

@@ -13,6 +13,7 @@ from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED
 from visadapt.diagnosis.saved import load_effects
+from visadapt.effects.catalogue import catalogue
 from visadapt.learning.explanation import Explain, Explanation
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
@@ -34,6 +35,7 @@ def explained(source: World, renderer: nn.Module | None = None, report: Report |
     """
     if len(source.effects):
         raise ValueError("a diagnosis starts from the bare system: give the source without effects")
+    catalogue(source.system)  # makes the effects of a system of one's own known, by which a file names them
     measured = () if renderer else tuple(state.name for state in source.system.states)
 
     def explain(episodes: Sequence[Episode], path: Path) -> Explanation:

@@ -20,17 +20,17 @@ class RunError(ValueError):
     """A folder in which a run cannot be continued; the message is one line that says why."""
 
 
-def open_run(folder: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Begin a run in `folder`, or continue the one that is there; returns its settings and versions.
+def open_run(folder: Path, settings: Mapping[str, Any], file: str = "settings.json") -> dict[str, Any]:
+    """Begin a run in `folder`, or continue the one that is there; returns its settings and versions, kept in `file`.
 
     Raises:
         RunError: the folder holds a run with other settings.
     """
     wanted = json.loads(json.dumps(_finite(settings), default=str))
-    run = once(folder / "settings.json", lambda: {"settings": wanted, "versions": versions()})
+    run = once(folder / file, lambda: {"settings": wanted, "versions": versions()})
     found = run.get("settings")
     if not isinstance(found, dict):
-        raise RunError(f"{folder / 'settings.json'}: holds no settings of a run: remove the folder or name another")
+        raise RunError(f"{folder / file}: holds no settings of a run: remove the folder or name another")
     if found != wanted:
         differing = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
         raise RunError(

@@ -188,8 +188,12 @@ class EnvMap:
 
     def frame(self, name: str, picture: object) -> NDArray[np.uint8]:
         """Our frame (height, width) of a picture (rows, columns, 3) or (rows, columns) uint8 of the environment."""
-        sound = isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.ndim in (2, 3)
-        if not sound or picture.shape[2:] not in ((), (3,)):
+        sizes = (2, ()), (3, (3,))  # number of axes, and the size of those after rows and columns
+        if (
+            not isinstance(picture, np.ndarray)
+            or picture.dtype != np.uint8
+            or (picture.ndim, picture.shape[2:]) not in sizes
+        ):
             got = f"{picture.dtype} {picture.shape}" if isinstance(picture, np.ndarray) else type(picture).__name__
             raise TargetError(f"{name}: render() gave {got}; a picture (rows, columns, 3) of uint8 is needed")
         left, top, right, bottom = self.crop or (0, 0, picture.shape[1], picture.shape[0])

@@ -203,7 +203,8 @@ def rollout_errors(model: CandidateModel, fits: FitState, black_box: BlackBox | 
     for h in range(horizon + 1):
         ends = slice(h, None, stride)
         used, found = shown[:, ends].clone(), predicted[:, : len(range(h, length, stride)), h]
-        used[others, 0] = 0
+        if used.shape[1]:
+            used[others, 0] = 0
         error = (model.measure(fits.theta[0], found, ends) - measured[:, ends]) * used
         # Predictions that would end beyond the window are not valid.
         parts.append([pad(x, (0, 0, 0, predicted.shape[1] - x.shape[1])) for x in (error, used, left[:, ends] * used)])

@@ -16,7 +16,7 @@ from visadapt.effects import Effect
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import Convention, profile_of
 from visadapt.estimation.repeated_readings import RepeatedReadings, find_repeats
-from visadapt.estimation.segments import Segments, cut
+from visadapt.estimation.segments import Segments, cut, interpolated
 from visadapt.recordings import Recording
 from visadapt.recordings.thinning import spread
 from visadapt.systems import System
@@ -100,7 +100,7 @@ class _Readings:
         parts = zip(self.recording.episodes, self.stamps, self.commands, self.states, self.repeats.used, strict=True)
         episodes = []
         for episode, time, command, state, used in parts:
-            action, filled = (command_sign * command).numpy(), (sign * _filled(state, used, time)).numpy()
+            action, filled = (command_sign * command).numpy(), (sign * interpolated(state, used, time)).numpy()
             episodes.append(replace(episode, time=time.numpy(), action=action, state=filled))
         return replace(self.recording, episodes=tuple(episodes))
 
@@ -232,15 +232,8 @@ def _in_signs_of_source(draft: _Draft, first: FitState, catalogue: Sequence[type
 
 def _evenly_spaced(stamps: Tensor) -> Tensor:
     """Stamps (T,), in s, of a steady clock that is closest to these."""
+    if len(stamps) < 2:
+        return stamps
     index = torch.arange(len(stamps), dtype=stamps.dtype)
     index = index - index.mean()
     return stamps.mean() + index * (index @ stamps) / (index @ index)
-
-
-def _filled(values: Tensor, used: Tensor, stamps: Tensor) -> Tensor:
-    """Readings (T, m); those that are not used are interpolated linearly between those that are."""
-    columns = [
-        np.interp(stamps, stamps[kept], column[kept]) if kept.any() else column
-        for column, kept in zip(values.numpy().T, used.numpy().T > 0, strict=True)
-    ]
-    return torch.tensor(np.stack(columns, 1))

@@ -30,6 +30,7 @@ def on_sensors(system: type[System]) -> Iterator[Made]:
                 "equation": f"{name} measured = {name} + offset",
                 "table": (Parameter("offset", unit, -most, most, 0.0, linear=True),),
                 "sensor": column,
+                "order": sensing.AngleOffset.order,
             },
         )
         if column in rates.values():
@@ -54,5 +55,6 @@ def on_sensors(system: type[System]) -> Iterator[Made]:
                 "equation": f"({both}) measured = scale ({both})",
                 "table": (Parameter("scale", "1", 0.5, 2.0, 1.0, linear=True),),
                 "columns": scaled,
+                "order": sensing.SensorScale.order,
             },
         )
