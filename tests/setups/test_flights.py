@@ -1,4 +1,5 @@
 import math
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -13,6 +14,7 @@ from visadapt.history import HORIZON
 from visadapt.policies import AutoregressivePolicy, FollowPolicy, Policy
 from visadapt.setups.flight import fixed_wing
 from visadapt.storage.checkpoints import CheckpointError
+from visadapt.storage.run_folder import RunError
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION, VELOCITY
 from visadapt.targets import FlightTarget, TargetError
@@ -245,9 +247,13 @@ class TestAdapt:
         assert [len(each.policy) for each in found.rounds] == [4, 4]
         assert not torch.equal(policy.state_dict()["first.weight"], whole[0].state_dict()["first.weight"])
 
-    def test_a_folder_of_a_residual_without_history_is_refused_with_one(self, whole):
-        with pytest.raises(CheckpointError, match=r"round-01/residual\.safetensors: made for another architecture"):
+    def test_a_folder_of_a_residual_without_history_is_refused_with_one(self, whole, tmp_path):
+        with pytest.raises(RunError, match=r"holds a run with other settings \(tuning\)"):
             adapted(whole[1].folder, with_history=True)
+        copied = shutil.copytree(whole[1].folder, tmp_path / "copied")
+        (copied / "adaptation.json").unlink()
+        with pytest.raises(CheckpointError, match=r"round-01/residual\.safetensors: made for another architecture"):
+            adapted(copied, with_history=True)
 
 
 class TestPretrain:
