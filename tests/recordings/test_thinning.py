@@ -2,8 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 
+from tests.diagnosed import record
 from tests.recorded import HEADER, STATES, a_table, load, refuses, write
+from visadapt.diagnosis.search.preparation import prepare
+from visadapt.effects import ActuatorDelay
+from visadapt.estimation.candidate import CandidateModel
 from visadapt.recordings import Episode, load_recording, write_recording
 from visadapt.recordings.thinning import STRETCH, spread
 from visadapt.systems import CartPole
@@ -58,9 +63,22 @@ def test_reading_tells_how_far_it_is(tmp_path):
 
 def test_rows_for_a_diagnosis_are_spread_evenly_and_keep_their_times(tmp_path):
     whole = load(a_file(tmp_path / "run.csv"))
-    part = spread(whole, 1000, 200)
-    assert sum(len(episode.time) for episode in part.episodes) == pytest.approx(1000, abs=20)
-    assert {len(episode.time) for episode in part.episodes} == {200}
-    assert [episode.time[0] for episode in part.episodes] == pytest.approx([0, 24, 48, 122, 148], abs=5)
+    part = spread(whole, 1000, 200, 50)
+    assert sum(rows.sum() for rows in part.usable) == pytest.approx(1000, abs=20)
+    assert {rows.sum() for rows in part.usable} == {200}
+    begins = [episode.time[rows.argmax()] for episode, rows in zip(part.episodes, part.usable, strict=True)]
+    assert begins == pytest.approx([0, 24, 48, 122, 148], abs=5)
+    assert [source.rpartition(", ")[2] for source in part.sources] == [f"from {time:.1f} s" for time in begins]
     assert "10,000 rows are more than a diagnosis looks at: 1,000 of them were used" in part.warnings[-1]
-    assert spread(whole, 20_000, 200) is whole
+    assert spread(whole, 20_000, 200, 50) is whole
+
+
+def test_the_commands_before_a_stretch_are_in_the_memory_of_what_is_late():
+    rows = prepare(spread(record(episodes=1, rows=400), 120, 40, 20), CartPole()).rows
+    assert rows.inside.sum() == 120
+    model = CandidateModel(CartPole(), (ActuatorDelay,), rows)
+    acting = model.commands(torch.tensor([[0.15]], dtype=torch.float64))[0, :, 0].mean((1, 2))
+    given = torch.stack([rows.command[k, max(0, first - 3)] for k, first in zip(rows.episode, rows.first, strict=True)])
+    later = rows.first > 0
+    assert later.sum() >= 2
+    torch.testing.assert_close(acting[later], given[later, 0])

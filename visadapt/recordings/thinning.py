@@ -27,10 +27,11 @@ def kept(first: int, last: int, every: int) -> NDArray[np.bool_]:
     return np.arange(first, last) // STRETCH % every == 0
 
 
-def spread(recording: Recording, most: int, length: int) -> Recording:
-    """A recording of at most about `most` rows: stretches of about `length` of them, spread evenly over it.
+def spread(recording: Recording, most: int, length: int, before: int) -> Recording:
+    """A recording of at most about `most` usable rows: stretches of about `length`, spread evenly over it.
 
-    Each stretch becomes an episode, whose times count from the start of its own one. A warning says what is used.
+    Each stretch becomes an episode, whose times count from the start of its own one. It begins with up to `before` rows
+    that are not usable, for their commands: a motor that is late has these in its memory. A warning says what is used.
     """
     rows = [len(episode.time) for episode in recording.episodes]
     if sum(rows) <= most:
@@ -42,17 +43,28 @@ def spread(recording: Recording, most: int, length: int) -> Recording:
     count = max(1, most * len(stretches) // sum(rows))
     chosen = [stretches[k] for k in np.linspace(0, len(stretches) - 1, count).round().astype(int)]
     episodes = [recording.episodes[number] for number, _ in chosen]
+    led = [slice(max(0, own.start - before), own.stop) for _, own in chosen]
     parts = tuple(
         replace(episode, time=episode.time[own], action=episode.action[own], state=episode.state[own], task_state=None)
-        for episode, (_, own) in zip(episodes, chosen, strict=True)
+        for episode, own in zip(episodes, led, strict=True)
         if episode.state is not None
     )
-    used = sum(len(part.time) for part in parts)
+    usable = []
+    for (number, own), whole in zip(chosen, led, strict=True):
+        rows_used = (
+            recording.usable[number][whole].copy() if recording.usable else np.ones(whole.stop - whole.start, bool)
+        )
+        rows_used[: own.start - whole.start] = False
+        usable.append(rows_used)
+    used = sum(own.stop - own.start for _, own in chosen)
     return replace(
         recording,
         episodes=parts,
-        sources=tuple(recording.sources[number] for number, _ in chosen),
-        usable=tuple(recording.usable[number][own] for number, own in chosen) if recording.usable else (),
+        sources=tuple(
+            f"{recording.sources[number]}, from {recording.episodes[number].time[own.start]:.1f} s"
+            for number, own in chosen
+        ),
+        usable=tuple(usable),
         warnings=(
             *recording.warnings,
             f"{sum(rows):,} rows are more than a diagnosis looks at: {used:,} of them were used, in {count} stretches "

@@ -17,7 +17,7 @@ from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import Convention, profile_of
 from visadapt.estimation.repeated_readings import RepeatedReadings, find_repeats
 from visadapt.estimation.segments import Segments, cut, interpolated
-from visadapt.recordings import Recording
+from visadapt.recordings import Episode, Recording
 from visadapt.recordings.thinning import spread
 from visadapt.systems import System
 from visadapt.systems.rigid_body import continuous_quaternion
@@ -42,6 +42,9 @@ class PreparedRecording:
 MIN_JITTER = 1e-3
 """Deviation of stamps from even spacing, in periods, above which a fit decides whether the readings share it."""
 
+MEMORY_TIME = 1.0
+"""s before a stretch of rows whose commands are used too: what is late, or lags, remembers them."""
+
 MOST_SEARCHES, STRETCH_WINDOWS = 24, 4
 """Most rows of a recording that are used, as a multiple of those that the search uses, and windows in a stretch of
 them: the intervals from so many rows are narrow already, and the time grows with the rows."""
@@ -51,7 +54,7 @@ def limited(recording: Recording, system: System) -> Recording:
     """The recording; where it has more rows than a diagnosis uses, stretches that are spread evenly over it."""
     profile = profile_of(system)
     stretch = STRETCH_WINDOWS * max(profile.window_rows, round(PREDICTION_TIME / recording.period))
-    return spread(recording, MOST_SEARCHES * profile.search_rows, stretch)
+    return spread(recording, MOST_SEARCHES * profile.search_rows, stretch, round(MEMORY_TIME / recording.period))
 
 
 def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effect]] = ()) -> PreparedRecording:
@@ -79,8 +82,10 @@ class _Readings:
     usable: list[Tensor]  # (T, m) 1 where the recording may be used
 
     def draft(self, stretches: Sequence[tuple[int, int, int]] | None = None) -> _Draft:
-        """Windows of the episodes, or of stretches of these."""
+        """Windows of the episodes from their first usable row on, or of stretches of these."""
         period = self.recording.period
+        if stretches is None:
+            stretches = [(k, first, len(self.states[k])) for k, first in enumerate(self.first_usable)]
         # A window holds predictions from half of its rows, however fast these follow each other.
         least = round(2 * PREDICTION_TIME / period)
         longest = max(profile_of(self.system).window_rows, least)
@@ -94,15 +99,21 @@ class _Readings:
             rows, raw = (replace(each, resolution=resolution) for each in (rows, raw))
         return _Draft(self, rows, raw)
 
+    @property
+    def first_usable(self) -> list[int]:
+        """The first row of each episode of which a reading may be used."""
+        return [int(rows.any(1).int().argmax()) for rows in self.usable]
+
     def whole(self, convention: Convention | None) -> Recording:
-        """Episodes from end to end, repeated readings filled in, in the signs of the source."""
+        """Episodes from their first usable row on, repeated readings filled in, in the signs of the source."""
         sign, command_sign = sensor_checks.signs(convention, self.channels), convention.command if convention else 1.0
-        parts = zip(self.recording.episodes, self.stamps, self.commands, self.states, self.repeats.used, strict=True)
+        parts = zip(self.stamps, self.commands, self.states, self.repeats.used, strict=True)
         episodes = []
-        for episode, time, command, state, used in parts:
+        for rows, first in zip(parts, self.first_usable, strict=True):
+            time, command, state, used = (values[first:] for values in rows)
             action, filled = (command_sign * command).numpy(), (sign * interpolated(state, used, time)).numpy()
-            episodes.append(replace(episode, time=time.numpy(), action=action, state=filled))
-        return replace(self.recording, episodes=tuple(episodes))
+            episodes.append(Episode(time.numpy(), action, filled))
+        return replace(self.recording, episodes=tuple(episodes), usable=())
 
 
 @dataclass(frozen=True)
