@@ -19,6 +19,7 @@ from visadapt.effects import (
     Dropout,
     Effect,
     FrictionPatch,
+    Gust,
     MeasurementDelay,
     Residual,
     RotorEfficiency,
@@ -79,6 +80,24 @@ def test_the_clock_runs_a_period_a_step_and_starts_at_zero_in_every_row(substeps
     for k in range(1, 4):
         at = world.step(at, torch.zeros(2, 1, dtype=torch.float64))
         assert at.time.tolist() == pytest.approx([0.04 * k] * 2)
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [Gust(start=0.11, end=0.135, force=10.0), FrictionPatch(start=0.01, end=0.04, coefficient=40.0)],
+    ids=lambda effect: effect.name,
+)
+def test_steps_resolve_where_an_effect_sets_in(effect):
+    state, actions = columns(0.0, 0.3, 0.0, 0.0), [columns(0.0)] * 6
+
+    def end(world):
+        return run(world, state, actions)[-1]
+
+    exact = end(World(CartPole(), [effect.double()], substeps=100))
+    acted = (end(World(CartPole())) - exact).abs().max()
+    for world in (World(CartPole(), [effect]), World(CartPole()).with_effects([effect])):
+        assert (end(world) - exact).abs().max() < 0.02 * acted
+    assert World(CartPole(), [effect], substeps=1).substeps == 1
 
 
 @pytest.mark.parametrize("integrator", ["euler", "midpoint", "rk3", "rk4"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -17,6 +18,15 @@ from visadapt.effects.camera import seen_by
 from visadapt.history import History
 from visadapt.systems import System
 from visadapt.systems.integrators import INTEGRATORS, Duration
+
+EDGE_STEP = 0.0125
+"""s, integration step that resolves the edges of abrupt loads (`PulseLaw`, `FrictionPatch`)."""
+
+
+def resolving(effects: Sequence[nn.Module], period: float) -> int:
+    """Integration steps in a period that resolve where effects set in; 1 where none does within a period."""
+    edges = (e.abrupt and not e.rubs() for e in effects if isinstance(e, DynamicsEffect))
+    return math.ceil(period / EDGE_STEP - 1e-9) if any(edges) else 1
 
 
 @dataclass(frozen=True)
@@ -37,7 +47,8 @@ class World(nn.Module):
         effects: what separates the target from it.
         period: s between commands.
         integrator: one of `visadapt.systems.integrators.INTEGRATORS`.
-        substeps: integration steps in a period.
+        substeps: integration steps in a period; None: one, or as many as it takes to resolve where an effect sets in
+            (a gust, a patch of friction).
 
     Raises:
         ValueError: an unknown integrator, or a period or number of substeps that is not positive.
@@ -56,12 +67,14 @@ class World(nn.Module):
         effects: Sequence[Effect] = (),
         period: float = 0.05,
         integrator: str = "rk4",
-        substeps: int = 1,
+        substeps: int | None = None,
     ) -> None:
         super().__init__()
         if integrator not in INTEGRATORS:
             raise ValueError(f"unknown integrator {integrator!r}; there are {', '.join(INTEGRATORS)}")
-        if not period > 0 or substeps < 1:
+        if substeps is None and period > 0:
+            substeps = resolving(effects, period)
+        if not period > 0 or substeps is None or substeps < 1:
             raise ValueError(f"period and substeps must be positive, got {period!r} s and {substeps!r}")
         for effect in effects:
             check_acts_on(system, effect)
@@ -89,8 +102,9 @@ class World(nn.Module):
         return torch.stack(values) if values else torch.zeros(0)
 
     def with_effects(self, effects: Sequence[Effect]) -> World:
-        """The same system and clock with these effects instead."""
-        return World(self.system, effects, self.period, self.integrator, self.substeps)
+        """The same system and clock with these effects instead, in steps that are at least as fine."""
+        steps = max(self.substeps, resolving(effects, self.period))
+        return World(self.system, effects, self.period, self.integrator, steps)
 
     def with_values(self, values: Tensor) -> World:
         """The same world with other values of the parameters of its effects.
