@@ -1,6 +1,7 @@
 """What `train` and `adapt` leave alone: the caller's world, and what they cannot know."""
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -59,6 +60,17 @@ def test_a_residual_is_no_part_of_a_source(policy):
     residual = va.Residual(StateResidualNetwork(4), torch.ones(4))
     with pytest.raises(ValueError, match="the source has a residual, which is learnt for a target"):
         va.adapt(policy, va.World(va.CartPole(), [residual]))
+
+
+def test_a_policy_that_aims_at_goals_of_another_clock_is_refused():
+    policy = va.load_policy(va.shipped("quadrotor"))
+    with pytest.raises(ValueError, match=r"aims at goals 0\.1 s apart, the source has 0\.05 s between actions"):
+        va.adapt(
+            policy,
+            va.World(va.Quadrotor(), period=0.05),
+            references=replace(waves(3, rows=21), period=0.05),
+            iterations=1,
+        )
 
 
 def test_a_flight_is_scored_over_fewer_steps_than_its_task_has_but_not_over_more():

@@ -171,6 +171,9 @@ class Setup:
                 f"the policy is a {type(policy).__name__} of {policy.n_state} states and {policy.n_action} commands; "
                 f"a {self.source.system.name} needs a {type(wanted).__name__} of {wanted.n_state} and {wanted.n_action}"
             )
+        own, here = (each.arguments.get("period", self.source.period) for each in (policy, wanted))
+        if abs(own - here) > 1e-6:
+            raise ValueError(f"the policy aims at goals {own:g} s apart, the source has {here:g} s between actions")
 
     def check_target(self, target: Target) -> None:
         """Raises ValueError where `target` has another period or another number of actions than the source."""
