@@ -34,8 +34,8 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add(
         "--policy",
         metavar="P.safetensors",
-        help="a policy on states, as `visadapt train` writes it: the terms of the paper's Theorem 1 are given for it, "
-        "on the terminal and in the report, and --plan adds to its commands",
+        help="a cart-pole's policy on states, as `visadapt train` writes it: the terms of the paper's Theorem 1 are "
+        "given for it, on the terminal and in the report, and --plan adds to its commands",
     )
     add("--json", metavar="F", help="write the result here as JSON (schema: visadapt/diagnosis/schema.json)")
     add("--report", metavar="F.html", help="write a page with figures here")
@@ -112,7 +112,7 @@ def train(parser: argparse.ArgumentParser) -> None:
         help="the camera, as `visadapt renderer` writes it; implies --frames (default: that of the drawn cart-pole)",
     )
     add("--references", metavar="F.csv", help="what a quadrotor is to follow: columns time, x, y, z in s and m")
-    add("--with-history", action="store_true", help="read the last 5 periods too, which show a changing force")
+    add("--with-history", action="store_true", help="let a cart-pole's policy on states read the last 5 periods")
     _add_effects(parser)
     add("--iterations", metavar="N", type=_positive, help="iterations of training (default: the system's own)")
     add("--seeing", metavar="N", type=_positive, help="iterations of the frame encoder's training")
@@ -131,7 +131,12 @@ def adapt(parser: argparse.ArgumentParser) -> None:
     _add_policy_and_target(parser)
     add("--out", required=True, metavar="FOLDER", help="folder of the run; it gets the policy, policy.safetensors")
     add("--samples", metavar="N", type=_positive, default=1000, help="steps of the target in all (default: 1000)")
-    add("--round", metavar="B", type=_positive, help="steps of the target in a round (default: a fifth of --samples)")
+    add(
+        "--round",
+        metavar="B",
+        type=_positive,
+        help="steps of the target in a round (default: a fifth of --samples, at least 20)",
+    )
     renderer_help = "the one that the policy was trained with (default: that of the drawn cart-pole)"
     add("--renderer", metavar="R.safetensors", help=renderer_help)
     add("--references", metavar="F.csv", help="what a quadrotor is to follow, if the target has none")
@@ -183,7 +188,9 @@ def _add_seed(parser: argparse.ArgumentParser) -> None:
 
 def _add_effects(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--diagnosis", metavar="D.json", help="put the effects that `visadapt diagnose --json` named into the simulator"
+        "--diagnosis",
+        metavar="D.json",
+        help="put the effects that `visadapt diagnose --json` named into the simulator, in place of those it has",
     )
     parser.add_argument(
         "--effect",
@@ -191,7 +198,7 @@ def _add_effects(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         help="put an effect into the simulator, as in viscous_friction:coefficient=2.1 (`visadapt effects` lists them "
-        "with their units); may be repeated",
+        "with their units), in place of those it has; may be repeated",
     )
     parser.add_argument("--effects", metavar="FILE.py", help="a file that defines effects of your own")
 
