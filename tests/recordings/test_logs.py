@@ -63,6 +63,13 @@ def test_a_slower_topic_gives_the_rows_and_the_others_are_interpolated(tmp_path)
     assert "/theta is interpolated" in " ".join(found.warnings)
 
 
+def test_a_bag_and_the_file_in_it_count_once(tmp_path):
+    path = ros_bag(tmp_path / "run", 2, stamped=False)
+    found = load_recording([path, next(path.glob("*.db3"))], CartPole(), ROS)
+    assert len(found.episodes) == 1
+    assert "holds the same as" in " ".join(found.warnings)
+
+
 def test_the_slower_topic_is_not_the_one_that_ends_first_and_what_is_cut_off_is_said(tmp_path):
     stamps = {"/x": np.arange(0, 10, 0.05), "/theta": np.arange(0, 1.5, 0.01), "/u": np.arange(0.5, 10, 0.05)}
     found = load_recording(numbers(tmp_path / "run", stamps), CartPole(), FIELDS)

@@ -140,7 +140,8 @@ def _files(paths: Sequence[str | os.PathLike[str]], note: Note) -> list[Path]:
 
 def _is_the_same(one: Path, other: Path) -> bool:
     with suppress(OSError):
-        return one.samefile(other) or filecmp.cmp(one, other, shallow=False)
+        bag = one.resolve() in other.resolve().parents or other.resolve() in one.resolve().parents
+        return bag or one.samefile(other) or filecmp.cmp(one, other, shallow=False)
     return False
 
 
