@@ -82,10 +82,10 @@ def untuned(setup: Setup, policy: Policy) -> Setup:
 
 def held_over_a_plan(setup: Setup, policy: Policy) -> Setup:
     """The residual's correction is constant over a plan, so that the gradient flows through the physics alone."""
-    plans, own = from_states(setup.source).refinement, setup.settings.refinement
+    plans, own = from_states(setup.source).refinement, setup.settings.tuning
     assert plans is not None
-    assert own is not None
-    held = replace(plans, iterations=300, streams=32, recorded=0.8, observation_noise=own.observation_noise)
+    held = replace(plans, recorded=own.recorded, observation_noise=own.observation_noise)
+    held = replace(held, iterations=300, streams=32)
     return replace(setup, settings=replace(setup.settings, tuning=held))
 
 

@@ -38,6 +38,8 @@ CODE = (
     "benchmarks/baselines",
     "benchmarks/blind",
     "assets/*.safetensors",
+    "constraints.txt",
+    "pyproject.toml",
 )
 """What tables depend on, as git's path patterns."""
 RUNS = Path("results/runs.json")

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import importlib
 import statistics
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -144,6 +144,8 @@ def main(settings: Settings) -> None:
         camera = work / "renderer.safetensors"
         renderer = learnt_renderer(camera, states, target.show, GUESS, settings.renderer_steps, report)
         setup = cartpole_frames(World(SOURCE, period=target.period), renderer)
+        # The suite begins a new episode by itself after LENGTH steps.
+        setup = replace(setup, settings=replace(setup.settings, longest_episode=LENGTH // REPEAT))
         source = work / "source" / "policy.safetensors"
         policy = setup.pretrain(source, 0, report)
         earned = {0: [_returns(work / "before.json", policy, target, settings.episodes)]}

@@ -102,7 +102,8 @@ def main(settings: Settings) -> None:
 
     rows = rows_of(GENTLY, EPISODES * ROWS, [each["answer"] for each in found])
     for method in (PLANNED, WHITE, NEITHER):
-        rows += rows_of(f"{GENTLY}, then {method}", MORE_ROWS, [each["after"][method] for each in planned])
+        answers = [each["after"][method] for each in planned]
+        rows += rows_of(f"{GENTLY}, then {method}", EPISODES * ROWS + MORE_ROWS, answers)
     write_rows(settings.out, rows)
     for each in rows:
         print(f"{each.method:60} {each.measure:24} {each.mean:.2f} of {each.episodes}")
@@ -133,7 +134,8 @@ def _outcome(hidden: va.Effect, seed: int) -> dict[str, Any]:
     if not plan.settles:
         return out
     added = torch.from_numpy(plan.added)
-    noise = torch.randn(added.shape, generator=torch.Generator().manual_seed(seed), dtype=added.dtype)
+    # Of another seed than the plan's own, which tries white noise too.
+    noise = torch.randn(added.shape, generator=torch.Generator().manual_seed(200 + seed), dtype=added.dtype)
     white = added.square().mean().sqrt() * noise
     after = {}
     for method, excitation in ((PLANNED, added), (WHITE, white), (NEITHER, torch.zeros_like(added))):

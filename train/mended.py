@@ -120,8 +120,9 @@ def _cause(cause: dict[str, Any]) -> str:
     found = {name: Estimate(**value) for name, value in cause["parameters"].items()}
     parts = [f"{name} {estimate(one)} (90 %: {interval(one)})" for name, one in found.items()]
     unit = next(iter(found.values())).unit
-    hidden = with_unit(f"{HIDDEN[cause['effect']]:g}", unit)
-    return f"{plain(cause['effect'])}: {', '.join(parts)}; hidden: {hidden}"
+    line = f"{plain(cause['effect'])}: {', '.join(parts)}"
+    hidden = HIDDEN.get(cause["effect"])
+    return line if hidden is None else f"{line}; hidden: {with_unit(f'{hidden:g}', unit)}"
 
 
 if __name__ == "__main__":

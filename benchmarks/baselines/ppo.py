@@ -19,11 +19,10 @@ from torch import Tensor
 
 from benchmarks.baselines.courses import Balancing, Course, flying, starting
 from benchmarks.baselines.machines import MACHINES, Machines
-from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage, score_path, unadapted
+from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage, unadapted
 from experiments.kept_scores import kept_score
 from visadapt.history import History
 from visadapt.policies import Policy
-from visadapt.storage.run_folder import read_json
 from visadapt.targets import FlightTarget, SyntheticTarget
 from visadapt.targets.synthetic import WorldTarget, no_effects
 
@@ -36,7 +35,7 @@ LOOKS = 5
 GAMMA = 0.99
 LOG_STD = -1.5
 CURVE = (2048, 4096, 10240, 20480, 51200, 102400, 200704)
-"""samples after which the fine-tuned policy is scored, until it has reached the best of ours"""
+"""samples after which the fine-tuned policy is scored"""
 
 
 class Trained(Policy):
@@ -80,7 +79,7 @@ def pretrained(problem: Problem, course: Course, sizes: Sizes, path: Path, seed:
     if path.exists():
         return PPO.load(path, env=machines, device="cpu")
     model = PPO("MlpPolicy", machines, **settings_of(seed))
-    best = (math.inf, math.inf)
+    best, kept_so_far = (math.inf, math.inf), path.with_name("source-best.zip")
     for look in range(LOOKS):
         model.learn(sizes.source_steps // LOOKS, reset_num_timesteps=False)
         kept = path.with_name(f"source-{look}.json")
@@ -89,7 +88,8 @@ def pretrained(problem: Problem, course: Course, sizes: Sizes, path: Path, seed:
         row = problem.row("PPO", "source", 0, [kept])
         if (row.failed, row.mean) < best:
             best = row.failed, row.mean
-            model.save(path)
+            model.save(kept_so_far)
+    kept_so_far.rename(path)
     return PPO.load(path, env=machines, device="cpu")
 
 
@@ -104,17 +104,6 @@ def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[
     assert isinstance(target, WorldTarget)
     model.set_env(Machines(course, target.draw_effects, None, seed))
     model.num_timesteps = 0
-    goal = _best_of_ours(folder)
     for samples in [each for each in CURVE if each <= sizes.target_steps + ROLLOUT]:
         model.learn(samples - model.num_timesteps, reset_num_timesteps=False)
-        stage = Stage("adapted", samples, policy)
-        yield stage
-        found = read_json(score_path(folder, stage))
-        if "survived" in found and found["survived"] == found["episodes"] and found["mean_speed"] <= goal:
-            return
-
-
-def _best_of_ours(folder: Path) -> float:
-    """The least speed of a cart-pole of ours in this problem and seed, m/s; 0 where it has not been run."""
-    paths = (folder.parents[2] / "ours" / folder.parent.name / folder.name).glob("score-adapted-*.json")
-    return min((read_json(path)["mean_speed"] or math.inf for path in paths), default=0.0)
+        yield Stage("adapted", samples, policy)

@@ -98,7 +98,7 @@ def main(settings: Settings) -> None:
     in_processes(_scores, settings, jobs)
     rows = [
         row
-        for experiment in PROBLEMS
+        for experiment in settings.experiments
         for name, method in BASELINES.items()
         for row in _rows(experiment, method, [_folder(settings, name, experiment, seed) for seed in seeds])
     ]

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import nn
 
+import visadapt as va
 from tests.flying import PERIOD, drag, push, seeded, small_quadrotor, straight, waves
 from visadapt.effects import ConstantForce
 from visadapt.evaluation import score
@@ -121,6 +122,14 @@ class TestTarget:
             assert one.episode.samples == int((away.norm(dim=1) > 1.0).int().argmax())
             assert not one.survived
             assert other.survived
+
+    def test_beyond_its_point_a_flight_may_go_where_it_likes(self):
+        policy = va.load_policy(va.shipped("fixed_wing"))
+        task = va.setup_for(va.World(va.FixedWing()), policy).settings.source.task
+        near, far = (FlightTarget(task, FixedWing(), reach=reach) for reach in (5.0, math.inf))
+        ended, whole = (score(policy, target, episodes=8, seed=0) for target in (near, far))
+        assert ended == whole
+        assert math.isfinite(ended.mean)
 
     def test_a_step_before_a_reset_is_an_error(self):
         with pytest.raises(TargetError, match="synthetic vehicle: step before reset"):

@@ -148,7 +148,7 @@ def read_stretches(
             size = sum(dataset.nbytes for each in every for dataset in each.values())
             used = [kept(start, end, max(1, math.ceil(size / most_bytes))) for start, end in pairwise(starts)]
             episodes = {
-                number: _read_episode(path, file, number, datasets, rows)
+                number: _read_episode(path, number, datasets, rows)
                 for number, (datasets, rows) in enumerate(zip(every, used, strict=True))
                 if rows.any() or not rows.size
             }
@@ -255,9 +255,7 @@ def _datasets(path: Path, file: h5py.File, number: int, frames: bool) -> dict[st
     return found
 
 
-def _read_episode(
-    path: Path, file: h5py.File, number: int, datasets: Mapping[str, h5py.Dataset], rows: NDArray[np.bool_]
-) -> Episode:
+def _read_episode(path: Path, number: int, datasets: Mapping[str, h5py.Dataset], rows: NDArray[np.bool_]) -> Episode:
     where = f"{path}: {_group_name(number)}"
     arrays = {name: _read_dataset(dataset, name, where, rows) for name, dataset in datasets.items()}
     try:

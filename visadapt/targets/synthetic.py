@@ -183,7 +183,7 @@ class FlightTarget(WorldTarget):
         task: where flights start and what a policy is shown.
         system: its physics.
         draw_effects: draws the hidden effects of a batch of flights.
-        reach: m off its task's line beyond which a flight ends.
+        reach: m off its task's line beyond which a flight ends, unless it has its task behind it.
 
     >>> import torch, visadapt as va
     >>> from visadapt.tasks.reach import Reach
@@ -219,6 +219,7 @@ class FlightTarget(WorldTarget):
     def _observe(self) -> Observation:
         seen = super()._observe()
         assert seen.force is not None
-        near = self.task.distance_off(self._at.state, self._task_state) <= self.reach
+        where = self._at.state, self._task_state
+        near = (self.task.distance_off(*where) <= self.reach) | self.task.passed(*where)
         goal = self.task.goal(self._task_state)
         return Observation(seen.state, seen.alive & near, None, seen.force[:, :3], goal, self._task_state)

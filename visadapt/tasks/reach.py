@@ -70,6 +70,9 @@ class Reach(FlightTask):
         position = state[:, POSITION]
         return (position - (position * along).sum(-1, keepdim=True) * along).norm(dim=-1)
 
+    def passed(self, state: Tensor, task_state: Tensor) -> Tensor:
+        return (state[:, POSITION] * task_state).sum(-1) >= task_state.square().sum(-1)
+
     def training_start(self, batch: int, progress: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """In level flight somewhere on the way, half of the streams at its beginning."""
         state, task_state = self.evaluation_start(batch, generator)
