@@ -11,7 +11,7 @@ from tests.scenes import (
     small_renderer,
     stir,
 )
-from visadapt.effects import ActuatorDelay, ActuatorGain, ConstantForce, DynamicsEffect, Residual
+from visadapt.effects import ActuatorDelay, ActuatorGain, ConstantForce, CoulombFriction, DynamicsEffect, Residual
 from visadapt.evaluation import score
 from visadapt.history import HORIZON, History
 from visadapt.learning.plans import ClosedLoop, imagine
@@ -221,6 +221,10 @@ class TestOpposing:
         known = [ActuatorGain(scale=0.5), ActuatorDelay(delay=0.1)]
         found = self.answered(2.0, torch.ones(4), torch.ones(4), known)
         torch.testing.assert_close(found, torch.full((10,), -4.0), rtol=1e-3, atol=1e-3)
+
+    def test_dry_friction_that_is_known_does_not_hide_what_a_command_does(self):
+        found = self.answered(2.0, torch.ones(4), torch.ones(4), [CoulombFriction(force=4.0)])
+        torch.testing.assert_close(found, torch.full((10,), -2.0), rtol=1e-3, atol=1e-3)
 
     def test_what_no_command_can_do_is_met_by_the_nearest_that_one_can(self):
         scale = torch.tensor([0.003, 0.1, 0.004, 0.15])

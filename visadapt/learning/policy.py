@@ -18,6 +18,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from visadapt.effects import DynamicsEffect, Effect
 from visadapt.estimation.linearise import linearise_step
 from visadapt.history import HORIZON
 from visadapt.learning.plans import ClosedLoop, KeptPlans, Plans
@@ -72,8 +73,11 @@ class TuneSettings:
 def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None:
     """Make the feed-forward cancel the correction that the residual predicts, by least squares about rest.
 
-    `scale` (n_state,) is the residual's, the unit of the corrections that the policy reads.
+    Joints count as moving: of a small command dry friction would let nothing through. `scale` (n_state,) is the
+    residual's, the unit of the corrections that the policy reads.
     """
+    effects = [effect for effect in source.effects if isinstance(effect, Effect)]
+    source = source.with_effects([e for e in effects if not (isinstance(e, DynamicsEffect) and e.rubs())])
     rest = torch.zeros(1, policy.n_state, dtype=torch.float64)
     still = rest.new_zeros(1, source.substeps, policy.n_action)
     with torch.no_grad():
