@@ -126,6 +126,7 @@ class TestTarget:
     def test_beyond_its_point_a_flight_may_go_where_it_likes(self):
         policy = va.load_policy(va.shipped("fixed_wing"))
         task = va.setup_for(va.World(va.FixedWing()), policy).settings.source.task
+        assert isinstance(task, Reach)
         near, far = (FlightTarget(task, FixedWing(), reach=reach) for reach in (5.0, math.inf))
         ended, whole = (score(policy, target, episodes=8, seed=0) for target in (near, far))
         assert ended == whole
