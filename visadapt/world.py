@@ -190,6 +190,16 @@ class World(nn.Module):
             state = state + (self.correction(action, history) if correction is None else correction)
         return WorldState(at.time + self.period, state, (*acting, *chain(*others)))
 
+    def steps_along(self, states: Tensor, actions: Tensor) -> Tensor:
+        """The step from each of the states (B, T, n) that follow each other, under actions (B, T, n_action).
+
+        Actuation effects remember the actions given here, but none before them; the time in the episode counts as 0.
+        """
+        memory = self.memories(states[:, 0], actions, states)
+        before = tuple(each[:, :-1].flatten(0, 1) for each in memory)
+        at = WorldState(states.new_zeros(states[..., 0].numel()), states.flatten(0, 1), before)
+        return self.step(at, actions.flatten(0, 1)).state.unflatten(0, states.shape[:2])
+
     def correction(self, action: Tensor, history: History | None) -> Tensor:
         """What the residuals add (B, n_state) to the state after a period with `action` (B, n_action)."""
         if history is None:

@@ -1,7 +1,6 @@
 """The baselines are set the same problem, and their models are what they say."""
 
 import csv
-from functools import partial
 
 import pytest
 import torch
@@ -16,7 +15,6 @@ from tests.flying import waves
 from visadapt.effects import ConstantForce, LinearDrag, PeriodicForce, Residual
 from visadapt.history import HORIZON, LENGTH, History
 from visadapt.policies.networks import FlightResidualNetwork, StateResidualNetwork
-from visadapt.setups.policy_file import source_steps
 from visadapt.systems import CartPole, FixedWing, Quadrotor
 from visadapt.targets import FlightTarget, SyntheticTarget
 from visadapt.tasks.follow import Follow
@@ -62,7 +60,7 @@ def test_the_model_of_the_mpc_of_a_vehicle_is_the_world_with_the_residual(kind, 
     from benchmarks.baselines.symbolic import step, weights
 
     source = World(kind(), period=0.1, substeps=2)
-    network = FlightResidualNetwork(kind(), 0.1, partial(source_steps, source) if with_history else None).double()
+    network = FlightResidualNetwork(kind(), 0.1, source.steps_along if with_history else None).double()
     assert isinstance(network.head, torch.nn.Linear)
     generator = torch.Generator().manual_seed(0)
     network.head.weight.data = 0.01 * torch.randn(network.head.weight.shape, generator=generator, dtype=torch.float64)

@@ -1,7 +1,6 @@
 """What the vehicles' residual learns from a few hundred samples."""
 
 import math
-from functools import partial
 
 import numpy as np
 import pytest
@@ -16,14 +15,13 @@ from visadapt.learning.plans import imagine
 from visadapt.learning.transitions import Transitions
 from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.recordings import Episode
-from visadapt.setups.policy_file import source_steps
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION, VELOCITY
 from visadapt.world import World
 
 RATE = 0.3
 SOURCE = World(Quadrotor(), period=PERIOD, substeps=2)
-predict = partial(source_steps, SOURCE)
+predict = SOURCE.steps_along
 
 
 def a_network(with_history=False):
@@ -201,14 +199,14 @@ class TestNetwork:
 
     def test_it_fits_a_wing_as_well(self, with_history):
         source = World(FixedWing(), period=0.05)
-        back = partial(source_steps, source) if with_history else None
+        back = source.steps_along if with_history else None
         assert FlightResidualNetwork(FixedWing(), 0.05, back)(self.history()).shape == (3, 13)
 
 
 def test_what_a_named_lag_explains_is_not_left_over_whatever_the_commands_before():
     """A source that forgot its commands between two rows would blame the lag's memory on a disturbance."""
     source = World(Quadrotor(), [ActuatorLag(time_constant=0.08)], PERIOD, substeps=2).requires_grad_(False)
-    network = FlightResidualNetwork(Quadrotor(), PERIOD, partial(source_steps, source)).double()
+    network = FlightResidualNetwork(Quadrotor(), PERIOD, source.steps_along).double()
     state = torch.zeros(3, 13, dtype=torch.float64)
     state[:, 6] = 1.0
     at = source.start(state)

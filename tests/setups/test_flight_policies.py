@@ -1,5 +1,3 @@
-from functools import partial
-
 import pytest
 import torch
 
@@ -9,7 +7,6 @@ from visadapt.effects import Residual
 from visadapt.history import LENGTH, History
 from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.policies.networks import FlightResidualNetwork
-from visadapt.setups.policy_file import source_steps
 from visadapt.storage.checkpoints import CheckpointError, load_network, save_network
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION, rotation
@@ -46,7 +43,7 @@ def a_residual(kind, dtype=torch.float64):
     system, period = (Quadrotor(), PERIOD) if kind == "follow" else (FixedWing(), 0.05)
     source = World(system, period=period)
 
-    network = FlightResidualNetwork(system, period, partial(source_steps, source))
+    network = FlightResidualNetwork(system, period, source.steps_along)
     return Residual(stir(network), torch.ones(13)).to(dtype)
 
 
@@ -112,7 +109,7 @@ class TestPolicies:
     def test_what_its_residual_tells_of_the_past_is_heard_once_it_has_learnt_to_listen(self, kind):
         policy = made(kind, torch.float64)
         source = World(Quadrotor(), period=PERIOD)
-        network = FlightResidualNetwork(Quadrotor(), PERIOD, partial(source_steps, source)).double()
+        network = FlightResidualNetwork(Quadrotor(), PERIOD, source.steps_along).double()
         policy.residual = Residual(network, torch.ones(13).double())
         calm = a_history(kind)
         pushed = History(calm.observations.clone(), calm.actions)

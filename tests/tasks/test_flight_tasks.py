@@ -1,6 +1,5 @@
 import dataclasses
 import math
-from functools import partial
 
 import pytest
 import torch
@@ -15,7 +14,6 @@ from visadapt.learning.streams import Streams
 from visadapt.learning.transitions import Transitions
 from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.policies.networks import FlightResidualNetwork
-from visadapt.setups.policy_file import source_steps
 from visadapt.systems import FixedWing, Quadrotor
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
 from visadapt.targets.rollout import run
@@ -255,7 +253,7 @@ class TestStreams:
         transitions = Transitions.cut([each.episode for each in flown])
         made = Streams(self.WORLD, task, identity, transitions, 40, 1000, 1.0, torch.zeros(()))
         made.start(0.0, seeded(5))
-        network = FlightResidualNetwork(Quadrotor(), PERIOD, partial(source_steps, self.WORLD))
+        network = FlightResidualNetwork(Quadrotor(), PERIOD, self.WORLD.steps_along)
 
         def unexplained(history):
             return network.unexplained(network.predict, history.observations[..., :13], history.actions)
@@ -328,7 +326,7 @@ class Imagined:
     def __init__(self, task, system, period, policy):
         self.task = task
         source = World(system, period=period)
-        network = FlightResidualNetwork(system, period, partial(source_steps, source))
+        network = FlightResidualNetwork(system, period, source.steps_along)
         self.residual = Residual(stir(network.double(), 1), torch.full((13,), 0.02)).double()
         self.world = World(system, [self.residual, LinearDrag(coefficient=0.3)], period).requires_grad_(False)
         state, self.task_state = task.training_start(3, 1.0, seeded(2))

@@ -24,4 +24,4 @@ def run(options: argparse.Namespace) -> None:
         write_json(Path(options.json), {**asdict(found), **about})
     if options.film:
         with checked():
-            film(policy, target, options.film)
+            film(policy, target, options.film, seed=options.seed)

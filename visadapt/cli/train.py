@@ -25,7 +25,7 @@ from visadapt.storage.atomic_files import replacing
 from visadapt.systems import CartPole, Quadrotor
 from visadapt.tasks.references import read_reference
 from visadapt.weights import shipped
-from visadapt.world import World
+from visadapt.world import World, resolving
 
 LONGEST_STEP = 0.05
 """Longest integration step of the simulator, s."""
@@ -50,7 +50,9 @@ def run(options: argparse.Namespace) -> None:
 def _setup(options: argparse.Namespace) -> Setup:
     system = the_system(options)
     period = options.period or (0.1 if isinstance(system, Quadrotor) else 0.05)
-    world = World(system, given_effects(options, system), period, substeps=math.ceil(period / LONGEST_STEP))
+    effects = given_effects(options, system)
+    steps = max(math.ceil(period / LONGEST_STEP), resolving(effects, period))
+    world = World(system, effects, period, substeps=steps)
     renderer = options.renderer or (shipped("renderer") if options.frames else None)
     if renderer and not isinstance(system, CartPole):
         raise InputError(f"a {system.name} has no renderer: --frames and --renderer are for a cartpole")

@@ -23,6 +23,7 @@ from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.stability import stable
 from visadapt.learning.transitions import Observe, Transitions
 from visadapt.policies import Policy
+from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, read_recording, write_recording
 from visadapt.storage.checkpoints import fitting, load_tree, load_weights, save_tree
@@ -31,6 +32,8 @@ from visadapt.targets.rollout import run
 from visadapt.world import World
 
 COLLECTING, GROUNDING, TUNING, ACCEPTING = range(4)  # Stages of a round, each with random numbers of its own
+
+LARGEST_SEED = 2**63 - 1  # That a generator takes
 
 EXPLORATION = 0.05  # Standard deviation of white noise on the commands while data are collected
 
@@ -59,7 +62,7 @@ class RoundFolder:
     def of(cls, run: Path, number: int, count: int, seed: int) -> RoundFolder:
         """Round `number`, from 0, of `count` rounds in the folder `run`, with the run's seed."""
         path, name = run / f"round-{number + 1:02d}", f"round {number + 1}/{count}"
-        return cls(path, name, 1_000_000 * seed + 10 * number)
+        return cls(path, name, (1_000_000 * seed + 10 * number) % LARGEST_SEED)
 
     @property
     def recording(self) -> Path:
@@ -135,6 +138,7 @@ class JointLearning:
         self._collect(folder, samples)
         if self.explain is not None:
             self.found = self.explain(self.recorded, folder.diagnosis)
+            self._estimate_beside_what_is_known()
         if self.found.complete:
             losses: list[GroundLoss] = []
             self.residual.network.load_state_dict(self.untrained)
@@ -143,6 +147,13 @@ class JointLearning:
             losses, transitions = self._ground(folder)
             tuning = self._tune_with_residual(folder, transitions)
         return Round(self.ledger.used, losses, tuning, self.found)
+
+    def _estimate_beside_what_is_known(self) -> None:
+        """Let a vehicle's disturbance estimate be of what the named effects leave unexplained too, as it will be where
+        the adapted policy is read from its file."""
+        network = self.residual.network
+        if isinstance(network, FlightResidualNetwork) and network.predict is not None:
+            network.predict = self.known.steps_along
 
     def _collect(self, folder: RoundFolder, samples: int) -> None:
         """Run the policy on the target for so many samples, or read those that it has run."""

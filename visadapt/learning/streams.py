@@ -94,7 +94,9 @@ class Streams:
                 times, state = an_episode(self.world, self.task)
             else:
                 times, state = self.transitions.time, self.transitions.state[:1]
-                self._recorded = self.transitions.start(self.world) if self.recorded > 0 else None
+                # Without the progress of its task, where a flight is to go from a recorded state is not known.
+                known = not isinstance(self.task, FlightTask) or self.transitions.task_states.shape[-1] > 0
+                self._recorded = self.transitions.start(self.world) if self.recorded > 0 and known else None
             self._times = times if depends_on_time(self.world, times.unique(), state) else None
 
     @torch.no_grad()

@@ -23,7 +23,7 @@ from visadapt.policies.networks import FlightResidualNetwork, ImageResidualNetwo
 from visadapt.storage.checkpoints import CheckpointError, check_sizes, fitting, load_tree, load_weights, save_network
 from visadapt.systems import SYSTEMS, RigidBody
 from visadapt.systems.base import NAMED
-from visadapt.world import World, WorldState
+from visadapt.world import World
 
 KINDS: dict[str, type[Policy]] = {kind.__name__: kind for kind in (ImagePolicy, StatePolicy, FollowPolicy, ReachPolicy)}
 
@@ -195,18 +195,7 @@ def residual_for(
         physics = system if policy.with_history else None
         network = StateResidualNetwork(policy.n_state, policy.n_action, physics, period)
     elif isinstance(policy, FlightPolicy) and isinstance(system, RigidBody):
-        network = FlightResidualNetwork(system, period, partial(source_steps, source) if with_history else None)
+        network = FlightResidualNetwork(system, period, source.steps_along if with_history else None)
     else:
         raise TypeError(f"no residual is known for a {type(policy).__name__} of a {system.name}")
     return Residual(network, torch.ones(policy.n_state))
-
-
-def source_steps(source: World, states: Tensor, actions: Tensor) -> Tensor:
-    """The source's step from each of the states (B, T, n) that follow each other, under actions (B, T, n_action).
-
-    Actuation effects remember the actions given here, but none before them; the time in the episode counts as 0.
-    """
-    memory = source.memories(states[:, 0], actions, states)
-    before = tuple(each[:, :-1].flatten(0, 1) for each in memory)
-    at = WorldState(states.new_zeros(states[..., 0].numel()), states.flatten(0, 1), before)
-    return source.step(at, actions.flatten(0, 1)).state.unflatten(0, states.shape[:2])

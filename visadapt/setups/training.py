@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import overload
 
+import torch
+
 from renderers import LayeredRenderer
 from visadapt.learning.joint import Adapted
 from visadapt.policies import ImagePolicy, Policy, StatePolicy
@@ -169,7 +171,8 @@ def adapt(
         the effects that were found.
 
     Raises:
-        ValueError: a policy of another system, a target of another period or with other actions, or too few samples.
+        ValueError: a policy of another system, a target of another period or with other actions, too few samples, or
+            other references than a target's own, with a history.
         TargetError: the target misbehaves.
 
     >>> import visadapt as va
@@ -180,8 +183,11 @@ def adapt(
     >>> result.ledger.used
     20
     """
-    if references is None and isinstance(target, FlightTarget) and isinstance(target.task, Follow):
-        references = target.task.references
+    if isinstance(target, FlightTarget) and isinstance(target.task, Follow):
+        courses = target.task.references
+        if references is not None and with_history and not torch.equal(references.positions, courses.positions):
+            raise ValueError("the target has references of its own, from which histories start: give no others")
+        references = courses if references is None else references
     setup = setup_for(copy.deepcopy(source), policy, renderer, references, with_history)
     if iterations is not None:
         own = setup.settings

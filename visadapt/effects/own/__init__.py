@@ -60,7 +60,10 @@ def _alike(system: System) -> Iterator[tuple[str, str]]:
         stronger = system.derivative(state, command * (1 + unit), rest)
         for field in scalable(system):
             for factor in (2.0, 0.5):
-                scaled: Any = replace(system, **{field: factor * getattr(system, field)})  # type: ignore[type-var]
+                try:
+                    scaled: Any = replace(system, **{field: factor * getattr(system, field)})  # type: ignore[type-var]
+                except ValueError:  # the system has no such value of this parameter beside the others
+                    continue
                 if equal(scaled.derivative(state, command, rest), stronger):
                     yield f"{action.name}.actuator_gain", f"{field}.scale"
 
