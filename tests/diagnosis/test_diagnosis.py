@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tests.diagnosed import record
+from tests.diagnosed import NOISE, record
 from visadapt import diagnose
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.effects import (
@@ -127,6 +127,8 @@ def test_one_effect_is_named_with_its_size(effect):
     assert estimate.value == pytest.approx(truth, rel=0.2)
     assert estimate.ci90[0] < estimate.value < estimate.ci90[1]
     assert result.gap.closed > 0.9
+    for shown in result.figures.predictions:
+        assert np.sqrt(np.nanmean((shown.corrected - shown.measured) ** 2)) < 3 * NOISE[0]
 
 
 def diagnosed_push():
@@ -300,11 +302,6 @@ def test_a_repeated_diagnosis_is_equal(pushed):
 def test_probabilities_sum_to_one(pushed):
     assert sum(ranked.probability for ranked in pushed.ranking) == pytest.approx(1)
     assert all(0 <= cause.probability <= 1 for cause in pushed.causes)
-
-
-def test_a_source_with_effects_is_refused():
-    with pytest.raises(ValueError, match="the world has viscous_friction; give the source without effects"):
-        diagnose(record(), World(CartPole(), [ViscousFriction(coefficient=1.0)]))
 
 
 def test_error_grows_with_the_horizon(pushed):

@@ -33,6 +33,22 @@ def jittered(read_late: bool):
     return dataclasses.replace(WHOLE, episodes=tuple(episodes), measured=("x", "theta"))
 
 
+def test_lost_rows_are_counted_among_those_that_may_be_used():
+    generator = np.random.default_rng(0)
+    episodes, usable, lost = [], [], 0
+    for episode in record(episodes=4, rows=100).episodes:
+        state, kept = episode.state.copy(), generator.random(100) < 0.6
+        for row in np.flatnonzero(generator.random(100) < 0.15):
+            state[row] = state[row - 1] if row else state[row]
+            lost += bool(row and kept[row])
+        episodes.append(Episode(episode.time, episode.action, state))
+        usable.append(kept)
+    whole = dataclasses.replace(record(episodes=4, rows=100), episodes=tuple(episodes), usable=tuple(usable))
+    repeats = prepare(whole, CartPole()).repeats
+    assert sum(int(rows.sum()) for rows in repeats.lost) == lost
+    assert sum(int(rows[1:].sum()) for rows in repeats.seen) == sum(rows[1:].sum() for rows in usable)
+
+
 def with_filtered_velocities(recording):
     """The same with velocities as a rig derives them: differences through a first-order filter of 0.1 s."""
     episodes = []

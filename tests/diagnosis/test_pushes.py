@@ -123,6 +123,15 @@ def test_a_kick_of_the_cart_is_found():
     assert push.impulse == pytest.approx(4.0 * 0.1 * math.sqrt(2 * math.pi), rel=0.3)
 
 
+def test_a_joint_that_stands_still_in_one_episode_hides_no_push_of_another():
+    whole = balanced(4.0, 0.0)
+    run = whole.episodes[0]
+    still = Episode(run.time, 0 * run.action, 0 * run.state)
+    both = Recording((still, run), whole.measured, whole.period, ("still", "run"))
+    with torch.inference_mode():
+        assert {push.episode for push in pushes(both, World(CartPole()))} == {1}
+
+
 def balanced(force, jitter, seed=0):
     """12 s of a cart-pole that is balanced by feedback, read by encoders, with a push of `force` N for about 0.5 s at
     8 s; steps of the clock are up to `jitter` longer than 20 ms."""

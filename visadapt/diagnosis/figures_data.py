@@ -80,15 +80,17 @@ def _predictions(search: Search, source: RolloutErrors, corrected: RolloutErrors
             continue
         start = best * source.stride
         end = start + horizon
+        channels = list(rows.channels)
         measured = np.full((horizon + 1, source.predicted.shape[-1]), np.nan)
-        measured[:, list(rows.channels)] = rows.measured[window, start : end + 1].numpy()
+        shown = rows.measured[window, start : end + 1].masked_fill(rows.used[window, start : end + 1] == 0, math.nan)
+        measured[:, channels] = shown.numpy()
         out.append(
             Prediction(
                 int(rows.episode[window]),
                 rows.time[window, start : end + 1].numpy(),
                 measured,
-                source.predicted[window, best].numpy(),
-                corrected.predicted[window, best].numpy(),
+                source.expected(window, best, channels).numpy(),
+                corrected.expected(window, best, channels).numpy(),
             )
         )
     return tuple(out)

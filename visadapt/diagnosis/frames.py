@@ -147,6 +147,7 @@ def _without_gap(motion: Diagnosis, seen_by_a_faulty_camera: bool, system: Syste
         motion,
         verdict=IDENTIFIED if drops else NO_GAP,
         causes=drops,
+        partial=(),
         where=replace(motion.where, stages=stages | ({Stage.CAMERA.value: 1.0} if drops else {})),
         next_experiment="" if drops else next_experiment.more(profile_of(system)),
     )

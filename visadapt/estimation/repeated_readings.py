@@ -41,6 +41,7 @@ class RepeatedReadings:
 
     used: list[Tensor]  # (T, m) 1 where a reading is a measurement
     lost: list[Tensor]  # (T,) whether the whole row is repeated
+    seen: list[Tensor]  # (T,) whether the row may be used, so that its loss would be seen
     frozen: list[Tensor]  # (T,) whether the angle is repeated and the rest of the row is not
     silent: list[Tensor]  # (T,) whether a row tells nothing of the angles at which the sensor stands still
 
@@ -75,7 +76,8 @@ def find_repeats(
         waking[1:] = partial[:-1] & ~partial[1:]
         used.append(1.0 - (whole[:, None] | partial | waking).double())
     silent = [whole | (still & ~sure) for whole, still, sure in zip(lost, doubtful, frozen, strict=True)]
-    return RepeatedReadings(used, lost, frozen, silent)
+    seen = [torch.ones_like(whole) for whole in lost]
+    return RepeatedReadings(used, lost, seen, frozen, silent)
 
 
 def _between_held(angles: Sequence[Tensor], frozen: Sequence[Tensor]) -> list[Tensor]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import io
 import re
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -76,7 +77,8 @@ def _most_wrong(one: Prediction, measured: Sequence[int]) -> list[int]:
     """The MAX_STATES measured states with the largest error of the source relative to its change from row to row, a
     measure of the noise."""
     error = (one.source - one.measured)[:, measured]
-    relative = np.sqrt((error**2).mean(0) / (np.diff(error, axis=0) ** 2).mean(0).clip(1e-300))
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of a state without two readings in a row
+        relative = np.sqrt(np.nanmean(error**2, 0) / np.nanmean(np.diff(error, axis=0) ** 2, 0).clip(1e-300))
     return sorted(measured[k] for k in np.argsort(-relative)[:MAX_STATES])
 
 

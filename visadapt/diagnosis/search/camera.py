@@ -76,7 +76,9 @@ class CameraFindings:
                 parameters[p.name] = Estimate(value, p.unit, (p.low, p.high) if p.name in self.fixed else (low, high))
             closed = (self.unchanged.misfit - self.alone[kind].misfit) / whole
             reopened = (self.without[kind].misfit - self.best.misfit) / whole
-            out.append(Cause(kind.name, parameters, 1.0, closed, reopened, indistinguishable_from=self.alike[kind]))
+            named = {other.name for other in self.best.camera}
+            alike = tuple(name for name in self.alike[kind] if name not in named)
+            out.append(Cause(kind.name, parameters, 1.0, closed, reopened, indistinguishable_from=alike))
         return out
 
 

@@ -95,7 +95,8 @@ def regions_of(found: Disturbance, seed: int) -> list[Region]:
         p_value = min(1.0, p_value * len(tested))
         contained = float(total[0, best] / len(power))
         if p_value <= max(MAX_P_VALUE, len(tested) / (1 + SHIFTS)) and contained > REGION_SHARE:
-            out.append(Region(name, float(edges[first[best]]), float(edges[last[best]]), contained, p_value))
+            within = found.variables[name].flatten()[here][(bins >= first[best]) & (bins < last[best])]
+            out.append(Region(name, float(within.min()), float(within.max()), contained, p_value))
     return sorted(out, key=lambda region: (region.p_value, -region.share))
 
 

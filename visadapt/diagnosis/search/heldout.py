@@ -53,8 +53,15 @@ class RolloutErrors:
     error: Tensor  # (H + 1, W, S, m) prediction minus measurement; 0 where not `valid`
     valid: Tensor  # (H + 1, W, S, m) 1 where there are both a prediction and a measurement
     predicted: Tensor  # (W, S, H + 1, n) states predicted from each of these rows
+    read: Tensor  # (H + 1, W, S, m) readings that these predictions expect
     left: Tensor  # (H + 1, W, S, m) errors of the states estimated at the rows where the predictions end
     stride: int  # rows from one start to the next
+
+    def expected(self, window: int, start: int, channels: Sequence[int]) -> Tensor:
+        """(H + 1, n) one prediction: of the `channels` what sensors would read, of other states these themselves."""
+        states = self.predicted[window, start].clone()
+        states[:, channels] = self.read[:, window, start]
+        return states
 
     def rms(self, deviation: Tensor) -> Tensor:
         """(H, m) root mean square errors 1 to H rows ahead, in units of `deviation` (m,)."""
@@ -205,11 +212,12 @@ def rollout_errors(model: CandidateModel, fits: FitState, black_box: BlackBox | 
         used, found = shown[:, ends].clone(), predicted[:, : len(range(h, length, stride)), h]
         if used.shape[1]:
             used[others, 0] = 0
-        error = (model.measure(fits.theta[0], found, ends) - measured[:, ends]) * used
+        read = model.measure(fits.theta[0], found, ends)
+        every = (read - measured[:, ends]) * used, used, read, left[:, ends] * used
         # Predictions that would end beyond the window are not valid.
-        parts.append([pad(x, (0, 0, 0, predicted.shape[1] - x.shape[1])) for x in (error, used, left[:, ends] * used)])
-    error, valid, left = (torch.stack(each) for each in zip(*parts, strict=True))
-    return RolloutErrors(error, valid, predicted, left, stride)
+        parts.append([pad(x, (0, 0, 0, predicted.shape[1] - x.shape[1])) for x in every])
+    error, valid, read, left = (torch.stack(each) for each in zip(*parts, strict=True))
+    return RolloutErrors(error, valid, predicted, read, left, stride)
 
 
 def _rollouts(
@@ -252,5 +260,10 @@ def _merged(parts: Sequence[tuple[Tensor, RolloutErrors]]) -> RolloutErrors:
 
     first = parts[0][1]
     return RolloutErrors(
-        joined("error", 1), joined("valid", 1), joined("predicted", 0), joined("left", 1), first.stride
+        joined("error", 1),
+        joined("valid", 1),
+        joined("predicted", 0),
+        joined("read", 1),
+        joined("left", 1),
+        first.stride,
     )

@@ -165,8 +165,9 @@ def _read(recording: Recording, system: System) -> _Draft:
     if recording.usable:
         usable = [every * torch.tensor(rows)[:, None] for every, rows in zip(usable, recording.usable, strict=True)]
         used = [a * b for a, b in zip(repeats.used, usable, strict=True)]
-        lost = [rows & torch.tensor(kept) for rows, kept in zip(repeats.lost, recording.usable, strict=True)]
-        repeats = replace(repeats, used=used, lost=lost)
+        seen = [torch.tensor(kept) for kept in recording.usable]
+        lost = [rows & kept for rows, kept in zip(repeats.lost, seen, strict=True)]
+        repeats = replace(repeats, used=used, lost=lost, seen=seen)
     return _Readings(recording, system, channels, states, commands, stamps, repeats, usable).draft()
 
 

@@ -35,7 +35,7 @@ def repeated_reading_causes(
     """
     out = []
     repeats = recording.repeats
-    lost, rows = sum(int(x.sum()) for x in repeats.lost), sum(len(x) - 1 for x in repeats.lost)
+    lost, rows = sum(int(x.sum()) for x in repeats.lost), sum(int(x[1:].sum()) for x in repeats.seen)
     if lost >= MIN_REPEATS:
         parameters = {"rate": Estimate(lost / rows, lost_rows.table[0].unit, wilson(lost, rows, Z_90))}
         cost = _cost(recording, search, comparison, repeats.lost)

@@ -149,7 +149,7 @@ def _track(number: int, episode: Episode, world: World, measured: Sequence[int],
     stormy = smooth(acceleration.abs(), 2 * smoothing)
     activity = torch.cat(
         (
-            (stormy / stormy.mean(0) + 0.1).log(),
+            (stormy / stormy.mean(0).clamp(min=1e-300) + 0.1).log(),
             (smooth(state[:, velocities].abs(), 2 * smoothing) / fastest + 0.03).log(),
             (smooth(rate(commanded).abs(), 2 * smoothing) / largest + 0.3).log(),
         ),
