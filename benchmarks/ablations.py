@@ -84,8 +84,7 @@ def held_over_a_plan(setup: Setup, policy: Policy) -> Setup:
     """The residual's correction is constant over a plan, so that the gradient flows through the physics alone."""
     plans, own = from_states(setup.source).refinement, setup.settings.tuning
     assert plans is not None
-    held = replace(plans, recorded=own.recorded, observation_noise=own.observation_noise)
-    held = replace(held, iterations=300, streams=32)
+    held = replace(plans, iterations=300, streams=32, recorded=own.recorded, observation_noise=own.observation_noise)
     return replace(setup, settings=replace(setup.settings, tuning=held))
 
 

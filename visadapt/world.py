@@ -72,16 +72,14 @@ class World(nn.Module):
         super().__init__()
         if integrator not in INTEGRATORS:
             raise ValueError(f"unknown integrator {integrator!r}; there are {', '.join(INTEGRATORS)}")
-        if substeps is None and period > 0:
-            substeps = resolving(effects, period)
-        if not period > 0 or substeps is None or substeps < 1:
+        if not period > 0 or (substeps is not None and substeps < 1):
             raise ValueError(f"period and substeps must be positive, got {period!r} s and {substeps!r}")
         for effect in effects:
             check_acts_on(system, effect)
         self.system = system
         self.period = period
         self.integrator = integrator
-        self.substeps = substeps
+        self.substeps = resolving(effects, period) if substeps is None else substeps
         self.effects = nn.ModuleList(effects)
         self._arrange()
 

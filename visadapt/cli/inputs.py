@@ -35,9 +35,6 @@ from visadapt.world import World
 OWN_FILES: set[str] = set()
 """Files of the user's whose code is run."""
 
-IMPORTED: dict[str | None, ModuleType] = {}
-"""Modules of the user's that were imported, by the fingerprint of their file."""
-
 
 class InputError(ValueError):
     """An argument that cannot be used; the message is one line: what, where, and what would be right."""
@@ -151,20 +148,24 @@ def import_effects(options: argparse.Namespace) -> None:
     """
     if not options.effects:
         return
-    module = import_file(options.effects)
+    system = getattr(options, "system", None)
+    module = sys.modules.get(system.__module__) if system else None
+    # A file that has the system too was imported with it: run again, it would define another class of the same name.
+    if module is None or getattr(module, "__file__", None) != str(Path(options.effects).absolute()):
+        module = import_file(options.effects)
     own = [effect for effect in EFFECTS.values() if effect.__module__ == module.__name__]
     if not own:
         raise InputError(f"{options.effects}: defines no effect: a class with a name that derives from visadapt.Effect")
     for effect in own:
-        for kind in [options.system] if getattr(options, "system", None) else SYSTEMS.values():
+        for kind in [system] if system else SYSTEMS.values():
             if issubclass(kind, effect.systems) and (wrong := complaints_of_effect(effect, kind())):
                 raise InputError(f"{options.effects}: {effect.__name__}: {wrong[0]}")
-    if getattr(options, "system", None) and not any(issubclass(options.system, effect.systems) for effect in own):
-        raise InputError(f"{options.effects}: none of its effects acts on a {options.system.name}")
+    if system and not any(issubclass(system, effect.systems) for effect in own):
+        raise InputError(f"{options.effects}: none of its effects acts on a {system.name}")
 
 
 def import_file(given: str) -> ModuleType:
-    """The module in a file of the user's; one that was imported before is not run again.
+    """The module in a file of the user's.
 
     Raises:
         InputError: the file is missing, no Python, or raises; names its line.
@@ -172,9 +173,6 @@ def import_file(given: str) -> ModuleType:
     path = Path(given).absolute()  # as Python's own messages name it
     if not path.is_file():
         raise InputError(f"{path}: there is no such file")
-    content = fingerprint(path)
-    if content in IMPORTED and IMPORTED[content].__file__ == str(path):
-        return IMPORTED[content]
     # Under a name of its own, by which worker processes find its classes.
     name = f"visadapt_own_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
@@ -186,7 +184,6 @@ def import_file(given: str) -> ModuleType:
     with own_code(lambda error: f"{path}: {describe(error, str(path))}"):
         spec.loader.exec_module(module)
     sys.modules.setdefault(path.stem, module)  # so that another file of the user's that imports it gets these classes
-    IMPORTED[content] = module
     return module
 
 

@@ -33,8 +33,6 @@ RESUMED = ("adapt", "train", "renderer")  # Subcommands that go on where an inte
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command: 0 done; 2 bad input, described by one line on stderr; 130 interrupted."""
     command = ""
-    if before := sys.modules.get("visadapt.cli.inputs"):
-        before.IMPORTED.clear()  # of an earlier command in this process
     with suppress(ValueError):  # outside the main thread
         signal.signal(signal.SIGTERM, _terminated)
     try:

@@ -25,7 +25,7 @@ from visadapt.storage.atomic_files import replacing
 from visadapt.systems import CartPole, Quadrotor
 from visadapt.tasks.references import read_reference
 from visadapt.weights import shipped
-from visadapt.world import World, resolving
+from visadapt.world import World
 
 LONGEST_STEP = 0.05
 """Longest integration step of the simulator, s."""
@@ -50,9 +50,8 @@ def run(options: argparse.Namespace) -> None:
 def _setup(options: argparse.Namespace) -> Setup:
     system = the_system(options)
     period = options.period or (0.1 if isinstance(system, Quadrotor) else 0.05)
-    effects = given_effects(options, system)
-    steps = max(math.ceil(period / LONGEST_STEP), resolving(effects, period))
-    world = World(system, effects, period, substeps=steps)
+    bare = World(system, (), period, substeps=math.ceil(period / LONGEST_STEP))
+    world = bare.with_effects(given_effects(options, system))
     renderer = options.renderer or (shipped("renderer") if options.frames else None)
     if renderer and not isinstance(system, CartPole):
         raise InputError(f"a {system.name} has no renderer: --frames and --renderer are for a cartpole")

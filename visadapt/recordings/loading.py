@@ -49,9 +49,9 @@ def load_recording(
     Names are matched by `csv.py`; those of logs, bags of ROS and ULog, are TOPIC.FIELD (`logs.py`). Clocks are checked
     by `clock.py`; rows of an unsteady one keep their stamps. Angles after whose whole turns the physics repeat are
     unwrapped within an episode so that upright is 0 (if the pole turns over, in the turn in which it is upright most
-    often). A command in N (a column `force` that
-    exceeds 1) is divided by the system's `max_force`. Where files are too long for memory, stretches of rows are left
-    out (`thinning.py`). The recording's warnings say what was changed or left out.
+    often). A command in N (a column `force` that exceeds 1) is divided by the system's `max_force`. Where files are too
+    long for memory, stretches of rows are left out (`thinning.py`). The recording's warnings say what was changed or
+    left out.
 
     Args:
         paths: one or several: files, bags of ROS 2, or folders whose recordings are taken in the order of their names.
@@ -94,7 +94,8 @@ def load_recording(
         for _, of_file in groupby(whole, lambda raw: raw.path):
             check_units(list(of_file), system)
         whole = check_sensors(whole, system, note)
-    parts = [part for raw in whole for part in uninterrupted(_unwrapped(raw, system), note)]
+    turning = [state.name for state in system.states if state.unit == "rad" and turns(system, state.name)]
+    parts = [part for raw in whole for part in uninterrupted(_unwrapped(raw, turning), note)]
     parts, period = alike(_long_enough(parts, note), note)
     return Recording(
         episodes=tuple(Episode(part.time, part.action, None if frames else part.state, part.frame) for part in parts),
@@ -232,12 +233,11 @@ def _commands(episodes: list[RawEpisode], system: System, note: Note) -> list[Ra
     ]
 
 
-def _unwrapped(raw: RawEpisode, system: System) -> RawEpisode:
-    """The episode with its angles unwrapped, in the turn in which they are upright most often; angles of which the
-    physics tell one turn from the next stay as they are."""
+def _unwrapped(raw: RawEpisode, turning: Sequence[str]) -> RawEpisode:
+    """The episode with the angles `turning` unwrapped, in the turn in which they are upright most often."""
     state = raw.state.copy()
     for column, name in enumerate(raw.measured):
-        if system.states[system.index(name)].unit == "rad" and turns(system, name):
+        if name in turning:
             angle = np.unwrap(state[:, column])
             turn = np.round(angle / (2 * np.pi))
             upright = np.abs(angle - 2 * np.pi * turn) < UPRIGHT_RAD

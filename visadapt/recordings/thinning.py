@@ -49,13 +49,11 @@ def spread(recording: Recording, most: int, length: int, before: int) -> Recordi
         for episode, own in zip(episodes, led, strict=True)
         if episode.state is not None
     )
-    usable = []
-    for (number, own), whole in zip(chosen, led, strict=True):
-        rows_used = (
-            recording.usable[number][whole].copy() if recording.usable else np.ones(whole.stop - whole.start, bool)
-        )
-        rows_used[: own.start - whole.start] = False
-        usable.append(rows_used)
+    every = recording.usable or [np.ones(count, bool) for count in rows]
+    usable = tuple(
+        every[number][whole] & (np.arange(whole.start, whole.stop) >= own.start)
+        for (number, own), whole in zip(chosen, led, strict=True)
+    )
     used = sum(own.stop - own.start for _, own in chosen)
     return replace(
         recording,
@@ -64,7 +62,7 @@ def spread(recording: Recording, most: int, length: int, before: int) -> Recordi
             f"{recording.sources[number]}, from {recording.episodes[number].time[own.start]:.1f} s"
             for number, own in chosen
         ),
-        usable=tuple(usable),
+        usable=usable,
         warnings=(
             *recording.warnings,
             f"{sum(rows):,} rows are more than a diagnosis looks at: {used:,} of them were used, in {count} stretches "

@@ -88,8 +88,8 @@ class EnvMap:
             self._check_crop(*self.crop)
         if self.period is not None and not _is_positive(self.period):
             raise TargetError(f"period must be a positive number of seconds, got {self.period!r}")
-        greys = [grey for grey in self.contrast if isinstance(grey, int | float)]
-        if len(greys) != len(self.contrast) or len(greys) != 2 or not greys[0] < greys[1]:
+        numbers = all(isinstance(grey, int | float) for grey in self.contrast)
+        if len(self.contrast) != 2 or not numbers or not self.contrast[0] < self.contrast[1]:
             raise TargetError(f"contrast must be two rising grey levels, got {self.contrast!r}")
         if not self.actions:
             raise TargetError("actions is empty: say which entry of the environment's action our command sets")

@@ -75,7 +75,10 @@ class GymnasiumTarget(Target):
         self.name = name or (first.spec.id if first.spec is not None else type(first.unwrapped).__name__)
         self.n_action = len(mapping.actions)
         self._n_env_action = self._check(first)
-        self.period, self.period_origin, self._held = self._period(first)
+        self.period, self.period_origin = self._period(first)
+        own = _own_step(first)
+        # One that a function makes may be wrapped so that it repeats actions by itself.
+        self._held = round(self.period / own[1]) if own and isinstance(env, str) else 1
         self._mujoco = frames and mujoco_frames.is_mujoco(first)
         if self._mujoco:
             mujoco_frames.probe(self.name)
@@ -199,31 +202,26 @@ class GymnasiumTarget(Target):
         self.mapping.check(self.name, self.system, int(env.observation_space.shape[0]), n_action)
         return n_action
 
-    def _period(self, env: Any) -> tuple[float, str, int]:
-        """s between actions, where that number comes from, and for how many of the environment's steps each is held."""
-        given, body, rate = self.mapping.period, env.unwrapped, env.metadata.get("render_fps")
-        own = next((name for name in ("tau", "dt") if isinstance(getattr(body, name, None), Real)), None)
-        step = None if own is None else float(getattr(body, own))
+    def _period(self, env: Any) -> tuple[float, str]:
+        """s between actions, and where that number comes from."""
+        given, own, rate = self.mapping.period, _own_step(env), env.metadata.get("render_fps")
         if given is not None:
-            if step is None:
-                return float(given), "as given", 1
             # No environment is stepped for a part of its step.
-            if given < 0.99 * step or abs(given / step - round(given / step)) > 0.01:
+            if own and (given < 0.99 * own[1] or abs(given / own[1] - round(given / own[1])) > 0.01):
                 raise TargetError(
-                    f"{self.name}: its {own} says {step:g} s a step, so that the period given, {given:g} s, is no "
+                    f"{self.name}: its {own[0]} says {own[1]:g} s a step, so that the period given, {given:g} s, is no "
                     "whole number of steps"
                 )
-            # One that a function makes may be wrapped so that it repeats actions by itself.
-            return float(given), "as given", round(given / step) if isinstance(self._source, str) else 1
-        if step is not None:
-            return step, f"its {own}", 1
+            return float(given), "as given"
+        if own:
+            return own[1], f"its {own[0]}"
         if not rate:
             raise TargetError(
                 f"{self.name}: the environment states no step length (tau, dt or render_fps); give `period` in s"
             )
         origin = f"render_fps = {rate:g} of its metadata, which may be the speed of a film alone: give `period` in s"
         warnings.warn(f"{self.name}: the period, {1 / rate:g} s, is taken from {origin}", stacklevel=3)
-        return 1 / float(rate), origin, 1
+        return 1 / float(rate), origin
 
     def _place(self, env: Any, seen: NDArray[np.floating], state: NDArray[np.floating]) -> NDArray[np.floating]:
         """Put an environment that observes `seen` and has not been stepped into our state; its observation there."""
@@ -282,6 +280,12 @@ class GymnasiumTarget(Target):
             alive=torch.tensor(alive),
             frame=torch.from_numpy(np.stack(pictures)) if self.frames else None,
         )
+
+
+def _own_step(env: Any) -> tuple[str, float] | None:
+    """What an environment calls the length of its step, and that length in s; None where it states none."""
+    names = (name for name in ("tau", "dt") if isinstance(getattr(env.unwrapped, name, None), Real))
+    return next(((name, float(getattr(env.unwrapped, name))) for name in names), None)
 
 
 def _close(target: weakref.ref[GymnasiumTarget]) -> None:
