@@ -286,6 +286,23 @@ class TestPretrain:
         with pytest.raises(CheckpointError, match="trained with other values of source: remove it"):
             heavier.pretrain(path, 0)
 
+    def test_what_an_interrupted_training_left_goes_on_with_its_own_seed_alone(self, tmp_path, monkeypatch):
+        monkeypatch.setattr("visadapt.learning.training_state.CHECKPOINT_ITERATIONS", 1)
+        setup, path = small_quadrotor(rows=11, **SMALL), tmp_path / "quadrotor.safetensors"
+        whole = setup.pretrain(tmp_path / "whole.safetensors", 0)
+
+        def interrupt(stage, done, total, loss):
+            if done == 2:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            setup.pretrain(path, 0, interrupt)
+        with pytest.raises(CheckpointError, match=r"partial\.safetensors: was trained with other values of seed"):
+            setup.pretrain(path, 1)
+        resumed = setup.pretrain(path, 0)
+        assert all(torch.equal(value, resumed.state_dict()[key]) for key, value in whole.state_dict().items())
+        assert {each.name for each in tmp_path.iterdir()} == {path.name, "whole.safetensors"}
+
     def test_another_vehicles_weights_are_refused(self, tmp_path):
         path = tmp_path / "policy.safetensors"
         small_quadrotor(rows=11, **SMALL).pretrain(path, 0)

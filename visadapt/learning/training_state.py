@@ -109,20 +109,31 @@ def train_or_load(
         may_be_unstated: keys of `about` that a file may lack.
 
     Raises:
-        CheckpointError: `path` holds another network, or one that was trained in another way.
+        CheckpointError: `path`, or what an interrupted training left, holds another network, or one that is trained in
+            another way.
     """
     if path.exists():
-        kept = load_network(path, network)
-        stated = {key: value for key, value in about.items() if key in kept or key not in may_be_unstated}
-        if other := [key for key, value in stated.items() if key not in kept or not _same(kept[key], value)]:
-            raise CheckpointError(
-                f"{path}: was trained with other values of {', '.join(other)}: remove it, or name another file"
-            )
+        _check(path, load_network(path, network), about, may_be_unstated)
         return
-    partial = path.with_suffix(".partial.safetensors")
+    partial, begun = path.with_suffix(".partial.safetensors"), path.with_suffix(".begun.safetensors")
+    if partial.exists() and begun.exists():
+        _check(partial, load_tree(begun), about)
+    save_tree(begun, about)
     train(partial)
     save_network(path, network, about)
     partial.unlink(missing_ok=True)
+    begun.unlink()
+
+
+def _check(
+    path: Path, kept: Mapping[str, Any], about: Mapping[str, Any], may_be_unstated: Collection[str] = ()
+) -> None:
+    """Raise CheckpointError where what was `kept` of a training differs from what it is to be."""
+    stated = {key: value for key, value in about.items() if key in kept or key not in may_be_unstated}
+    if other := [key for key, value in stated.items() if key not in kept or not _same(kept[key], value)]:
+        raise CheckpointError(
+            f"{path}: was trained with other values of {', '.join(other)}: remove it, or name another file"
+        )
 
 
 def _same(kept: Any, wanted: Any) -> bool:
