@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from visadapt.batch import Batch
 from visadapt.dynamics import Dynamics
 from visadapt.effects import ActuationEffect, CameraEffect, DynamicsEffect, Effect, Parameter, Residual, SensingEffect
+from visadapt.effects.applied import LastApplied, applied
 from visadapt.effects.base import check_acts_on
 from visadapt.effects.camera import seen_by
 from visadapt.history import History
@@ -89,6 +90,11 @@ class World(nn.Module):
         return bool(self._residuals)
 
     @property
+    def reads_commands(self) -> bool:
+        """Whether what sensors read depends on what acts of the commands."""
+        return any(type(effect).under is not SensingEffect.under for effect in self._sensing)
+
+    @property
     def table(self) -> list[Parameter]:
         """The parameters of all effects, in the order of the effects."""
         return [parameter for effect in self._named for parameter in effect.table]
@@ -154,11 +160,11 @@ class World(nn.Module):
         generator = torch.Generator().manual_seed(0)  # which readings were lost is not known
         system = self.altered(first)
         for t in range(commands.shape[1]):
-            _, acting = self._act(commands[:, t, None], acting, system, None if held is None else held[:, t, None])
             if states is not None:
                 row = states[:, min(t, states.shape[1] - 1)]
-                _, sensing = self._read(row, sensing, generator)
+                _, sensing = self._read(row, sensing, generator, self._applied(acting))
                 _, seeing = self._scene(row, seeing)
+            _, acting = self._act(commands[:, t, None], acting, system, None if held is None else held[:, t, None])
             rows.append((*acting, *sensing, *seeing))
         return tuple(torch.stack(memory, 1) for memory in zip(*rows, strict=True))
 
@@ -171,6 +177,16 @@ class World(nn.Module):
         like = commands.new_zeros(episodes, len(self.system.states))
         acting, _ = self._act(commands, self._split(self._at_rest(like))[0], self.altered(like), held)
         return acting.reshape(episodes, length, self.substeps, width)
+
+    def applied(self, acting: Tensor, held: Tensor) -> Tensor:
+        """What acts (B, T, 2, n_action) as each row is read, and its rate of change over the period before, per s.
+
+        `acting` (B, T, substeps, n_action) acts after the rows of whole episodes, as `actuate` has it, for `held` s
+        (B, T); before an episode the command was zero.
+        """
+        rest = acting.new_zeros(len(acting), 2, acting.shape[-1])
+        after = applied(acting[:, :-1].mean(2), held[:, :-1], rest)
+        return torch.cat((rest[:, None], after), 1)
 
     def step(
         self, at: WorldState, action: Tensor, history: History | None = None, correction: Tensor | None = None
@@ -221,7 +237,7 @@ class World(nn.Module):
         `generator` is needed by random effects alone.
         """
         acting, sensing, seeing = self._split(at.memory)
-        measured, sensing = self._read(at.state, sensing, generator)
+        measured, sensing = self._read(at.state, sensing, generator, self._applied(acting))
         return measured, replace(at, memory=(*acting, *sensing, *seeing))
 
     def show(
@@ -237,9 +253,13 @@ class World(nn.Module):
         frame, seeing = seen_by(self._camera, draw(state), seeing, generator)
         return frame, replace(at, memory=(*acting, *sensing, *seeing))
 
-    def reading(self, state: Tensor) -> Tensor:
-        """What sensors read (B, n_state) of states, each as if it were the first row of an episode."""
-        return self._read(state, self._split(self._at_rest(state))[1], None)[0]
+    def reading(self, state: Tensor, applied: Tensor | None = None) -> Tensor:
+        """What sensors read (B, n_state) of states, each as if it were the first row of an episode.
+
+        `applied` (B, 2, n_action) is what acts of the command in that row, and its rate of change, per s; 0 without it.
+        Only a world that `reads_commands` needs it.
+        """
+        return self._read(state, self._split(self._at_rest(state))[1], None, applied)[0]
 
     def load(self, at: WorldState) -> Tensor:
         """Sum of the loads (B, n_load) of all effects at an instant without a command, with dry friction of the
@@ -263,6 +283,8 @@ class World(nn.Module):
             (e for e in effects if isinstance(e, ActuationEffect)), key=lambda effect: effect.order
         )
         self._sensing = sorted((e for e in effects if isinstance(e, SensingEffect)), key=lambda effect: effect.order)
+        if self.reads_commands:
+            self._actuation.append(LastApplied(self.substeps))
         self._camera = sorted((e for e in effects if isinstance(e, CameraEffect)), key=lambda effect: effect.order)
         self._residuals = [effect for effect in effects if isinstance(effect, Residual)]
         dynamics = [effect for effect in effects if isinstance(effect, DynamicsEffect)]
@@ -303,12 +325,23 @@ class World(nn.Module):
             time = time + h
         return state
 
+    def _applied(self, acting: tuple[Tensor, ...]) -> Tensor | None:
+        """What acts (B, 2, n_action) as a row is read, and its rate, of what actuation effects remember."""
+        return acting[-1] if self.reads_commands else None
+
     def _read(
-        self, state: Tensor, memory: tuple[Tensor, ...], generator: torch.Generator | None
+        self,
+        state: Tensor,
+        memory: tuple[Tensor, ...],
+        generator: torch.Generator | None,
+        applied: Tensor | None,
     ) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """What sensors read of states (B, n_state), and the new memory."""
+        """What sensors read of states (B, n_state) while `applied` (B, 2, n_action) acts, and the new memory."""
         remembered = []
+        system = self.system if applied is None else self.altered(state)
         for effect, own in zip(self._sensing, memory, strict=True):
+            if applied is not None:
+                effect = effect.under(system, *applied.unbind(1))
             state, own = effect.apply_to(state, own, self.period, generator)
             remembered.append(own)
         return state, tuple(remembered)

@@ -37,7 +37,7 @@ def test_the_tutorial_as_a_user_runs_it(rig, capsys, monkeypatch):
     runpy.run_path("record.py")
     del sys.modules["furuta"]
     assert cli.main(["check", "furuta.py:Furuta"]) == 0
-    assert "furuta is right; 45 effects act on it" in capsys.readouterr().out
+    assert "furuta is right; 46 effects act on it" in capsys.readouterr().out
     assert cli.main(["effects", "--system", "furuta.py"]) == 0
     assert "hinge.coulomb_friction (dynamics)" in capsys.readouterr().out
     assert len((rig / "run.csv").read_text().splitlines()) == 161

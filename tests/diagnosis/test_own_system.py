@@ -22,7 +22,7 @@ SEARCHED = [
     for name in (
         *("joint.viscous_friction", "joint.coulomb_friction", "joint.spring", "joint.constant_load", "inertia.scale"),
         *("torque.actuator_gain", "torque.actuator_bias", "torque.actuator_delay", "torque.actuator_lag"),
-        *("sensors.measurement_delay", "angle.sensor_offset"),
+        *("sensors.measurement_delay", "angle.sensor_offset", "joint.transmission_compliance"),
     )
 ]
 
@@ -52,6 +52,7 @@ def recording(*effects):
         ("joint.coulomb_friction", {"torque": 0.1}),
         ("torque.actuator_gain", {"scale": 0.8}),
         ("torque.actuator_delay", {"delay": 0.03}),
+        ("joint.transmission_compliance", {"compliance": 0.006}),
     ],
 )
 def test_what_is_there_is_found(name, values):

@@ -84,11 +84,14 @@ def policy_terms(policy: StatesToActions, system: System, rows: Segments, best: 
     """
     corrected = CandidateModel(system, best.effects, rows)
     state, disturbance, variance = _estimated_steps(corrected, best)
-    histories, complete = _histories(corrected.at(best.fits.theta[0]).reading(state.flatten(0, 1)), rows)
+    theta, applied = best.fits.theta[0], None
+    if corrected.reads_commands:
+        applied = corrected.applied(corrected.acting(theta[None])[0], slice(-1))
+    histories, complete = _histories(corrected.at(theta).reading(state.flatten(0, 1), applied), rows)
     acted = actions(policy, system, histories).reshape(variance.shape)
     source, no_values = CandidateModel(system, (), rows), best.fits.theta[0, :0]
     before = _steps(source, no_values, state, acted, complete)
-    after = _steps(corrected, best.fits.theta[0], state, acted, complete)
+    after = _steps(corrected, theta, state, acted, complete)
     machine = after[0] + disturbance[complete], variance[complete]
     reference, acted = (1 - 1 / HORIZON) * state[complete], acted[complete]
     pairs = (_terms(*steps, *machine, acted, reference) for steps in (before, after))

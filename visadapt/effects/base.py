@@ -277,6 +277,11 @@ class SensingEffect(Effect):
         """
         return state[:, None, :0]
 
+    def under(self, system: System, command: Tensor, rate: Tensor) -> Self:
+        """The effect bound to the altered system and to what acts of the command (B, n_action) as the row is read, with
+        its rate of change (B, n_action) over the period before, per s; itself where it needs none of these."""
+        return self
+
     def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
         """The reading of one row (B, n_state) and the new memory; rows are `period` s apart.
 

@@ -67,6 +67,7 @@ class CandidateModel:
         named = [effect for effect in effects for _ in effect.table]
         self.acting_parameters = [k for k, effect in enumerate(named) if acting and (effect in acting or not alone)]
         """columns of the parameters that change what acts of the commands"""
+        self.reads_commands = self._world.reads_commands
         self._late = [(k, effect.late) for k, effect in enumerate(named) if issubclass(effect, LateSensors)]
         rubs = any(issubclass(effect, DynamicsEffect) and effect.rubs() for effect in effects)
         self.feels_unmodelled_loads = rows.colour is not None and rubs
@@ -141,8 +142,12 @@ class CandidateModel:
     def measure(self, theta: Tensor, state: Tensor, chosen: slice = slice(None)) -> Tensor:
         """Readings without noise (W, T', m), with parameters (P,), that show the states (W, T', n) of the `chosen` rows
         of every window: those of `shown`."""
-        after = self.following(theta, self.acting(theta[None])[0], chosen) if self._late else None
-        seen = reading(self._world, self.by_row(theta, state.shape[1]), state.flatten(0, 1), after)
+        after = applied = None
+        if self._late or self.reads_commands:
+            acting = self.acting(theta[None])[0]
+            after = self.following(theta, acting, chosen)
+            applied = self.applied(acting, chosen) if self.reads_commands else None
+        seen = reading(self._world, self.by_row(theta, state.shape[1]), state.flatten(0, 1), after, applied)
         return seen[:, list(self.rows.channels)].unflatten(0, state.shape[:2])
 
     def read_along(self, theta: Tensor, state: Tensor, later: Sequence[int]) -> Tensor:
@@ -154,7 +159,11 @@ class CandidateModel:
         seen = interpolated(self.rows, state, later, delays, self.profile.position_of)
         instant = theta.clone()
         instant[:, [k for k, _ in self._late]] = 0.0
-        read = self.at(self.by_row(instant, state.shape[1])).reading(seen.flatten(0, 2))
+        applied = None
+        if self.reads_commands:
+            acting = self.acting(theta if self.acting_parameters else theta[:1])
+            applied = torch.stack([self.applied(each) for each in acting]).expand(len(theta), -1, -1, -1).flatten(0, 1)
+        read = self.at(self.by_row(instant, state.shape[1])).reading(seen.flatten(0, 2), applied)
         return read[:, list(self.rows.channels)].unflatten(0, seen.shape[:3])
 
     def shown(self, theta: Tensor) -> tuple[Tensor, Tensor]:
@@ -177,6 +186,12 @@ class CandidateModel:
         if not self._late:
             return None
         return following(self.rows, self._delays(theta), acting, len(self.system.states), chosen)
+
+    def applied(self, acting: Tensor, chosen: slice = slice(None)) -> Tensor:
+        """What acts (N, 2, n_action) as the `chosen` rows of every window, flattened, are read, and its rate of change;
+        `acting` (E, L, substeps, n_action) acts in whole episodes."""
+        every = self._world.applied(acting, self.rows.held)
+        return every[self.rows.episode[:, None], self.rows.index[:, chosen]].flatten(0, 1)
 
     def _delays(self, theta: Tensor) -> Delays:
         """s by which states are read late."""
@@ -217,8 +232,10 @@ def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised
     step = _step(model, theta, state, model.in_windows(whole)[:, :, :-1].flatten(1, 2), variant)
     followings = [shown for each in whole if (shown := model.following(theta, each)) is not None]
     after = [followings[k] for k in variant] if followings else []
+    applied = [model.applied(each) for each in whole] if model.reads_commands else []
+    applied = [applied[k] for k in variant] if applied else []
     values = model.by_row(theta, length)
-    read = linearise_reading(model.at(theta), values, state.flatten(0, 1), after, by_state=known is None)
+    read = linearise_reading(model.at(theta), values, state.flatten(0, 1), after, applied, by_state=known is None)
     channels = list(model.rows.channels)
     steps, rows = (windows, length - 1), (windows, length)
     out = Linearised(

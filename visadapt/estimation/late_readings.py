@@ -32,12 +32,15 @@ class Following(Batch):
     read: Tensor  # (N, n_state) s from each state to the row in which each of its sensors is read
 
 
-def reading(world: World, values: Tensor, state: Tensor, following: Following | None) -> Tensor:
+def reading(
+    world: World, values: Tensor, state: Tensor, following: Following | None, applied: Tensor | None = None
+) -> Tensor:
     """What sensors read (N, n_state), each in the row that `following` says, of the motion that goes through N states;
-    without it, no sensor is late. `values` (P,), or (N, P), are those of the effects' parameters."""
+    without it, no sensor is late. `values` (P,), or (N, P), are those of the effects' parameters; `applied` is that of
+    `World.reading`."""
     here = world.with_values(values)
     if following is None:
-        return here.reading(state)
+        return here.reading(state, applied)
     every = values.expand(len(state), -1)
     sensors = [effect for effect in here.effects if isinstance(effect, LateSensors)]
     seen, shown = state.clone(), dict[tuple[int, ...], Tensor]()
@@ -48,7 +51,7 @@ def reading(world: World, values: Tensor, state: Tensor, following: Following | 
             shown[of] = _later(world, every, state, following, following.read[:, column] - delay)
         if of:
             seen[:, column] = shown[of][:, column]
-    return here.reading(seen)
+    return here.reading(seen, applied)
 
 
 def _later(world: World, values: Tensor, state: Tensor, following: Following, ahead: Tensor) -> Tensor:

@@ -116,24 +116,31 @@ def linearise_step(
 
 
 def linearise_reading(
-    world: World, values: Tensor, state: Tensor, following: Sequence[Following], by_state: bool = True
+    world: World,
+    values: Tensor,
+    state: Tensor,
+    following: Sequence[Following],
+    applied: Sequence[Tensor],
+    by_state: bool = True,
 ) -> Tangent:
     """Sensor readings (N, n) that show N states, with derivatives.
 
     `following` is what late sensors show: with `values`, then with each parameter moved by `parameter_steps`; empty
-    without such sensors. The other arguments are those of `linearise_step`.
+    without such sensors. `applied` is, in the same way, what acts in each row, (N, 2, n_action) as in `World.reading`;
+    empty where no sensor depends on it. The other arguments are those of `linearise_step`.
     """
 
     def read(rows: Tensor, states: Tensor, moved: Sequence[int], pushed: Tensor) -> Tensor:
         after = [following[k] for k in moved] if following else []
         shown = after[0].map(lambda *each: torch.cat(each), *after[1:]) if after else None
-        return reading(world, rows, states, shown)
+        acts = torch.cat([applied[k] for k in moved]) if applied else None
+        return reading(world, rows, states, shown, acts)
 
     if not any(isinstance(effect, SensingEffect) for effect in world.effects):
         count, n = state.shape
         identity = torch.eye(n, dtype=state.dtype, device=state.device).expand(count, n, n)[..., : n if by_state else 0]
         return Tangent(state, identity, state.new_zeros(count, n, values.shape[-1]), state.new_zeros(count, n, 0))
-    columns = _columns(world, sensing=True) + (_columns(world, sensing=False) if following else [])
+    columns = _columns(world, sensing=True) + (_columns(world, sensing=False) if following or applied else [])
     return _tangent(read, world, values, state, by_state, columns, 0, len(world.system.actions))
 
 

@@ -121,13 +121,15 @@ class Sensitivity:
 
     def _changes(self, effect: type[Effect], tried: Tensor) -> Tensor:
         """Change (N, M) of the innovations with the effect at parameters (M, P)."""
-        if not issubclass(effect, SensingEffect):
-            return self.innovations.response(
-                self._drive(effect, tried), torch.zeros_like(self.rows.measured[..., None])
-            )
-        read = self._read(*self._with(effect, tried))
-        reading = (read[:1] - read[1:]).movedim(0, -1).nan_to_num()
-        return self.innovations.response(torch.zeros_like(self.fits.state[0, :, 1:, :, None]), reading)
+        drive = torch.zeros_like(self.fits.state[0, :, 1:, :, None])
+        reading = torch.zeros_like(self.rows.measured[..., None])
+        sensed = issubclass(effect, SensingEffect)
+        if not sensed:
+            drive = self._drive(effect, tried)
+        if sensed or (issubclass(effect, ActuationEffect) and self.innovations.model.reads_commands):
+            read = self._read(*self._with(effect, tried))
+            reading = (read[:1] - read[1:]).movedim(0, -1).nan_to_num()
+        return self.innovations.response(drive, reading)
 
     def _drive(self, effect: type[Effect], tried: Tensor) -> Tensor:
         """Change (W, T - 1, n, M) of the states a period after each row with an effect that is not on the sensors.

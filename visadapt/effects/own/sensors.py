@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import torch
+
 from visadapt.effects import late_sensors, sensing
 from visadapt.effects.base import Parameter
 from visadapt.effects.own.statement import ALL_SENSORS, Made, delay_of_all
+from visadapt.effects.transmission import TransmissionCompliance
 from visadapt.systems import System
+from visadapt.systems.contract import ROUNDING, inputs
 
 
 def on_sensors(system: type[System]) -> Iterator[Made]:
@@ -19,6 +23,7 @@ def on_sensors(system: type[System]) -> Iterator[Made]:
         late_sensors.MeasurementDelay,
         {**moving, "late": list(range(len(system.states))), "indistinguishable_from": (delay_of_all(system),)},
     )
+    yield from _transmissions(system)
     for column, state in enumerate(system.states):
         name, unit = state.name, state.unit
         most = 0.2 * state.largest
@@ -58,3 +63,29 @@ def on_sensors(system: type[System]) -> Iterator[Made]:
                 "order": sensing.SensorScale.order,
             },
         )
+
+
+LARGEST_TWIST = 0.02
+"""Share of a joint's range that its transmission is searched to give under its largest load."""
+
+
+def _transmissions(system: type[System]) -> Iterator[Made]:
+    """The transmission of each joint that a motor moves."""
+    example, largest = system(), torch.tensor([load.largest for load in system.loads])
+    state, command, _ = inputs(example)
+    moved = example.motor_loads(state, command).abs() > ROUNDING * largest
+    for joint, (load, (column, rate)) in enumerate(zip(system.loads, system.coordinates, strict=True)):
+        if bool(moved[:, joint].any()):
+            position, velocity = system.states[column], system.states[rate]
+            per = f"({load.unit})" if " " in load.unit else load.unit
+            most = LARGEST_TWIST * position.largest / load.largest
+            yield (
+                f"{load.name}.transmission_compliance",
+                TransmissionCompliance,
+                {
+                    "equation": f"{position.name} measured = {position.name} + compliance Q, {velocity.name} measured "
+                    f"= {velocity.name} + compliance dQ/dt, with the motor's load Q on the {load.name}",
+                    "table": (Parameter("compliance", f"{position.unit}/{per}", 0.0, most, 0.0, linear=True),),
+                    "joint": joint,
+                },
+            )
