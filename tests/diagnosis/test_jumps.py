@@ -42,8 +42,10 @@ def search_of(recording):
 
 
 def test_it_is_searched_with_jumps_that_are_not_white(jumping):
-    search = with_jumps(search_of(jumping))
+    with_loads = search_of(jumping)
+    search = with_jumps(with_loads)
     assert search.rows.jumps
+    assert with_loads.best.names in [each.names for each in search.ranked], "what explains loads was not tried"
     assert colour_left_by(search, search.best) is not None
 
 

@@ -98,7 +98,7 @@ class Search(FittedModels):
         self.extend([self.source])
         exchanged, settled = Exchanges(), None
         while self.best.names != settled:
-            self._grow_best(progress)
+            self.grow_best(progress)
             settled = self.best.names
             if exchange:
                 self._settle(exchanged)
@@ -106,7 +106,7 @@ class Search(FittedModels):
                 self._polish()
         self._report(progress, MAX_EFFECTS)
 
-    def _grow_best(self, progress: Progress | None) -> None:
+    def grow_best(self, progress: Progress | None = None) -> None:
         """Add effects to the best set while that raises the posterior odds."""
         before = None
         while self.best is not before and len(self.best.effects) < MAX_EFFECTS:
