@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from visadapt.batch import Batch
 from visadapt.dynamics import Dynamics
 from visadapt.effects import ActuationEffect, CameraEffect, DynamicsEffect, Effect, Parameter, Residual, SensingEffect
-from visadapt.effects.applied import LastApplied, applied
+from visadapt.effects.applied import LastApplied
 from visadapt.effects.base import check_acts_on
 from visadapt.effects.camera import seen_by
 from visadapt.history import History
@@ -177,16 +177,6 @@ class World(nn.Module):
         like = commands.new_zeros(episodes, len(self.system.states))
         acting, _ = self._act(commands, self._split(self._at_rest(like))[0], self.altered(like), held)
         return acting.reshape(episodes, length, self.substeps, width)
-
-    def applied(self, acting: Tensor, held: Tensor) -> Tensor:
-        """What acts (B, T, 2, n_action) as each row is read, and its rate of change over the period before, per s.
-
-        `acting` (B, T, substeps, n_action) acts after the rows of whole episodes, as `actuate` has it, for `held` s
-        (B, T); before an episode the command was zero.
-        """
-        rest = acting.new_zeros(len(acting), 2, acting.shape[-1])
-        after = applied(acting[:, :-1].mean(2), held[:, :-1], rest)
-        return torch.cat((rest[:, None], after), 1)
 
     def step(
         self, at: WorldState, action: Tensor, history: History | None = None, correction: Tensor | None = None

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from visadapt.effects import ActuationEffect, DynamicsEffect, Effect
+from visadapt.effects.applied import applied_along
 from visadapt.effects.late_sensors import LateSensors
 from visadapt.estimation.episode_phases import phase_columns
 from visadapt.estimation.late_readings import Delays, Following, following, interpolated, reading, rows_later
@@ -190,7 +191,7 @@ class CandidateModel:
     def applied(self, acting: Tensor, chosen: slice = slice(None)) -> Tensor:
         """What acts (N, 2, n_action) as the `chosen` rows of every window, flattened, are read, and its rate of change;
         `acting` (E, L, substeps, n_action) acts in whole episodes."""
-        every = self._world.applied(acting, self.rows.held)
+        every = applied_along(acting, self.rows.held)
         return every[self.rows.episode[:, None], self.rows.index[:, chosen]].flatten(0, 1)
 
     def _delays(self, theta: Tensor) -> Delays:

@@ -117,7 +117,7 @@ def train_or_load(
         return
     partial, begun = path.with_suffix(".partial.safetensors"), path.with_suffix(".begun.safetensors")
     if partial.exists() and begun.exists():
-        _check(partial, load_tree(begun), about)
+        _check(partial, load_tree(begun), about, may_be_unstated)
     save_tree(begun, about)
     train(partial)
     save_network(path, network, about)
@@ -125,10 +125,8 @@ def train_or_load(
     begun.unlink()
 
 
-def _check(
-    path: Path, kept: Mapping[str, Any], about: Mapping[str, Any], may_be_unstated: Collection[str] = ()
-) -> None:
-    """Raise CheckpointError where what was `kept` of a training differs from what it is to be."""
+def _check(path: Path, kept: Mapping[str, Any], about: Mapping[str, Any], may_be_unstated: Collection[str]) -> None:
+    """Raise CheckpointError where the training in `path`, `kept` says of which kind, is not the one of `about`."""
     stated = {key: value for key, value in about.items() if key in kept or key not in may_be_unstated}
     if other := [key for key, value in stated.items() if key not in kept or not _same(kept[key], value)]:
         raise CheckpointError(

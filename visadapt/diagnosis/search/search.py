@@ -117,8 +117,7 @@ class Search(FittedModels):
     def resume(self, found: ScoredModel) -> bool:
         """Fit a set that another search has found, and go on from it where it is the best; return whether it is."""
         before = self.best
-        (alone,) = self.fit([(found.effects, found.fits)], CAREFUL, process_noise=False)
-        self.fit([(alone.effects, alone.fits)], CAREFUL)
+        self._fit_from_quiet([(found.effects, found.fits)], CAREFUL)
         if self.best.names == before.names:
             return False
         if not self.rows.jumps:
@@ -147,13 +146,17 @@ class Search(FittedModels):
         # Process noise may stand for most of what a large effect does, at a value far from the right one: a delay of 80
         # ms was fitted as one of 45, in steps of 50, and five more effects for the rest.
         best = sorted(alone, key=lambda each: -each.log_odds)[:LEADERS]
-        quiet = self.fit([(each.effects, each.fits) for each in best], QUICK, process_noise=False)
-        self.fit([(each.effects, each.fits) for each in quiet], QUICK)
+        self._fit_from_quiet([(each.effects, each.fits) for each in best], QUICK)
         return [self.fitted[key_of(each.effects)] for each in alone]
 
     def _in_turn(self, starts: Sequence[tuple[Effects, FitState]]) -> list[ScoredModel]:
         """Fit the first few sets, which promise most, then the others, which stop early where they fall far behind."""
         return self.fit(starts[:LEADERS], QUICK) + self.fit(starts[LEADERS:], QUICK)
+
+    def _fit_from_quiet(self, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int]) -> None:
+        """Fit sets without process noise and, from there, with it."""
+        quiet = self.fit(starts, effort, process_noise=False)
+        self.fit([(each.effects, each.fits) for each in quiet], effort)
 
     def _improve_while_unexplained(self, exchanged: Exchanges) -> float:
         """Refit the best set without process noise, prune and settle, until it stays the best; return the log
@@ -190,7 +193,7 @@ class Search(FittedModels):
             for e in late
             if e not in base.effects
         ]
-        self.fit([(each.effects, each.fits) for each in self.fit(starts, QUICK, process_noise=False)], QUICK)
+        self._fit_from_quiet(starts, QUICK)
 
     def _settle(self, exchanged: Exchanges) -> None:
         """Exchange, remove and fit carefully until the best set stays the best; no exchange is made again, and those
