@@ -11,6 +11,17 @@ class TestClock:
         table["time"][5] = later
         refuses(rf"row 6 \(line 7\), column 'time': the clock {problem}", write(file, table))
 
+    def test_stamps_of_an_epoch_are_shown_whole(self, file):
+        table = a_table()
+        table["time"] = 1.7e9 + np.round(table["time"], 3)
+        table["time"][5] -= 0.08
+        refuses(r"the clock runs backward \(from 1700000000.2 s to 1700000000.17 s\)", write(file, table))
+
+    def test_long_numbers_of_episodes_are_told_apart(self, file):
+        table = {"episode": [20240601] * 41 + [20240602] * 41, **{name: [*c, *c] for name, c in a_table().items()}}
+        sources = load(write(file, table)).sources
+        assert [source.rpartition(" ")[2] for source in sources] == ["20240601", "20240602"]
+
     def test_rounded_stamps_are_those_of_a_steady_clock(self, file):
         table = a_table(rows=200, period=0.0203)
         table["time"] = np.round(1234.5 + table["time"], 3)
@@ -80,8 +91,9 @@ class TestEpisodes:
         table["x"][50] = np.nan
         refuses(r"episode 4: row 51 \(line 52\), column 'x' is nan", write(file, table))
 
-    def test_three_rows(self, file):
-        refuses("run.csv: too short: 3 rows, 0.1 s; .* at least 0.5 s", write(file, a_table(rows=3)))
+    @pytest.mark.parametrize("rows", [1, 2, 3])
+    def test_a_few_rows(self, file, rows):
+        refuses(rf"run.csv: too short: {rows} rows, .* s; .* at least 0.5 s", write(file, a_table(rows=rows)))
 
     def test_a_short_episode_is_left_out(self, tmp_path):
         write(tmp_path / "a.csv", a_table())

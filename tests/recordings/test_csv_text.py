@@ -70,6 +70,7 @@ class TestText:
             ("1_0.5", "column 'theta' is '1_0.5'; a number is right"),
             ("\uff11", "column 'theta' is .*; a number is right"),
             ("1" * 200_000, "no row of CSV: field larger than field limit"),
+            ("oops # a remark", "column 'theta' is 'oops'; a number is right"),
             ('"0.1', "a quotation mark is left open|no row of CSV"),
         ],
     )

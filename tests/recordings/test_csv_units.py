@@ -3,7 +3,8 @@ import pytest
 
 from tests.own_systems import Winch
 from tests.recorded import a_run, a_table, load, refuses, write
-from visadapt.recordings import load_recording
+from visadapt.recordings import RecordingError, load_recording
+from visadapt.systems import Quadrotor
 
 
 class TestUnits:
@@ -133,6 +134,15 @@ class TestCommands:
         table = a_table()
         table["command"] = 30 * table["command"]
         refuses(r"row \d+ \(line \d+\), column 'command' is -?\d.*within \[-1, 1\] is right", write(file, table))
+
+    def test_a_hint_is_one_that_helps(self, file):
+        table = a_table()
+        table["command"] = 30 * table["command"]
+        refuses(r"is right \(name a column in N 'force'\)", write(file, table))
+        flight = {state.name: np.zeros(41) for state in Quadrotor.states} | {"time": table["time"], "qw": np.ones(41)}
+        flight |= {action.name: np.full(41, 5.0) for action in Quadrotor.actions}
+        with pytest.raises(RecordingError, match=r"within \[-1, 1\] is right$"):
+            load(write(file, flight), system=Quadrotor())
 
     def test_a_little_out_of_range(self, file):
         table = a_table()

@@ -47,7 +47,7 @@ def numbers(path, stamps):
             for time in times:
                 # The angle passes the turn at 3 rad, as an encoder's does.
                 angle = (2 * time + 3 + np.pi) % (2 * np.pi) - np.pi
-                value = {"/x": time, "/theta": angle, "/u": 0.5}[topic]
+                value = {"/x": time, "/theta": angle, "/u": 0.5 if time > -0.1 else np.nan}[topic]
                 raw = store.serialize_cdr(number(value), "std_msgs/msg/Float64")
                 writer.write(connection, int(1e9 * (START + time)), raw)
     return path
@@ -63,9 +63,24 @@ def test_a_slower_topic_gives_the_rows_and_the_others_are_interpolated(tmp_path)
     assert "/theta is interpolated" in " ".join(found.warnings)
 
 
-def test_a_bag_and_the_file_in_it_count_once(tmp_path):
+def test_commands_before_the_first_row_count_for_nothing(tmp_path):
+    steady = np.arange(0, 3, 0.05)  # an actuator that is not armed yet is commanded nan
+    stamps = {"/x": steady, "/theta": steady, "/u": np.arange(-1, 3, 0.05)}
+    (episode,) = load_recording(numbers(tmp_path / "run", stamps), CartPole(), FIELDS).episodes
+    np.testing.assert_allclose(episode.action, 0.5)
+
+
+@pytest.mark.parametrize("alone", [["/x"], ["/theta"], ["/x", "/theta"]])
+def test_a_topic_with_a_single_reading_is_refused(alone, tmp_path):
+    stamps = dict.fromkeys(["/x", "/theta", "/u"], np.arange(0, 3, 0.05)) | dict.fromkeys(alone, np.ones(1))
+    with pytest.raises(RecordingError, match=r"run: /\w+ has a single message; readings all along are right"):
+        load_recording(numbers(tmp_path / "run", stamps), CartPole(), FIELDS)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_bag_and_the_file_in_it_count_once(turned, tmp_path):
     path = ros_bag(tmp_path / "run", 2, stamped=False)
-    found = load_recording([path, next(path.glob("*.db3"))], CartPole(), ROS)
+    found = load_recording([path, next(path.glob("*.db3"))][:: -1 if turned else 1], CartPole(), ROS)
     assert len(found.episodes) == 1
     assert "holds the same as" in " ".join(found.warnings)
 
@@ -86,6 +101,7 @@ def test_the_slower_topic_is_not_the_one_that_ends_first_and_what_is_cut_off_is_
         ({"x": "/joint_states.place[0]"}, "'place' there are effort, header, name, position, velocity"),
         ({"x": "/joint_states.position[7]"}, r"no 'position\[7\]': at '\[7\]' there are 2 values"),
         ({"x": "/joint_states.name[0]"}, "is no number but a str"),
+        ({"x": "/joint_states.position[0][1]"}, r"no 'position\[0\]\[1\]': at '\[1\]' there is a float"),
         ({"x": "position"}, "the column 'position' is not of the form TOPIC.FIELD"),
         ({"speed": "/joint_states.velocity[0]"}, "cartpole has no 'speed'"),
     ],

@@ -303,6 +303,14 @@ class TestPretrain:
         assert all(torch.equal(value, resumed.state_dict()[key]) for key, value in whole.state_dict().items())
         assert {each.name for each in tmp_path.iterdir()} == {path.name, "whole.safetensors"}
 
+    def test_what_a_run_left_that_was_killed_when_it_had_written_its_policy_is_removed(self, tmp_path):
+        setup, path = small_quadrotor(rows=11, **SMALL), tmp_path / "quadrotor.safetensors"
+        setup.pretrain(path, 0)
+        for left in (".partial.safetensors", ".begun.safetensors"):
+            path.with_suffix(left).touch()
+        setup.pretrain(path, 0)
+        assert list(tmp_path.iterdir()) == [path]
+
     def test_another_vehicles_weights_are_refused(self, tmp_path):
         path = tmp_path / "policy.safetensors"
         small_quadrotor(rows=11, **SMALL).pretrain(path, 0)

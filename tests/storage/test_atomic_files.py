@@ -119,6 +119,13 @@ with replacing({str(path)!r}) as temporary:
     assert names(tmp_path) == ["film.mp4"]
 
 
+def test_a_name_as_long_as_the_system_allows(tmp_path):
+    path = tmp_path / (80 * "\u6a5f" + ".h5")
+    with replacing(path) as temporary:
+        temporary.write_text("whole")
+    assert names(tmp_path) == [path.name]
+
+
 @pytest.mark.parametrize(
     ("name", "says"),
     [

@@ -71,7 +71,7 @@ def headline(page: Axes, title: str) -> Callable[[float], None]:
     """A title, as large as fits between 11 px and 20 px, and a clock; what is returned sets the clock, in s."""
     width = page.get_xlim()[1]
     for size in range(20, 10, -1):
-        text = page.text(0, 26, title, fontsize=size, fontweight="bold", clip_on=True)
+        text = page.text(0, 26, title, fontsize=size, fontweight="bold", clip_on=True, parse_math=False)
         if text.get_window_extent().width < width - 110 or size == 11:
             break
         text.remove()

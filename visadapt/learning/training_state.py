@@ -112,17 +112,17 @@ def train_or_load(
         CheckpointError: `path`, or what an interrupted training left, holds another network, or one that is trained in
             another way.
     """
+    partial, begun = path.with_suffix(".partial.safetensors"), path.with_suffix(".begun.safetensors")
     if path.exists():
         _check(path, load_network(path, network), about, may_be_unstated)
-        return
-    partial, begun = path.with_suffix(".partial.safetensors"), path.with_suffix(".begun.safetensors")
-    if partial.exists() and begun.exists():
-        _check(partial, load_tree(begun), about, may_be_unstated)
-    save_tree(begun, about)
-    train(partial)
-    save_network(path, network, about)
-    partial.unlink(missing_ok=True)
-    begun.unlink()
+    else:
+        if partial.exists() and begun.exists():
+            _check(partial, load_tree(begun), about, may_be_unstated)
+        save_tree(begun, about)
+        train(partial)
+        save_network(path, network, about)
+    for each in (partial, begun):  # also those of a run that was killed right after it had written `path`
+        each.unlink(missing_ok=True)
 
 
 def _check(path: Path, kept: Mapping[str, Any], about: Mapping[str, Any], may_be_unstated: Collection[str]) -> None:

@@ -36,13 +36,13 @@ def check_finite(raw: RawEpisode, actions: Sequence[Variable]) -> None:
         )
 
 
-def check_commands(episodes: Sequence[RawEpisode], actions: Sequence[Variable], note: Note) -> None:
+def check_commands(episodes: Sequence[RawEpisode], system: System, note: Note) -> None:
     """Check that commands lie in the system's range; notes those outside, and commands that never change.
 
     Raises:
         RecordingError: most commands lie outside, or one is more than twice as large as the range allows.
     """
-    for column, variable in enumerate(actions):
+    for column, variable in enumerate(system.actions):
         every = np.concatenate([raw.action[:, column] for raw in episodes])
         share = float(((every < variable.low) | (every > variable.high)).mean())
         if share == 0:
@@ -59,9 +59,11 @@ def check_commands(episodes: Sequence[RawEpisode], actions: Sequence[Variable], 
         largest = raw.action[row, column]
         right = f"within [{variable.low:g}, {variable.high:g}] is right"
         if share > 0.5 or abs(largest) > 2 * scale:
+            unit = "" if variable.unit == "1" else f" ({variable.unit})"
+            hint = " (name a column in N 'force')" if not unit and hasattr(system, "max_force") else unit
             raise RecordingError(
-                f"{raw.cell(row, variable.name)} is {largest:g}, and {share:.0%} of the column lie outside; {right}"
-                + (" (name a column in N 'force')" if variable.unit == "1" else f" ({variable.unit})")
+                f"{raw.cell(row, variable.name)} is {largest:g}, and {share:.0%} of the column lie outside; "
+                f"{right}{hint}"
             )
         note(f"{share:.1%} of {variable.name} lie outside, up to {largest:g}; {right}", "the recording")
 

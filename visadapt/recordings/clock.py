@@ -69,7 +69,7 @@ class RawEpisode:
     @property
     def source(self) -> str:
         """The file, and the episode if the file has several, for messages."""
-        return str(self.path) if self.number is None else f"{self.path}, episode {self.number:g}"
+        return str(self.path) if self.number is None else f"{self.path}, episode {self.number:.15g}"
 
     @property
     def states(self) -> dict[str, NDArray[np.float64]]:
@@ -101,9 +101,9 @@ def check_forward(raw: RawEpisode) -> None:
     if len(backwards):
         row = int(backwards[0])
         before, after = raw.time[row], raw.time[row + 1]
-        problem = "repeats itself" if f"{before:.9g}" == f"{after:.9g}" else "runs backward"
+        problem = "repeats itself" if before == after else "runs backward"
         raise RecordingError(
-            f"{raw.cell(row + 1, 'time')}: the clock {problem} (from {before:.9g} s to {after:.9g} s); each row must "
+            f"{raw.cell(row + 1, 'time')}: the clock {problem} (from {before:.15g} s to {after:.15g} s); each row must "
             "be later than the one before; mark several episodes by a column 'episode'"
         )
 

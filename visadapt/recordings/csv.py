@@ -181,11 +181,12 @@ class Table:
                 )
             if len(cells) > len(self.header):
                 raise RecordingError(f"{where} has {len(cells)} cells, the line of names {len(self.header)}")
+            used = [cells[column].partition("#")[0] for column in columns]
             try:
-                values = [_number(cells[column].partition("#")[0]) for column in columns]
+                values = [_number(cell) for cell in used]
             except ValueError:
-                column = next(column for column in columns if not _is_number(cells[column]))
-                raise RecordingError(f"{where}, column {self.header[column]!r} {_complaint(cells[column])}") from None
+                column, cell = next(each for each in zip(columns, used, strict=True) if not _is_number(each[1]))
+                raise RecordingError(f"{where}, column {self.header[column]!r} {_complaint(cell)}") from None
             yield [number, line, *values]
 
 

@@ -38,8 +38,8 @@ FORMAT, VERSION = "visadapt recording", 2
 READABLE = (1, VERSION)
 COMPRESSION = 1100
 """Highest ratio of bytes to stored bytes that compression reaches; a dataset that claims more is damaged."""
-READING_S, READING_BYTES_PER_S = 5, 10e6
-"""CPU time in s that reading any file may take, and bytes of the file for each second more."""
+READING_S, READING_BYTES_PER_S = 5, 50e6
+"""CPU time in s that opening any file may take, and bytes of its values, unpacked, for each second more."""
 DATASETS = ("time", "action", "state", "task_state", "frame")
 PART_BYTES = 2**24
 """Bytes of a dataset that are read at once where not all of its rows are used."""
@@ -79,7 +79,13 @@ def write_recording(
                 width = 0 if columns is None else columns.shape[1]
                 if len(names) != width:
                     raise RecordingError(f"{path}: {len(names)} names for {width} columns of {kind}")
-                file.attrs[f"{kind}_names"] = list(names)
+                if len({*names}) < width or not all(isinstance(name, str) for name in names):
+                    found = ", ".join(map(str, names))
+                    raise RecordingError(
+                        f"{path}: the columns of {kind} are called {found}; names that differ are right"
+                    )
+                if width:
+                    file.attrs[f"{kind}_names"] = list(names)
         for number, episode in enumerate(episodes):
             group = file.create_group(_group_name(number))
             present = {name: values for name in DATASETS if (values := getattr(episode, name)) is not None}
@@ -99,7 +105,7 @@ def write_recording(
 def read_names(path: str | os.PathLike[str], system: System | type[System]) -> tuple[list[str], list[str]]:
     """Names of the columns of state and of action, the system's if the file has none; raises like `read_recording`."""
 
-    def read() -> tuple[list[str], list[str]]:
+    def read(_: Callable[[int], None]) -> tuple[list[str], list[str]]:
         with _opened(Path(path)) as file:
             return (
                 _names(file, "state") or [variable.name for variable in system.states],
@@ -136,7 +142,7 @@ def read_stretches(
     """
     path = Path(path)
 
-    def read() -> tuple[dict[int, Episode], int]:
+    def read(allow: Callable[[int], None]) -> tuple[dict[int, Episode], int]:
         with _opened(path) as file:
             for number in range(len(file)):
                 if _group_name(number) not in file:
@@ -146,6 +152,7 @@ def read_stretches(
             every = [_datasets(path, file, number, frames) for number in range(len(file))]
             starts = [0, *accumulate(each["time"].size for each in every)]
             size = sum(dataset.nbytes for each in every for dataset in each.values())
+            allow(size)
             used = [kept(start, end, max(1, math.ceil(size / most_bytes))) for start, end in pairwise(starts)]
             episodes = {
                 number: _read_episode(path, number, datasets, rows)
@@ -158,8 +165,10 @@ def read_stretches(
     return _tried(path, read)
 
 
-def _tried(path: str | os.PathLike[str], read: Callable[[], Read]) -> Read:
+def _tried(path: str | os.PathLike[str], read: Callable[[Callable[[int], None]], Read]) -> Read:
     """The result of `read`, tried first in a process of its own: a damaged file can make HDF5 hang, or end the process.
+
+    `read` is given a function that it calls with the bytes that it is going to unpack, which take their time.
 
     Raises:
         RecordingError: that process was ended by either; or whatever `read` raises.
@@ -167,17 +176,20 @@ def _tried(path: str | os.PathLike[str], read: Callable[[], Read]) -> Read:
     if hasattr(os, "fork") and Path(path).is_file():
         import resource  # not on every system, as fork
 
-        seconds = READING_S + int(Path(path).stat().st_size / READING_BYTES_PER_S)
+        def allow(size: int) -> None:
+            hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+            resource.setrlimit(resource.RLIMIT_CPU, (READING_S + int(size / READING_BYTES_PER_S), hard))
+
         if (child := os.fork()) == 0:
             try:
-                resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+                allow(0)
                 with suppress(Exception):
-                    read()
+                    read(allow)
             finally:
                 os._exit(0)
         if os.waitpid(child, 0)[1]:
-            raise RecordingError(f"{path}: is damaged: to read it ends the process, or takes more than {seconds} s")
-    return read()
+            raise RecordingError(f"{path}: is damaged: to read it ends the process, or takes far too long")
+    return read(lambda size: None)
 
 
 @contextmanager

@@ -89,7 +89,7 @@ def load_recording(
         check_steps(episodes)
         whole += [without_outliers(raw, system, note) for raw in episodes]
     whole = _commands(_shared(whole, system, note), system, note)
-    check_commands(whole, system.actions, note)
+    check_commands(whole, system, note)
     if not frames:
         for _, of_file in groupby(whole, lambda raw: raw.path):
             check_units(list(of_file), system)
@@ -116,7 +116,8 @@ def _usable(part: RawEpisode) -> NDArray[np.bool_]:
 
 def _files(paths: Sequence[str | os.PathLike[str]], note: Note) -> list[Path]:
     """The files that are given, each once; of a folder, the recordings that are not hidden."""
-    files: list[Path] = []
+    files: dict[Path, Path] = {}  # by where they are
+    of_size: dict[int, list[Path]] = {}
     for path in map(Path, paths):
         found = [path]
         if path.is_dir() and reader(path) is None:
@@ -130,19 +131,27 @@ def _files(paths: Sequence[str | os.PathLike[str]], note: Note) -> list[Path]:
         elif not path.is_file() and not path.is_dir():
             raise RecordingError(f"{path}: no regular file; a CSV or HDF5 file is right")
         for file in found:
-            if twin := next((other for other in files if _is_the_same(file, other)), None):
+            place, as_large = file.resolve(), of_size.setdefault(file.stat().st_size, [])
+            if twin := _the_same(file, place, files) or next((o for o in as_large if _same_content(file, o)), None):
                 note(f"holds the same as {twin}, so it is not used twice", str(file))
             else:
-                files.append(file)
+                files[place] = file
+                as_large.append(file)
     if not files:
         raise RecordingError("no recording was given")
-    return files
+    return [*files.values()]
 
 
-def _is_the_same(one: Path, other: Path) -> bool:
+def _the_same(file: Path, place: Path, files: Mapping[Path, Path]) -> Path | None:
+    """Of `files`, by where they are, the one that is at `place`, or a bag that holds it or that it holds."""
+    around = [files[each] for each in (place, *place.parents) if each in files]
+    inside = [other for each, other in files.items() if place in each.parents] if file.is_dir() else []
+    return next(iter((*around, *inside)), None)
+
+
+def _same_content(one: Path, other: Path) -> bool:
     with suppress(OSError):
-        bag = one.resolve() in other.resolve().parents or other.resolve() in one.resolve().parents
-        return bag or one.samefile(other) or filecmp.cmp(one, other, shallow=False)
+        return filecmp.cmp(one, other, shallow=False)
     return False
 
 

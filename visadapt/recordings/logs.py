@@ -63,6 +63,8 @@ def _rows(
         stamps = topics[name].time
         if not len(stamps):
             raise RecordingError(f"{path}: {name} has no messages")
+        if len(stamps) < 2 and any(places[state][0] == name for state in measured):
+            raise RecordingError(f"{path}: {name} has a single message; readings all along are right")
         if (back := np.flatnonzero(np.diff(stamps) < 0)).size:
             raise RecordingError(f"{path}: the clock of {name} runs backwards after its message {back[0] + 1}")
     read = list(dict.fromkeys(places[name][0] for name in measured))
@@ -119,8 +121,8 @@ def _rows(
 
 
 def _interval(stamps: NDArray[np.float64]) -> float:
-    """The median interval in s between a topic's messages; infinite for a single one."""
-    return float(np.median(np.diff(stamps))) if len(stamps) > 1 else float("inf")
+    """The median interval in s between a topic's messages."""
+    return float(np.median(np.diff(stamps)))
 
 
 def _between_readings(time: NDArray[np.float64], stamps: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -133,6 +135,8 @@ def _between_readings(time: NDArray[np.float64], stamps: NDArray[np.float64]) ->
 
 def _held(time: NDArray[np.float64], stamps: NDArray[np.float64], commands: NDArray[np.float64]) -> NDArray[np.float64]:
     """The mean of the held commands (N,) from each time (T,) to the next; for the last time, the command held there."""
+    first = max(0, int(np.searchsorted(stamps, time[0], side="right")) - 1)  # a command that was replaced may be NaN
+    stamps, commands = stamps[first:], commands[first:]
     total = np.concatenate(([0.0], np.cumsum(commands[:-1] * np.diff(stamps))))
     mean = np.diff(np.interp(time, stamps, total)) / np.maximum(np.diff(time), 1e-12)
     return np.append(mean, commands[np.searchsorted(stamps, time[-1], side="right") - 1])

@@ -47,7 +47,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     final = Path(os.path.realpath(path))
     through = _is_device(path)
     folder = Path(tempfile.gettempdir()) if through else final.parent
-    stem = f".{final.stem[:100]}.{socket.gethostname()[:50]}"
+    stem = f".{final.stem.encode()[:100].decode(errors='ignore')}.{socket.gethostname()[:50]}"
     temporary = folder / f"{stem}.{os.getpid()}-{uuid.uuid4().hex[:8]}{final.suffix}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
