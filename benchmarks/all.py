@@ -171,7 +171,7 @@ COMMANDS = (
     Command(
         "planned_experiments",
         "planned_experiments.csv",
-        ("benchmarks.planned_experiments", "--seeds", "1"),
+        ("benchmarks.planned_experiments",),
         15,
         work="--work",
     ),
