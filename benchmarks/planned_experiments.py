@@ -5,8 +5,8 @@
 The source policy runs gently on a cart-pole with one hidden effect: 80 noisy rows, diagnosed with the whole catalogue.
 Where the diagnosis is ambiguous, 200 more rows are recorded in three ways: with the excitation of `visadapt.plan` added
 to the policy's commands, with white noise of the same root mean square, and with neither. Each is diagnosed together
-with the first recording, and is right where the hidden effect alone is then identified. Ambiguities that no excitation
-is expected to settle, as that of a force with a bias of the motor, are left as they are.
+with the first recording, and is right where nothing but the hidden effect is then named, and those that no motion tells
+from it, as a bias of the motor from a force.
 
 Writes results/planned_experiments.csv. Interrupt it anywhere; started again, it goes on.
 """
@@ -27,7 +27,9 @@ import visadapt as va
 from experiments.parallel import in_processes
 from experiments.result_tables import Row, write_rows
 from visadapt import effects
-from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, Diagnosis, without_slight
+from visadapt.diagnosis.result import AMBIGUOUS, Diagnosis, without_slight
+from visadapt.effects import EFFECTS
+from visadapt.effects.catalogue import twins
 from visadapt.storage.run_folder import once, open_run
 from visadapt.weights import shipped
 
@@ -68,7 +70,8 @@ HIDDEN: Mapping[str, Callable[[], va.Effect]] = {
 }
 """Small enough that a gentle recording may leave the cause open."""
 GENTLY, PLANNED, WHITE, NEITHER = "gently run", "as planned", "white noise of the same power", "no excitation"
-OUTCOMES = SETTLED, OTHERWISE, OPEN = "the hidden effect alone", "another answer", "ambiguous"
+OUTCOMES = SETTLED, OTHERWISE, OPEN = "the hidden effect alone, or with twins", "another answer", "ambiguous"
+"""Twins are effects that no motion tells apart."""
 
 
 @dataclass(frozen=True)
@@ -153,9 +156,11 @@ def _named(found: Diagnosis) -> dict[str, list[str]]:
 
 
 def _judged(found: Diagnosis, hidden: va.Effect) -> str:
-    if found.verdict == AMBIGUOUS:
-        return OPEN
-    return SETTLED if found.verdict == IDENTIFIED and list(_named(found)) == [hidden.name] else OTHERWISE
+    named = _named(found).keys()
+    alike = {hidden.name, *(twin.name for twin in twins(type(hidden), EFFECTS.values(), va.CartPole()))}
+    if hidden.name in named and named <= alike:
+        return SETTLED
+    return OPEN if found.verdict == AMBIGUOUS else OTHERWISE
 
 
 def _recorded(

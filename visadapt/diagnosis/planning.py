@@ -1,11 +1,11 @@
 """The experiment that settles an ambiguity: the excitation of the commands that tells two explanations apart best.
 
 An ambiguous diagnosis names effects that fit a recording equally well. Each explanation is simulated under every
-excitation of a family (square waves, sines, white noise; the largest that keeps all states within 0.9 of the system's
-ranges), and every explanation is fitted to what each shows. The worth of an excitation is the log posterior odds of the
-true against the other explanation: the least over all pairs of the first explanation and another, with either of them
-true. This is the expected information of Box and Hill (1967), Technometrics 9(1), with fits in place of a linear model
-and the worst case in place of the mean.
+excitation of a family (square waves, sines, pseudo-random binary sequences, white noise; the largest that keeps all
+states within 0.9 of the system's ranges), and every explanation is fitted to what each shows. The worth of an
+excitation is the log posterior odds of the true against the other explanation: the least over all pairs of the first
+explanation and another, with either of them true. This is the expected information of Box and Hill (1967),
+Technometrics 9(1), with fits in place of a linear model and the worst case in place of the mean.
 
 The odds are those of readings without noise under the recording's noise, which is what they are on average: drawn noise
 would add a few units at random, and the best of many excitations would be the luckiest.
@@ -39,7 +39,8 @@ from visadapt.systems import System
 from visadapt.world import World
 
 FREQUENCIES = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # Hz
-SIZES = (0.05, 0.1, 0.2, 0.4, 0.8)
+BIT_ROWS = (1, 2, 4, 8)  # Rows of a bit of a pseudo-random binary sequence
+SIZES = (0.05, 0.1, 0.14, 0.2, 0.28, 0.4, 0.57, 0.8)
 """Amplitudes that are tried, and the standard deviation of white noise, as shares of half the command's range."""
 MARGIN = 0.9  # Share of the states' ranges that an experiment may reach
 SUBSTEP = 0.0125  # s, the longest integration step of a simulation
@@ -260,6 +261,10 @@ def _excitations(system: System, period: float, samples: int, generator: torch.G
             f"a square wave of {f:g} Hz{where}": torch.where(phase.sin() >= 0, 1.0, -1.0) for f, phase in phases.items()
         }
         signals |= {f"a sine of {f:g} Hz{where}": phase.sin() for f, phase in phases.items()}
+        for rows in BIT_ROWS:
+            coin = torch.randint(2, (math.ceil(samples / rows),), generator=generator).to(time)
+            held = coin.repeat_interleave(rows)[:samples]
+            signals[f"a pseudo-random binary sequence with bits of {rows * period:.3g} s{where}"] = 2 * held - 1
         signals[f"white noise{where}"] = torch.randn(samples, generator=generator, dtype=torch.float64)
         for name, values in signals.items():
             shape = torch.zeros(samples, len(system.actions), dtype=torch.float64)
