@@ -20,6 +20,7 @@ from benchmarks.pages import BLOCK, GENERATED, PAGES, RESULTS_PAGES, TABLES, fil
 from tests.own_systems import page_code
 from visadapt.cli import main
 from visadapt.effects import EFFECTS
+from visadapt.history import History
 from visadapt.systems import CartPole
 from visadapt.systems.parameter_file import load_parameters
 from visadapt.targets import Target
@@ -209,6 +210,19 @@ def test_the_loop_of_the_page_balances_a_cart_pole(tmp_path):
     _, speed, angle, _ = at[-1].state[0].abs().tolist()
     assert speed < 0.01
     assert angle < 0.01
+
+
+def test_the_loop_of_the_page_flies(tmp_path):
+    (code,) = (block for block in PYTHON.findall(text_of("own_rig.md")) if "def control" in block)
+    scope: dict = {}
+    exec(compile(code, "machine.py", "exec"), scope)
+    policy, sent = va.load_policy(va.shipped("fixed_wing")), []
+    va.export_policy(tmp_path / "policy.onnx", policy)
+    state = torch.tensor([[0.0, 0.0, 0.0, 12.0, 0.0, 0.0, 1.0, *6 * [0.0]]])
+    shown = torch.cat((state, torch.tensor([[60.0, 1.0, 2.0]])), 1)
+    scope["control"](tmp_path / "policy.onnx", lambda: shown[0].numpy(), sent.append, 2, commands=4)
+    first = policy.act(History.start(shown, 4))[0].detach()
+    assert torch.allclose(torch.as_tensor(sent[0]), first, atol=1e-5)
 
 
 def test_the_rig_and_the_map_of_the_page_load(tmp_path):

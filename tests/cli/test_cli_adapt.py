@@ -64,6 +64,7 @@ def test_the_causes_of_the_gap_are_named_and_put_into_the_simulator(here, capsys
     only_effects("constant_force", "actuator_bias", "actuator_gain", "viscous_friction", "spring", "angle_offset")
     # One excitation for the next round of 30, for the time it takes.
     monkeypatch.setattr(planning, "FREQUENCIES", (0.8,))
+    monkeypatch.setattr(planning, "BIT_ROWS", ())
     monkeypatch.setattr(planning, "SIZES", (0.2,))
     policy = ("--policy", SHIPPED, "--target", "rig:states", "--diagnose")
     assert run("adapt", *policy, *SMALL) == 0

@@ -46,6 +46,7 @@ def test_what_two_causes_explain_is_settled_by_an_experiment_in_the_next_round(t
     only_effects("viscous_friction", "coulomb_friction", "actuator_gain")
     # One excitation of 30, and coarser steps of the target, for the time they take.
     monkeypatch.setattr(planning, "FREQUENCIES", (0.8,))
+    monkeypatch.setattr(planning, "BIT_ROWS", ())
     monkeypatch.setattr(planning, "SIZES", (0.4,))
     monkeypatch.setattr(synthetic, "SMOOTH_STEP", 0.0125)
     effects = [va.effects.ViscousFriction(coefficient=0.3), ReadingNoise()]

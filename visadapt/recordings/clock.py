@@ -27,7 +27,7 @@ LONGEST_STEP_PERIODS = 3.0
 """Longest step, in periods, of an irregular clock; at longer ones the episode is split."""
 HARMLESS_GAP_S = 0.01
 """Step up to which an episode is never split: a loop of a few ms that stalls for so long holds its command."""
-SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-4, 0.5 / 3
+SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-4, 0.1667
 """Least and largest period in s; at the largest, the shortest episode, of 0.5 s, has three steps."""
 LEAST_STEP_PERIODS = 1e-3
 """Step between two rows, in periods, below which the stamps are not those of the readings."""
@@ -123,7 +123,7 @@ def check_steps(episodes: Sequence[RawEpisode]) -> None:
         units = [name for name, unit in UNITS_S.items() if SHORTEST_PERIOD_S <= unit * period <= LONGEST_PERIOD_S]
         raise RecordingError(
             f"{raw.source}: column 'time': rows are {period:.4g} s apart; {SHORTEST_PERIOD_S:g} to "
-            f"{LONGEST_PERIOD_S:.2g} s are right" + (f" (is the clock in {' or '.join(units)}?)" if units else "")
+            f"{LONGEST_PERIOD_S:g} s are right" + (f" (is the clock in {' or '.join(units)}?)" if units else "")
         )
     for raw, own in zip(episodes, steps, strict=True):
         if len(own) and own.min() < LEAST_STEP_PERIODS * period:
