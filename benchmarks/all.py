@@ -83,8 +83,8 @@ COMMANDS = (
     Command("action_times", "action_times.csv", ("benchmarks.action_times",), 1, extra="onnx"),
     Command("power_loop", "power_loop.csv", ("benchmarks.power_loop",), 10),
     Command("residual_samples", "residual_samples.csv", ("benchmarks.residual_samples",), 5),
-    Command("cartpole_states", "cartpole_states.csv", ("benchmarks.cartpole_states",), 10, work="--work"),
-    Command("swing_up", "swing_up.csv", ("train.swing_up",), 20, work="--work"),
+    Command("cartpole_states", "cartpole_states.csv", ("benchmarks.cartpole_states",), 20, work="--work"),
+    Command("swing_up", "swing_up.csv", ("train.swing_up",), 60, work="--work"),
     Command("swing_up_ppo", "swing_up_ppo.csv", ("benchmarks.swing_up_ppo",), 10, extra="baselines"),
     Command("cartpole_pixels", "cartpole_pixels.csv", ("benchmarks.cartpole_pixels",), 30, work="--work"),
     Command(
@@ -160,7 +160,7 @@ COMMANDS = (
         reads=(("--cartpole", "cartpole_states"), ("--flight", "flight")),
     ),
     Command("named_effects", "named_effects.csv", ("benchmarks.named_effects",), 30, work="--work"),
-    Command("named_control", "named_control.csv", ("benchmarks.named_control", "--seeds", "2"), 30, work="--work"),
+    Command("named_control", "named_control.csv", ("benchmarks.named_control", "--seeds", "2"), 80, work="--work"),
     Command(
         "named_control_frames",
         "named_control_frames.csv",
@@ -234,11 +234,11 @@ COMMANDS = (
         "blind_diagnosis_2029.csv",
     ),
     _blind("blind_hard", "--seed 2028 --kinds hard --count 100 --jobs 2", 20),
-    _blind("blind_easy", "--seed 2028 --kinds easy --count 24 --jobs 2", 10),
+    _blind("blind_easy", "--seed 2028 --kinds easy --count 24 --jobs 2", 20),
     _blind(
         "blind_rig",
         "--seed 2045 --kinds rig --effects all --count 48 --jobs 2 --diagnosers ours --out results/blind_rigs.csv",
-        10,
+        20,
         "blind_rigs.csv",
     ),
     _blind(
