@@ -216,7 +216,8 @@ def test_the_loop_of_the_page_flies(tmp_path):
     (code,) = (block for block in PYTHON.findall(text_of("own_rig.md")) if "def control" in block)
     scope: dict = {}
     exec(compile(code, "machine.py", "exec"), scope)
-    policy, sent = va.load_policy(va.shipped("fixed_wing")), []
+    policy = va.load_policy(va.shipped("fixed_wing"))
+    sent: list = []
     va.export_policy(tmp_path / "policy.onnx", policy)
     state = torch.tensor([[0.0, 0.0, 0.0, 12.0, 0.0, 0.0, 1.0, *6 * [0.0]]])
     shown = torch.cat((state, torch.tensor([[60.0, 1.0, 2.0]])), 1)
