@@ -226,7 +226,6 @@ COMMANDS = (
         work="--out",
         extra="rotorpy",
     ),
-    # The second draw first: results/blind_confusion.csv keeps the last answers to a set, those of the first draw.
     _blind(
         "blind_2029",
         "--seed 2029 --kinds hard --count 100 --jobs 2 --diagnosers ours --out results/blind_diagnosis_2029.csv",

@@ -28,6 +28,7 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -164,7 +165,7 @@ def _setup(settings: Settings, source: World | None = None) -> Setup:
     if settings.shown == "frames":
         return cartpole_frames(source)
     own = from_states(World(CartPole())).shortened(settings.source_iterations)
-    own = replace(own, tuning=replace(own.tuning, iterations=settings.iterations))
+    own = own.with_tuning(partial(replace, iterations=settings.iterations))
     return cartpole_states(source, with_history=True, settings=own)
 
 

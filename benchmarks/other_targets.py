@@ -11,7 +11,7 @@ chooses anything. Interrupt it anywhere; started again, it goes on.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -48,6 +48,7 @@ class Settings:
 
 def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
+    settings = replace(settings, work=settings.work / settings.shown)
     source(settings.shown, settings.work)  # trained here, once, where it is not shipped
     before = in_processes(unadapted_score, settings, [(name,) for name in settings.targets])
     jobs = [(name, seed) for name in settings.targets for seed in range(settings.seeds)]

@@ -117,8 +117,9 @@ def main(settings: Settings) -> None:
 def _settled(settings: Settings, name: str, seed: int) -> dict[str, Any]:
     """What the gentle recording is answered, and, where an experiment is planned, what is answered with more rows."""
     torch.set_num_threads(1)
-    folder = settings.work / name.replace(" ", "-").replace(",", "") / str(seed)
-    open_run(folder, {"hidden": name, "seed": seed, "noise": NOISE.tolist(), "gentle": GENTLE, "rows": MORE_ROWS})
+    folder = settings.work / name.replace(" ", "-").replace("/", "-").replace(",", "") / str(seed)
+    rows = (EPISODES, ROWS, MORE_ROWS)
+    open_run(folder, {"hidden": name, "seed": seed, "noise": NOISE.tolist(), "gentle": GENTLE, "rows": rows})
     return once(folder / "outcome.json", lambda: _outcome(HIDDEN[name](), seed))
 
 

@@ -78,7 +78,8 @@ def main(settings: Settings) -> None:
         }
         about = ("CartPole, states, one hidden effect and a vibration", "cartpole", method, "target", EPISODES * ROWS)
         for measure, number in numbers.items():
-            rows.append(Row(*about, measure, "share", round(number, 4), None, len(answers), 0, settings.seeds))
+            unit = "1" if measure == OTHERS else "share"
+            rows.append(Row(*about, measure, unit, round(number, 4), None, len(answers), 0, settings.seeds))
     write_rows(settings.out, rows)
     for row in rows:
         print(f"{row.method:24} {row.measure:36} {row.mean:.3f}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -40,7 +41,7 @@ class CartPoleProblem(Problem):
 
     def setup(self, sizes: Sizes) -> Setup:
         settings = from_states(World(CartPole())).shortened(sizes.iterations)
-        settings = replace(settings, tuning=replace(settings.tuning, iterations=sizes.tuning))
+        settings = settings.with_tuning(partial(replace, iterations=sizes.tuning))
         return cartpole_states(with_history=self.with_history, settings=settings)
 
     def target(self) -> SyntheticTarget:

@@ -1,4 +1,4 @@
-"""What else one could use, on the same task, cost, inputs, starts, budgets and 100 scored episodes as ours.
+"""What else one could use, on the same task, cost, inputs, starts and budgets as ours (`--episodes`: of every score).
 
     python -m benchmarks.baselines [--baselines ppo mpc] [--smoke]
     python -m benchmarks.baselines --baselines mpc ppo pets --experiments 'quadrotor, drag' 'fixed wing, drag' \

@@ -7,7 +7,7 @@
 Makes the recordings with datasets.blind.gaps or datasets.blind.flights unless they exist, gives every diagnoser the
 path of one CSV at a time, and opens the key only for scoring. Every answer is appended to a log, so that an interrupted
 run resumes; with --data, recordings made elsewhere are scored. Writes results/blind_diagnosis.csv (one row per set,
-diagnoser and measure) and results/blind_confusion.csv, in which rows of other diagnosers and sets are kept.
+diagnoser and measure) and results/blind_diagnosis_confusion.csv, in which rows of other diagnosers and sets are kept.
 """
 
 from __future__ import annotations
@@ -292,7 +292,7 @@ def write(out: Path, rows: list[Row], taken: list[dict[str, str | int]]) -> None
 
     if rows:
         write_table(out, rows, others(out))
-        beside = out.with_name("blind_confusion.csv")
+        beside = out.with_name(f"{out.stem}_confusion.csv")
         write_csv(beside, ("kind", "diagnoser", "truth", "answer", "count"), [*others(beside), *taken])
 
 

@@ -34,8 +34,7 @@ def open_run(folder: Path, settings: Mapping[str, Any], file: str = "settings.js
     if found != wanted:
         differing = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
         raise RunError(
-            f"{folder} holds a run with other settings ({', '.join(differing)}): remove that folder, or name another "
-            "by --out"
+            f"{folder} holds a run with other settings ({', '.join(differing)}): remove that folder, or name another"
         )
     return run
 
