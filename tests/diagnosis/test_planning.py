@@ -17,8 +17,9 @@ SOURCE = va.World(va.CartPole())
 
 @pytest.fixture(autouse=True)
 def few_excitations(monkeypatch):
-    """Two frequencies of six, for the time it takes."""
+    """Two frequencies of six and one binary sequence of four, for the time it takes."""
     monkeypatch.setattr(planning, "FREQUENCIES", (0.2, 0.8))
+    monkeypatch.setattr(planning, "BIT_ROWS", (4,))
 
 
 @pytest.fixture(scope="module")
