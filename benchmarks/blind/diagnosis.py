@@ -149,8 +149,9 @@ def diagnose_one(name: str, path: Path) -> dict[str, Any]:
 
 
 def fingerprint(path: Path) -> str:
-    """SHA-256 of a recording, to check that a logged answer belongs to it."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    """SHA-256 of a recording, and of a film's renderer, to check that a logged answer belongs to them."""
+    renderer = renderer_of(path.parent).read_bytes() if path.suffix == ".h5" else b""
+    return hashlib.sha256(path.read_bytes() + renderer).hexdigest()
 
 
 def read_log(path: Path) -> dict[str, dict[str, Any]]:
