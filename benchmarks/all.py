@@ -172,7 +172,7 @@ COMMANDS = (
         "planned_experiments",
         "planned_experiments.csv",
         ("benchmarks.planned_experiments",),
-        15,
+        20,
         work="--work",
     ),
     Command("vibrations", "vibrations.csv", ("benchmarks.vibrations", "--seeds", "2"), 10, work="--work"),

@@ -6,7 +6,7 @@ The source policy runs gently on a cart-pole with one hidden effect: 80 noisy ro
 Where the diagnosis is ambiguous, 200 more rows are recorded in three ways: with the excitation of `visadapt.plan` added
 to the policy's commands, with white noise of the same root mean square, and with neither. Each is diagnosed together
 with the first recording, and is right where nothing but the hidden effect is then named, and those that no motion tells
-from it, as a bias of the motor from a force.
+from it, as a bias of the motor from a force. Ambiguities that no excitation is expected to settle are left as they are.
 
 Writes results/planned_experiments.csv. Interrupt it anywhere; started again, it goes on.
 """
@@ -28,7 +28,6 @@ from experiments.parallel import in_processes
 from experiments.result_tables import Row, write_rows
 from visadapt import effects
 from visadapt.diagnosis.result import AMBIGUOUS, Diagnosis, without_slight
-from visadapt.effects import EFFECTS
 from visadapt.effects.catalogue import twins
 from visadapt.storage.run_folder import once, open_run
 from visadapt.weights import shipped
@@ -158,7 +157,7 @@ def _named(found: Diagnosis) -> dict[str, list[str]]:
 
 def _judged(found: Diagnosis, hidden: va.Effect) -> str:
     named = _named(found).keys()
-    alike = {hidden.name, *(twin.name for twin in twins(type(hidden), EFFECTS.values(), va.CartPole()))}
+    alike = {hidden.name, *(twin.name for twin in twins(type(hidden), effects.EFFECTS.values(), va.CartPole()))}
     if hidden.name in named and named <= alike:
         return SETTLED
     return OPEN if found.verdict == AMBIGUOUS else OTHERWISE

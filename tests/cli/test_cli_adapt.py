@@ -62,7 +62,7 @@ def test_effects_of_a_diagnosis_are_fitted_to_the_target(here, trained, diagnosi
 
 def test_the_causes_of_the_gap_are_named_and_put_into_the_simulator(here, capsys, only_effects, monkeypatch):
     only_effects("constant_force", "actuator_bias", "actuator_gain", "viscous_friction", "spring", "angle_offset")
-    # One excitation for the next round of 30, for the time it takes.
+    # Three excitations of one size for the next round, for the time they take.
     monkeypatch.setattr(planning, "FREQUENCIES", (0.8,))
     monkeypatch.setattr(planning, "BIT_ROWS", ())
     monkeypatch.setattr(planning, "SIZES", (0.2,))

@@ -32,7 +32,7 @@ def browser():
 
 
 @pytest.fixture
-def opened(browser, tmp_path, request):
+def opened(browser, tmp_path):
     """Opens a report on a screen of some size; afterwards nothing may have been fetched or complained of."""
     complaints, contexts = [], []
 

@@ -139,7 +139,7 @@ class TestCommands:
         table = a_table()
         table["command"] = 30 * table["command"]
         refuses(r"is right \(name a column in N 'force'\)", write(file, table))
-        flight = {state.name: np.zeros(41) for state in Quadrotor.states} | {"time": table["time"], "qw": np.ones(41)}
+        flight = {state.name: np.zeros(41) for state in Quadrotor.states} | {"time": table["time"], "q_w": np.ones(41)}
         flight |= {action.name: np.full(41, 5.0) for action in Quadrotor.actions}
         with pytest.raises(RecordingError, match=r"within \[-1, 1\] is right$"):
             load(write(file, flight), system=Quadrotor())

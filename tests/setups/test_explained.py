@@ -44,7 +44,7 @@ def test_what_a_file_names_on_a_system_of_ones_own_is_known_before_it_is_read():
 
 def test_what_two_causes_explain_is_settled_by_an_experiment_in_the_next_round(tmp_path, monkeypatch, only_effects):
     only_effects("viscous_friction", "coulomb_friction", "actuator_gain")
-    # One excitation of 30, and coarser steps of the target, for the time they take.
+    # Three excitations of one size, and coarser steps of the target, for the time they take.
     monkeypatch.setattr(planning, "FREQUENCIES", (0.8,))
     monkeypatch.setattr(planning, "BIT_ROWS", ())
     monkeypatch.setattr(planning, "SIZES", (0.4,))

@@ -115,11 +115,13 @@ def _number(path: Path, message: Any, topic: str, field: str) -> float:
         try:
             value = value[int(part[1:-1])] if part.startswith("[") else getattr(value, part)
         except (AttributeError, IndexError, TypeError):
-            names = getattr(value, "__dataclass_fields__", None)
-            has = f"are {_some(set(names) - {'__msgtype__'})}" if names else f"is a {type(value).__name__}"
-            if hasattr(value, "__len__"):
-                has = f"are {len(value)} values"
-            raise RecordingError(f"{path}: {topic} has no {field!r}: at {part!r} there {has}") from None
+            if names := getattr(value, "__dataclass_fields__", None):
+                there = f"are {_some(set(names) - {'__msgtype__'})}"
+            elif hasattr(value, "__len__"):
+                there = f"are {len(value)} values"
+            else:
+                there = f"is a {type(value).__name__}"
+            raise RecordingError(f"{path}: {topic} has no {field!r}: at {part!r} there {there}") from None
     try:
         return float(value)
     except (TypeError, ValueError):
