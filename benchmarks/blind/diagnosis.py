@@ -24,11 +24,13 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import tyro
 
+from benchmarks.blind.ablations import PARTS, watched, without
 from benchmarks.blind.baselines import BASELINES, FLYING
 from benchmarks.blind.flight_onestep import system_of
 from benchmarks.blind.scoring import Answer, Score, Truth, score
@@ -105,6 +107,19 @@ def ours(path: Path) -> Answer:
     return answer
 
 
+def watched_ours(path: Path) -> Answer:
+    """The same, and which of its parts acted."""
+    with watched() as acting:
+        answer = ours(path)
+    return {**answer, "acting": sorted(acting)}
+
+
+def ours_without(part: str, path: Path) -> Answer:
+    """The same without one of its parts."""
+    with without(part):
+        return ours(path)
+
+
 def _visadapt(*arguments: str) -> None:
     """The command `visadapt`, run in this process; raises RuntimeError with what it said where it fails."""
     # Imported here: a worker that runs a baseline need not load the command line.
@@ -121,7 +136,13 @@ def renderer_of(folder: Path) -> Path:
     return folder.with_name(folder.name + ".renderer.safetensors")
 
 
-DIAGNOSERS: dict[str, Callable[[Path], Answer]] = {"ours": ours, **BASELINES}
+WATCHED = "ours, watched"
+DIAGNOSERS: dict[str, Callable[[Path], Answer]] = {
+    "ours": ours,
+    **BASELINES,
+    WATCHED: watched_ours,
+    **{part: partial(ours_without, part) for part in PARTS},
+}
 """path of a CSV -> answer, by name"""
 
 

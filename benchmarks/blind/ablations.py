@@ -1,0 +1,148 @@
+"""The parts of our diagnosis: on which recordings each acts, and the diagnosis without it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import wraps
+from importlib import import_module
+from typing import Any
+from unittest.mock import patch
+
+from visadapt.diagnosis.search import heldout, search
+from visadapt.diagnosis.search.fitted_models import (
+    MIN_BETTER,
+    FittedModels,
+    ScoredModel,
+    WithoutProcessNoise,
+    less,
+)
+from visadapt.diagnosis.search.model_comparison import MIN_LEFTOVER, ModelComparison
+from visadapt.diagnosis.search.search import TWO_FOR_ONE_UP_TO, WIDEN_ABOVE, Exchanges, Search
+from visadapt.estimation.fit_states import CAREFUL, QUICK, Effects
+from visadapt.estimation.likelihood import FitState
+
+DIAGNOSE = import_module("visadapt.diagnosis.diagnose")
+"""The module; as an attribute of its package, the name is that of the function."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the diagnosis, by the function or method that does it."""
+
+    owner: Any
+    """module or class"""
+    name: str
+    without: Callable[..., Any]
+    """what is called in its place in the diagnosis without the part"""
+    acts: Callable[..., bool] = lambda *_: True
+    """of what it returned, and its arguments: whether the diagnosis may be another without the part"""
+
+
+@contextmanager
+def without(part: str) -> Iterator[None]:
+    """A context in which the diagnosis lacks a part."""
+    one = PARTS[part]
+    with patch.object(one.owner, one.name, one.without):
+        yield
+
+
+@contextmanager
+def watched() -> Iterator[set[str]]:
+    """A context that collects the names of the parts that act in it."""
+    acting: set[str] = set()
+    with ExitStack() as stack:
+        for name, part in PARTS.items():
+            stack.enter_context(patch.object(part.owner, part.name, _noting(name, part, acting)))
+        yield acting
+
+
+def _noting(name: str, part: Part, acting: set[str]) -> Callable[..., Any]:
+    """The function of a part, which adds the part's name to `acting` where it acts."""
+    function = getattr(part.owner, part.name)
+
+    @wraps(function)
+    def noting(*arguments: Any, **options: Any) -> Any:
+        out = function(*arguments, **options)
+        if part.acts(out, *arguments, **options):
+            acting.add(name)
+        return out
+
+    return noting
+
+
+def _nothing(*_: object, **__: object) -> None:
+    pass
+
+
+def _remove_only(self: Search, centre: ScoredModel, exchanged: Exchanges) -> None:
+    self.fit([less(centre, [removed]) for removed in centre.effects], QUICK)
+
+
+def _one_for_one_only(self: Search, centre: ScoredModel, exchanged: Exchanges) -> None:
+    with patch.object(search, "TWO_FOR_ONE_UP_TO", 0):
+        _fit_neighbours(self, centre, exchanged)
+
+
+def _without_widening(self: Search, exchanged: Exchanges) -> float:
+    _improve_while_unexplained(self, exchanged)
+    return 0.0
+
+
+def _fit_with_noise(self: Search, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int]) -> None:
+    self.fit(starts, effort)
+
+
+def _measure_what_is_left(self: FittedModels, sets: Sequence[ScoredModel]) -> list[WithoutProcessNoise]:
+    out = self._fits([(each.effects, each.fits) for each in sets], CAREFUL, float("-inf"), process_noise=False)
+    left = [max(0.0, float(each.fits.likelihood - fits.likelihood)) for each, fits in zip(sets, out, strict=True)]
+    return [WithoutProcessNoise(fits, rest) for fits, rest in zip(out, left, strict=True)]
+
+
+def _by_noise_and_black_box(self: ModelComparison, improvable: bool) -> bool:
+    return improvable or self.leftover > MIN_LEFTOVER
+
+
+_fit_neighbours, _improve_while_unexplained = Search._fit_neighbours, Search._improve_while_unexplained
+
+PARTS = {
+    "every effect alone": Part(Search, "_alone", lambda _: [], lambda out, _: bool(out)),
+    "exchanges": Part(Search, "_fit_neighbours", _remove_only, lambda _, self, centre, made: bool(centre.effects)),
+    "two for one": Part(
+        Search,
+        "_fit_neighbours",
+        _one_for_one_only,
+        lambda _, self, centre, made: 2 <= len(centre.effects) <= TWO_FOR_ONE_UP_TO,
+    ),
+    "careful fits": Part(Search, "_polish", _nothing),
+    "starts without process noise": Part(Search, "_fit_from_quiet", _fit_with_noise),
+    "better fits without process noise": Part(
+        FittedModels,
+        "without_process_noise",
+        _measure_what_is_left,
+        lambda out, self, sets: any(
+            one.fits.likelihood > each.fits.likelihood + MIN_BETTER for one, each in zip(out, sets, strict=True)
+        ),
+    ),
+    "widening": Part(
+        Search, "_improve_while_unexplained", _without_widening, lambda left, self, made: left > WIDEN_ABOVE
+    ),
+    "late sensors": Part(Search, "try_late_sensors", _nothing),
+    "phases of episodes": Part(Search, "_phases_of_episodes", _nothing),
+    "jumps": Part(DIAGNOSE, "with_jumps", _nothing, lambda out, _: out is not None),
+    "coloured noise": Part(
+        DIAGNOSE,
+        "with_coloured_noise",
+        lambda found, compared, *_: (found, compared),
+        lambda out, found, *_: out[0] is not found,
+    ),
+    "black box": Part(heldout, "predicts_better", lambda *_: False, lambda out, *_: out),
+    "smooth functions": Part(
+        ModelComparison,
+        "unexplained",
+        _by_noise_and_black_box,
+        lambda out, self, improvable: out != _by_noise_and_black_box(self, improvable),
+    ),
+}
+"""What may be left out, by the name of the row in the table."""
