@@ -87,7 +87,8 @@ def main(settings: Settings) -> None:
             rows.append(_row(kind, part, truths, whole, {one.name: lines[one.name] for one in acts}))
             print(rows[-1])
     run = {(row["kind"], row["without"]) for row in rows}
-    kept = [row for row in read_rows(settings.out) if (row["kind"], row["without"]) not in run] if settings.out.exists() else []
+    others = read_rows(settings.out) if settings.out.exists() else []
+    kept = [row for row in others if (row["kind"], row["without"]) not in run]
     write_csv(settings.out, COLUMNS, [*kept, *rows])
 
 

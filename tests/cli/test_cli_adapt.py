@@ -155,10 +155,23 @@ def test_a_diagnosis_that_named_nothing(here, trained, diagnosis, capsys):
 
 def test_a_renderer_that_the_policy_was_not_trained_with(here, trained, capsys):
     command = ("adapt", "--policy", trained / "frames.safetensors", "--target", "rig:filmed", *SMALL)
-    assert "frames.safetensors: was not trained with the renderer" in refused(capsys, *command)
+    assert "the policy was not trained with this renderer" in refused(capsys, *command)
     write_frames(here / "a.h5", 40)
     other = ("--hinge", "22,28", "--scale", 15, "--iterations", 3, "--out", "other.safetensors")
     assert run("renderer", "a.h5", *other) == 0
     line = refused(capsys, *command, "--renderer", "other.safetensors")
-    assert "was not trained with the renderer other.safetensors" in line
+    assert "the policy was not trained with this renderer: give the one that" in line
+    assert not (here / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["constant_force:force=0", "constant_force:force=1"], "constant_force is given more than once"),
+        (["actuator_bias:offset=0", "constant_force:force=0"], "passive data cannot tell apart actuator_bias and"),
+    ],
+)
+def test_effects_that_cannot_be_fitted_are_refused_before_the_machine_is_run(here, trained, capsys, given, said):
+    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL)
+    assert said in refused(capsys, *command, *(part for effect in given for part in ("--effect", effect)))
     assert not (here / "run").exists()

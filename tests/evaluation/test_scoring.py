@@ -7,8 +7,11 @@ import torch
 from visadapt.evaluation.scoring import score, score_runs
 from visadapt.policies import Policy
 from visadapt.recordings import Episode
+from visadapt.setups.policy_file import load_policy
+from visadapt.systems import FixedWing
 from visadapt.targets import SyntheticTarget, sine_force
 from visadapt.targets.rollout import Run, run
+from visadapt.weights import shipped
 
 
 def an_episode(speeds, survived):
@@ -89,3 +92,21 @@ class TestEvaluate:
         found = score_runs(runs)
         assert 0 < found.survived < 12
         assert all((r.episode.samples == 60) == r.survived for r in runs)
+
+
+def test_what_is_no_cart_and_no_flight_is_not_scored_as_one():
+    class Motor(SyntheticTarget):
+        def __init__(self):
+            super().__init__()
+            self.system = FixedWing()
+
+    with pytest.raises(ValueError, match="is a fixed_wing: use run"):
+        score(load_policy(shipped("cartpole_states")), Motor(), episodes=1)
+    with pytest.raises(ValueError, match="flights are scored by their task: derive the target from FlightTarget"):
+        score(load_policy(shipped("fixed_wing")), SyntheticTarget(), episodes=1)
+
+
+@pytest.mark.parametrize("size", [{"episodes": 0}, {"steps": 0}, {"steps": -5}])
+def test_nothing_to_score_is_refused(size):
+    with pytest.raises(ValueError, match="at least one of each is right"):
+        score(load_policy(shipped("cartpole_states")), SyntheticTarget(), **size)

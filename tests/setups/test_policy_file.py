@@ -1,5 +1,8 @@
 """Policy files: the residual comes back as it was, and a policy of one's own by its own setup."""
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import pytest
 import torch
 
@@ -15,6 +18,7 @@ from visadapt.policies import ReachPolicy, StatePolicy
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.setups.policy_file import describe, load_policy, load_source, residual_for, save_policy
 from visadapt.storage.checkpoints import CheckpointError, load_tree
+from visadapt.systems import Variable
 from visadapt.tasks.balance import Balance, Cost
 
 
@@ -45,6 +49,14 @@ def test_a_policy_in_double_precision_comes_back_in_it(tmp_path, kind):
     assert torch.equal(read.act(history), policy.act(history))
 
 
+@dataclass(frozen=True)
+class WeakPendulum(Pendulum):
+    """One whose torque has the range of a policy's commands."""
+
+    name = "weak_pendulum"
+    actions: ClassVar[tuple[Variable, ...]] = (Variable("torque", "N m", -1.0, 1.0),)
+
+
 class OwnPolicy(StatePolicy):
     pass
 
@@ -62,21 +74,21 @@ def own_setup(source):
 class TestOwnSetup:
     def test_a_policy_of_ones_own_is_refused_with_what_reads_it(self, tmp_path):
         path = tmp_path / "policy.safetensors"
-        own_setup(va.World(Pendulum())).pretrain(path, 0)
+        own_setup(va.World(WeakPendulum())).pretrain(path, 0)
         with pytest.raises(
             CheckpointError, match=r"holds a OwnPolicy, a policy .* is read by the `load` of that setup"
         ):
             load_policy(path)
-        assert load_source(path).system == Pendulum()
+        assert load_source(path).system == WeakPendulum()
 
     def test_its_setup_reads_it_with_its_residual_and_the_world_that_this_completes(self, tmp_path):
-        effect = next(each for each in own_effects(Pendulum) if each.name == "joint.viscous_friction")
-        setup, path = own_setup(va.World(Pendulum())), tmp_path / "policy.safetensors"
+        effect = next(each for each in own_effects(WeakPendulum) if each.name == "joint.viscous_friction")
+        setup, path = own_setup(va.World(WeakPendulum())), tmp_path / "policy.safetensors"
         policy = stir(setup.policy()).eval()
-        grounded = va.World(Pendulum(), [effect(coefficient=0.02)])
+        grounded = va.World(WeakPendulum(), [effect(coefficient=0.02)])
         policy.residual, policy.grounded_in = stir(setup.residual(policy, grounded)), describe(grounded)
         save_policy(path, policy)
-        for each in own_effects(Pendulum):  # as in a process that has not asked for them yet
+        for each in own_effects(WeakPendulum):  # as in a process that has not asked for them yet
             del EFFECTS[each.name]
         read = setup.load(path)
         for key, value in policy.state_dict().items():

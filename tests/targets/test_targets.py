@@ -10,7 +10,16 @@ from visadapt.effects import AngleOffset, Dropout
 from visadapt.history import HORIZON
 from visadapt.policies import Policy, StatePolicy
 from visadapt.systems import CartPole
-from visadapt.targets import Start, SyntheticTarget, TargetError, constant_force, no_effects, sine_force
+from visadapt.targets import (
+    Observation,
+    Start,
+    SyntheticTarget,
+    Target,
+    TargetError,
+    constant_force,
+    no_effects,
+    sine_force,
+)
 from visadapt.targets.rollout import run, see_frames
 from visadapt.world import World
 
@@ -227,3 +236,39 @@ class TestRun:
         runs = run(SyntheticTarget(camera=DrawnCartPole()), Watch(), 2, 4, seeded(), see=see_frames)
         latest = np.stack([history.observations[0, -1].numpy() for history in shown])
         np.testing.assert_allclose(latest, runs[0].episode.frame[:4] / 255, atol=1e-6)
+
+
+class Rig(Target):
+    """A machine of the user's, which writes every instant into the same arrays."""
+
+    name, period, n_action = "rig", 0.05, 1
+
+    def __init__(self, shown=None):
+        self.shown = shown or {}
+        self.state = torch.zeros(1, 4)
+
+    def reset(self, batch, generator):
+        return self.step(torch.zeros(batch, 1))
+
+    def step(self, action):
+        self.state += 0.001
+        return Observation(**{"state": self.state, "alive": torch.ones(1, dtype=torch.bool), **self.shown})
+
+
+def test_a_machine_may_write_every_instant_into_the_same_arrays():
+    (found,) = run(Rig(), Feedback(), 1, 4, seeded())
+    np.testing.assert_allclose(found.episode.state[:, 0], 0.001 * np.arange(1, 6), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("shown", "said"),
+    [
+        ({"state": torch.zeros(4)}, r"rig: state is \(4,\) and torch.float32; a torch tensor that is \(1, n_state\)"),
+        ({"state": np.zeros((1, 4))}, r"rig: state is ndarray; a torch tensor that is \(1, n_state\) is right"),
+        ({"alive": True}, r"rig: alive is bool; a torch tensor that is \(1,\) and bool is right"),
+        ({"frame": torch.zeros(3, 100, 120)}, r"rig: frame is \(3, 100, 120\) and torch.float32; .* \(1, ...\) is"),
+    ],
+)
+def test_what_is_no_observation_of_the_batch_is_an_error(shown, said):
+    with pytest.raises(TargetError, match=said):
+        run(Rig(shown), Feedback(), 1, 4, seeded())

@@ -7,19 +7,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from renderers import load_renderer
 from visadapt.cli.inputs import InputError, checked, fingerprint, given_effects, import_effects, progress
 from visadapt.cli.target import load_both
 from visadapt.diagnosis.words import number, with_unit
 from visadapt.effects import Effect, Parameter
 from visadapt.learning.explanation import Explanation
-from visadapt.policies import ImagePolicy, Policy
-from visadapt.setups.training import adapt, setup_for
+from visadapt.policies import ImagePolicy
+from visadapt.setups.training import adapt, setup_to_adapt
 from visadapt.storage.run_folder import open_run, write_json
 from visadapt.tasks.references import read_reference
-from visadapt.weights import shipped
 
 
 def run(options: argparse.Namespace) -> None:
@@ -33,11 +29,12 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(f"{options.policy}: was made in a world with effects; --diagnose starts from the bare system")
     if effects:
         source = source.with_effects(effects)
-    _check_renderer(options, policy)
+    if options.renderer and not isinstance(policy, ImagePolicy):
+        raise InputError(f"{options.policy}: is shown states, for which --renderer has no use: leave it out")
     references = read_reference(options.references, source.period) if options.references else None
-    with checked():
-        followed = references or getattr(getattr(target, "task", None), "references", None)
-        setup_for(source, policy, options.renderer, followed)
+    with checked():  # before the machine is run
+        about = policy, source, target, options.renderer, references, options.with_history
+        setup_to_adapt(*about).check_adaptation(policy, target)
     if options.round and options.round > options.samples:
         raise InputError(f"--round {options.round} is more than --samples {options.samples}: lower it, or raise those")
     folder = Path(options.out)
@@ -74,18 +71,3 @@ def _in_words(explanation: Explanation) -> str:
 
 def _value(effect: Effect, parameter: Parameter) -> str:
     return with_unit(number(float(effect.get_parameter(parameter.name).detach())), parameter.unit)
-
-
-def _check_renderer(options: argparse.Namespace, policy: Policy) -> None:
-    """Raises InputError where the policy was not trained through the renderer that it is to be adapted through."""
-    if not isinstance(policy, ImagePolicy):
-        if options.renderer:
-            raise InputError(f"{options.policy}: is shown states, for which --renderer has no use: leave it out")
-        return
-    path = Path(options.renderer or shipped("renderer"))
-    background, trained = load_renderer(path).state_dict().get("background"), policy.perception.background
-    if background is None or background.shape != trained.shape or not torch.allclose(background.sigmoid(), trained):
-        raise InputError(
-            f"{options.policy}: was not trained with the renderer {path}: give by --renderer the one that it was "
-            "trained with"
-        )

@@ -82,9 +82,9 @@ def renderer(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("recording", nargs="*", metavar="RECORDING.h5", help="HDF5 with frames, as visadapt.write_recording writes it")
     _add_target(parser, required=False)
-    add("--show", metavar="N", type=_positive, default=4000, help="states that --target is put into (default: 4000)")
+    add("--show", metavar="N", type=_positive, help="states that --target is put into (default: 4000)")
     within_help = "largest |x| in m and |theta| in rad of these states (default: 1.0,0.35)"
-    add("--within", metavar="X,THETA", type=_pair, default=(1.0, 0.35), help=within_help)
+    add("--within", metavar="X,THETA", type=_pair, help=within_help)
     add("--out", required=True, metavar="R.safetensors", help="write the renderer here")
     add("--hinge", required=True, type=_pair, metavar="COLUMN,ROW", help="px, where the pole's hinge is seen at x = 0")
     add("--scale", required=True, type=_positive_number, metavar="PX", help="px per m")

@@ -24,6 +24,9 @@ from visadapt.targets import Start
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.world import World
 
+SHOWN, WITHIN = 4000, (1.0, 0.35)
+"""States that an environment is put into, and the largest |x| in m and |theta| in rad of these."""
+
 HELD_OUT = 10
 """Every tenth frame is left out of the training and compared with what the renderer makes of its state."""
 
@@ -32,6 +35,8 @@ def run(options: argparse.Namespace) -> None:
     """Train the renderer, write it, and say how well it draws frames that it was not trained on."""
     if bool(options.recording) == bool(options.target):
         raise InputError("give recordings, or a gymnasium environment by --target and --map")
+    if options.recording and (options.map or options.show or options.within):
+        raise InputError("--map, --show and --within are for --target: recordings have their frames")
     x, theta, frames = _read(options.recording) if options.recording else _show(options)
     if len(frames) < 2 * HELD_OUT:
         raise InputError(f"{len(frames)} frames are too few to learn from; some hundred are right")
@@ -75,8 +80,8 @@ def _show(options: argparse.Namespace) -> tuple[Tensor, Tensor, Tensor]:
     target = load_target(options, World(CartPole()), True)
     if not isinstance(target, GymnasiumTarget):
         raise InputError(f"{options.target}: cannot be put into chosen states; give recordings of frames and states")
-    start = Start(options.within[0], 0.0, options.within[1], 0.0)
-    states = start.draw(options.show, torch.Generator().manual_seed(options.seed))
+    x, theta = options.within or WITHIN
+    states = Start(x, 0.0, theta, 0.0).draw(options.show or SHOWN, torch.Generator().manual_seed(options.seed))
     return states[:, 0], states[:, 2], torch.from_numpy(target.show(states.double().numpy()))
 
 

@@ -17,7 +17,7 @@ from visadapt.setups.policy_file import load_policy, load_source
 from visadapt.targets import Target
 from visadapt.targets.env_map import EnvMap
 from visadapt.targets.gymnasium import GymnasiumTarget
-from visadapt.targets.rollout import see_frames
+from visadapt.targets.rollout import SHOWN, checked
 from visadapt.world import World
 
 
@@ -88,13 +88,12 @@ def _check(path: str, policy: Policy, source: World, target: Target) -> None:
     if own.name != system.name:
         raise InputError(f"{path}: a policy of a {system.name}; {target.name} is a {own.name}")
     # Only what is observed says how large it is. A reset is no step: it is not counted.
-    observed = target.reset(1, torch.Generator().manual_seed(0))
-    if policy.shown == "state" and observed.state.shape[1] != policy.n_state:
-        raise InputError(
-            f"{target.name} shows {observed.state.shape[1]} numbers of state; {path} was trained on {policy.n_state}"
-        )
+    observed = checked(target, target.reset(1, torch.Generator().manual_seed(0)), 1)
+    shown = SHOWN[policy.shown](observed).shape[1:]
+    if policy.shown != "frame" and shown != policy.observation_shape:
+        (here,), (needed,) = shown, policy.observation_shape
+        raise InputError(f"{target.name} shows {here} numbers of {policy.shown}; {path} was trained on {needed}")
     if policy.shown == "frame":
-        shown = see_frames(observed)[0].shape
         height, width = policy.observation_shape
         if shown != (height, width):
             raise InputError(

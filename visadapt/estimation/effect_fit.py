@@ -69,11 +69,8 @@ def fit_effects(
         ValueError: an effect cannot be fitted or is given twice, or passive data cannot tell two apart.
     """
     kinds = [with_episode_phases(sized(type(effect), system), len(measured)) for effect in effects]
+    check_fittable(kinds, system)
     fitted = tuple(kind for kind in kinds if not kind.repeats_readings)
-    for kind in fitted:
-        if remembers(kind, system):
-            raise ValueError(f"{kind.name} cannot be fitted: what it measures depends on earlier rows")
-    _check_separable(kinds, system)
     columns, first = {}, 0
     for kind in fitted:
         columns[kind] = slice(first, first + len(kind.table))
@@ -115,9 +112,12 @@ def remembers(effect: type[Effect], system: System) -> bool:
     return without_effect.memory(torch.zeros(1, len(system.states)), 1.0).numel() > 0
 
 
-def _check_separable(kinds: Sequence[type[Effect]], system: System) -> None:
-    """Raise ValueError, which names them, for two effects that passive data of the system cannot tell apart."""
+def check_fittable(kinds: Sequence[type[Effect]], system: System) -> None:
+    """Raise ValueError, which names it, for an effect that cannot be fitted, is given twice, or that passive data of
+    the system cannot tell from another."""
     for place, kind in enumerate(kinds):
+        if not kind.repeats_readings and remembers(kind, system):
+            raise ValueError(f"{kind.name} cannot be fitted: what it measures depends on earlier rows")
         others = [*kinds[:place], *kinds[place + 1 :]]
         if kind in others:
             raise ValueError(f"{kind.name} is given more than once: leave all but one out")

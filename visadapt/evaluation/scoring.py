@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from visadapt.policies import Policy
+from visadapt.systems import CartPole, System
 from visadapt.targets import FlightTarget, Target
 from visadapt.targets.rollout import Run, run
 from visadapt.tasks.balance import EPISODE_STEPS
@@ -41,11 +42,12 @@ class CartPoleScore:
 
 @dataclass(frozen=True)
 class FlightScore:
-    """How far flights miss. The mean includes failed flights; it is infinite where a flight's state was not finite."""
+    """How far flights miss. The mean includes failed flights; it is infinite where a flight ended early: its state was
+    not finite, or it was further off than its target allows."""
 
     flights: int
     failed: int
-    """flights that were more than FAR off somewhere, or not finite"""
+    """flights that were more than FAR off somewhere, or ended early"""
     mean: float
     """m, mean over flights of the mean error of each"""
     std: float
@@ -78,13 +80,16 @@ def score(
         steps: of an episode; without it, those of the task, or 250.
 
     Raises:
-        ValueError: more steps than the task of a flight has.
+        ValueError: more steps than the task of a flight has, no episode or step, a policy that is shown a goal on a
+            target that is no `FlightTarget`, or a target whose system is neither a vehicle nor a cart-pole.
 
     >>> import visadapt as va
     >>> found = va.score(va.load_policy(va.shipped("cartpole_states")), va.SyntheticTarget(), episodes=2, steps=20)
     >>> found.survived, found.mean_speed < 1.0  # print(found) says both
     (2, True)
     """
+    if episodes < 1 or (steps is not None and steps < 1):
+        raise ValueError(f"{episodes} episodes of {steps} steps; at least one of each is right")
     policy.eval()
     generator = torch.Generator().manual_seed(seed)
     if isinstance(target, FlightTarget):
@@ -92,6 +97,11 @@ def score(
             raise ValueError(f"a flight of this task has {target.task.steps} steps, got steps = {steps}")
         runs = run(target, policy, episodes, steps or target.task.steps, generator, strict=False)
         return _score_flights(runs, target)
+    if policy.shown == "state and goal":
+        raise ValueError(f"{target.name}: flights are scored by their task: derive the target from FlightTarget")
+    system = getattr(target, "system", None)
+    if isinstance(system, System) and not isinstance(system, CartPole):
+        raise ValueError(f"a score is that of a cart's speed or of a flight; {target.name} is a {system.name}: use run")
     return score_runs(run(target, policy, episodes, steps or EPISODE_STEPS, generator))
 
 

@@ -13,7 +13,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from visadapt.batch import placed
 from visadapt.history import LENGTH, History
-from visadapt.recordings import Episode
+from visadapt.recordings import Episode, RecordingError
 from visadapt.world import World, WorldState
 
 Observe = Callable[[Tensor], Tensor]
@@ -42,7 +42,8 @@ class Transitions:
         """Transitions of all samples of the episodes, which show the camera's frames, or the states.
 
         Raises:
-            ValueError: episodes without states, or without the frames that are asked for, or no sample at all.
+            ValueError: episodes without states, or without the frames that are asked for.
+            RecordingError: there is no sample at all.
         """
         dtype = torch.get_default_dtype()
         parts: list[tuple[Tensor, ...]] = []
@@ -59,7 +60,9 @@ class Transitions:
             parts.append((seen, action, state, time, task_state, first + back.clamp(min=0)))
             first += len(state)
         if first == len(episodes):
-            raise ValueError("the recording holds no sample: every episode has a single row")
+            raise RecordingError(
+                "there is no sample to learn from: every episode is too short; collect more in a round"
+            )
         return cls([len(each.time) for each in episodes], *(torch.cat(own) for own in zip(*parts, strict=True)))
 
     def to(self, like: Tensor) -> Transitions:

@@ -48,6 +48,8 @@ class Policy(nn.Module):
         """those of the constructor, with which a policy file makes the policy again"""
         self.grounded_in: dict[str, Any] | None = None
         """the world that its residual completes, as `setups.policy_file.describe` puts it; None without a residual"""
+        self.trained_in: dict[str, Any] | None = None
+        """the world that it was trained or tuned in, put the same way; None where that is not known"""
         self.observation_shape = observation_shape or (n_state,)
         """shape of one observation: a state, a state and a goal, or a frame"""
         self.n_state = n_state

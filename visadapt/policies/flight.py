@@ -56,6 +56,9 @@ class FlightPolicy(Policy):
 
     def embed(self, history: History) -> Tensor:
         shown = history.observations[:, -1]
+        if shown.shape[1:] != self.observation_shape:
+            needed = self.observation_shape[0]
+            raise ValueError(f"the policy was trained on {needed} numbers of state and goal, got {shown.shape[1]}")
         state, goal = shown[:, : self.n_state], shown[:, self.n_state :]
         axes = rotation(state[:, ATTITUDE])
         disturbance = self.disturbance_inputs(self.disturbance(history), axes)

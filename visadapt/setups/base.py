@@ -6,28 +6,36 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from torch import nn
 
-from visadapt.effects import Residual
+from visadapt.effects import Effect, Residual, Stage
+from visadapt.effects.catalogue import sized
+from visadapt.estimation.effect_fit import check_fittable
 from visadapt.learning.joint import Adapted, adapt
 from visadapt.learning.policy import tune
 from visadapt.learning.rounds import Label
 from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.training_state import train_or_load
 from visadapt.learning.transitions import Observe
-from visadapt.policies import Policy
+from visadapt.policies import ImagePolicy, Policy
 from visadapt.progress import Report, staged
 from visadapt.setups.explained import explained
 from visadapt.setups.policy_file import describe, load_into
+from visadapt.storage.checkpoints import weights_digest
 from visadapt.storage.run_folder import open_run
+from visadapt.systems import System
 from visadapt.targets import Target
 from visadapt.tasks.base import Task
 from visadapt.world import World
 
-Prepare = Callable[[Policy, Path, int, Report | None], None]
-"""Prepares a new policy for training, from (policy, file, seed, report); takes what it has written to the file."""
+Prepare = Callable[[Policy, Path, int, SetupSettings, Report | None], None]
+"""Prepares a new policy for training, from (policy, file, seed, settings, report); takes what it has written to the
+file."""
+
+Made = TypeVar("Made")
 
 NEWER = ("perception", "refinement")
 """Settings that policy files of earlier versions do not state; such files are taken as they are."""
@@ -75,6 +83,13 @@ class Setup:
                     f"the source's {effect.name} has {rows} values of a parameter, one for each row of a batch; a "
                     "setup needs one value of each, which holds for batches of any size"
                 )
+        for action in self.source.system.actions:
+            if (action.low, action.high) != (-1.0, 1.0):
+                raise ValueError(
+                    f"{action.name} of a {self.source.system.name} ranges from {action.low:g} to {action.high:g} "
+                    f"{action.unit}, the commands of a policy from -1 to 1: give the action that range, and let the "
+                    "system's derivative multiply it by its largest value"
+                )
 
     def pretrain(self, path: Path, seed: int, report: Report | None = None) -> Policy:
         """The policy trained in the source, or read from `path` where that exists; an interrupted training goes on.
@@ -82,11 +97,10 @@ class Setup:
         Raises:
             CheckpointError: `path` holds another network, or one that was trained in another way.
         """
-        torch.manual_seed(seed)
-        policy = self.policy()
+        policy = _seeded(seed, self.policy)
         prepared = path.with_suffix(".prepared.safetensors")
         if self.prepare is not None and not path.exists():
-            self.prepare(policy, prepared, seed, report)
+            self.prepare(policy, prepared, seed, self.settings, report)
         numbers = self.settings.numbers()
         given = {"arguments": policy.arguments, "source": describe(self.source), "seed": seed}
         about = {**given, **numbers["source"], "perception": numbers["perception"]}
@@ -106,6 +120,7 @@ class Setup:
                 train_or_load(made, policy, described, partial(tune, *args), NEWER)
         for finished in (prepared, rough):
             finished.unlink(missing_ok=True)
+        policy.trained_in = describe(self.source)
         return policy.eval()
 
     def load(self, path: Path) -> Policy:
@@ -119,10 +134,14 @@ class Setup:
     def tune(self, policy: Policy, seed: int, report: Report | None = None) -> list[float]:
         """Tune `policy`, in place, in the source with its effects, without a target; returns the loss by iteration.
 
+        A residual that it has of an earlier adaptation, which the source does not contain, is taken away.
+
         Raises:
             ValueError: a policy of another kind.
         """
         self.check_policy(policy)
+        policy.residual, policy.grounded_in = None, None
+        policy.trained_in = describe(self.source)
         generator = torch.Generator().manual_seed(seed)
         args = (policy, self.source, self.observe, self.settings.with_names, generator)
         return tune(*args, progress=staged(report, "tune"))
@@ -141,39 +160,62 @@ class Setup:
     ) -> Adapted:
         """Adapt `policy`, in place, to `target` with at most `budget` counted samples: Algorithm 1 in `folder`.
 
+        A policy that was adapted before collects the first round with the residual that it has; the residual is then
+        fitted to the new samples alone.
+
         Args:
             explorer: collects the data in place of `policy`.
             diagnose: name the causes of the gap in each round: `explained`.
 
         Raises:
-            ValueError: a policy of another kind, a target of another period or with other actions, or a budget that
-                is smaller than a round.
+            ValueError: as `check_adaptation`, or a budget that is smaller than a round.
             TargetError: the target misbehaves. CheckpointError: `folder` holds a run of other networks.
-            RunError: it holds one that was asked for otherwise.
+            RunError: it holds one that was asked for otherwise: of another policy, source, or target. A target is
+                known by its name and, where it has one, its system.
         """
-        self.check_policy(policy)
-        self.check_target(target)
+        self.check_adaptation(policy, target)
         asked = {"target": target.name, "samples": budget, "round": round_samples, "seed": seed, "diagnose": diagnose}
-        open_run(folder, {**asked, "source": describe(self.source), **self.settings.numbers()}, "adaptation.json")
-        torch.manual_seed(seed)
-        residual = self.residual(policy, self.source).to(next(policy.parameters()))
+        system = getattr(target, "system", None)
+        asked["machine"] = describe(World(system))["parameters"] if isinstance(system, System) else None
+        asked |= {"policy": weights_digest(policy), "explorer": None if explorer is None else weights_digest(explorer)}
+        open_run(folder, {**asked, "known": describe(self.source), **self.settings.numbers()}, "adaptation.json")
+        residual = _seeded(seed, partial(self.residual, policy, self.source)).to(next(policy.parameters()))
+        if policy.residual is not None:
+            residual.load_state_dict(policy.residual.state_dict())
         args = (policy, residual, self.source, target, self.settings, folder, budget, round_samples, seed)
-        explain = explained(self.source, self.renderer, report) if diagnose else None
+        explain = explained(self.source, self.renderer, seed, report) if diagnose else None
         adapted = adapt(*args, self.observe, self.label, report, explorer, explain)
         policy.grounded_in = describe(adapted.source)
         return adapted
 
+    def check_adaptation(self, policy: Policy, target: Target) -> None:
+        """Raises ValueError where `adapt` cannot begin: a policy of another kind, a target of another period or with
+        other actions, effects of the source that cannot be fitted, or behind which no states are found in frames."""
+        self.check_policy(policy)
+        self.check_target(target)
+        system = self.source.system
+        named = [each for each in self.source.effects if isinstance(each, Effect) and each.stage is not Stage.CAMERA]
+        check_fittable([sized(type(each), system) for each in named], system)
+        if self.label is not None:
+            self.label([])
+
     def check_policy(self, policy: Policy) -> None:
         """Raises ValueError where `policy` is not one that this setup makes."""
-        wanted = self.policy()
+        wanted = _seeded(0, self.policy)
         if type(policy) is not type(wanted) or (policy.n_state, policy.n_action) != (wanted.n_state, wanted.n_action):
             raise ValueError(
                 f"the policy is a {type(policy).__name__} of {policy.n_state} states and {policy.n_action} commands; "
                 f"a {self.source.system.name} needs a {type(wanted).__name__} of {wanted.n_state} and {wanted.n_action}"
             )
-        own, here = (each.arguments.get("period", self.source.period) for each in (policy, wanted))
-        if abs(own - here) > 1e-6:
-            raise ValueError(f"the policy aims at goals {own:g} s apart, the source has {here:g} s between actions")
+        if isinstance(policy, ImagePolicy) and isinstance(wanted, ImagePolicy):
+            own, seen = (each.perception.background.double().cpu() for each in (policy, wanted))
+            if own.shape != seen.shape or not torch.allclose(own, seen):
+                raise ValueError(
+                    "the policy was not trained with this renderer: give the one that it was trained with (--renderer)"
+                )
+        apart, here = (each.arguments.get("period", self.source.period) for each in (policy, wanted))
+        if abs(apart - here) > 1e-6:
+            raise ValueError(f"the policy aims at goals {apart:g} s apart, the source has {here:g} s between actions")
 
     def check_target(self, target: Target) -> None:
         """Raises ValueError where `target` has another period or another number of actions than the source."""
@@ -187,3 +229,10 @@ class Setup:
             raise ValueError(
                 f"{target.name} takes {target.n_action} actions, a {self.source.system.name} has {actions}"
             )
+
+
+def _seeded(seed: int, make: Callable[[], Made]) -> Made:
+    """What `make` makes with random numbers of `seed`; torch's own generator is left as it was."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return make()

@@ -134,12 +134,11 @@ def cartpole_frames(
         RendererError: the file holds no layered renderer.
     """
     source = source or World(CartPole())
-    seen = renderer if isinstance(renderer, LayeredRenderer) else _load(Path(renderer or shipped("renderer")))
-    seen.requires_grad_(False).eval()
+    given = renderer if isinstance(renderer, LayeredRenderer) else _load(Path(renderer or shipped("renderer")))
+    seen = copy.deepcopy(given).requires_grad_(False).eval()
     camera = [effect for effect in source.effects if isinstance(effect, CameraEffect)]
     tracker = Tracker(seen, source.with_effects(()), camera)
     settings = settings or _narrowed(from_frames(source), seen)
-    perception = settings.perception or PerceptionSettings()
 
     @cache
     def copied(device: torch.device, dtype: torch.dtype) -> LayeredRenderer:
@@ -155,9 +154,10 @@ def cartpole_frames(
     def observe(state: Tensor) -> Tensor:
         return render(state[:, 0], state[:, 2])
 
-    def prepare(policy: Policy, path: Path, seed: int, report: Report | None) -> None:
+    def prepare(policy: Policy, path: Path, seed: int, settings: SetupSettings, report: Report | None) -> None:
         """Train the policy's frame encoder and keep it in `path`, or take the one that is there."""
         assert isinstance(policy, ImagePolicy)
+        perception = settings.perception or PerceptionSettings()
         eyes = policy.perception.requires_grad_(True)
         args = (
             eyes,
@@ -174,7 +174,7 @@ def cartpole_frames(
     return Setup(
         source=source,
         policy=lambda: ImagePolicy(seen.background.sigmoid().detach(), CONTRAST),
-        residual=partial(residual_for, perception=perception),
+        residual=partial(residual_for, perception=settings.perception),
         settings=settings,
         renderer=seen,
         observe=observe,

@@ -23,7 +23,7 @@ from visadapt.storage.run_folder import read_json, write_json
 from visadapt.world import World
 
 
-def explained(source: World, renderer: nn.Module | None = None, report: Report | None = None) -> Explain:
+def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, report: Report | None = None) -> Explain:
     """Diagnoses episodes from all their states or, given the renderer of their scene, from their frames alone.
 
     Each diagnosis is written as by `visadapt diagnose --json`. Episodes shorter than `SHORTEST_EPISODE_S` are left out.
@@ -44,7 +44,7 @@ def explained(source: World, renderer: nn.Module | None = None, report: Report |
             return Explanation(UNEXPLAINED, [], complete=False)
         sources = tuple(f"episode {number}" for number in range(len(long)))
         recording = Recording(long, measured, source.period, sources)
-        diagnosed = partial(diagnose, recording, source, progress=report, renderer=renderer)
+        diagnosed = partial(diagnose, recording, source, seed=seed, progress=report, renderer=renderer)
         found = None
         if not path.exists():
             found = diagnosed()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+from visadapt.history import LENGTH
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.policy import TuneSettings
 from visadapt.learning.setup_settings import SetupSettings
@@ -37,39 +38,44 @@ def quadrotor(
             periods, which show a changing force.
 
     Raises:
-        ValueError: a source whose period is not that of the references.
+        ValueError: a source whose period is not that of the references, or these are too short for a history.
     """
     if source is not None and abs(source.period - train.period) > 1e-6:
         raise ValueError(
             f"the references have rows {train.period:g} s apart, the source {source.period:g} s between commands"
         )
-    train, test = train.as_many(), None if test is None else test.as_many()
-    task, far_off = Follow(train), partial(Follow, train, start_spread=(0.3, 0.8), divergence=3.0)
+    source = source or World(Quadrotor(), period=train.period, substeps=2)
+    assert isinstance(source.system, Quadrotor)
+    follow = partial(Follow, gravity=float(source.system.gravity))
+    task, far_off = follow(train), partial(follow, train, start_spread=(0.3, 0.8), divergence=3.0)
+    if with_history and task.steps < LENGTH:
+        raise ValueError(f"references of {task.steps + 1} rows are too short for a history: {LENGTH + 1} are right")
     tuning = _learn(task, 200, 256, 1e-3, curriculum=False)
     if with_history:
         tuning = _learn(far_off(RecoverCost()), 400, 128, 5e-3, longest=60, curriculum=False, recorded=RECORDED)
     return Setup(
-        source=source or World(Quadrotor(), period=train.period, substeps=2),
+        source=source,
         policy=lambda: FollowPolicy(train.period),
         residual=partial(residual_for, with_history=with_history),
         # First to keep to the reference, then to come back from far off.
         settings=_settings(
             _learn(task, 4000, 256, 4e-3), tuning, refinement=_learn(far_off(), 2000, 256, 1e-3, curriculum=False)
         ),
-        test=task if test is None else Follow(test),
+        test=task if test is None else follow(test),
     )
 
 
-def fixed_wing(source: World | None = None, with_history: bool = False) -> Setup:
-    """The fixed wing that flies through points 50 m ahead.
+def fixed_wing(source: World | None = None, with_history: bool = False, task: Reach | None = None) -> Setup:
+    """The fixed wing that flies through points ahead.
 
     Args:
         source: the physics known beforehand; without it, Waldock's aircraft, 0.05 s between commands.
         with_history: as for `quadrotor`.
+        task: where the points are, and how fast it flies; without it, 50 m ahead at 11.5 m/s.
     """
     source = source or World(FixedWing(), period=0.05)
     assert isinstance(source.system, FixedWing)
-    task = Reach(source.period, source.system)
+    task = task or Reach(source.period, source.system)
     recorded = RECORDED if with_history else 0.0
     tuning = _learn(task, 200, 128, 3e-4, curriculum=False, recorded=recorded)
     return Setup(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import warnings
 from collections.abc import Iterator
@@ -68,6 +69,7 @@ def export_policy(path: str | Path, policy: Policy, source: World | None = None)
     (10, 1)
     """
     onnx, runtime = _packages()
+    policy = copy.deepcopy(policy).float()
     deployed = _Deployed(policy).eval()
     examples = _examples(policy)
     with _quiet(), torch.no_grad():

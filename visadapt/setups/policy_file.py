@@ -40,7 +40,8 @@ def save_policy(path: str | Path, policy: Policy, about: Mapping[str, Any] | Non
     >>> type(va.load_policy(path)).__name__
     'FollowPolicy'
     """
-    made: dict[str, Any] = {"arguments": policy.arguments, "grounded_in": policy.grounded_in}
+    made: dict[str, Any] = {"arguments": policy.arguments}
+    made |= {"grounded_in": policy.grounded_in, "source": policy.trained_in}
     if policy.residual is not None and isinstance(policy.residual.network, FlightResidualNetwork):
         made["with_history"] = policy.residual.network.predict is not None
     save_network(Path(path), policy, {**made, **(about or {})})
@@ -92,6 +93,7 @@ def _restored(
     policy: Policy, tree: Mapping[str, Any], path: Path, residual: Callable[[Policy, World], Residual]
 ) -> Policy:
     policy.to(_dtype(tree["weights"]))
+    policy.trained_in = tree["settings"].get("source")
     if (grounded_in := tree["settings"].get("grounded_in")) is not None:
         policy.grounded_in = grounded_in
         policy.residual = residual(policy, _world(grounded_in, path)).to(next(policy.parameters()))

@@ -22,6 +22,7 @@ from visadapt.setups.policy_file import save_policy
 from visadapt.systems import SYSTEMS, CartPole, FixedWing, Quadrotor
 from visadapt.targets import FlightTarget, Target
 from visadapt.tasks.follow import Follow
+from visadapt.tasks.reach import Reach
 from visadapt.tasks.references import Reference
 from visadapt.world import World
 
@@ -41,10 +42,12 @@ def setup_for(
         renderer: a cart-pole's states to frames, for a policy that is shown frames; without it, a new policy is shown
             states, and one that is shown frames takes the shipped renderer.
         references: (N, T, 3) or (T, 3), what a quadrotor is to follow.
-        with_history: whether policy or residual also read the last periods, which show a changing force.
+        with_history: whether a cart-pole's policy, or a vehicle's residual, also reads the last periods, which show a
+            changing force.
 
     Raises:
-        ValueError: a policy of another system, a system without a setup, or a quadrotor without references.
+        ValueError: a policy of another system, a system without a setup, a quadrotor without references, or what the
+            system or the policy has no use for.
 
     >>> import visadapt as va
     >>> setup = va.setup_for(va.World(va.CartPole()))
@@ -52,11 +55,20 @@ def setup_for(
     3000
     """
     system = world.system
+    if references is not None and not isinstance(system, Quadrotor):
+        raise ValueError(f"references are for a quadrotor, not for a {system.name}: leave them out")
+    if renderer is not None and not isinstance(system, CartPole):
+        raise ValueError(f"a {system.name} is shown its states, for which a renderer has no use: leave it out")
     if isinstance(system, CartPole):
         if renderer is not None or isinstance(policy, ImagePolicy):
+            if with_history:
+                raise ValueError("a policy that is shown frames reads the last 5 in any case: leave the history out")
             setup = cartpole_frames(world, renderer)
         else:
-            setup = cartpole_states(world, policy.with_history if isinstance(policy, StatePolicy) else with_history)
+            own = policy.with_history if isinstance(policy, StatePolicy) else with_history
+            if with_history and not own:
+                raise ValueError("the policy reads the last state alone: train one with a history, or leave it out")
+            setup = cartpole_states(world, own)
     elif isinstance(system, Quadrotor):
         if references is None:
             raise ValueError("a quadrotor follows references: give some, by references= or --references")
@@ -89,16 +101,19 @@ def train(
         path: file of the policy: an interrupted training goes on, a finished one is read. Without it, the policy is
             not written.
         iterations: instead of the setup's own.
-        renderer, references, with_history: as for `setup_for`.
+        renderer, references, with_history: as for `setup_for`; a vehicle has no residual yet that could read a history.
 
     Raises:
-        ValueError: a system without a setup, or a quadrotor without references.
+        ValueError: as `setup_for`.
 
     >>> import visadapt as va
     >>> policy = va.train(va.World(va.CartPole(), [va.effects.ViscousFriction(coefficient=2.0)]), iterations=2)
     >>> policy.n_action
     1
     """
+    if with_history and not isinstance(world.system, CartPole):
+        raise ValueError(f"a {world.system.name}'s policy reads no history; its residual may, where it is adapted")
+    _check_iterations(iterations)
     setup = setup_for(copy.deepcopy(world), None, renderer, references, with_history)
     if iterations is not None:
         setup = replace(setup, settings=setup.settings.shortened(iterations))
@@ -171,8 +186,9 @@ def adapt(
         the effects that were found.
 
     Raises:
-        ValueError: a policy of another system, a target of another period or with other actions, too few samples, or
-            other references than a target's own, with a history.
+        ValueError: a policy of another system, a target of another period or with other actions, effects that cannot
+            be fitted, too few samples, other references than a target's own, with a history, or arguments that are for
+            a target where there is none.
         TargetError: the target misbehaves.
 
     >>> import visadapt as va
@@ -183,12 +199,10 @@ def adapt(
     >>> result.ledger.used
     20
     """
-    if isinstance(target, FlightTarget) and isinstance(target.task, Follow):
-        courses = target.task.references
-        if references is not None and with_history and not torch.equal(references.positions, courses.positions):
-            raise ValueError("the target has references of its own, from which histories start: give no others")
-        references = courses if references is None else references
-    setup = setup_for(copy.deepcopy(source), policy, renderer, references, with_history)
+    _check_iterations(iterations)
+    if target is None and (folder is not None or round_samples is not None or with_history or diagnose):
+        raise ValueError("folder, round_samples, with_history and diagnose are for a target, and none is given")
+    setup = setup_to_adapt(policy, copy.deepcopy(source), target, renderer, references, with_history)
     if iterations is not None:
         own = setup.settings
         ground = replace(own.ground, steps=min(own.ground.steps, iterations))
@@ -198,10 +212,40 @@ def adapt(
     if target is None:
         setup.tune(policy, seed, report)
         return policy
-    in_round = round_samples or min(samples, max(20, samples // 5))
+    in_round = min(samples, max(20, samples // 5)) if round_samples is None else round_samples
     with tempfile.TemporaryDirectory() as temporary:
         place = Path(folder or temporary)
         adapted = setup.adapt(policy, target, place, samples, in_round, seed, report, diagnose=diagnose)
         if folder is not None:
             save_policy(place / "policy.safetensors", policy)
     return adapted if folder is not None else replace(adapted, folder=None)
+
+
+def setup_to_adapt(
+    policy: Policy,
+    source: World,
+    target: Target | None,
+    renderer: Renderer | None = None,
+    references: Reference | None = None,
+    with_history: bool = False,
+) -> Setup:
+    """As `setup_for`, with the references, or the points, that a `FlightTarget` has.
+
+    Raises:
+        ValueError: as `setup_for`, or other references than the target's own, with a history.
+    """
+    task = target.task if isinstance(target, FlightTarget) else None
+    if isinstance(task, Reach) and isinstance(source.system, FixedWing):
+        return fixed_wing(source, with_history, replace(task, system=source.system))
+    if isinstance(task, Follow):
+        own = task.references
+        if references is None:
+            references = own
+        elif with_history and not torch.equal(references.as_many().positions, own.positions):
+            raise ValueError("the target has references of its own, from which histories start: give no others")
+    return setup_for(source, policy, renderer, references, with_history)
+
+
+def _check_iterations(iterations: int | None) -> None:
+    if iterations is not None and iterations < 0:
+        raise ValueError(f"{iterations} iterations; 0 or more are right")

@@ -79,4 +79,6 @@ def _finite(content: Any) -> Any:
         return {key: _finite(value) for key, value in content.items()}
     if isinstance(content, list | tuple):
         return [_finite(value) for value in content]
+    if hasattr(content, "tolist"):  # of NumPy or torch
+        return _finite(content.tolist())
     return content

@@ -159,6 +159,9 @@ class EnvMap:
         if len(self.actions) != len(system.actions):
             count = len(system.actions)
             raise TargetError(f"{name}: the map has {len(self.actions)} actions, {system.name} has {count}")
+        read = [entry.index for entry in self.states.values()]
+        if twice := [name for name, entry in self.states.items() if read.count(entry.index) > 1]:
+            raise TargetError(f"{name}: the map takes {' and '.join(twice)} from the same entry of the observation")
         taken = [(f"takes {state} from observation", entry, n_observation) for state, entry in self.states.items()]
         for does, entry, count in (*taken, *(("sets action", entry, n_action) for entry in self.actions)):
             if entry.index >= count:

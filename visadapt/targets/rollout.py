@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -89,7 +89,7 @@ def run(
     [(20, True), (20, True)]
     """
     see = see or SHOWN[policy.shown]
-    observation = target.reset(batch, generator)
+    observation = checked(target, target.reset(batch, generator), batch)
     _check_finite(target, observation, torch.ones_like(observation.alive), "the first state")
     like = next(policy.parameters(), observation.state)
     history = History.start(see(observation).to(like), target.n_action)
@@ -105,7 +105,7 @@ def run(
         if added is not None:
             action = (action + added[len(rows)].to(action)).clamp(-1, 1)
         rows.append((observation, action))
-        observation = target.step(action)
+        observation = checked(target, target.step(action), batch)
         finite = observation.state.isfinite().all(1)
         if strict:
             _check_finite(target, observation, running, f"the state after step {len(rows)}")
@@ -114,6 +114,30 @@ def run(
         history = history.acting(action.to(like)).observing(see(observation).to(like))
     rows.append((observation, torch.zeros(batch, target.n_action)))
     return [_cut(rows, b, int(length[b]), bool(running[b]), target.period) for b in range(batch)]
+
+
+def checked(target: Target, observation: Any, batch: int) -> Observation:
+    """A copy of what a target shows of `batch` episodes, since it may write the next instant over it.
+
+    Raises:
+        TargetError: it is no observation of that many episodes.
+    """
+    if not isinstance(observation, Observation):
+        what = type(observation).__name__
+        raise TargetError(f"{target.name}: reset and step return a visadapt.Observation, not a {what}")
+    right = {"state": f"({batch}, n_state)", "alive": f"({batch},) and bool"}
+    copies: dict[str, Any] = {}
+    for field in fields(observation):
+        name, value = field.name, getattr(observation, field.name)
+        if value is None and name not in right:
+            continue
+        fits = isinstance(value, Tensor) and value.shape[:1] == (batch,)
+        if not fits or (name == "state" and value.dim() != 2) or (name == "alive" and value.dtype != torch.bool):
+            what = f"{tuple(value.shape)} and {value.dtype}" if isinstance(value, Tensor) else type(value).__name__
+            needed = right.get(name, f"({batch}, ...)")
+            raise TargetError(f"{target.name}: {name} is {what}; a torch tensor that is {needed} is right")
+        copies[name] = value.clone()
+    return Observation(**copies)
 
 
 def _check_finite(target: Target, observation: Observation, rows: Tensor, which: str) -> None:

@@ -77,7 +77,10 @@ class RecoverCost(FollowCost):
 
 @dataclass(frozen=True)
 class Follow(FlightTask):
-    """Fly along one of many references, from its first row to its last. A task state is (reference, row)."""
+    """Fly along one of many references, or a single one, from its first row to its last.
+
+    A task state is (reference, row).
+    """
 
     references: Reference  # (N, T, 3)
     plan_cost: FollowCost = FollowCost()
@@ -87,6 +90,10 @@ class Follow(FlightTask):
     first_divergence: float = 0.05
     """share of `divergence` that the curriculum begins with; it reaches 1 at half of the iterations"""
     candidates: int = 64  # rows of references drawn at random, of which `augment` takes the most similar one
+    gravity: float = 9.81  # m/s2, in which a quadrotor is to fly along them
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "references", self.references.as_many())
 
     def to(self, like: Tensor) -> Follow:
         return replace(self, references=self.references.to(like))
@@ -143,7 +150,7 @@ class Follow(FlightTask):
         own = self.references
         every = (own.positions, own.velocities, own.accelerations, own.jerks)
         position, velocity, acceleration, jerk = (values[which, row] for values in every)
-        return demanded(acceleration, jerk).state(position, velocity)
+        return demanded(acceleration, jerk, self.gravity).state(position, velocity)
 
     def ahead(self, task_state: Tensor) -> Tensor:
         """Positions and velocities (B, HORIZON, 6) of the next rows; at its end a reference goes straight on."""
