@@ -19,6 +19,7 @@ from visadapt.effects.camera import seen_by
 from visadapt.history import History
 from visadapt.systems import System
 from visadapt.systems.integrators import INTEGRATORS, Duration
+from visadapt.systems.stiffness import longest_step
 
 EDGE_STEP = 0.0125
 """s, integration step that resolves the edges of abrupt loads (`PulseLaw`, `FrictionPatch`)."""
@@ -80,7 +81,9 @@ class World(nn.Module):
         self.system = system
         self.period = period
         self.integrator = integrator
-        self.substeps = resolving(effects, period) if substeps is None else substeps
+        if substeps is None:
+            substeps = max(resolving(effects, period), math.ceil(period / longest_step(type(system)) - 1e-9))
+        self.substeps = substeps
         self.effects = nn.ModuleList(effects)
         self._arrange()
 

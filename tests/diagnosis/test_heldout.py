@@ -4,13 +4,15 @@ import pytest
 import torch
 
 from tests.diagnosed import record
+from visadapt import diagnose
 from visadapt.diagnosis.search.heldout import rollout_errors
 from visadapt.diagnosis.search.model_comparison import compare
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.search import Search
-from visadapt.effects import CoulombFriction
+from visadapt.effects import ConstantForce, CoulombFriction
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.systems import CartPole
+from visadapt.world import World
 
 STICKING = CoulombFriction(force=2.0)
 
@@ -29,14 +31,22 @@ def test_a_right_set_predicts_within_the_noise_also_where_the_cart_sticks(search
     comparison = compare(search)
     assert comparison.best.names == ("coulomb_friction",)
     deviation = (comparison.predicting.log_noise[0] / 2).exp()
-    errors = rollout_errors(CandidateModel(CartPole(), [CoulombFriction], search.rows), comparison.predicting)
+    errors = rollout_errors(CandidateModel(CartPole(), [CoulombFriction], search.rows), comparison.predicting, 10)
     torch.testing.assert_close(errors.rms(deviation)[-1], errors.floor(deviation)[-1], rtol=0.002, atol=0)
 
 
 @pytest.mark.parametrize(("rows", "first_is_used"), [(11, True), (12, False), (60, False)])
 def test_a_window_starts_no_prediction_with_its_first_state_unless_it_has_no_other(rows, first_is_used):
     cut = prepare(record([STICKING], 4, rows), CartPole()).rows
-    errors = rollout_errors(CandidateModel(CartPole(), [], cut), Search(CartPole(), cut, []).source.fits)
+    errors = rollout_errors(CandidateModel(CartPole(), [], cut), Search(CartPole(), cut, []).source.fits, 10)
     starts = errors.valid[-1].sum((0, 2)) > 0
     assert bool(starts[0]) == first_is_used
     assert starts.any()
+
+
+def test_a_gap_shows_in_episodes_that_are_shorter_than_half_a_second():
+    recording = record([ConstantForce(force=6.0)], 12, rows=9)
+    found = diagnose(recording, World(CartPole()), [ConstantForce])
+    assert found.verdict == "identified"
+    assert "predictions 0.4 s ahead" in found.gap.measure
+    assert found.gap.closed > 0.9

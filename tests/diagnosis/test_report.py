@@ -257,6 +257,12 @@ class TestWords:
     def test_what_is_unexplained(self, ranking, text):
         assert text in sentence(a_diagnosis("unexplained", ranking=ranking))
 
+    def test_repeated_readings_beside_which_there_is_no_gap(self):
+        gap = Gap("error", 1.0, 1.0, 1.0, 1.0, math.nan)
+        dropout = Cause("dropout", {"rate": Estimate(0.013, "1", (0.005, 0.03))}, 1.0, math.nan)
+        text = sentence(a_diagnosis("identified", causes=(dropout,), gap=gap))
+        assert text == "Dropout (rate 0.013) explains the readings that are repeated."
+
     def test_one_cause_is_sure_and_two_are_open(self):
         text = sentence(a_diagnosis("ambiguous", causes=(PATCH, GAIN, MASS)))
         assert re.match(r"Friction patch \(.*\) and either actuator gain \(.*\) or cart mass \(.*\) close 96 %", text)

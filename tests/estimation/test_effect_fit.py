@@ -65,3 +65,23 @@ def test_the_memory_of_a_sensor_is_looked_for_in_all_states_of_its_system():
     with pytest.raises(ValueError, match="slow_gyros cannot be fitted: what it measures depends on earlier rows"):
         fitted(va.Quadrotor(), SlowGyros(share=0.2))
     assert not remembers(MeasurementDelay, va.CartPole())
+
+
+@pytest.mark.parametrize(
+    "known", [va.effects.ActuatorSaturation(limit=0.6), va.effects.FrictionPatch(start=0.5, end=0.7, coefficient=20.0)]
+)
+def test_what_the_samples_do_not_show_stays_as_it_was_known(known):
+    generator = torch.Generator().manual_seed(0)
+    (run,) = va.run(va.SyntheticTarget(), va.load_policy(va.shipped("cartpole_states")), 1, 60, generator, 0.05)
+    state, command = torch.from_numpy(run.episode.state), torch.from_numpy(run.episode.action)
+    assert command.abs().max() < 0.5
+    assert state[:, 0].abs().max() < 0.4
+    noise = torch.tensor([0.002, 0.01, 0.002, 0.01]) * torch.randn(state.shape, generator=generator)
+    found = fit_effects(va.CartPole(), [known], [state + noise], [command], 0.05)
+    values = torch.stack([getattr(known, p.name) for p in known.table]).detach().double()
+    torch.testing.assert_close(found.values[type(known)], values, rtol=0.05, atol=0)
+
+
+def test_an_effect_of_the_camera_is_not_fitted_to_states():
+    with pytest.raises(ValueError, match="camera_rotation cannot be fitted to states: only frames show it"):
+        fitted(va.CartPole(), va.effects.CameraRotation(angle=0.1))

@@ -51,6 +51,11 @@ ANGLE, RATE = Pendulum.states
     [
         ({"states": (Variable("angle", "", -3.0, 3.0), RATE)}, "states: angle has no unit; an SI unit such as m"),
         ({"states": (Variable("angle", "rad", 3.0, -3.0), RATE)}, "angle goes from 3.0 to -3.0; two finite numbers"),
+        (
+            {"states": (Variable("angle", "rad", -3e-3, 3e-3), RATE)},
+            "angle reaches 0.003 rad; in another unit",
+        ),
+        ({"actions": (Variable("angle", "N m", -1.0, 1.0),)}, "'angle' is a state and an action, which are columns"),
         ({"states": (ANGLE, ANGLE)}, "states has 'angle' twice"),
         ({"states": ("angle", "rate")}, "states holds 'angle'; states = (Variable("),
         ({"states": (Variable("time", "rad", -3.0, 3.0), RATE)}, "(time and episode are taken)"),

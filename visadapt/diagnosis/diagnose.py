@@ -227,11 +227,11 @@ def _warnings(
     explored: _Explored, measured: MeasuredGap, verdict: str, found: Sequence[Cause], source: str
 ) -> Iterator[str]:
     """What a reader of the diagnosis must know of the recording `source`, the comparison and the causes found."""
-    comparison, system = explored.comparison, explored.search.system
+    comparison = explored.comparison
     yield from explored.prepared.warnings
     if not measured.held_out:
         yield f"{source}: {TOO_SHORT}"
-    yield from left_unexplained(comparison, verdict, comparison.unexplained(measured.improvable), system)
+    yield from left_unexplained(comparison, verdict, comparison.unexplained(measured.improvable))
     yield from at_bounds(comparison)
     if found:
         yield from phases_of_episodes(comparison.best)

@@ -5,6 +5,7 @@ Velocities are never differentiated: they are unknowns of the fits, as of any re
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -18,6 +19,7 @@ from visadapt.diagnosis import next_experiment
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Diagnosis, Gap, Pixels
 from visadapt.diagnosis.search.camera import CameraFindings, find_camera
 from visadapt.diagnosis.search.pixels import judged, left_over, usual
+from visadapt.diagnosis.verdict import CLOSES_BUT
 from visadapt.diagnosis.words import estimate
 from visadapt.effects import (
     EFFECTS,
@@ -148,6 +150,12 @@ def _without_gap(motion: Diagnosis, seen_by_a_faulty_camera: bool, system: Syste
         verdict=IDENTIFIED if drops else NO_GAP,
         causes=drops,
         partial=(),
+        gap=replace(motion.gap, closed=math.nan),
+        warnings=tuple(
+            warning
+            for warning in motion.warnings
+            if warning.partition(":")[0] not in (CLOSES_BUT, *(cause.effect for cause in motion.causes))
+        ),
         where=replace(motion.where, stages=stages | ({Stage.CAMERA.value: 1.0} if drops else {})),
         next_experiment="" if drops else next_experiment.more(profile_of(system)),
     )

@@ -76,7 +76,7 @@ def measure(
     rms += heldout.held_out(search.system, rows, _fitted(sets), lambda errors: errors.rms(noise), jobs)
     done(2)
     source = with_repeats or source
-    errors = PredictionErrors(source.rms(noise), reached, corrected.floor(noise), reached, noise)
+    errors = PredictionErrors(source.rms(noise), reached, corrected.floor(noise), reached, noise, rows.period)
     improvable, is_held_out = False, rows.shape[0] > 1
     if is_held_out and errors.gap().closed < MIN_GAP_CLOSED:  # else a black box cannot close enough of what is left
         black_box = heldout.beside_black_box(search.system, rows, best.effects, best.fits, jobs)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
+from visadapt.diagnosis.search.unexplained import SmoothFunction
 from visadapt.diagnosis.words import listed, plain
 from visadapt.effects import Effect, Stage
 from visadapt.effects.catalogue import separable
@@ -54,19 +55,19 @@ def separate(classes: Sequence[Collection[type[Effect]]], system: System) -> str
     return " ".join(parts)
 
 
-def disturbance_on(port: str, variable: str, system: System) -> str:
+def disturbance_in_words(function: SmoothFunction) -> str:
     """An unexplained disturbance in words: a load, or an error of a state's reading, that depends on a variable."""
-    loads = [load.name for load in system.loads]
-    what = f"load ({plain(port)})" if port in loads else f"error of the reading of {plain(port)}"
-    return f"an unexplained {what} depends on {plain(variable)}"
+    port = plain(function.port)
+    what = f"error of the reading of {port}" if function.of_reading else f"load ({port})"
+    return f"an unexplained {what} depends on {plain(function.variable)}"
 
 
-def explain(port: str, variable: str, system: System) -> str:
-    """The experiment that shows an unexplained disturbance on `port`, a function of `variable`, more clearly."""
-    said = disturbance_on(port, variable, system)
-    whole = f"the whole range of {plain(variable)} slowly and fast"
+def explain(function: SmoothFunction) -> str:
+    """The experiment that shows an unexplained disturbance more clearly."""
+    said = disturbance_in_words(function)
+    whole = f"the whole range of {plain(function.variable)} slowly and fast"
     runs = f"runs that cover {whole}, with all else as constant as possible"
-    if variable == "time":
+    if function.variable == "time":
         runs = "several long runs under the same commands, to see what returns in each"
     return f"{said[0].upper()}{said[1:]}: record {runs}, and add an effect of your own for it (--effects)."
 

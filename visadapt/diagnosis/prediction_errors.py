@@ -22,6 +22,7 @@ class PredictionErrors:
     floor: Tensor  # of the states that the smoother estimates: noise
     black_box: Tensor  # the best that a black box reaches beside the causes
     deviation: Tensor  # (m,) standard deviations of the measurement noise, in the states' units
+    period: float  # s between rows
 
     def closed_by(self, rms: Tensor) -> float:
         """Share of the gap that the set with these errors (H, m) closes."""
@@ -31,7 +32,7 @@ class PredictionErrors:
         """The errors at the longest horizon, over all channels."""
         before, after, floor, box = (_last(e) for e in (self.before, self.after, self.floor, self.black_box))
         measure = (
-            f"root mean square error of predictions {heldout.PREDICTION_TIME:g} s ahead on held-out episodes, "
+            f"root mean square error of predictions {len(self.before) * self.period:.2g} s ahead on held-out episodes, "
             "in standard deviations of the measurement noise"
         )
         return Gap(measure, before, after, floor, box, heldout.closed(before, after, floor))

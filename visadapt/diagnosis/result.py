@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visadapt.effects import EFFECTS, Effect
+from visadapt.effects.own import is_own, own_effects
+from visadapt.systems.base import NAMED
 
 IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP = "identified", "ambiguous", "unexplained", "no_gap"
 VERDICTS = (IDENTIFIED, AMBIGUOUS, UNEXPLAINED, NO_GAP)
@@ -306,6 +308,8 @@ class Diagnosis:
         >>> [(effect.name, round(effect.coefficient.item(), 2)) for effect in world.effects]
         [('viscous_friction', 2.1)]
         """
+        if (kind := NAMED.get(self.system)) is not None and is_own(kind):
+            own_effects(kind)  # two systems of one's own may have effects of the same name
         return named_effects(self.verdict, self.causes)
 
     def to_json(self) -> dict[str, Any]:

@@ -15,7 +15,6 @@ from visadapt.diagnosis.search.sensor_checks import CoarseSteps
 from visadapt.diagnosis.search.unexplained import smooth_functions
 from visadapt.diagnosis.words import with_unit
 from visadapt.estimation.candidate import CandidateModel
-from visadapt.systems import System
 
 MIN_GAP_CLOSED = 0.95
 """Share of the gap that the causes must close to be named although something remains unexplained, or although
@@ -26,6 +25,9 @@ CLEAR_OF_NOISE = 3.0
 share of the gap that they close decides the verdict."""
 
 AT_BOUND = 1e-3  # Distance from an end of its range, as a share of it, within which a strength is at that end
+
+CLOSES_BUT = "the causes close the gap but do not explain everything"
+"""What the warning of `left_unexplained` begins with."""
 
 MIN_CLOSED_TO_EXPLAIN = 0.5
 """Share of the gap that the best set must close for the next experiment to be about what it leaves unexplained; else it
@@ -87,7 +89,7 @@ def next_step(
         if not gap.closed >= MIN_CLOSED_TO_EXPLAIN:
             source = CandidateModel(search.system, (), search.rows)
             first = smooth_functions(source, search.source.fits)[0]
-        return next_experiment.explain(first.port, first.variable, search.system)
+        return next_experiment.explain(first)
     return next_experiment.separate([[one.effect for one in group] for group in groups], search.system)
 
 
@@ -104,12 +106,8 @@ def at_bounds(comparison: ModelComparison) -> list[str]:
     ]
 
 
-def left_unexplained(comparison: ModelComparison, verdict: str, unexplained: bool, system: System) -> list[str]:
+def left_unexplained(comparison: ModelComparison, verdict: str, unexplained: bool) -> list[str]:
     """A warning where causes are named although they leave something."""
     if verdict in (IDENTIFIED, AMBIGUOUS) and unexplained:
-        first = comparison.functions[0]
-        return [
-            "the causes close the gap but do not explain everything: "
-            + next_experiment.disturbance_on(first.port, first.variable, system)
-        ]
+        return [f"{CLOSES_BUT}: {next_experiment.disturbance_in_words(comparison.functions[0])}"]
     return []

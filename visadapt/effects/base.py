@@ -122,6 +122,12 @@ class Effect(nn.Module):
             taken = EFFECTS.get(cls.name)
             if taken is not None and taken.__qualname__ != cls.__qualname__:
                 raise ValueError(f"the effect name {cls.name!r} is taken by {taken.__module__}.{taken.__qualname__}")
+            for parameter in cls.table:
+                if callable(getattr(cls, parameter.name, None)):
+                    raise ValueError(
+                        f"{cls.name}: {parameter.name} is a method of every effect, so no parameter can be called so: "
+                        "name it otherwise"
+                    )
             EFFECTS[cls.name] = cls
 
     def __init__(self, **values: float | Tensor) -> None:

@@ -14,7 +14,7 @@ from visadapt.effects import ActuationEffect, DynamicsEffect, Effect
 from visadapt.effects.applied import applied_along
 from visadapt.effects.late_sensors import LateSensors
 from visadapt.estimation.episode_phases import phase_columns
-from visadapt.estimation.late_readings import Delays, Following, following, interpolated, reading, rows_later
+from visadapt.estimation.late_readings import Delays, Following, Rows, following, interpolated, reading, rows_later
 from visadapt.estimation.linearise import (
     Tangent,
     linearise_reading,
@@ -49,7 +49,7 @@ class CandidateModel:
         self.effects = tuple(effects)
         self.rows = rows
         self.accuracy = accuracy
-        smooth = math.inf if accuracy == COARSEST else self.profile.longest_step
+        smooth = self.profile.coarsest_step if accuracy == COARSEST else self.profile.longest_step
         longest_step = smooth
         if any(effect.abrupt for effect in effects):
             longest_step = min(longest_step, self.profile.longest_abrupt_steps[accuracy])
@@ -140,7 +140,7 @@ class CandidateModel:
         time = rows.time[:, :length].flatten()
         return WorldState(time, state.flatten(0, 1), tuple(m[episode, index] for m in memory))
 
-    def measure(self, theta: Tensor, state: Tensor, chosen: slice = slice(None)) -> Tensor:
+    def measure(self, theta: Tensor, state: Tensor, chosen: Rows = slice(None)) -> Tensor:
         """Readings without noise (W, T', m), with parameters (P,), that show the states (W, T', n) of the `chosen` rows
         of every window: those of `shown`."""
         after = applied = None
@@ -181,14 +181,14 @@ class CandidateModel:
         """The same of all states (n,), measured or not."""
         return rows_later(self.rows, self._delays(theta), range(len(self.system.states)))
 
-    def following(self, theta: Tensor, acting: Tensor, chosen: slice = slice(None)) -> Following | None:
+    def following(self, theta: Tensor, acting: Tensor, chosen: Rows = slice(None)) -> Following | None:
         """What late sensors with parameters (P,) show of what follows the `chosen` rows of every window, where `acting`
         (E, L, substeps, n_action) acts; None without such sensors."""
         if not self._late:
             return None
         return following(self.rows, self._delays(theta), acting, len(self.system.states), chosen)
 
-    def applied(self, acting: Tensor, chosen: slice = slice(None)) -> Tensor:
+    def applied(self, acting: Tensor, chosen: Rows = slice(None)) -> Tensor:
         """What acts (N, 2, n_action) as the `chosen` rows of every window, flattened, are read, and its rate of change;
         `acting` (E, L, substeps, n_action) acts in whole episodes."""
         every = applied_along(acting, self.rows.held)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from visadapt.effects import Dropout, Effect, FrozenZone, LateSensors, Role, SensingEffect
+from visadapt.effects import Dropout, Effect, FrozenZone, LateSensors, Role, SensingEffect, Stage
 from visadapt.effects.catalogue import sized, twins
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.covariance import inverse_information
@@ -35,6 +35,8 @@ from visadapt.estimation.repeated_readings import SMOOTHING_RATIO, RepeatedReadi
 from visadapt.estimation.screening import screen
 from visadapt.estimation.segments import Segments, cut
 from visadapt.systems import System
+
+ALIKE = 1.0  # Log likelihood within which fits count as equally good
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,8 @@ def check_fittable(kinds: Sequence[type[Effect]], system: System) -> None:
     for place, kind in enumerate(kinds):
         if not kind.repeats_readings and remembers(kind, system):
             raise ValueError(f"{kind.name} cannot be fitted: what it measures depends on earlier rows")
+        if kind.stage is Stage.CAMERA:
+            raise ValueError(f"{kind.name} cannot be fitted to states: only frames show it")
         others = [*kinds[:place], *kinds[place + 1 :]]
         if kind in others:
             raise ValueError(f"{kind.name} is given more than once: leave all but one out")
@@ -126,7 +130,8 @@ def check_fittable(kinds: Sequence[type[Effect]], system: System) -> None:
 
 
 def _fitted(system: System, effects: Effects, rows: Segments, present: Sequence[float]) -> FitState:
-    """The likelier fit from two starts: effects added one by one, the most promising first; and `present`."""
+    """The likeliest fit from two starts: `present`, which stays where the data do not show an effect; and effects added
+    one by one, the most promising first."""
     chosen: Effects = ()
     base = initial_fit(system, rows)
     for _ in effects:
@@ -139,7 +144,7 @@ def _fitted(system: System, effects: Effects, rows: Segments, present: Sequence[
     order = [column[effect, p.name] for effect in effects for p in effect.table]
     starts = [replace(base, theta=base.theta[:, order])]
     if list(present) != [value for effect in effects for value in neutral(effect)]:
-        starts.append(replace(base, theta=torch.tensor([list(present)], dtype=torch.float64)))
+        starts.insert(0, replace(base, theta=torch.tensor([list(present)], dtype=torch.float64)))
     if effects:
         # With process noise a fit may end where noise explains what an effect would.
         starts += [_best(system, effects, starts, rows, QUICK, process_noise=False)]
@@ -154,11 +159,13 @@ def _best(
     effort: tuple[int, int],
     process_noise: bool = True,
 ) -> FitState:
-    """The likeliest fit of one set of effects from several starts."""
+    """The likeliest fit of one set of effects from several starts; of fits that are `ALIKE`, that from the first."""
     iterations, care = effort
     models = [CandidateModel(system, effects, rows, care) for _ in starts]
     out = fit(models, stacked(starts), iterations, process_noise)
-    return single_fit(out, int(out.likelihood.nan_to_num(-math.inf).argmax()), len(models[0].table))
+    likelihood = out.likelihood.nan_to_num(-math.inf)
+    first = int((likelihood >= likelihood.max() - ALIKE).int().argmax())
+    return single_fit(out, first, len(models[0].table))
 
 
 def _within_a_turn(effect: type[Effect], values: Tensor) -> Tensor:

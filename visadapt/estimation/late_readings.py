@@ -21,6 +21,9 @@ from visadapt.world import World
 Delays = Mapping[int, float]
 """Late states, by index, to the s by which they are read late."""
 
+Rows = slice | Tensor
+"""Rows of every window, by a slice or by their indices."""
+
 
 @dataclass(frozen=True)
 class Following(Batch):
@@ -87,7 +90,7 @@ def _rows_in(delay: float, clock: Tensor, period: float) -> int:
     return count
 
 
-def following(rows: Segments, delays: Delays, acting: Tensor, states: int, chosen: slice) -> Following:
+def following(rows: Segments, delays: Delays, acting: Tensor, states: int, chosen: Rows) -> Following:
     """What follows the `chosen` rows of every window, flattened, where `acting` (E, L, substeps, n_action) acts."""
     clock, episode, index = _clock(rows), rows.episode[:, None], rows.index[:, chosen]
 

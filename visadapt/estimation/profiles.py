@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 
 from visadapt.systems import CartPole, FixedWing, Quadrotor, System
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY
+from visadapt.systems.stiffness import longest_step
 
 Columns = tuple[int, ...]
 """Indices into the state vector."""
@@ -49,6 +51,7 @@ class SystemProfile:
     longest_step: float = 0.025
     """s, the longest Runge-Kutta step for smooth physics when an effect is fitted (screening takes one per period): one
     of 0.05 s errs by 3e-4 of a velocity that friction damps at 10 1/s, more than the noise of a good sensor"""
+    coarsest_step: float = math.inf  # s, the longest step in the screening, beyond which Runge-Kutta is unstable
     longest_abrupt_steps: tuple[float, float, float] = (float("inf"), 0.0125, 0.005)
     """s, the longest integration steps under abrupt effects, at the accuracies COARSEST, COARSE and FINE"""
     relinearise_every: int = 1
@@ -172,6 +175,8 @@ def _own_profile(system: type[System]) -> SystemProfile:
         region_variables={"s": "time", **places},
         plotted_variables=(names[velocities[0]], names[positions[0]], system.actions[0].name, "time"),
         residual_name=system.loads[0].name.replace("_", " "),
+        longest_step=min(SystemProfile.longest_step, longest_step(system)),
+        coarsest_step=longest_step(system),
         smooth_function_factors={
             load.name: (None, names[velocity]) for load, velocity in zip(system.loads, velocities, strict=True)
         },

@@ -12,6 +12,8 @@ that leads from each state to the next, less what that load does without frictio
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -31,9 +33,11 @@ def load_response(rows: Segments, system: System) -> Tensor:
     states."""
     windows, length = rows.shape
     load = load_effect(type(system))
-    world = World(system, [load(**{parameter.name: 0.0 for parameter in load.table})], rows.period)
+    substeps = max(1, math.ceil(float(rows.held.max()) / profile_of(system).coarsest_step - 1e-9))
+    nothing = load(**{parameter.name: 0.0 for parameter in load.table})
+    world = World(system, [nothing], rows.period, substeps=substeps)
     (time, duration), state = rows.clock, initial_states(rows, system)[:, :-1].flatten(0, 1)
-    commands = rows.given[:, :-1].flatten(0, 1)[:, None]
+    commands = rows.given[:, :-1].flatten(0, 1)[:, None].expand(-1, substeps, -1)
     none = torch.zeros(len(system.loads), dtype=torch.float64)
     step = linearise_step(world, none, time, state, commands, by_state=False, duration=duration)
     return step.by_parameter.unflatten(0, (windows, length - 1)) * rows.inside[:, 1:, None, None]

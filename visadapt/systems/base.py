@@ -61,6 +61,8 @@ class System(ABC):
     """Generalised forces that a dynamics effect may add, one entry per degree of freedom."""
     coordinates: ClassVar[tuple[tuple[int, int], ...]] = ()
     """For each load the columns of the position and the velocity that it acts on; dry friction needs them."""
+    longest_step: ClassVar[float | None] = None
+    """s, the longest Runge-Kutta step that follows the dynamics; None: found from the derivative"""
 
     @abstractmethod
     def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:

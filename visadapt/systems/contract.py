@@ -18,6 +18,7 @@ ROWS = 5  # States that the derivative is tried in, drawn from the states' range
 TOLERANCE = 1e-4  # Largest error of an automatic derivative, as a share of max(1, the largest)
 STEP = 1e-6  # Finite difference, as a share of a variable's range
 ROUNDING = 1e-9  # Share by which numbers may differ that ought to be equal
+SMALLEST = 0.01  # Least value that a state has to reach, in its unit: fits take steps and noises of 1e-6 and more
 
 
 def complaints(system: type[System]) -> list[str]:
@@ -69,6 +70,7 @@ _EXAMPLES = {
 def _variables(system: type[System]) -> Iterator[str]:
     if not isinstance(system.name, str) or not system.name.isidentifier():
         yield f"name is {system.name!r}; a word such as {_EXAMPLES['name']} would be right"
+    names: dict[str, list[Any]] = {}
     for kind in ("states", "actions", "loads"):
         every = getattr(system, kind)
         if not isinstance(every, tuple) or not every:
@@ -79,8 +81,11 @@ def _variables(system: type[System]) -> Iterator[str]:
                 yield f"{kind} holds {variable!r}; {_EXAMPLES[kind]} would be right"
             else:
                 yield from _variable(kind, variable)
-        names = [getattr(variable, "name", None) for variable in every]
-        yield from (f"{kind} has {name!r} twice" for name in dict.fromkeys(names) if names.count(name) > 1)
+        own = names[kind] = [getattr(variable, "name", None) for variable in every]
+        yield from (f"{kind} has {name!r} twice" for name in dict.fromkeys(own) if own.count(name) > 1)
+    for name in names.get("states", ()):
+        if name in names.get("actions", ()):
+            yield f"{name!r} is a state and an action, which are columns of one file: call one otherwise"
 
 
 def _variable(kind: str, variable: Variable) -> Iterator[str]:
@@ -92,6 +97,11 @@ def _variable(kind: str, variable: Variable) -> Iterator[str]:
     numbers = isinstance(low, int | float) and isinstance(high, int | float)
     if not numbers or not isfinite(low) or not isfinite(high) or low >= high:
         yield f"{kind}: {name} goes from {low!r} to {high!r}; two finite numbers, the lower first, would be right"
+    elif kind == "states" and variable.largest < SMALLEST:
+        yield (
+            f"{kind}: {name} reaches {variable.largest:g} {unit}; in another unit, such as mm, would be right: fits "
+            f"need numbers that reach {SMALLEST:g}"
+        )
 
 
 def inputs(system: System) -> list[Tensor]:

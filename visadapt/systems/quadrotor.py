@@ -57,6 +57,7 @@ class Quadrotor(RigidBody):
     wind_z: float | Tensor = 0.0  # m/s
 
     name: ClassVar[str] = "quadrotor"
+    longest_step: ClassVar[float | None] = 0.07  # the rate loop decays at 16.6 1/s
     actions: ClassVar[tuple[Variable, ...]] = tuple(
         Variable(name, "1", -1.0, 1.0) for name in ("thrust", "rate_x", "rate_y", "rate_z")
     )

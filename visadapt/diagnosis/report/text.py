@@ -134,6 +134,8 @@ def _described(cause: Cause) -> str:
 
 def _closes(diagnosis: Diagnosis) -> str:
     many = len(_alternatives(without_slight(diagnosis.causes))) > 1
+    if math.isnan(diagnosis.gap.closed):  # beside the repeated readings the source predicts as well as the noise allows
+        return f"{'explain' if many else 'explains'} the readings that are repeated"
     return f"{'close' if many else 'closes'} {percent(diagnosis.gap.closed)} of the gap to the simulator"
 
 

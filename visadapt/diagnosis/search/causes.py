@@ -121,8 +121,8 @@ def _probability(comparison: ModelComparison, one: Alternative, group: Sequence[
 
 def _twin(search: Search, one: Alternative, fitted: Mapping[str, Estimate]) -> Mapping[str, Estimate]:
     """The parameters with which a twin has the same effect."""
-    if [(p.name, p.unit) for p in one.effect.table] == [(p.name, p.unit) for p in one.canonical.table]:
-        return fitted
+    if all(p.unit == "s" for effect in (one.effect, one.canonical) for p in effect.table):
+        return fitted  # a delay of commands equals the same delay of readings
     model = search.exchange(one.compared.model, one.canonical, one.effect)
     values, spread = _fitted(search, model)[one.effect]
     return _estimates(search, model, one.effect, values, values - Z_90 * spread, values + Z_90 * spread)

@@ -40,7 +40,8 @@ START_TIME = 0.02
 BLACK_BOX_ROWS = 1600  # Rows to which a black box is fitted: windows spread evenly over the recording
 
 STATE_LIMIT = 1e3
-"""Bound on predicted states, in their units, so that an unstable prediction gives a large but finite error."""
+"""Bound on predicted states, in their units, so that an unstable prediction gives a large but finite error; ten times
+the largest value in a state's range where that is more."""
 
 
 LEAST_FLOOR = 0.5  # Least noise floor, in standard deviations of the measurement noise
@@ -174,6 +175,8 @@ def _of_folds(
         model = CandidateModel(system, effects, rows.select(windows), COARSE)
         return model, one.on(windows)
 
+    # Episodes may be shorter than the time of a prediction.
+    horizon = max(1, min(round(PREDICTION_TIME / rows.period), int(rows.inside.sum(1).max()) - 1))
     parts = []
     for k in indices:
         box = None
@@ -182,15 +185,16 @@ def _of_folds(
             with suppress(torch.linalg.LinAlgError):  # type: ignore[attr-defined]  # then nothing is predicted better than without it
                 box = fit_black_box(*on(k, others[rows.select(others).spread(BLACK_BOX_ROWS)]))
         held = out[k].nonzero()[:, 0]
-        parts.append((held, rollout_errors(*on(k, held), box)))
+        parts.append((held, rollout_errors(*on(k, held), horizon, box)))
     return parts
 
 
-def rollout_errors(model: CandidateModel, fits: FitState, black_box: BlackBox | None = None) -> RolloutErrors:
-    """Errors of one fitted set, perhaps with a black box, whose loads follow the predicted states."""
+def rollout_errors(
+    model: CandidateModel, fits: FitState, horizon: int, black_box: BlackBox | None = None
+) -> RolloutErrors:
+    """Errors of one fitted set up to `horizon` rows ahead, perhaps with a black box, whose loads follow the states."""
     rows = model.rows
     length = rows.shape[1]
-    horizon = max(1, round(PREDICTION_TIME / rows.period))
     stride = max(1, int(START_TIME / rows.period + 1e-9))
     if black_box is not None:
         fits = replace(fits, log_process=black_box.fits.log_process)
@@ -206,13 +210,16 @@ def rollout_errors(model: CandidateModel, fits: FitState, black_box: BlackBox | 
     # A window's first state is known from what follows alone; where a joint sticks, that does not show its velocity.
     others = rows.inside.sum(1) > horizon + stride
     left = model.measure(fits.theta[0], estimated) - measured
+    # Rows in which the predictions of each horizon end, read all at once: late sensors take a simulation to read.
+    every_end = [torch.arange(h, length, stride) for h in range(horizon + 1)]
+    sizes = [len(ends) for ends in every_end]
+    found = torch.cat([predicted[:, :size, h] for h, size in enumerate(sizes)], 1)
+    readings = model.measure(fits.theta[0], found, torch.cat(every_end)).split(sizes, 1)
     parts = []
-    for h in range(horizon + 1):
-        ends = slice(h, None, stride)
-        used, found = shown[:, ends].clone(), predicted[:, : len(range(h, length, stride)), h]
+    for ends, read in zip(every_end, readings, strict=True):
+        used = shown[:, ends].clone()
         if used.shape[1]:
             used[others, 0] = 0
-        read = model.measure(fits.theta[0], found, ends)
         every = (read - measured[:, ends]) * used, used, read, left[:, ends] * used
         # Predictions that would end beyond the window are not valid.
         parts.append([pad(x, (0, 0, 0, predicted.shape[1] - x.shape[1])) for x in every])
@@ -238,6 +245,7 @@ def _rollouts(
     world = model.at(values)
     if black_box is None:
         world, commands = model.stepping(values, commands)
+    limit = torch.tensor([max(STATE_LIMIT, 10 * one.largest) for one in model.system.states], dtype=state.dtype)
     for h in range(horizon):
         now = slice(h, h + length, stride)
         if black_box is not None:
@@ -247,7 +255,7 @@ def _rollouts(
             time.flatten(), out[-1].flatten(0, 1), commands[:, now].flatten(0, 1), duration[:, now].flatten()
         )
         time, after = time + duration[:, now], after.reshape(out[-1].shape)
-        out.append(after.nan_to_num(STATE_LIMIT, STATE_LIMIT, -STATE_LIMIT).clamp(-STATE_LIMIT, STATE_LIMIT))
+        out.append(torch.where(after.isnan(), limit, after).clamp(-limit, limit))
     return torch.stack(out, 2)
 
 

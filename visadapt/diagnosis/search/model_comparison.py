@@ -55,7 +55,6 @@ class ModelComparison:
     """for each effect of the best: the models without it, with others in its place, that fit as well"""
     gained: float  # log likelihood of the best minus that of the source
     threshold: float  # log odds above which a function of a reading counts as something unexplained
-    loads: tuple[str, ...]  # ports of the other functions: the system's loads
 
     @property
     def best(self) -> ScoredModel:
@@ -68,14 +67,14 @@ class ModelComparison:
         if improvable or self.leftover > MIN_LEFTOVER:
             return True
         # A load that improves no held-out prediction must be clear; errors of readings are not in the black box.
-        required = {load: max(self.threshold, CLEAR_LOG_ODDS) for load in self.loads}
-        return any(each.log_odds > required.get(each.port, self.threshold) for each in self.functions)
+        required = {True: self.threshold, False: max(self.threshold, CLEAR_LOG_ODDS)}
+        return any(each.log_odds > required[each.of_reading] for each in self.functions)
 
     @property
     def misread(self) -> bool:
         """Whether a reading clearly has an error beyond the best model. Predictions may not show it: that of a velocity
         is fitted as noise where the positions are read too."""
-        return any(each.log_odds > CLEAR_LOG_ODDS and each.port not in self.loads for each in self.functions)
+        return any(each.of_reading and each.log_odds > CLEAR_LOG_ODDS for each in self.functions)
 
     @property
     def negligible(self) -> bool:
@@ -93,12 +92,11 @@ def compare(search: Search) -> ModelComparison:
     functions = smooth_functions(CandidateModel(search.system, best.effects, search.rows), best.fits)
     gained = float(best.fits.likelihood[0] - search.source.fits.likelihood[0])
     threshold = search.profile.smooth_function_threshold
-    loads = tuple(load.name for load in search.system.loads)
     # The source, which is not refitted, is best only where it is close.
     alone = {f.names: each for f, each in zip(close, quiet, strict=True)}.get(best.names)
     left = alone.left if alone else 0.0
     predicting = alone.fits if alone and left <= MIN_LEFTOVER else best.fits
-    return ModelComparison(models, predicting, left, functions, _alternatives_to(models), gained, threshold, loads)
+    return ModelComparison(models, predicting, left, functions, _alternatives_to(models), gained, threshold)
 
 
 def compare_coloured(search: Search, white: ModelComparison) -> ModelComparison:

@@ -32,6 +32,7 @@ class SmoothFunction:
     """One smooth function of one variable, fitted alone."""
 
     port: str  # the load, or the state whose reading is in error
+    of_reading: bool  # whether it is an error of a reading; a load may have the name of a state
     variable: str  # a state, a command, a command of the period before, or time
     log_odds: float  # that it is there, at even prior odds
 
@@ -41,6 +42,7 @@ class Block:
     """The bumps of one function as inputs to the filter."""
 
     port: str
+    of_reading: bool
     variable: str
     drive: Tensor  # (W, T - 1, n, BUMPS) to the states
     reading: Tensor  # (W, T, m, BUMPS) to the readings
@@ -53,7 +55,8 @@ def smooth_functions(model: CandidateModel, fits: FitState) -> list[SmoothFuncti
     # One after the other: together they would need much memory.
     for block in _blocks(model, fits):
         response = innovations.response(block.drive, block.reading)
-        out.append(SmoothFunction(block.port, block.variable, _log_odds(response, innovations.error)))
+        log_odds = _log_odds(response, innovations.error)
+        out.append(SmoothFunction(block.port, block.of_reading, block.variable, log_odds))
     return sorted(out, key=lambda function: -function.log_odds)
 
 
@@ -72,13 +75,13 @@ def _blocks(model: CandidateModel, fits: FitState) -> Iterator[Block]:
             for factor in model.profile.smooth_function_factors.get(load.name, (None,)):
                 factors = 1.0 if factor is None else variables[factor][:, :-1, None]
                 drive = loads[..., k, None] * (factors * inner)[:, :, None]
-                yield Block(load.name, name, drive, no_reading)
+                yield Block(load.name, False, name, drive, no_reading)
         for k, channel in enumerate(rows.channels):
             state_name = system.states[channel].name
             if name in (state_name, "time"):
                 reading = no_reading.clone()
                 reading[:, :, k] = -bumps * used[:, :, k, None]
-                yield Block(state_name, name, no_drive, reading)
+                yield Block(state_name, True, name, no_drive, reading)
 
 
 def variables_of(model: CandidateModel, state: Tensor) -> dict[str, Tensor]:

@@ -74,9 +74,11 @@ def _named(
     # Where effects of two systems have the same name, the later ones replace the earlier in `EFFECTS`.
     own = {"__module__": system.__module__, "__qualname__": name, "name": name, "systems": (system,)}
     settled = {other: _MOTOR_OFF for other in alike if other.endswith(".constant_load")}
+    settled |= {other: _MEASURED for other in alike if other.endswith(".scale")}
     return type(name, (base,), {"indistinguishable_from": alike, "settled_by": settled, **own, **attributes})
 
 
+_MEASURED = "no motion tells an actuator's gain from that parameter: measure the parameter by itself"
 _MOTOR_OFF = (
     "switch the motor off and measure the load on the joint with a balance: a constant load is still there, an "
     "actuator's bias is gone"

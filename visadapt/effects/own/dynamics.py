@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
+from typing import Any
 
 from visadapt.effects import laws
 from visadapt.effects.base import Parameter, Role
@@ -120,6 +121,7 @@ def _laws(
 def on_parameters(system: type[System]) -> Iterator[Made]:
     """A factor on each positive parameter but gravity."""
     for field in scalable(system()):
+        low, high = (_accepted(system, field, factor) for factor in (0.2, 5.0))
         yield (
             f"{field}.scale",
             ParameterScale,
@@ -127,10 +129,30 @@ def on_parameters(system: type[System]) -> Iterator[Made]:
                 "__doc__": f"A machine whose {field} differs from the source's.",
                 "equation": f"{field} = scale {field}_source",
                 "source": f"the parameters of {system.name}",
-                "table": (Parameter("scale", "1", 0.2, 5.0, 1.0),),
+                "table": (Parameter("scale", "1", low, high, 1.0),),
                 "scaled": {"scale": field},
             },
         )
+
+
+def _accepted(system: type[System], field: str, factor: float) -> float:
+    """The factor on a parameter nearest to `factor` that the class takes beside its other parameters, to 1 %."""
+    own: Any = system()
+
+    def taken(one: float) -> bool:
+        try:
+            replace(own, **{field: one * getattr(own, field)})
+        except ValueError:
+            return False
+        return True
+
+    if taken(factor):
+        return factor
+    inner, outer = 1.0, factor
+    while abs(math.log(outer / inner)) > 0.01:
+        middle = math.sqrt(inner * outer)
+        inner, outer = (middle, outer) if taken(middle) else (inner, middle)
+    return inner
 
 
 def scalable(system: System) -> list[str]:
