@@ -232,6 +232,13 @@ COMMANDS = (
         15,
         "blind_diagnosis_2029.csv",
     ),
+    Command(
+        "ablations_diagnosis",
+        "ablations_diagnosis.csv",
+        ("benchmarks.diagnosis_ablations",),
+        90,
+        work="--work",
+    ),
     _blind("blind_hard", "--seed 2028 --kinds hard --count 100 --jobs 2", 20),
     _blind("blind_easy", "--seed 2028 --kinds easy --count 24 --jobs 2", 20),
     _blind(

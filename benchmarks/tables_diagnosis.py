@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 from benchmarks.blind.tables import STRENGTH_EDGES
+from benchmarks.diagnosis_ablations import WHOLE
 from benchmarks.planned_experiments import OUTCOMES
 from benchmarks.tables_adaptation import Lines, Rows
 from benchmarks.vibrations import OTHERS
@@ -64,6 +65,25 @@ def blind_strengths(first: Rows, second: Rows) -> Lines:
         cells = [_cell(rows.get(key)) for key in keys for rows in found]
         if any(cells):
             lines.append([f"{low:g} to {high:g}", *cells])
+    return lines
+
+
+def parts(rows: Rows) -> Lines:
+    """The diagnosis with one part left out, on a draw for development."""
+    lines = [
+        [
+            *("set", "without", "recordings on which it acts", "named effects: all, nothing else"),
+            *("nothing hidden: no_gap", "foreign: unexplained", "coverage"),
+            "CPU time where it acts, against the whole",
+        ]
+    ]
+    for row in rows:
+        shares = [f"{row[f'{what}_right']} of {row[what]}" for what in ("named", "none", "foreign")]
+        covered, intervals = (float(row[key]) for key in ("covered", "intervals"))
+        alone, whole = float(row["seconds"]), float(row["seconds_whole"])
+        time = f"{alone:.0f} s for {whole:.0f} s" if row["without"] != WHOLE and alone else ""
+        shown = [row["kind"], row["without"], row["acts"], *shares, f"{100 * covered / intervals:.0f} %", time]
+        lines.append(shown)
     return lines
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields
-from typing import Any, Self
+from typing import Any, Self, get_type_hints
 
 import torch
 from torch import Tensor
@@ -31,6 +31,23 @@ class Batch:
     def detach(self) -> Self:
         """The same, cut off from the graph."""
         return self.map(Tensor.detach)
+
+    def tree(self) -> dict[str, Any]:
+        """All tensors by the names of their fields, for a checkpoint."""
+        values: Any = self
+        own = {field.name: getattr(values, field.name) for field in fields(values)}
+        return {name: value.tree() if isinstance(value, Batch) else value for name, value in own.items()}
+
+    @classmethod
+    def of(cls, tree: Mapping[str, Any]) -> Self:
+        """The inverse of `tree`, also where tuples have become lists."""
+        kinds, values = get_type_hints(cls), dict(tree)
+        for name, value in tree.items():
+            if isinstance(value, Mapping):
+                values[name] = kinds[name].of(value)
+            elif isinstance(value, list):
+                values[name] = tuple(value)
+        return cls(**values)
 
     def __getitem__(self, rows: Tensor | slice) -> Self:
         return self.map(lambda tensor: tensor[rows])

@@ -10,6 +10,7 @@ from visadapt.learning.joint import adapt
 from visadapt.learning.ledger import BudgetExceeded, Ledger
 from visadapt.learning.perception import PerceptionSettings
 from visadapt.learning.policy import TuneSettings
+from visadapt.learning.rounds import JointLearning
 from visadapt.learning.setup_settings import SetupSettings
 from visadapt.policies import StatePolicy
 from visadapt.policies.networks import StateResidualNetwork
@@ -62,8 +63,8 @@ def run(
     policy = StatePolicy(4, with_history=with_history)
     residual = Residual(state_residual_network(with_history), torch.ones(4))
     source = World(CartPole(), integrator="euler")
-    args = (policy, residual, source, target or Counted(), settings, folder, budget, round_samples, seed)
-    return policy, adapt(*args, None, label, report)
+    about = (policy, residual, source, target or Counted(), settings, Ledger(budget))
+    return policy, adapt(JointLearning(*about, label=label, report=report), folder, round_samples, seed)
 
 
 class TestLedger:
@@ -177,13 +178,15 @@ class TestInterruption:
         for after in (None, 0, 2):
             torch.manual_seed(0)
             policy, residual = StatePolicy(4), Residual(StateResidualNetwork(4), torch.ones(4))
-            args = (World(CartPole(), [AngleOffset(offset=0.0)]), Counted(), QUICK, tmp_path / str(after), 50, 30, 1)
+            source, where = World(CartPole(), [AngleOffset(offset=0.0)]), (tmp_path / str(after), 30, 1)
             if after is not None:
+                report = stopping("round 2/2: tune", after)
+                about = (policy, residual, source, Counted(), QUICK, Ledger(50))
                 with pytest.raises(KeyboardInterrupt):
-                    adapt(policy, residual, *args, report=stopping("round 2/2: tune", after))
+                    adapt(JointLearning(*about, report=report), *where)
                 torch.manual_seed(0)
                 policy, residual = StatePolicy(4), Residual(StateResidualNetwork(4), torch.ones(4))
-            adapt(policy, residual, *args)
+            adapt(JointLearning(policy, residual, source, Counted(), QUICK, Ledger(50)), *where)
             policies.append(policy)
         for policy in policies[1:]:
             for key, value in policies[0].state_dict().items():

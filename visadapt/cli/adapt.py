@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from visadapt.cli.inputs import InputError, checked, fingerprint, given_effects, import_effects, progress
+from visadapt.cli.inputs import InputError, asked_for, checked, given_effects, import_effects, progress
 from visadapt.cli.target import load_both
 from visadapt.diagnosis.words import number, with_unit
 from visadapt.effects import Effect, Parameter
@@ -38,10 +38,7 @@ def run(options: argparse.Namespace) -> None:
     if options.round and options.round > options.samples:
         raise InputError(f"--round {options.round} is more than --samples {options.samples}: lower it, or raise those")
     folder = Path(options.out)
-    settings = {name: value for name, value in vars(options).items() if name != "out"}
-    for name in ("policy", "renderer", "references", "diagnosis", "map", "effects"):
-        settings[f"{name} SHA-256"] = fingerprint(settings[name])
-    open_run(folder, settings)
+    open_run(folder, asked_for(options, "policy", "renderer", "references", "diagnosis", "map", "effects"))
     with progress() as report:
         asked = {
             name: getattr(options, name) for name in ("seed", "iterations", "renderer", "with_history", "diagnose")

@@ -72,8 +72,17 @@ def unfinished(out: Path, settings: Mapping[str, Any]) -> Iterator[Path]:
     shutil.rmtree(folder)
 
 
-def fingerprint(path: str | Path | None) -> str | None:
-    """The SHA-256 of a file that a run depends on, so that it does not go on with another; None without one."""
+def asked_for(options: argparse.Namespace, *files: str) -> dict[str, Any]:
+    """The options of a run but for its output, so that it does not go on with others; those that name files, or lists
+    of files, by the SHA-256 of each, so that these may be moved."""
+    settings = {name: value for name, value in vars(options).items() if name != "out"}
+    for name in files:
+        given = settings[name]
+        settings[name] = [_fingerprint(path) for path in given] if isinstance(given, list) else _fingerprint(given)
+    return settings
+
+
+def _fingerprint(path: str | Path | None) -> str | None:
     return None if path is None else hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from renderers import LayeredRenderer, save_renderer
 from renderers.training import fit
-from visadapt.cli.inputs import InputError, fingerprint, progress, unfinished
+from visadapt.cli.inputs import InputError, asked_for, progress, unfinished
 from visadapt.cli.target import load_target
 from visadapt.estimation.structure import size_of, structure
 from visadapt.progress import staged
@@ -46,8 +46,7 @@ def run(options: argparse.Namespace) -> None:
     torch.manual_seed(options.seed)
     renderer = LayeredRenderer(height, width, column, row, options.scale, options.pole)
     held = torch.arange(len(frames)) % HELD_OUT == 0
-    settings = {name: value for name, value in vars(options).items() if name != "out"}
-    settings["SHA-256"] = [fingerprint(path) for path in (*options.recording, options.map)]
+    settings = asked_for(options, "recording", "map")
     out = Path(options.out)
     with unfinished(out, settings) as folder, progress() as report:
         state = folder / "training.safetensors"

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from visadapt.cli.inputs import (
     InputError,
+    asked_for,
     checked,
-    fingerprint,
     given_effects,
     import_effects,
     progress,
@@ -35,10 +35,8 @@ def run(options: argparse.Namespace) -> None:
     import_effects(options)
     out = Path(options.out)
     setup = _setup(options)
-    settings = {name: value for name, value in vars(options).items() if name not in ("out", "system")}
-    for name in ("renderer", "references", "diagnosis", "params", "effects"):
-        settings[name] = fingerprint(settings[name])
-    with unfinished(out, {"system": options.system.name, **settings}) as folder, progress() as report:
+    settings = asked_for(options, "renderer", "references", "diagnosis", "params", "effects")
+    with unfinished(out, {**settings, "system": options.system.name}) as folder, progress() as report:
         made = folder / "policy.safetensors"
         setup.pretrain(made, options.seed, report)
         with replacing(out) as temporary:

@@ -154,7 +154,8 @@ def diagnose(
         warnings=(*used.warnings, *_warnings(explored, measured, verdict, found, recording.sources[0])),
         figures=replace(
             figure_data(search, measured.source, measured.corrected, measured.errors, before, after, regions),
-            film=film_frames(film, rows, measured.corrected) if film else None,
+            # Of a film that is too long, stretches were used, whose episodes are not the film's.
+            film=film_frames(film, rows, measured.corrected) if film and used is recording else None,
         ),
         policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, comparison.best),
         partial=partial,

@@ -11,17 +11,11 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from visadapt.effects import Residual
-from visadapt.learning.explanation import Explain
 from visadapt.learning.ledger import Ledger
-from visadapt.learning.rounds import JointLearning, Label, Round, RoundFolder
-from visadapt.learning.setup_settings import SetupSettings
-from visadapt.learning.transitions import Observe
+from visadapt.learning.rounds import JointLearning, Round, RoundFolder
 from visadapt.policies import Policy
-from visadapt.progress import Report
 from visadapt.recordings import Episode
 from visadapt.storage.checkpoints import load_tree, load_weights
-from visadapt.targets import Target
 from visadapt.world import World
 
 
@@ -61,51 +55,25 @@ class Adapted:
         load_weights(policy, load_tree(path)["weights"], path)
 
 
-def adapt(
-    policy: Policy,
-    residual: Residual,
-    source: World,
-    target: Target,
-    settings: SetupSettings,
-    folder: Path,
-    budget: int,
-    round_samples: int,
-    seed: int,
-    observe: Observe | None = None,
-    label: Label | None = None,
-    report: Report | None = None,
-    explorer: Policy | None = None,
-    explain: Explain | None = None,
-) -> Adapted:
+def adapt(learning: JointLearning, folder: Path, round_samples: int, seed: int) -> Adapted:
     """Run Algorithm 1 in `folder`, going on from what is there.
 
     Args:
-        policy, residual: the networks, changed in place; the policy reads the residual.
-        source: the physics known beforehand; the parameters of its effects, if it has any, are fitted.
-        budget, round_samples: N and B, target samples in all and in a round.
-        observe: renders simulated states as the camera would; None where the policy sees what the sensors measure.
-        label: estimates the states from the camera's frames; without it, the target's own states are used.
-        explorer: the policy that collects the target's data, in place of the one that is tuned (Algorithm 1).
-        explain: names the causes of the gap, which are then added to the source. The residual learns the gap only where
-            they do not explain it; where there is no gap, the policy gets its weights from before the first round.
-            Where other causes explain the data as well, the next round adds to its commands the excitation that tells
-            them apart.
+        learning: what learns from what; the budget of its ledger is N, the target samples in all.
+        round_samples: B, the target samples in a round.
 
     Raises:
         ValueError: an empty round, or a budget that is smaller than a round.
         TargetError: the target misbehaves. BudgetExceeded: a step more than the budget.
         CheckpointError: `folder` holds a run of other networks.
     """
+    budget = learning.ledger.budget
     if round_samples < 1:
         raise ValueError(f"a round needs at least 1 sample, got B = {round_samples}")
     if budget < round_samples:
         raise ValueError(
             f"the budget N = {budget} is smaller than a round of B = {round_samples} samples: raise N or lower B"
         )
-    ledger = Ledger(budget)
-    learning = JointLearning(
-        policy, residual, source, target, settings, ledger, observe, label, report, explorer, explain
-    )
     count = math.ceil(budget / round_samples)
     rounds = [learning.round(RoundFolder.of(folder, number, count, seed), round_samples) for number in range(count)]
-    return Adapted(policy, ledger, rounds, learning.episodes, folder, learning.known)
+    return Adapted(learning.policy, learning.ledger, rounds, learning.episodes, folder, learning.known)

@@ -109,7 +109,7 @@ class KeptPlans(Plans):
         assert self.past is not None
         drawn = self.past[torch.randint(len(self.past.inputs), (self.batch,), generator=self.generator)]
         plan = self.policy.decide(drawn.inputs, drawn.expected)
-        states = rollout_with_constant_correction(streams.world, drawn.at, plan, drawn.correction)
+        states, _ = imagine(streams.world, None, drawn.at, None, plan, correction=drawn.correction)
         return streams.task.cost(states, plan, drawn.at.state, drawn.task_state).mean()
 
     def tree(self) -> dict[str, Any]:
@@ -124,10 +124,11 @@ def imagine(
     world: World,
     observe: Observe | None,
     at: WorldState,
-    history: History,
+    history: History | None,
     plan: Tensor,
     show: Callable[[Tensor], Tensor] = lambda seen: seen,
     generator: torch.Generator | None = None,
+    correction: Tensor | None = None,
 ) -> tuple[Tensor, WorldState]:
     """Simulate a plan (B, K, n_action): the states that follow (B, K, n_state), and the world after the first step.
 
@@ -136,15 +137,16 @@ def imagine(
         at: where the plan begins; the sensors have read this row, but not yet that of the world returned.
         show: appends to an observation what the task shows beside it, such as a goal.
         generator: for random sensing effects.
+        correction: (B, n_state), held over the plan in the place of the residual's, which then needs no history.
     """
     states = []
     first = at
     for k in range(plan.shape[1]):
-        at = world.step(at, plan[:, k], history)
+        at = world.step(at, plan[:, k], history, correction)
         states.append(at.state)
         if k == 0:
             first = at
-        if world.has_residual and k + 1 < plan.shape[1]:
+        if history is not None and world.has_residual and k + 1 < plan.shape[1]:
             seen, at = look(world, observe, at, generator)
             history = history.acting(plan[:, k]).observing(show(seen))
     return torch.stack(states, 1), first
@@ -163,12 +165,3 @@ def visit(policy: Policy, world: World, stream: StreamState, shown: History) -> 
         correction = world.correction(action, stream.history)
     visited = Visited(stream.at, stream.task_state, inputs, expected, correction)
     return visited, action, world.step(stream.at, action, correction=correction)
-
-
-def rollout_with_constant_correction(world: World, at: WorldState, plan: Tensor, correction: Tensor) -> Tensor:
-    """The states (B, K, n_state) that follow a plan (B, K, n_action) under a constant correction (B, n_state)."""
-    states = []
-    for k in range(plan.shape[1]):
-        at = world.step(at, plan[:, k], correction=correction)
-        states.append(at.state)
-    return torch.stack(states, 1)

@@ -93,17 +93,23 @@ class RoundFolder:
 class JointLearning:
     """A run of Algorithm 1 between two rounds; policy and residual are changed in place."""
 
-    policy: Policy
+    policy: Policy  # reads the residual
     residual: Residual
-    source: World
+    source: World  # the physics known beforehand; the parameters of its effects, if it has any, are fitted
     target: Target
     settings: SetupSettings
     ledger: Ledger
-    observe: Observe | None
-    label: Label | None
-    report: Report | None
-    explorer: Policy | None
-    explain: Explain | None
+    observe: Observe | None = None
+    """renders simulated states as the camera would; None where the policy sees what the sensors measure"""
+    label: Label | None = None
+    """estimates the states from the camera's frames; without it, the target's own states are used"""
+    report: Report | None = None
+    explorer: Policy | None = None
+    """collects the target's data in place of the policy that is tuned"""
+    explain: Explain | None = None
+    """names the causes of the gap, which are then added to the source. The residual learns the gap only where they do
+    not explain it; where there is no gap, the policy gets its weights from before the first round. Where other causes
+    explain the data as well, the next round adds to its commands the excitation that tells them apart."""
     recorded: list[Episode] = field(default_factory=list)  # all episodes of the target
     labelled: list[Episode] = field(default_factory=list)  # those with the states that grounding learns from
     waiting: list[Episode] = field(default_factory=list)  # the others, from rounds that needed no residual

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -27,23 +26,6 @@ class StreamState(Batch):
     history: History
     task_state: Tensor  # (B, ...) the task's
 
-    def tree(self) -> dict[str, Any]:
-        """All of it as a tree of tensors, for a checkpoint."""
-        return {
-            "time": self.at.time,
-            "state": self.at.state,
-            "memory": list(self.at.memory),
-            "observations": self.history.observations,
-            "actions": self.history.actions,
-            "task_state": self.task_state,
-        }
-
-    @classmethod
-    def of(cls, tree: dict[str, Any]) -> Self:
-        """The inverse of `tree`."""
-        at = WorldState(tree["time"], tree["state"], tuple(tree["memory"]))
-        return cls(at, History(tree["observations"], tree["actions"]), tree["task_state"])
-
 
 @dataclass(frozen=True)
 class Visited(Batch):
@@ -54,19 +36,6 @@ class Visited(Batch):
     inputs: Tensor  # (B, inputs) of the policy's plan, `Policy.embed`
     expected: Tensor  # (B, n_state) the correction that the policy expects, in units of the residual's scale
     correction: Tensor  # (B, n_state) that the residual made
-
-    def tree(self) -> dict[str, Any]:
-        """All of it as a tree of tensors, for a checkpoint."""
-        return {
-            "world": [self.at.time, self.at.state, *self.at.memory],
-            "rest": [self.task_state, self.inputs, self.expected, self.correction],
-        }
-
-    @classmethod
-    def of(cls, tree: dict[str, Any]) -> Self:
-        """The inverse of `tree`."""
-        time, state, *memory = tree["world"]
-        return cls(WorldState(time, state, tuple(memory)), *tree["rest"])
 
 
 @dataclass

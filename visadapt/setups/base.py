@@ -15,8 +15,9 @@ from visadapt.effects import Effect, Residual, Stage
 from visadapt.effects.catalogue import sized
 from visadapt.estimation.effect_fit import check_fittable
 from visadapt.learning.joint import Adapted, adapt
+from visadapt.learning.ledger import Ledger
 from visadapt.learning.policy import tune
-from visadapt.learning.rounds import Label
+from visadapt.learning.rounds import JointLearning, Label
 from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.training_state import train_or_load
 from visadapt.learning.transitions import Observe
@@ -182,9 +183,20 @@ class Setup:
         residual = _seeded(seed, partial(self.residual, policy, self.source)).to(next(policy.parameters()))
         if policy.residual is not None:
             residual.load_state_dict(policy.residual.state_dict())
-        args = (policy, residual, self.source, target, self.settings, folder, budget, round_samples, seed)
-        explain = explained(self.source, self.renderer, seed, report) if diagnose else None
-        adapted = adapt(*args, self.observe, self.label, report, explorer, explain)
+        learning = JointLearning(
+            policy,
+            residual,
+            self.source,
+            target,
+            self.settings,
+            Ledger(budget),
+            self.observe,
+            self.label,
+            report,
+            explorer,
+            explained(self.source, self.renderer, seed, report) if diagnose else None,
+        )
+        adapted = adapt(learning, folder, round_samples, seed)
         policy.grounded_in = describe(adapted.source)
         return adapted
 
