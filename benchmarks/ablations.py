@@ -180,7 +180,7 @@ KNOWING: dict[str, Callable[[Setup, Policy, Path, int], Policy]] = {
     "true effect, tuned": tuned_with_the_truth,
     "true effect, trained anew": trained_with_the_truth,
 }
-"""By name, how a policy is made by who has the target's effects in the simulator, without samples."""
+"""By name: makes a policy in a simulator that has the target's effects, which takes no samples of the target."""
 
 
 def _in_the_true_physics(setup: Setup, machine: SyntheticTarget, seed: int) -> Setup:

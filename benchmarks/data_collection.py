@@ -4,11 +4,11 @@
 
 The experiments of `benchmarks.flight`, whose own adaptations are those with data of the current policy: where they are
 kept, they are read. The random policy wanders about hover or level flight, on the same courses. The MPC
-(`benchmarks.baselines.mpc`) plans in the source with the residual as it was fitted in the round before. A flight that
-one of these two leads 5 m off ends, and all its samples count. Nothing else differs. After every round 100 flights of
-the policy as it then stands, on courses that were not trained on and of which nothing was learnt, tell how far it
-misses, and the dynamics mismatch delta (equation 6): the mean norm of the error in velocity of one step of the
-simulator, residual and all.
+(`benchmarks.baselines.mpc`) plans in the source with the residual as it was fitted in the round before. A flight of
+either of these two ends once it is 5 m off its course; all its samples count. Nothing else differs. After every round
+the policy flies 100 courses that were not trained on, and nothing is learnt from these flights. They give its mean
+miss and the dynamics mismatch delta (equation 6): the mean norm of the velocity error of one step of the simulator with
+the residual.
 
 Writes results/data_collection.csv and assets/data_collection.png. Interrupt it anywhere; started again, it goes on.
 """

@@ -168,7 +168,7 @@ def rows_of(
     for what, (unit, divisor, places) in FOUND.items():
         own = [sizes[effect][name] for effect, name in places if effect in sizes]
         value = sum(one["value"] for one in own) / divisor if own else math.nan
-        # Only of a parameter that stands alone does its own interval tell.
+        # Where several parameters add up to a quantity, none of their intervals is that of the sum.
         low, high = (_number(end / divisor) for end in own[0]["ci90"]) if len(own) == 1 else ("", "")
         found = _row(kind, what, _number(value), unit)
         rows.append({**found, "low": low, "high": high, "published": _number(true.get(what, 0.0))})

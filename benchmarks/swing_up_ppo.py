@@ -2,8 +2,8 @@
 
     python -m benchmarks.swing_up_ppo
 
-The episodes, starts and success are those of `train.swing_up`; the reward of a step is (1 + cos theta) / 2, less the
-farther from the middle and the faster the cart. Scored on 100 episodes after every 51,200 samples, until all succeed.
+The episodes, starts and success are those of `train.swing_up`; the reward of a step is (1 + cos theta) / 2 times
+exp(-x^2 / 4 - x_dot^2 / 10). Scored on 100 episodes after every 51,200 samples, until all succeed.
 
 Writes results/swing_up_ppo.csv. Interrupted, it begins again.
 """

@@ -22,7 +22,7 @@ HEAD = ["paper", "here", "samples: paper, here", "kept up", "seeds", "verdict"]
 NOT_RUN = ["not run", "", "", "", "not run"]
 CURVE_HEAD = ["source", "0 samples", *(f"{count:,}" for count in CURVE_SAMPLES)]
 CLOSE_TO_ZERO = 5.0
-"""%, of the gap, that counts as such: the paper draws its figure 8 without numbers"""
+"""%: a smaller share of the gap that is left counts as the paper's "close to zero"; its figure 8 has no numbers"""
 METHODS = {"PPO": "ppo", "MBMF": "mpc", "PETS": "pets"}
 """The paper's name: a module of `benchmarks.baselines`"""
 
@@ -65,8 +65,8 @@ class Cell:
 
 
 def verdict(paper: str, here: float) -> str:
-    """Beaten, reached (the same in the paper's digits), or not; the smaller is the better. None where the paper has no
-    such row."""
+    """Beaten, reached (equal when rounded to the paper's digits), or not; smaller is better. Empty where the paper has
+    no such row."""
     if not paper:
         return ""
     if paper == "unstable":

@@ -22,7 +22,7 @@ REFERENCE_LEVELS = (("target", "before adaptation", ORANGE), ("source", "in the 
 """Domains of results without adaptation, drawn as levels: label and colour."""
 METHOD_COLOURS = (TEAL, BLUE, INK, "#8a5fb5", "#b8487a", "#7d8c2c", "#4fa3a0", "#9a6a3c")
 """Of the methods in charts, in the order in which they first come."""
-MOST_TICKS = 8  # Numbers of samples at most that are each labelled, or their labels overlap; of more, powers of ten are
+MOST_TICKS = 8  # Most sample counts labelled one by one; with more, labels would overlap: powers of ten are labelled
 
 
 @matplotlib.rc_context(STYLE)

@@ -14,10 +14,10 @@ from visadapt.targets.rollout import run, see_within_a_turn
 from visadapt.tasks.balance import within_a_turn
 
 STEPS, SWING = 300, 100
-"""of an episode, and how many of them may pass before the pole is up"""
+"""steps of an episode, and steps that may pass before the pole must be up"""
 UP = math.radians(10)
 ANYWHERE = (0.5, 0.5, math.pi, 1.0)
-"""half-widths of the uniform distribution of the first state"""
+"""half-widths of the uniform distribution of the first state: x, x_dot, theta, theta_dot, in m, m/s, rad, rad/s"""
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,7 @@ class LayeredRenderer(nn.Module):
 
     def _rows(self, layer: Layer, hinge: Tensor, moved: Tensor) -> tuple[int, int]:
         """The first row that a layer can cover and the one after the last; the others need not be computed."""
-        # A cart that is not in the world any more is drawn anywhere.
+        # Where a simulation has diverged (nan, infinite or huge positions), it does not matter where the cart is drawn.
         row = hinge.detach()[:, 1].nan_to_num().clamp(-1e6, 1e6)
         radius = layer.radius + float(moved.detach().norm())
         first = max(0, math.floor(float(row.min()) - radius))

@@ -106,10 +106,11 @@ def main(settings: Settings) -> None:
 
 
 def explain(episodes: Sequence[Episode]) -> dict[str, float]:
-    """What explains most of the force, in body axes, that the source lacks: see UNITS; `explained` is its share.
+    """The quantities of UNITS that explain best, by least squares, the acceleration that the source lacks.
 
-    Over a period the missing acceleration is that of the velocities, and gravity, less the thrust asked for. In a wind
-    w of constant velocity, with air = R^T (v - w):
+    In body axes, the missing acceleration of a period is the mean acceleration over it, from the measured velocities,
+    plus gravity, minus the thrust asked for; `explained` is the share of its mean square that they explain. In a wind w
+    of constant velocity, with air = R^T (v - w):
 
         x, y:  -drag air        z:  -drag_z air_z + lift (air_x^2 + air_y^2) + thrust that lags - thrust asked for
 
@@ -140,7 +141,7 @@ def explain(episodes: Sequence[Episode]) -> dict[str, float]:
 
 
 def _missing(episode: Episode) -> tuple[Tensor, Tensor, Tensor]:
-    """Accelerations (T, 3) in body axes that thrust and gravity leave; velocities and rotations amid the periods."""
+    """Missing accelerations (T, 3) in body axes; velocities (T, 3) and rotation matrices (T, 3, 3) at mid-period."""
     assert episode.state is not None
     state = torch.as_tensor(episode.state)
     middle = (state[1:] + state[:-1]) / 2

@@ -84,7 +84,8 @@ class Dynamics:
         return load
 
     def _dry_friction(self, time: Tensor, state: Tensor, command: Tensor, system: System) -> Limits | None:
-        """Sum of the largest dry friction of all effects near a state; None without any."""
+        """Limits of dry friction, added up over all effects, as a function of the velocities; all else is as in `state`
+        (B, n_state). None if no effect has dry friction."""
 
         def limits(velocities: Tensor) -> Tensor:
             near = state.index_copy(1, self._columns.to(state.device), velocities)

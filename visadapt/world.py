@@ -26,7 +26,8 @@ EDGE_STEP = 0.0125
 
 
 def resolving(effects: Sequence[nn.Module], period: float) -> int:
-    """Integration steps in a period that resolve where effects set in; 1 where none does within a period."""
+    """Integration steps in a period of `period` s, each at most EDGE_STEP long, if an effect on the dynamics is abrupt
+    without being dry friction; else 1."""
     edges = (e.abrupt and not e.rubs() for e in effects if isinstance(e, DynamicsEffect))
     return math.ceil(period / EDGE_STEP - 1e-9) if any(edges) else 1
 
@@ -49,8 +50,8 @@ class World(nn.Module):
         effects: what separates the target from it.
         period: s between commands.
         integrator: one of `visadapt.systems.integrators.INTEGRATORS`.
-        substeps: integration steps in a period; None: one, or as many as it takes to resolve where an effect sets in
-            (a gust, a patch of friction).
+        substeps: integration steps in a period; None: as few as resolve abrupt loads (a gust, a patch of friction) and
+            keep each step within the longest that follows the system's own dynamics (`systems/stiffness.py`).
 
     Raises:
         ValueError: an unknown integrator, or a period or number of substeps that is not positive.
@@ -172,7 +173,8 @@ class World(nn.Module):
         return tuple(torch.stack(memory, 1) for memory in zip(*rows, strict=True))
 
     def actuate(self, commands: Tensor, held: Tensor | None = None) -> Tensor:
-        """What acts (B, T, substeps, n_action) of the commands (B, T, n_action) of episodes, from their beginning.
+        """Commands after the actuation effects (B, T, substeps, n_action), from those given (B, T, n_action) since the
+        episodes began.
 
         `held` (B, T) s is how long each command is, where the clock is unsteady; one period without it.
         """

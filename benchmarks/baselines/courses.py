@@ -1,7 +1,8 @@
-"""What a reinforcement learner's episodes are: where they start, what it sees, what a step is worth, when they end.
+"""The episodes of a reinforcement learner: where they start, what it sees, its reward for a step, and when they end.
 
-The reward of a step is exp(-cost), of a vehicle exp(-sqrt(cost)), whose errors are larger: between 0 and 1, so that to
-go on always pays. A failed episode ends with nothing.
+The reward of a step is exp(-cost) or, for vehicles, whose errors are larger, exp(-sqrt(cost)). It is between 0 and 1,
+so that it always pays to go on. A step that fails ends the episode and earns 0. `SwingingUp` has a reward of its own,
+and `Reaching` adds one for passing the point.
 """
 
 from __future__ import annotations

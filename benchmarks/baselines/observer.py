@@ -2,10 +2,10 @@
 
     d = d + share * ((s_k - f(s_{k-1}, a_{k-1})) / (df / da) - d),    a_k = policy(history) - d
 
-The observer takes all of what the source f did not foresee for a command, least squares over the two velocities, and
-smooths it. It is what a control engineer would try first: it needs no sample of the target and no learning, and it
-cancels what enters where the command does. The share is chosen in the source under draws of the hidden kind of effect,
-so it is told the kind.
+The observer explains the whole one-step error of the source f by an additional command, by least squares over the two
+velocities, and smooths that estimate. It is what a control engineer would try first: it needs no sample of the target
+and no learning, and it cancels what enters where the command does. The share is chosen in the source under draws of the
+hidden kind of effect, so this baseline is told the kind.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from visadapt.world import World
 SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)
 """of a new estimate, in a step: 0 is the source policy alone"""
 LARGEST = 0.8
-"""of the command against the disturbance: what is left of it balances the pole"""
+"""largest command against the disturbance, in [-1, 1]; the rest of the range is left for balancing the pole"""
 VELOCITIES = slice(1, None, 2)
 
 

@@ -30,7 +30,7 @@ from visadapt.policies import Policy
 
 PLANS, ELITES, ITERATIONS = 200, 8, 5
 KEPT = 0.1
-"""of mean and deviation of the last iteration, in each (mbrl-lib's alpha)"""
+"""weight of the last iteration's mean and standard deviation in those of the next (mbrl-lib's alpha)"""
 TARGET_RATE = 1e-3
 TARGET_UPDATES = 300
 

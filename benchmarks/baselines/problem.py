@@ -117,7 +117,8 @@ def score_path(folder: Path, stage: Stage) -> Path:
 
 
 Learn = Callable[[Transitions, torch.Generator], Callable[[], Policy]]
-"""All samples of the target so far to what makes the policy that has learnt from them, anew each time."""
+"""Learns from all samples of the target so far; returns a function, each call of which makes a new policy that has
+learnt from them."""
 
 
 def in_rounds(

@@ -21,7 +21,8 @@ from visadapt.setups.cartpole import cartpole_states
 from visadapt.tasks.balance import EPISODE_STEPS
 
 DRAWS = EPISODE_STEPS
-"""one for each stream; as many as streams are probed with for a dependence on time"""
+"""draws of the effect, one for each stream; as many as an episode has steps, since `Streams` tests whether the world
+depends on time with a batch of all times of an episode, and the effect's values are for batches of one size"""
 
 
 def stages(problem: CartPoleProblem, sizes: Sizes, folder: Path, seed: int) -> Iterator[Stage]:
@@ -30,7 +31,8 @@ def stages(problem: CartPoleProblem, sizes: Sizes, folder: Path, seed: int) -> I
     effect = drawn(problem.kind, DRAWS, torch.Generator().manual_seed(seed))
     settings = setup.settings.shortened(sizes.iterations)
     assert settings.refinement is not None
-    # Each stream keeps its draw, so that no batch can be drawn from what other streams passed through.
+    # No visited states are kept to draw batches from: row k of a batch must be stream k, which has its own draw of the
+    # effect.
     refinement = replace(settings.refinement, batch=DRAWS, streams=None, every=1)
     world = setup.source.with_effects([effect])
     torch.manual_seed(seed)

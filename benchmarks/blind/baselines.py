@@ -37,7 +37,7 @@ NAMED_FROM = 3.0
 CART_POLE_MIX, FLIGHT_MIX = (0.2, 0.3, 0.2, 0.1, 0.2), (0.165, 0.67, 0.0, 0.0, 0.165)
 """shares of recordings without effect, with one, two and three, and with a foreign one"""
 RIDGE = 1.0
-"""prior precision of every parameter, in units of its 30 smallest steps"""
+"""prior precision of every parameter, where a parameter is measured in units of 30 times its `Free.step`"""
 
 
 def opened(path: Path) -> tuple[Data, list[Candidate]]:

@@ -83,7 +83,8 @@ class Steps:
     noise: Array
     """(4,) standard deviations of the states, known"""
     channels: list[int]
-    """columns of the state that are predicted: the measured ones, as a central difference has its rows' noise"""
+    """columns of the state whose prediction errors count: the measured ones alone. Where velocities are not
+    measured they are central differences, whose noise is that of the positions they are made of"""
     scale: Array = field(init=False)
     """(channels, 1) standard deviations of the source's one-step error, by the noise of both rows"""
     system: str = "cartpole"

@@ -55,7 +55,8 @@ class Score:
     exact: bool | None = None
     """whether, besides, there is no other class but slight ones"""
     stage: bool | None = None
-    """whether the classes are as many as the true effects, and a class of its own holds the stage of each"""
+    """whether classes and true effects pair up, slight classes aside, so that each class has an effect of its partner's
+    stage"""
     top3: bool | None = None
     """whether the true set is among the first three of the ranking"""
     strength: float | None = None

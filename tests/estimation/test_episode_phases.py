@@ -10,7 +10,7 @@ from visadapt import diagnose
 from visadapt.effects import ConstantForce, PeriodicForce, ViscousFriction
 from visadapt.estimation.candidate import CandidateModel, linearise
 from visadapt.estimation.effect_fit import fit_effects
-from visadapt.estimation.episode_phases import in_step, with_episode_phases
+from visadapt.estimation.episode_phases import with_common_phase, with_episode_phases
 from visadapt.estimation.fit_states import Effects
 from visadapt.estimation.segments import cut
 from visadapt.learning.grounding import fit_named, gap
@@ -103,6 +103,6 @@ def test_a_force_in_step_with_the_episodes_keeps_its_one_phase():
 
 
 def test_one_phase_again_is_the_effect_itself():
-    assert in_step(with_episode_phases(PeriodicForce, 5)) is PeriodicForce
+    assert with_common_phase(with_episode_phases(PeriodicForce, 5)) is PeriodicForce
     assert with_episode_phases(PeriodicForce, 1) is PeriodicForce
     assert with_episode_phases(ViscousFriction, 5) is ViscousFriction

@@ -73,8 +73,11 @@ def unfinished(out: Path, settings: Mapping[str, Any]) -> Iterator[Path]:
 
 
 def asked_for(options: argparse.Namespace, *files: str) -> dict[str, Any]:
-    """The options of a run but for its output, so that it does not go on with others; those that name files, or lists
-    of files, by the SHA-256 of each, so that these may be moved."""
+    """The settings of a run: it is resumed only if they are the same.
+
+    These are all options but --out. In place of the options in `files`, which name a file or a list of files, stands
+    the SHA-256 of each file, so that the files may be moved.
+    """
     settings = {name: value for name, value in vars(options).items() if name != "out"}
     for name in files:
         given = settings[name]
@@ -149,11 +152,13 @@ def _effect(text: str, system: System) -> Effect:
 
 
 def import_effects(options: argparse.Namespace) -> None:
-    """Import the file of --effects, if there is one, whose effects register themselves: before any that may be named.
+    """Import the file of --effects, if one is given; must be called before an effect is looked up by its name.
+
+    The effects in the file register themselves when it is imported.
 
     Raises:
-        InputError: the file is missing, no Python, or raises, which names its line; or it defines no effect that acts
-            on the system of --system, or one that does not keep to what effects are.
+        InputError: the file is missing, is not Python, or raises (the message names the line); or it defines no effect
+            that acts on the system of --system, or an effect that `cli.own_effects` finds fault with.
     """
     if not options.effects:
         return

@@ -241,12 +241,12 @@ def _warnings(
 
 
 def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:
-    """One effect of each group of twins; without effects that repeat readings, which are found by another method,
-    without sensors with memory, which candidate models cannot linearise by the present state, and without a camera's,
-    which are fitted to pixels."""
+    """The effects that are searched: one of each group of twins. Left out are effects that repeat readings, which are
+    found by another method; sensors with memory, which candidate models cannot linearise by the present state alone
+    (late sensors are kept); and effects of a camera, which are fitted to pixels."""
     out: list[type[Effect]] = []
-    # Of a late command and late readings, the readings: then commands change between rows, not within a step, which is
-    # exact also where a joint stops.
+    # Late commands and late readings are twins. The readings are kept: commands then change only between rows, not
+    # within a step, which is exact also where a joint stops.
     for effect in sorted(effects, key=lambda effect: not issubclass(effect, LateSensors)):
         fitted_here = not (effect.repeats_readings or remembers(effect, system) or effect.stage is Stage.CAMERA)
         if fitted_here and not twins(effect, out, system):

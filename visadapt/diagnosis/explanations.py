@@ -10,8 +10,8 @@ from visadapt.diagnosis.result import Cause, first_explanation
 def explanations(causes: Sequence[Cause]) -> list[list[Cause]]:
     """The first explanation, then this with a cause exchanged for what fits the recording equally well.
 
-    One cause may stand for two that act together, or two for one: a cause's alternatives that are no alternatives of
-    each other act together.
+    One cause may stand for two that act together, or two for one: two alternatives of the same cause act together if
+    they are not alternatives of each other.
 
     >>> from visadapt.diagnosis.result import Cause
     >>> names = {"quadratic_drag": ("viscous_friction",), "viscous_friction": ("quadratic_drag",)}

@@ -317,7 +317,7 @@ def _recording(
     columns = list(measured)
     time = like.period * np.arange(len(states))
     episode = Episode(time, commands.numpy(), states[:, columns].numpy())
-    # A fit takes no noise below that of rounding: the readings have none, so it takes exactly this.
+    # A fit assumes at least the noise of rounding to the resolution; these readings have none, so it assumes `noise`.
     rounding = tuple((math.sqrt(12) * noise[columns]).tolist())
     names = tuple(system.states[column].name for column in columns)
     return Recording((episode,), names, like.period, ("the simulated experiment",), resolution=rounding)
@@ -329,7 +329,7 @@ def _lead(truth: Sequence[Effect], other: Sequence[Effect], recording: Recording
     catalogue = list(dict.fromkeys((*sets[0], *sets[1])))
     prepared = prepare(recording, system)
     models = FittedModels(system, prepared.rows, catalogue, prepared.source)
-    # In one batch: of two fits in turn, the second would stop where it falls far behind on its way.
+    # Both in one batch: fitted one after the other, the second would be stopped early if it fell far behind the first.
     starts = [(kinds, _start(models.source.fits, effects)) for kinds, effects in zip(sets, (truth, other), strict=True)]
     first, second = models.fit(starts, QUICK)
     if first.log_odds == -math.inf:

@@ -34,12 +34,12 @@ __all__ = [
 class ActuatorDelay(ActuationEffect):
     """A pure delay of any length, also a fraction of a substep.
 
-    A delayed command can change inside a substep. What acts instead is constant over a substep and moves a mass just as
-    far and as fast by the end of the period: the mean over the substep, and a little of the impulse of the substep
-    after or before it. That is differentiable in the delay. Backlash, dead zone and saturation make the same of a
-    command before a delay as after it, but would ratchet on that impulse, so the delay is computed after them. Only the
-    start of an episode could separate it from measurement_delay, and only if the first state were known without noise
-    and not at rest.
+    A delayed command can change inside a substep; the command that acts is constant over a substep. It is the mean of
+    the delayed command, corrected by opposite impulses in neighbouring substeps, so that by the end of the period a
+    mass has moved just as far and is as fast. This is differentiable in the delay. Backlash, dead zone and saturation
+    commute with a delay, but would ratchet on these impulses, so the delay is computed after them. Only the start of an
+    episode could separate it from measurement_delay, and only if the first state were known without noise and not at
+    rest.
     """
 
     name = "actuator_delay"

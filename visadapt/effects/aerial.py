@@ -102,7 +102,7 @@ class Wind(AirDrag):
     """
 
     name = "wind"
-    equation = "F = coefficient (w - v), w = (velocity_x, velocity_y, velocity_z); to the wing, v - w is v"
+    equation = "F = coefficient (w - v), w = (velocity_x, velocity_y, velocity_z); the wing's aerodynamics use v - w"
     source = "Beard and McLain (2012), Small Unmanned Aircraft, section 2.4; Faessler, Franchi and Scaramuzza (2017)"
     table = (
         *(Parameter(f"velocity_{axis}", "m/s", -10.0, 10.0, 0.0) for axis in "xyz"),
@@ -123,7 +123,7 @@ class PeriodicWind(AirDrag):
     name = "periodic_wind"
     equation = (
         "F = coefficient (w - v), w = amplitude cos(2 pi frequency t + phase) (cos(direction), sin(direction), 0); "
-        "to the wing, v - w is v"
+        "the wing's aerodynamics use v - w"
     )
     source = "Hoblit (1988), Gust Loads on Aircraft, chapter 3 (one harmonic); Beard and McLain (2012), section 4.4"
     table = (

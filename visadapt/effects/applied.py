@@ -10,7 +10,8 @@ from visadapt.systems.integrators import Duration
 
 
 class LastApplied(ActuationEffect):
-    """Remembers what acts of the commands, after all other actuation effects, and changes nothing.
+    """Remembers the mean over the last period of the commands after all other actuation effects, and their rate of
+    change; changes nothing.
 
     Args:
         substeps: in a period.

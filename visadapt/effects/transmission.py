@@ -1,4 +1,4 @@
-"""A transmission that gives: the motor's encoder turns further than the joint, by the torque that it transmits."""
+"""A compliant transmission: the motor's encoder turns further than the joint, in proportion to the load transmitted."""
 
 from __future__ import annotations
 

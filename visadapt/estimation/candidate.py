@@ -122,9 +122,11 @@ class CandidateModel:
         return acting.unflatten(0, (len(theta), episodes))
 
     def stepping(self, theta: Tensor, acting: Tensor) -> tuple[World, Tensor]:
-        """The world with parameters (P,), and what acts (..., substeps, n_action), in no more substeps than it takes.
+        """The world with parameters (P,) and the commands that act (..., substeps, n_action), with no more substeps
+        than are needed.
 
-        A command that an effect scales or limits is still held over its period, and smooth physics need no more.
+        If no effect is abrupt but those on commands, and these leave every command constant over its period, as a gain
+        or a limit does, the substeps of smooth physics are enough.
         """
         if self._only_commands_jump and bool((acting == acting[..., :1, :]).all()):
             return self._smooth.with_values(theta), acting[..., : self._smooth.substeps, :]
@@ -141,8 +143,9 @@ class CandidateModel:
         return WorldState(time, state.flatten(0, 1), tuple(m[episode, index] for m in memory))
 
     def measure(self, theta: Tensor, state: Tensor, chosen: Rows = slice(None)) -> Tensor:
-        """Readings without noise (W, T', m), with parameters (P,), that show the states (W, T', n) of the `chosen` rows
-        of every window: those of `shown`."""
+        """Expected readings (W, T', m), without noise, of the states (W, T', n) in the `chosen` rows of every window,
+        with parameters (P,). As in `shown`, a late sensor's reading is in the row whose state it shows, not in the row
+        in which it is taken."""
         after = applied = None
         if self._late or self.reads_commands:
             acting = self.acting(theta[None])[0]
@@ -152,9 +155,9 @@ class CandidateModel:
         return seen[:, list(self.rows.channels)].unflatten(0, state.shape[:2])
 
     def read_along(self, theta: Tensor, state: Tensor, later: Sequence[int]) -> Tensor:
-        """Readings without noise (R, W, T, m), with R parameter vectors (R, P), of the motion through states (W, T, n):
-        those that come `later` (n,) rows after the row in which they are put. Between rows the motion is interpolated,
-        not integrated; NaN where a reading shows what is outside the window."""
+        """Expected readings (R, W, T, m), without noise, of the motion through states (W, T, n), with R parameter
+        vectors (R, P). Row t holds, for each state, the reading taken `later` (n,) rows after row t. Between rows the
+        motion is interpolated, not integrated; NaN where a reading shows an instant outside the window."""
         late, none = self._late_by(theta), torch.zeros_like(theta[:, 0])
         delays = [late.get(column, none) for column in range(state.shape[2])]
         seen = interpolated(self.rows, state, later, delays, self.profile.position_of)
@@ -265,7 +268,8 @@ def _step(model: CandidateModel, theta: Tensor, state: Tensor, acting: Tensor, v
 def _step_under_loads(
     model: CandidateModel, theta: Tensor, state: Tensor, acting: Tensor, variant: Sequence[int]
 ) -> Tangent:
-    """The same under the loads that lead from each state to the next, less what these do without friction."""
+    """As `_step`, but under the unmodelled loads that lead from each state to the next, so that dry friction feels
+    them; what these loads do without friction is then subtracted. See `unmodelled_loads`."""
     loaded, count = with_loads(model, model.accuracy), len(model.system.loads)
     time, duration = model.rows.clock
     now, following = state[:, :-1].flatten(0, 1), state[:, 1:].flatten(0, 1)

@@ -1,8 +1,9 @@
-"""Innovations of a model that is not right, which are not white.
+"""Coloured innovations: those of a model that leaves something out.
 
-What a model leaves out, such as the resonance of a belt, lasts for several rows. White process noise has the power of
-the whole of it at every frequency, so that the frequencies at which the model is wrong outweigh those at which it is
-right. Here the whitened innovations e (m channels) are described as a vector autoregression,
+What a model leaves out, such as the resonance of a belt, lasts for several rows. White process noise that is strong
+enough for the resonance is as strong at every other frequency, so that the frequencies at which the model is wrong
+outweigh those at which it is right. Here the whitened innovations e (m channels) are described as a vector
+autoregression,
 
     e_t = A_1 e_{t-1} + ... + A_p e_{t-p} + L n_t,   n_t ~ N(0, I),
 
@@ -33,7 +34,7 @@ BLOCK = 32  # Rows that are whitened by one product of matrices: faster than lag
 
 @dataclass(frozen=True)
 class Colour:
-    """The noise that a model's innovations show: that of the filter, and how its innovations go on."""
+    """Coloured noise: the noise variances of a filter, and the autoregression of its whitened innovations."""
 
     coefficients: Tensor  # (p, m, m) A
     whitening: Tensor  # (m, m) L^-1
@@ -51,7 +52,8 @@ class Colour:
 
     @cached_property
     def _block(self) -> Tensor:
-        """(BLOCK m, (p + BLOCK) m) what makes the n of BLOCK rows in a row of their innovations and the p before."""
+        """(BLOCK m, (p + BLOCK) m) the matrix that maps the innovations of BLOCK successive rows, and of the p rows
+        before them, to n of the BLOCK rows."""
         lags, channels = self.coefficients.shape[:2]
         taps = torch.cat((torch.eye(channels).to(self.coefficients)[None], -self.coefficients))
         taps = torch.cat((self.whitening @ taps, taps.new_zeros(1, channels, channels)))  # the last is of other rows

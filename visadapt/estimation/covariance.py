@@ -22,7 +22,7 @@ CORRELATION_TIME = 0.5  # s; scores further apart are taken as independent
 
 VAGUE = 1e-4
 """Share of the prior's precision that is added to the information, so that it can be inverted where data show nothing.
-More would belong to an estimate that the prior has drawn in, which the most likely one is not."""
+The whole of it would be right for a maximum a posteriori estimate; those used here are of maximum likelihood."""
 
 
 def inverse_information(effects: Effects, fits: FitState) -> Tensor:

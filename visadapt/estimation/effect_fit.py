@@ -17,7 +17,12 @@ from visadapt.effects import Dropout, Effect, FrozenZone, LateSensors, Role, Sen
 from visadapt.effects.catalogue import sized, twins
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.covariance import inverse_information
-from visadapt.estimation.episode_phases import has_episode_phases, in_step, with_episode_phases, with_own_phases
+from visadapt.estimation.episode_phases import (
+    has_episode_phases,
+    with_common_phase,
+    with_episode_phases,
+    with_own_phases,
+)
 from visadapt.estimation.fit_states import (
     CAREFUL,
     QUICK,
@@ -88,14 +93,14 @@ def fit_effects(
         value
         for effect, kind in zip(effects, kinds, strict=True)
         if kind in fitted
-        for value in with_own_phases(kind, [float(getattr(effect, p.name)) for p in in_step(kind).table])
+        for value in with_own_phases(kind, [float(getattr(effect, p.name)) for p in with_common_phase(kind).table])
     ]
     found = _fitted(system, fitted, rows, present)
     covariance = inverse_information(fitted, found) if fitted else torch.zeros(0, 0)
     states = _by_episode(rows, found.state[0], measured)
     values, spreads = {}, {}
     for kind, span in columns.items():
-        plain = in_step(kind)
+        plain = with_common_phase(kind)
         stated = slice(span.start, span.start + len(plain.table))
         values[plain] = _within_a_turn(plain, found.theta[0, stated])
         spreads[plain] = covariance[stated, stated]

@@ -31,7 +31,7 @@ def with_episode_phases(effect: type[Effect], episodes: int) -> type[Effect]:
     return with_table(effect.name, (*effect.table, *others))
 
 
-def in_step(effect: type[Effect]) -> type[Effect]:
+def with_common_phase(effect: type[Effect]) -> type[Effect]:
     """The same effect with one phase for all episodes."""
     if not has_episode_phases(effect):
         return effect
@@ -39,8 +39,8 @@ def in_step(effect: type[Effect]) -> type[Effect]:
 
 
 def with_own_phases(effect: type[Effect], values: Sequence[float]) -> tuple[float, ...]:
-    """All parameters of an effect, from those that it has `in_step`: the later episodes get the first's phase."""
-    phases = [v for p, v in zip(in_step(effect).table, values, strict=True) if p.role is Role.PHASE]
+    """All parameters of an effect, from those that it has `with_common_phase`: later episodes get the first's phase."""
+    phases = [v for p, v in zip(with_common_phase(effect).table, values, strict=True) if p.role is Role.PHASE]
     return (*values, *phases * (len(effect.table) - len(values)))
 
 

@@ -109,12 +109,13 @@ the step would have no bounds."""
 
 
 def refitted(model: CandidateModel, fits: FitState, window_used: Tensor) -> FitState:
-    """One fit (C = 1) to all windows, refitted to those where each row of `window_used` (C, W) is 1, by one step.
+    """One fit (C = 1) to all windows, refitted C times by one Gauss-Newton step: for each row of `window_used` (C, W),
+    to the windows where that row is 1.
 
-    The windows that are left out pull the optimum a little, to which one Gauss-Newton step is close, at the cost of one
-    step for all (Beirami, Razaviyayn, Shahrampour and Tarokh 2017, On optimal generalizability, NeurIPS). The states,
-    about which the model is linearised next, stay those of the whole fit: moved linearly, they may cross a stop of a
-    joint with dry friction, where its motion is not linear.
+    Leaving windows out moves the optimum only a little, so one step comes close to it, and all C refits together cost
+    one step (Beirami, Razaviyayn, Shahrampour and Tarokh 2017, On optimal generalizability, NeurIPS). The states, about
+    which the model is linearised next, stay those of the fit to all windows: moved linearly, they might cross an
+    instant at which a joint with dry friction stops, where its motion is not linear.
     """
     every = torch.zeros(len(window_used), dtype=torch.long)
     whole = differentiate([model], fits)

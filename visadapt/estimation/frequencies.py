@@ -1,14 +1,16 @@
-"""At which frequencies an effect that comes and goes would explain the innovations of a fitted set best.
+"""Frequencies at which a periodic effect would best explain the innovations of a fitted set.
 
-In T seconds a frequency is told from others that are 1 / T away, so a grid that is coarse enough to be tried point by
-point passes between them. Here all frequencies are scored at once. With g_t what a unit of the effect's strength in row
-t alone lowers half the squared innovations by, which one pass of the filter backwards gives, a strength
-cos(2 pi f t + phase) of the best size and phase lowers half the squares by
+Within T seconds, two frequencies can be told apart if they differ by about 1 / T. A grid coarse enough to be tried
+point by point would miss the best frequency between two of its points. So all frequencies are scored at once.
+
+Let g_t be the first-order decrease of half the sum of squared innovations per unit of the effect's strength, if it acts
+in the period after row t alone; one backward pass of the filter gives all g_t. With a strength
+A cos(2 pi f t + phase) of the best A and phase, the linear response lowers half the sum of squares by
 
     |sum_t g_t exp(-2 pi i f t)|^2 / (2 E(f))
 
-in the linear response. E(f) is the sum of the squares that a unit of it makes, which is smooth in f and needs few
-frequencies. The sums are one fast Fourier transform, of rows sorted into equal bins of time.
+E(f) is the sum of squares of the innovations' change under A = 1. It is smooth in f, so it is computed at a few
+frequencies and interpolated. The sum over t is one fast Fourier transform, of g_t added up in equal bins of time.
 """
 
 from __future__ import annotations
@@ -39,11 +41,12 @@ def comes_and_goes(effect: type[Effect]) -> bool:
 
 
 def likeliest(whole: Sensitivity, some: Sensitivity, effect: type[Effect]) -> Tensor:
-    """Frequencies (K,) in Hz at which the effect explains most, and those that are too low to be told apart.
+    """Frequencies (K,) in Hz to try: at most PEAKS at which the effect explains most, after those of the coarse grid
+    that are below 2 / T and so too low to be told apart. The coarse grid itself, if T is too short for any score.
 
     Args:
-        whole: of all windows, on which they are scored.
-        some: of as many windows as are to be used for E, but for a factor that all frequencies share.
+        whole: on all windows, from which g_t is computed.
+        some: on fewer windows, from which E is computed: too small by one factor for all f, so the best f are the same.
     """
     column, strength = _column(effect, Role.FREQUENCY), strengths(effect)[0]
     low, high = effect.table[column].low, effect.table[column].high

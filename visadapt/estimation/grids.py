@@ -67,8 +67,9 @@ def grid(effect: type[Effect], spans: Spans, frequencies: Tensor | None = None) 
 def starts(effect: type[Effect], spans: Spans) -> Tensor:
     """Points (G, P) from which Gauss-Newton steps of the effect's strengths start.
 
-    One strength has a grid, since its derivative may vanish far from the best value, as where no command reaches a
-    limit. Several start slightly off neutral: at neutral the derivatives vanish where it takes several of them to act.
+    A single strength is tried on a grid, since the derivative by it may be zero far from the best value: a saturation
+    limit that no command reaches changes nothing. Several strengths start slightly off neutral, since the derivatives
+    at neutral are zero if the effect acts only when more than one of them is off neutral.
     """
     several = len(strengths(effect)) > 1
     axes = []
@@ -140,7 +141,7 @@ def size(effect: type[Effect], points: Tensor) -> Tensor:
     return torch.stack([*away, torch.zeros(len(points), dtype=points.dtype)]).amax(0)
 
 
-def inside(effect: type[Effect], points: Tensor) -> Tensor:
+def clamped_to_range(effect: type[Effect], points: Tensor) -> Tensor:
     """Points (..., P) with every parameter limited to its range."""
     low, high = (torch.tensor([getattr(p, end) for p in effect.table], dtype=points.dtype) for end in ("low", "high"))
     return points.clamp(low, high)

@@ -116,7 +116,8 @@ def _means(
 
 
 def backward(filtered: Filtered) -> tuple[Tensor, Tensor]:
-    """Smoothed states (N, T, n, M), and adjoints (N, T, n, M): minus Q times them is the smoothed w before row t."""
+    """Smoothed states (N, T, n, M), and adjoints (N, T, n, M): -Q_(t-1) times the adjoint of row t is the smoothed
+    process noise w_(t-1), of the step that leads to row t."""
     adjoint = adjoints(filtered, filtered.white)
     return filtered.predicted - filtered.covariance @ adjoint, adjoint
 

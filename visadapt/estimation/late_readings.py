@@ -27,7 +27,8 @@ Rows = slice | Tensor
 
 @dataclass(frozen=True)
 class Following(Batch):
-    """What follows N states: the K periods after each, and when the sensors are read that show it."""
+    """The K periods after each of N states, and how long after it each sensor is read: a late sensor shows a state only
+    in a later reading."""
 
     time: Tensor  # (N,) s since the episode began
     command: Tensor  # (N, K, substeps, n_action) that acts
@@ -38,9 +39,9 @@ class Following(Batch):
 def reading(
     world: World, values: Tensor, state: Tensor, following: Following | None, applied: Tensor | None = None
 ) -> Tensor:
-    """What sensors read (N, n_state), each in the row that `following` says, of the motion that goes through N states;
-    without it, no sensor is late. `values` (P,), or (N, P), are those of the effects' parameters; `applied` is that of
-    `World.reading`."""
+    """Readings (N, n_state) of the motion through each of N states; the sensor of column k is read
+    `following.read[:, k]` s after the state. If `following` is None, no sensor is late, and all are read at the state.
+    `values` (P,), or (N, P), are the effects' parameters; `applied` is that of `World.reading`."""
     here = world.with_values(values)
     if following is None:
         return here.reading(state, applied)

@@ -42,7 +42,8 @@ MAX_LOG_PROCESS = math.log(3.0**2)
 """Bounds of the log process noise variance of the driven velocities, (m/s)^2 and (rad/s)^2."""
 
 MIN_READING_PER_STATE = 0.01
-"""Below it a reading says nothing of its state, as where a frozen sensor repeats."""
+"""Derivative of a reading by its own state at or below which the reading counts as telling nothing of that state, as
+when a frozen sensor repeats its last value."""
 
 
 @dataclass(frozen=True)
@@ -272,9 +273,9 @@ def _by_noise(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The adjoints (N, T, n, 1 + K), and the Fisher information (N, G + S, G + S) of the log variances with the
     derivatives (N, G + S) of the log likelihood by them."""
-    # The information of the log variances: that of inputs which are the smoothed noises of one group (Gilmour, Thompson
-    # and Cullis 1995, Biometrics 51(4)), in the mean of the data and of data that the model draws. The data alone would
-    # give steps that are too long far from the optimum, where they are unlike the model.
+    # Average information of the log variances (Gilmour, Thompson and Cullis 1995, Biometrics 51(4)): that of inputs
+    # equal to the smoothed noises of one group. It is the mean of two: from the recorded data and from data drawn from
+    # the model. Far from the optimum the recorded data are unlike the model and alone would give too long steps.
     white = torch.cat((here.white, (drawn * used)[..., None]), -1)
     adjoint = adjoints(here, white)
     both = [0, -1]

@@ -18,8 +18,9 @@ from torch import Tensor
 from visadapt.estimation.segments import smallest_step
 
 MIN_JUMP_STEPS, MIN_OTHER_STEPS = 8, 1.5
-"""Changes into and out of a run of equal readings, in steps of the sensor's resolution, that the larger and the smaller
-must exceed for the run to be repeated; below, the quantity may have stood still."""
+"""For a run of equal readings to count as repeated, the larger of the two changes into and out of it must exceed
+MIN_JUMP_STEPS steps of the sensor's resolution, and the smaller MIN_OTHER_STEPS: else the quantity may have stood
+still."""
 
 MIN_REST_ROWS = 4  # Equal rows at the start of an episode, above which the machine rests
 
@@ -125,7 +126,8 @@ def _equal_by_chance(change: Tensor, step: float) -> float:
 
 
 def _unless_by_chance(equal: list[Tensor], expected: float) -> list[Tensor]:
-    """The marks (T,) of episodes; none where `expected` of them by chance explain their number (Poisson)."""
+    """The marks (T,) of each episode; all False if chance may explain their number: if, with `expected` marks on
+    average (Poisson), at least as many occur with a probability above MAX_CHANCE."""
     count = sum(int(marks.sum()) for marks in equal)
     # Probability of at least `count`: the regularised lower incomplete gamma function.
     explained = (

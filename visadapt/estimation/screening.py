@@ -16,13 +16,13 @@ import torch
 from torch import Tensor
 
 from visadapt.effects import Effect, Role
-from visadapt.estimation.episode_phases import has_episode_phases, in_step
+from visadapt.estimation.episode_phases import has_episode_phases, with_common_phase
 from visadapt.estimation.frequencies import comes_and_goes, likeliest
 from visadapt.estimation.grids import (
     FREQUENCY_POINTS,
     SMALL_SHARE,
+    clamped_to_range,
     grid,
-    inside,
     is_proportional,
     size,
     spans,
@@ -41,12 +41,12 @@ EPISODES_SCREENED = 3
 """An effect with a phase for each episode is screened on the EPISODES_SCREENED longest episodes, one at a time."""
 
 STEPPED_POINTS = 2
-"""A Gauss-Newton step is tried from the STEPPED_POINTS best points of a grid, and from as many of its small ones, since
-a step from afar may promise too much."""
+"""A Gauss-Newton step is tried from the STEPPED_POINTS best points of a grid, and from as many of those whose strengths
+are within SMALL_SHARE of neutral: from a point far from neutral, the linear response may promise too much."""
 
 NEARLY = 0.9
-"""A smaller effect is proposed where it gains this share of the largest gain: the response is linear, so that a motor
-that does nothing may seem as good as a little backlash."""
+"""Share of the largest gain from which a smaller effect is proposed instead of the one with the largest gain. The gains
+are those of a linear response, by which a dead motor (large backlash) may seem as good as a little backlash."""
 
 MAX_STEPS = 6
 MIN_STEP_GAIN = 0.1
@@ -109,7 +109,7 @@ def screen(
 
 def _with_episode_phases(sensitivity: Sensitivity, effect: type[Effect]) -> Candidate | None:
     """The candidate that the screening of one long episode alone gives, with the phases that suit the others best."""
-    plain, rows, fits = in_step(effect), sensitivity.rows, sensitivity.fits
+    plain, rows, fits = with_common_phase(effect), sensitivity.rows, sensitivity.fits
     sizes = torch.zeros(len(rows.command)).index_add(0, rows.episode, rows.inside.sum(1).float())
     found = []
     longest = sizes.argsort(descending=True, stable=True)[: min(EPISODES_SCREENED, int((sizes > 0).sum()))]
@@ -122,7 +122,7 @@ def _with_episode_phases(sensitivity: Sensitivity, effect: type[Effect]) -> Cand
 
 def _best_phases(sensitivity: Sensitivity, effect: type[Effect], values: Sequence[float]) -> Candidate:
     """An effect with a phase for each episode: of parameters (P,) with one phase, the phase that suits each best."""
-    plain, rows = in_step(effect), sensitivity.rows
+    plain, rows = with_common_phase(effect), sensitivity.rows
     column = next(k for k, p in enumerate(plain.table) if p.role is Role.PHASE)
     phases = values_of(plain.table[column])
     points = torch.tensor(list(values), dtype=torch.float64).repeat(len(phases), 1)
@@ -138,7 +138,8 @@ def _best_phases(sensitivity: Sensitivity, effect: type[Effect], values: Sequenc
 
 
 def _window_stride(most: float, rows: Segments, points: int) -> int:
-    """Least power of two k: every k-th window has at most `most` rows times points; at least 8 windows stay."""
+    """The stride k, a power of two: the least for which the rows of every k-th window, times `points`, are at most
+    `most`; less where fewer than 8 windows would remain."""
     wanted = points * float(rows.inside.sum()) / most
     # A power of two, so that effects share their sensitivities.
     return 2 ** max(0, min(math.ceil(math.log2(max(1.0, wanted))), int(math.log2(max(1, rows.shape[0] // 8)))))
@@ -161,7 +162,7 @@ def _promising(sensitivity: Sensitivity, effect: type[Effect], points: Tensor, c
     order = after.argsort(stable=True)
     small = order[size(effect, points[order]) <= SMALL_SHARE]
     chosen = torch.cat((order[:STEPPED_POINTS], small[:STEPPED_POINTS], best[None]))
-    return inside(effect, torch.cat((stepped[chosen], points[best][None])))
+    return clamped_to_range(effect, torch.cat((stepped[chosen], points[best][None])))
 
 
 def _best_of(sensitivity: Sensitivity, effect: type[Effect], points: Tensor) -> Candidate | None:
@@ -204,7 +205,7 @@ def _descend(sensitivity: Sensitivity, effect: type[Effect], point: Tensor) -> C
             damping *= 10
         normal = slopes.T @ slopes
         normal = normal + torch.diag(damping * normal.diagonal() + 1e-12 * normal.diagonal().max() + 1e-30)
-        point = inside(effect, found - torch.linalg.solve(normal, slopes.T @ left))
+        point = clamped_to_range(effect, found - torch.linalg.solve(normal, slopes.T @ left))
     return Candidate(effect, tuple(found.tolist()), best) if best > 0 else None
 
 

@@ -75,7 +75,8 @@ class Segments:
         return self.time[:, :-1].flatten(), self.duration[:, :-1].flatten()
 
     def later(self, values: Tensor, by: Sequence[int]) -> Tensor:
-        """Of values (W, T, m) of every row those of `by` (m,) rows later in the episode; 0 where no window has them."""
+        """(W, T, m) for every row and channel, the value in `values` (W, T, m) of the row that is `by` (m,) rows later
+        in the episode; 0 where no window contains that row."""
         if not any(by):
             return values
         inside, index = self.inside > 0, self.index

@@ -22,8 +22,8 @@ from visadapt.world import WorldState
 
 
 class Innovations:
-    """Innovations over their standard deviations, of N readings in all, projected off the derivatives by the set's own
-    parameters: what refitting those would explain is not attributed to anything new. The set has one fit (C = 1)."""
+    """The whitened innovations (N,), N = W T m, of a fitted set (C = 1), without their components along the derivatives
+    by the set's own parameters: what refitting these would explain is not credited to a new effect."""
 
     def __init__(self, model: CandidateModel, fits: FitState) -> None:
         self.model = model
@@ -110,7 +110,8 @@ class Sensitivity:
         return changes[..., 0], (changes[..., 1:] - changes[..., :1]) / steps
 
     def pull(self, effect: type[Effect], point: Tensor, column: int) -> Tensor:
-        """(W, T - 1) what a unit of the strength `column` in each period alone lowers half the squared innovations by.
+        """(W, T - 1) for each period, the first-order decrease of half the sum of squared innovations per unit of the
+        strength in `column`, if the effect acts in that period alone.
 
         The effect must be proportional to the strength, which is neutral at the point (P,), and act on the motion.
         """
@@ -132,9 +133,10 @@ class Sensitivity:
         return self.innovations.response(drive, reading)
 
     def _drive(self, effect: type[Effect], tried: Tensor) -> Tensor:
-        """Change (W, T - 1, n, M) of the states a period after each row with an effect that is not on the sensors.
+        """Change (W, T - 1, n, M) of the next state after each row, with the effect at M parameter vectors `tried`
+        (M, P); the effect is not one on sensors.
 
-        Over short periods loads and commands change a step linearly, which takes no integration.
+        For periods up to SHORT_PERIOD the next state is taken as linear in loads and commands: nothing is integrated.
         """
         model, theta = self._with(effect, tried)
         linear = self.rows.period <= SHORT_PERIOD

@@ -4,10 +4,11 @@ Process noise is such a load, held for a period: what is missing from a model of
 its joints, which moves the others through the mass matrix and its own position by half of the period. Rows with
 `Segments.jumps` have a jump of each velocity by itself instead (`diagnosis/search/jumps.py`).
 
-It is added to the state at the end of the period, so that dry friction does not feel it: beside a vibration that is
-stronger than the friction, a joint sticks in the model wherever it turns round, but not on the machine. Where the noise
-has a colour, something strong is known to be missing; there the step of a set with dry friction is taken under the load
-that leads from each state to the next, less what that load does without friction.
+The filter adds process noise to the state at the end of a period, so dry friction does not feel it. If the model lacks
+a vibration that is stronger than the friction, a joint of the model sticks whenever its velocity changes sign, and the
+machine's joint does not. Where the noise has a colour, something strong is known to be missing. There, a set with dry
+friction takes its step under the load that leads from each state to the next; what that load does without friction is
+then subtracted.
 """
 
 from __future__ import annotations

@@ -48,10 +48,11 @@ class CartPolePanel:
     drawn: DrawnCartPole = field(default_factory=DrawnCartPole)
     """sizes of what is drawn, and the part of the track that is shown"""
     angle_limit: float = 0.3
-    """rad; an episode that ended early fell if its last angle is beyond this; the pole is to swing up where this is
-    infinite, and the track is shown as far as the carts go"""
+    """rad; an episode that ended early counts as a fall if its last angle is beyond this. Infinite means a swing-up,
+    for which the track is shown as far as the carts go"""
     position_limit: float | None = None
-    """m; else the cart left the frame if its last position is beyond this; None: as far as `drawn` shows"""
+    """m; an episode that ended early without a fall counts as having left the frame if its last position is beyond
+    this. None: the limit is as far as `drawn` shows"""
 
     def __post_init__(self) -> None:
         if self.run.episode.state is None:

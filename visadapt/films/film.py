@@ -59,7 +59,7 @@ class Film(ABC):
 
     @abstractmethod
     def draw_panel(self, page: Axes, panel: Any) -> Callable[[float], None]:
-        """Draw a panel on a page, axes in px from its top left corner; returns what moves it to its look at t s.
+        """Draw a panel on a page, axes in px from the top left corner; returns a function that updates it to time t, s.
 
         Artists that are to move are `animated`.
         """

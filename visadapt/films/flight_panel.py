@@ -48,7 +48,8 @@ class FlightPanel:
         nearest: (3,) m, where the path, straight between rows, came nearest to the point.
         worst: m, the greatest distance from the reference, or the distance by which the point was missed.
         passed: s at which the flight came nearest to its point.
-        failed: s at which the flight was first more than FAR off, or passed its point so, or was lost; or None.
+        failed: s at which the flight failed: it was first more than FAR from its reference, it passed its point at more
+            than FAR, or it ended early. None if it did not fail.
 
     Raises:
         ValueError: a run without states of a rigid body, or longer than its reference; a task of another kind.

@@ -142,9 +142,10 @@ def chart(page: Axes, top: float, title: str, duration: float) -> Axes:
 def trace(
     axes: Axes, time: Floats, values: Floats, score: Floats, words: Callable[[float], str]
 ) -> Callable[[int, bool], None]:
-    """Values (T,) and a score of those so far (T,), told in words; what is returned draws them up to a row.
+    """Curves of values (T,) and of a running score of them (T,); the function returned draws both up to a row.
 
-    A cursor is at the row, or where the run has failed a red line over the chart's height.
+    `words` turns the score at that row into the chart's right title. A dot marks the row; once the run has failed, a
+    red line over the chart's height does.
     """
     (line,) = axes.plot([], [], color=TEAL, linewidth=3, animated=True)
     (thin,) = axes.plot([], [], color=INK, linewidth=1.2, animated=True)

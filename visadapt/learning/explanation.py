@@ -26,9 +26,9 @@ class Explanation:
     complete: bool
     """whether they leave nothing for a residual to learn"""
     slight: frozenset[str] = frozenset()
-    """names of those without which less than 1 % of the gap opens again"""
+    """names of those effects whose removal would reopen less than 1 % of the gap"""
     experiment: Experiment | None = field(default=None, compare=False)
-    """where other causes explain the data as well: designs the excitation that tells them apart in the next round"""
+    """designs an excitation for the next round that tells causes apart; None unless other causes fit as well"""
 
 
 NOT_DIAGNOSED = Explanation("", (), complete=False)

@@ -117,8 +117,9 @@ def ground(
 ) -> list[GroundLoss]:
     """Fit the head of the residual's network, in place, to the transitions; returns losses in units of its scale.
 
-    Transitions whose history the network says is incomplete are left out, unless all are. Where `accept` says no to a
-    linear head, it is fitted again with the next larger of the `ridges`; the last is accepted without being asked for.
+    Transitions whose history the network says is incomplete are left out, unless all are. A linear head is fitted with
+    the one of the `ridges` that predicts held-out samples best. As long as `accept` returns False, it is fitted again
+    with the next larger ridge; the largest is kept without a call of `accept`.
     """
     target = gap(source, transitions) / residual.scale
     network = residual.network
@@ -145,7 +146,8 @@ def ground(
 def _best_penalty(inputs: Tensor, targets: Tensor, penalties: Sequence[Tensor]) -> int:
     """The index of the penalty (inputs,) with which a linear head errs least on FOLDS parts held out in turn.
 
-    A part is of stretches of STRETCH samples, as in `split`. Where there is one stretch alone, the last.
+    The samples are cut into stretches of STRETCH in a row, as in `split`, which go to the parts in turn. With a single
+    penalty, or a single stretch, returns the last index.
     """
     stretch = torch.arange(len(inputs)) // STRETCH
     if len(penalties) == 1 or not bool(stretch.any()):

@@ -2,9 +2,9 @@
 
 A batch of simulated streams runs under the policy. At each iteration the policy plans K actions, the world
 (physics, effects, residual, renderer) carries them out, and the gradient of the cost flows back through all of it; or,
-in closed loop, the policy decides anew at each of K steps. Streams keep the first step, or these K. A stream further
-than delta_div from the reference starts anew, and delta_div grows as training goes on, so the policy learns to recover
-from ever further off.
+in closed loop, the policy decides anew at each of K steps. Each stream then moves on by the first of the K steps or, in
+closed loop, by all K. A stream further than delta_div from the reference starts anew, and delta_div grows as training
+goes on, so the policy learns to recover from ever further off.
 
 Where visited states are kept (`TuneSettings.streams`, `KeptPlans`), the feed-forward is not tuned: it reads a noisy
 estimate of the correction that acts, and would learn to oppose only a part of it.
@@ -73,8 +73,9 @@ class TuneSettings:
 def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None:
     """Make the feed-forward cancel the correction that the residual predicts, by least squares about rest.
 
-    Joints count as moving: of a small command dry friction would let nothing through. `scale` (n_state,) is the
-    residual's, the unit of the corrections that the policy reads.
+    Effects with dry friction are left out of the linearisation, as if every joint were moving: at rest, dry friction
+    would let no small command through. `scale` (n_state,) is the residual's, the unit of the corrections that the
+    policy reads.
     """
     effects = [effect for effect in source.effects if isinstance(effect, Effect)]
     source = source.with_effects([e for e in effects if not (isinstance(e, DynamicsEffect) and e.rubs())])
@@ -88,7 +89,10 @@ def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None
 
 
 def lasting_gain(source: World) -> Tensor:
-    """(n_action,) what acts in the end of each unit of a command that lasts; 1 where next to nothing acts."""
+    """(n_action,) steady-state gain of the actuation effects: what acts per unit of a constant command.
+
+    Measured after LASTING_ROWS periods of +-LASTING_COMMAND; 1 where its magnitude is at most LEAST_GAIN.
+    """
     with torch.no_grad():
         given = LASTING_COMMAND * torch.ones(2, LASTING_ROWS, len(source.system.actions), dtype=torch.float64)
         given[1] *= -1

@@ -33,7 +33,7 @@ from visadapt.world import World
 
 COLLECTING, GROUNDING, TUNING, ACCEPTING = range(4)  # Stages of a round, each with random numbers of its own
 
-LARGEST_SEED = 2**63 - 1  # That a generator takes
+LARGEST_SEED = 2**63 - 1  # Seeds are taken modulo this, so that a torch.Generator accepts them
 
 EXPLORATION = 0.05  # Standard deviation of white noise on the commands while data are collected
 
@@ -112,7 +112,7 @@ class JointLearning:
     explain the data as well, the next round adds to its commands the excitation that tells them apart."""
     recorded: list[Episode] = field(default_factory=list)  # all episodes of the target
     labelled: list[Episode] = field(default_factory=list)  # those with the states that grounding learns from
-    waiting: list[Episode] = field(default_factory=list)  # the others, from rounds that needed no residual
+    waiting: list[Episode] = field(default_factory=list)  # those not labelled yet: no residual has needed them so far
     found: Explanation = NOT_DIAGNOSED  # by the last round's diagnosis
     grounded: bool = False  # whether the residual has been fitted
 
@@ -155,14 +155,17 @@ class JointLearning:
         return Round(self.ledger.used, losses, tuning, self.found)
 
     def _estimate_beside_what_is_known(self) -> None:
-        """Let a vehicle's disturbance estimate be of what the named effects leave unexplained too, as it will be where
-        the adapted policy is read from its file."""
+        """Let a vehicle's disturbance estimate predict with the source and the named effects, so that it holds only
+        what these leave unexplained. A policy that is loaded from its file estimates in the same way."""
         network = self.residual.network
         if isinstance(network, FlightResidualNetwork) and network.predict is not None:
             network.predict = self.known.steps_along
 
     def _collect(self, folder: RoundFolder, samples: int) -> None:
-        """Run the policy on the target for so many samples, or read those that it has run."""
+        """Collect `samples` steps of the target, but no more than the ledger has left, and enter them in the ledger.
+
+        A round that was interrupted after its collection reads its recording instead.
+        """
         if not folder.recording.exists():
             collector, longest = self.explorer or self.policy, self.settings.longest_episode
             wanted = min(samples, self.ledger.left)
@@ -175,8 +178,11 @@ class JointLearning:
             self.waiting.append(episode)
 
     def _transitions(self) -> Transitions:
-        """Those of all episodes. Only the residual needs their states, and from the frames of a faulty camera none
-        could be estimated."""
+        """Transitions of all episodes so far, for which the waiting ones are labelled first.
+
+        Labelling waits until here, since only the residual needs states, and none could be estimated from the frames of
+        a faulty camera.
+        """
         self.labelled += self.label(self.waiting) if self.label else self.waiting
         self.waiting = []
         return Transitions.cut(self.labelled, frames=self.observe is not None)

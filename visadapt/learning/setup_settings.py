@@ -45,8 +45,10 @@ class SetupSettings:
 
     @property
     def with_names(self) -> TuneSettings:
-        """Tuning in a source that has named effects alone. No start is recorded: these hold in every state, a residual
-        only near the recorded ones."""
+        """Settings of tuning in a source with named effects and no residual.
+
+        No stream starts from a recorded state: named effects hold in every state, a residual only near recorded ones.
+        """
         return replace(self.named or self.tuning, recorded=0.0)
 
     def with_tuning(self, change: Callable[[TuneSettings], TuneSettings]) -> SetupSettings:

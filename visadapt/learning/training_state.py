@@ -126,7 +126,7 @@ def train_or_load(
 
 
 def _check(path: Path, kept: Mapping[str, Any], about: Mapping[str, Any], may_be_unstated: Collection[str]) -> None:
-    """Raise CheckpointError where the training in `path`, `kept` says of which kind, is not the one of `about`."""
+    """Raise CheckpointError where the settings `kept` with the training in `path` differ from those in `about`."""
     stated = {key: value for key, value in about.items() if key in kept or key not in may_be_unstated}
     if other := [key for key, value in stated.items() if key not in kept or not _same(kept[key], value)]:
         raise CheckpointError(

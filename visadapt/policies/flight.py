@@ -82,9 +82,9 @@ class FlightPolicy(Policy):
 class FollowPolicy(FlightPolicy):
     """Follows a reference, whose next HORIZON positions and velocities (6 each), `period` s apart, are its goal.
 
-    It reads velocity, the vertical, rates, what `aim` makes of the goal and the disturbance estimate, all in body axes:
-    but for the residual's correction, which is in world axes, it answers alike whatever the heading, and under a strong
-    push may yaw, to tilt about two axes at once.
+    It reads velocity, the vertical, rates, what `aim` makes of the goal and the disturbance estimate, all in body axes.
+    So its response is the same at every heading, except for what it reads of the residual's correction, which is in
+    world axes; and under a strong push it may yaw in order to tilt about two axes at once.
     """
 
     goal = f"the next {HORIZON} points of the reference, a period apart: x, y, z in m and their rates in m/s"

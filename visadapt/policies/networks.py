@@ -139,8 +139,9 @@ class ImageResidualNetwork(ResidualNetwork):
     without a bias, so that it adds nothing where a bare source explains everything. An MLP instead learns from a few
     hundred samples where along the track the target happened to push, and is wrong in the next episode.
 
-    In the first rows of an episode, whose first frame is repeated, a cart that moves seems to start. Leaving these out
-    of the fit, or filling them as `held_back` does, changed nothing that 60 episodes show.
+    In the first rows of an episode the history repeats the first frame, so a cart that already moves seems to start
+    from rest there. Leaving these rows out of the fit, or filling them as `held_back` does, made no difference that 60
+    episodes could show.
 
     Args:
         background, contrast: those of `FrameEncoder`.
@@ -227,8 +228,9 @@ class StateResidualNetwork(ResidualNetwork):
     def penalties(self, inputs: Tensor) -> Tensor:
         """(inputs,) ACTION_UNIT squared for the actions of a history, else 1.
 
-        Near rest the commands are small, so their weights must be large to say that a motor is late or weak. Penalised
-        as much as the others, they said a quarter of it after 200 samples, and policies that were tuned with them fell.
+        Near rest the commands are small, so their weights must be large to represent a late or weak motor. With the
+        same penalty as the other inputs, they represented only a quarter of that effect after 200 samples, and policies
+        that were tuned with such a residual fell.
         """
         every = super().penalties(inputs)
         if self.system is not None:

@@ -47,9 +47,9 @@ def load_recording(
     """Read states and actions from CSV and HDF5 files and logs, or frames and actions from HDF5 files.
 
     Names are matched by `csv.py`; those of logs, bags of ROS and ULog, are TOPIC.FIELD (`logs.py`). Clocks are checked
-    by `clock.py`; rows of an unsteady one keep their stamps. Angles after whose whole turns the physics repeat are
-    unwrapped within an episode so that upright is 0 (if the pole turns over, in the turn in which it is upright most
-    often). A command in N (a column `force` that exceeds 1) is divided by the system's `max_force`. Where files are too
+    by `clock.py`; rows of an unsteady one keep their stamps. An angle is unwrapped within an episode if the physics are
+    the same after a whole turn. Upright is then 0; if the pole turns over, in the turn in which it is upright most
+    often. A command in N (a column `force` that exceeds 1) is divided by the system's `max_force`. Where files are too
     long for memory, stretches of rows are left out (`thinning.py`). The recording's warnings say what was changed or
     left out.
 

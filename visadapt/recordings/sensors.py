@@ -1,4 +1,4 @@
-"""Checks of sensors: outliers are set aside, dead, frozen and absurd ones are refused.
+"""Checks of sensors: outliers are set aside, dead rates left out; dead or frozen positions and absurd values refused.
 
 Values that cannot have been measured must not be diagnosed: the diagnosis would find an effect that imitates them.
 """
@@ -34,7 +34,8 @@ STILL_RANGES = 1e-9
 MOVING_RANGES = 1e-3
 """Rate of change, in ranges per s, by the source, above which a state must be seen to move."""
 NOISE_RATIO, FEWEST_NOISY = 1.5, 30
-"""Variance of changes over that of values above which a column resembles white noise (2.0); and fewest rows for it."""
+"""Ratio of the variance of row-to-row changes to that of the values, above which a column is taken for white noise
+(whose ratio is 2.0); and the fewest rows with which this is tested."""
 FROZEN_ROWS = 20
 """Fewest equal readings in a row at which a position is compared with its measured rate."""
 

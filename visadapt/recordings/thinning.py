@@ -30,8 +30,9 @@ def kept(first: int, last: int, every: int) -> NDArray[np.bool_]:
 def spread(recording: Recording, most: int, length: int, before: int) -> Recording:
     """A recording of at most about `most` usable rows: stretches of about `length`, spread evenly over it.
 
-    Each stretch becomes an episode, whose times count from the start of its own one. It begins with up to `before` rows
-    that are not usable, for their commands: a motor that is late has these in its memory. A warning says what is used.
+    Each stretch becomes an episode, whose times still count from the start of the episode that it is cut from. It is
+    led by up to `before` earlier rows, marked as not usable: their commands are needed, since a late motor still acts
+    on them. A warning says what is used.
     """
     rows = [len(episode.time) for episode in recording.episodes]
     if sum(rows) <= most:

@@ -47,8 +47,9 @@ def reader(path: Path) -> Read | None:
 
 
 class _ULogFile(io.BufferedReader):
-    """A file over which pyulog does not loop for ever: where the last definition is cut short, it reads what is there
-    and goes back by as much as there should be, to where it was before or further."""
+    """A log file that keeps pyulog from an endless loop. Where the last definition is cut short, pyulog reads the bytes
+    that are left, then seeks back by the full size of the message, and so to its beginning or before it. Such a seek
+    raises EOFError here."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from visadapt.effects import Effect, Residual, Stage
 from visadapt.effects.catalogue import sized
@@ -33,8 +33,8 @@ from visadapt.tasks.base import Task
 from visadapt.world import World
 
 Prepare = Callable[[Policy, Path, int, SetupSettings, Report | None], None]
-"""Prepares a new policy for training, from (policy, file, seed, settings, report); takes what it has written to the
-file."""
+"""Prepares a new policy for training; called with (policy, file, seed, settings, report). Writes its result to the file
+or, where the file exists, reads it from there."""
 
 Made = TypeVar("Made")
 
@@ -161,8 +161,8 @@ class Setup:
     ) -> Adapted:
         """Adapt `policy`, in place, to `target` with at most `budget` counted samples: Algorithm 1 in `folder`.
 
-        A policy that was adapted before collects the first round with the residual that it has; the residual is then
-        fitted to the new samples alone.
+        A policy that was adapted before collects the first round with the residual that it has, if that is one of this
+        setup; the residual is then fitted to the new samples alone.
 
         Args:
             explorer: collects the data in place of `policy`.
@@ -181,8 +181,7 @@ class Setup:
         asked |= {"policy": weights_digest(policy), "explorer": None if explorer is None else weights_digest(explorer)}
         open_run(folder, {**asked, "known": describe(self.source), **self.settings.numbers()}, "adaptation.json")
         residual = _seeded(seed, partial(self.residual, policy, self.source)).to(next(policy.parameters()))
-        if policy.residual is not None:
-            residual.load_state_dict(policy.residual.state_dict())
+        earlier = {} if policy.residual is None else policy.residual.state_dict()
         learning = JointLearning(
             policy,
             residual,
@@ -196,13 +195,17 @@ class Setup:
             explorer,
             explained(self.source, self.renderer, seed, report) if diagnose else None,
         )
+        if _sizes(residual.state_dict()) == _sizes(earlier):
+            # Only now: where there is no gap, the residual gets back the weights with which `learning` was made.
+            residual.load_state_dict(earlier)
         adapted = adapt(learning, folder, round_samples, seed)
         policy.grounded_in = describe(adapted.source)
         return adapted
 
     def check_adaptation(self, policy: Policy, target: Target) -> None:
         """Raises ValueError where `adapt` cannot begin: a policy of another kind, a target of another period or with
-        other actions, effects of the source that cannot be fitted, or behind which no states are found in frames."""
+        other actions, effects of the source that cannot be fitted, or effects of the camera, such as a delay, with
+        which no states can be estimated from frames."""
         self.check_policy(policy)
         self.check_target(target)
         system = self.source.system
@@ -248,3 +251,7 @@ def _seeded(seed: int, make: Callable[[], Made]) -> Made:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return make()
+
+
+def _sizes(weights: Mapping[str, Tensor]) -> dict[str, torch.Size]:
+    return {key: value.shape for key, value in weights.items()}

@@ -102,7 +102,7 @@ def _restored(
 
 
 def _dtype(weights: Mapping[str, Tensor]) -> torch.dtype:
-    """That of the first of the weights, which a policy has in common."""
+    """The dtype of the first floating-point weight, which all weights of a policy share; float32 without any."""
     return next((weight.dtype for weight in weights.values() if weight.is_floating_point()), torch.float32)
 
 
@@ -137,7 +137,13 @@ def _load(path: Path) -> dict[str, Any]:
 
 
 def describe(world: World) -> dict[str, Any]:
-    """A world as plain values: its system's parameters, its clock, and its effects with their present values."""
+    """A world as plain values: its system's parameters, its clock, and its effects with their present values; an effect
+    without a name by that of its class."""
+
+    def values(effect: Effect) -> dict[str, Any]:
+        name = getattr(effect, "name", type(effect).__name__)
+        return {"effect": name, **{each.name: getattr(effect, each.name).detach().clone() for each in effect.table}}
+
     system: Any = world.system
     return {
         "system": system.name,
@@ -145,11 +151,7 @@ def describe(world: World) -> dict[str, Any]:
         "period": world.period,
         "integrator": world.integrator,
         "substeps": world.substeps,
-        "effects": [
-            {"effect": effect.name, **{each.name: getattr(effect, each.name).detach().clone() for each in effect.table}}
-            for effect in world.modules()
-            if isinstance(effect, Effect)
-        ],
+        "effects": [values(effect) for effect in world.modules() if isinstance(effect, Effect)],
     }
 
 

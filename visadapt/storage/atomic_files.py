@@ -115,7 +115,7 @@ def _is_running(process: int) -> bool:
 
 
 def _is_device(path: str | os.PathLike[str]) -> bool:
-    """Whether it is no regular file, or one by which the system names an open one, as `/dev/stdout`."""
+    """Whether `path` exists, is no folder, and is either no regular file or lies in /dev, as `/dev/stdout` does."""
     place = Path(path)
     with suppress(OSError):
         exists = place.exists() and not place.is_dir()

@@ -50,7 +50,8 @@ class CartPole(System):
     coordinates: ClassVar[tuple[tuple[int, int], ...]] = ((0, 1), (2, 3))
 
     def load_scale(self, unit: str) -> float:
-        """Forces: ratio of the weights; torques: ratio of the pole's weight times half-length."""
+        """Ratio to the default cart-pole, at least 1: for forces, of the weight of cart and pole; for torques, of the
+        pole's weight times half-length. 1 for other units."""
         default = CartPole()
 
         def weight(one: CartPole) -> float:

@@ -70,7 +70,7 @@ class RigidBody(System):
     gravity: float | Tensor  # m/s2
 
     def load_scale(self, unit: str) -> float:
-        """Of forces and torques: as the weight."""
+        """For forces and torques, the weight over that of the default vehicle, at least 1; 1 for other units."""
         default = type(self)()
         ratio = float(self.mass * self.gravity) / float(default.mass * default.gravity)
         return max(1.0, ratio) if unit.startswith("N") else 1.0

@@ -38,11 +38,11 @@ class GymnasiumTarget(Target):
 
     Args:
         env: the environment's id, or a function that makes one (with `render_mode="rgb_array"` and no time limit).
-        mapping: the map between its numbers and frames and ours; `mapping.options` are for gymnasium.make alone. Where
-            it gives no period, that is the environment's `tau` or `dt`, or else 1 / `render_fps` of its metadata, with
-            a warning, since that may be the speed of its films alone. Where it gives several steps of an environment
-            that is named by its id, each action is held for so many. Only environments that `show` can put into a
-            state can begin where it says by `start`.
+        mapping: the map between its numbers and frames and ours; `mapping.options` are for gymnasium.make alone.
+            Without `mapping.period` the period is the environment's `tau` or `dt`, or else 1 / `render_fps` of its
+            metadata, with a warning, since that may be the playback speed of its films alone. If `mapping.period` is
+            several steps of an environment that is given by its id, each action is held for that many steps.
+            `mapping.start` works only with environments that `show` can put into a state.
         system: the system whose states and actions the mapping gives.
         frames: whether frames are drawn.
 

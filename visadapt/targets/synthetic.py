@@ -177,13 +177,14 @@ class SyntheticTarget(WorldTarget):
 class FlightTarget(WorldTarget):
     """A vehicle with hidden effects, integrated more finely and by another method than any source.
 
-    A flight ends where its state is no longer finite; how far off it is does not end it, unless `reach` says so.
+    A flight ends when its state is no longer finite or, with a finite `reach`, when it is too far off.
 
     Args:
         task: where flights start and what a policy is shown.
         system: its physics.
         draw_effects: draws the hidden effects of a batch of flights.
-        reach: m off its task's line beyond which a flight ends, unless it has its task behind it.
+        reach: m; a flight ends when it is further than this from its reference or its line to the point
+            (`FlightTask.distance_off`), unless it has passed the point.
 
     >>> import torch, visadapt as va
     >>> from visadapt.tasks.reach import Reach

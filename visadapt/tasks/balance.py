@@ -44,9 +44,9 @@ class Cost:
 class SettlingCost(Cost):
     """As `Cost`, plus `end` times the weighted squared distance of the last planned state from the goal.
 
-    Otherwise nothing after a plan's end has a cost. The cart's position is non-minimum phase: near upright, drawing the
-    cart back begins with a step away from the goal. A plan too short to gain from it runs away, the faster the more x
-    weighs.
+    Otherwise nothing after a plan's end has a cost. The cart's position is non-minimum phase: near upright, the cart
+    must first move away from the goal before it can return. Under plans too short to include the return the cart runs
+    away, the faster the larger the weight of x.
     """
 
     end: float = 0.0

@@ -51,10 +51,10 @@ class Task(ABC):
     def augment(
         self, observed: Tensor, state: Tensor, task_state: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Recorded histories transplanted to other goals, where the physics is the same there.
+        """Data augmentation: recorded histories moved to other goals at which the physics is the same; here unchanged.
 
-        Observations (B, LENGTH, ...) up to states (B, n_state), and task states (B, LENGTH, ...). A few hundred samples
-        cover a few goals only.
+        Takes and returns observations (B, LENGTH, ...), the states (B, n_state) at their last row, and task states
+        (B, LENGTH, ...). It is needed since a few hundred samples cover only a few goals.
         """
         return observed, state, task_state
 

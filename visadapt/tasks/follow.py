@@ -27,10 +27,10 @@ class FollowCost:
     C = sum_k position |x - x_nu|^2 + velocity |v - v_nu|^2 + turning |omega - omega_nu|^2 + action |a|^2
 
     omega is the angular velocity in world axes, rad/s. The paper weighs omega itself, by 0.1, and holds thrust and
-    rates near the middle of their range, by 5 and 0.1 on commands in [0, 1]. What pulls the thrust towards hovering, or
-    omega towards zero, also pulls the vehicle off its reference. With little weight on either, a policy that never
-    meets a lag may answer small errors with nearly all of its body rates, and swings up where the motors lag; with the
-    weight on the difference it keeps to both.
+    rates near the middle of their range, by 5 and 0.1 on commands in [0, 1]. Such terms, which pull the thrust towards
+    hovering and omega towards zero, also pull the vehicle off its reference. With little weight on them, a policy that
+    is trained without motor lag may answer small errors with nearly its full body rates, and where the motors lag it
+    oscillates ever more. A weight on the difference, omega - omega_nu, avoids both.
     """
 
     position: float = 10.0
@@ -172,12 +172,12 @@ class Follow(FlightTask):
     def augment(
         self, observed: Tensor, state: Tensor, task_state: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Shifted to another reference, at its row with the most similar motion, with the same errors and a spread.
+        """Histories shifted to another reference: they keep their errors, and a random error is added.
 
-        Without forces of the air a motion does not depend on position and velocity: these are shifted by the same in
-        all rows. Of `candidates` rows of references drawn at random, the one with the most similar velocity and
-        acceleration is taken, so that drag and tilt change little. The spread is that of other starts: recorded errors
-        are few, and smaller than those that a gust against a new policy makes.
+        Without aerodynamic forces a motion does not depend on position and velocity, so these are shifted by the same
+        amount in all rows. Of `candidates` rows of references drawn at random, the one with the most similar velocity
+        and acceleration is taken, so that drag and tilt change little. The random error has the `start_spread` of other
+        starts: recorded errors are few, and smaller than those that a gust causes under a new policy.
         """
         own, batch = self.references, len(observed)
         draws, device = (batch, self.candidates), own.positions.device

@@ -84,8 +84,8 @@ def power_loop(speed: float, radius: float = LOOP_RADIUS, period: float = 0.1) -
 def smallest_loop(speed: float, quadrotor: Quadrotor, margin: float = 0.9) -> float:
     """Smallest radius in m, to a millimetre, of a power loop that a quadrotor flies upright within its commands.
 
-    The circle's top decides: the thrust is least there, and points the way it turns fastest. No loop upside down
-    counts, though a quadrotor with more thrust and faster rates could fly it, and smaller ones.
+    The circle's top decides: the thrust is least there, and its direction turns fastest. Loops on which the quadrotor
+    turns upside down do not count, though one with more thrust and faster rates could fly them, and smaller ones.
 
     Args:
         speed: m/s.

@@ -21,7 +21,7 @@ def best_on_all_rows(
 ) -> Search:
     """The best set of a search, and at most `others` close to it, fitted to all rows."""
     whole = Search(search.system, rows, search.catalogue, search.source.fits, search.jobs)
-    close = [each for each in search.close() if each.effects][: 1 + others]
+    close = [each for each in search.near_best() if each.effects][: 1 + others]
     for group, how in ((close[:1], effort), (close[1:], FINAL)):
         # From the states of the best set so far, which a start from the readings would first have to find.
         whole.fit([(each.effects, replace(each.fits, state=whole.best.fits.state)) for each in group], how)

@@ -152,10 +152,11 @@ class _CameraSearch:
             best = without[idle[0]]
 
     def sharpen(self, best: CameraFit, without: Fits) -> tuple[CameraFit, Fits]:
-        """The camera fitted to smoothed frames, less the effects that these show to do nothing; arguments and result as
-        in `drop_idle`.
+        """The camera fitted to smoothed frames, without the effects that may do nothing by that fit (unless all may),
+        and this camera without each of its effects. `best` and `without` are what `drop_idle` returns.
 
-        A turned picture is softer than the drawn one, which a shift by a part of a pixel would seem to explain.
+        A turned picture is softer than the one drawn. In sharp frames, a shift by a fraction of a pixel would seem to
+        explain this softness.
         """
         if not best.camera:
             return best, without

@@ -17,7 +17,7 @@ from visadapt.effects import Effect, Parameter, Role, Stage
 from visadapt.effects.catalogue import twins
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.covariance import deviations
-from visadapt.estimation.episode_phases import has_episode_phases, in_step
+from visadapt.estimation.episode_phases import has_episode_phases, with_common_phase
 from visadapt.estimation.grids import spans
 from visadapt.systems import System
 
@@ -47,8 +47,8 @@ class Alternative:
 def alternatives(
     comparison: ModelComparison, effects: Sequence[type[Effect]], system: System
 ) -> list[list[Alternative]]:
-    """For each effect of the best set, those of `effects` that fit as well in its place, the best first, each among its
-    twins, which are in the order of `effects`."""
+    """For each effect of the best set: itself and those of `effects` that fit as well in its place, the most probable
+    model first. Of each effect that was fitted, the twins are listed with it, in the order of `effects`."""
     out = []
     for effect, rivals in comparison.alternatives.items():
         likeliest = {effect: comparison.models[0]}
@@ -71,7 +71,8 @@ def _same(effect: type[Effect], effects: Sequence[type[Effect]], system: System)
 def causes(
     search: Search, comparison: ModelComparison, groups: Sequence[Sequence[Alternative]], gap_closed: GapClosed
 ) -> list[Cause]:
-    """Every alternative as a cause; `gap_closed` holds each effect alone, and the best set, whole and without each."""
+    """Every alternative as a cause. `gap_closed` must hold the best set, that set without each of its effects, and the
+    empty set; an effect that it does not hold alone gets NaN as its `Cause.gap_closed`."""
     out: dict[str, Cause] = {}
     best = frozenset(comparison.best.names)
     reopens = {e: gap_closed[best] - gap_closed[best - {e.name}] for e in comparison.best.effects}
@@ -189,7 +190,7 @@ def _estimates(
 ) -> dict[str, Estimate]:
     """Parameters (P,) of an effect of a set, with intervals from `low` to `high` (P,), as the result states them."""
     covered = spans(search.system, search.rows, model.fits.state[0])
-    stated = in_step(effect).table
+    stated = with_common_phase(effect).table
     numbers = zip(stated, values.tolist(), low.tolist(), high.tolist(), strict=False)  # later episodes' phases are last
     out = {p.name: _estimate(p, value, first, last, covered) for p, value, first, last in numbers}
     if has_episode_phases(effect):

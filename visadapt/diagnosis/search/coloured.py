@@ -1,8 +1,9 @@
-"""The search gone on with coloured noise, where what it leaves unexplained is not white.
+"""The search continued with coloured noise, where what it leaves unexplained is not white.
 
-A real machine resonates, and its model does not: white noise that is as strong as that at every frequency hides what
-the model gets right at others, and parameters take up what they can of the rest. So the search goes on from the best
-sets with the colour of the best one's innovations as noise (`estimation/colour.py`).
+A real machine has resonances that its model lacks. White noise strong enough for a resonance is as strong at every
+other frequency: it hides what the model gets right there, and parameters absorb what they can of the rest. So the
+search continues from the best sets, with noise that has the colour of the best set's innovations
+(`estimation/colour.py`).
 """
 
 from __future__ import annotations
@@ -28,22 +29,22 @@ START_FROM = 4  # Best sets of a search from which the next one begins
 def with_coloured_noise(
     search: Search, comparison: ModelComparison, searched: Tensor, progress: Progress | None = None
 ) -> tuple[Search, ModelComparison]:
-    """The search and its comparison gone on with coloured noise, where something is unexplained that is not white; else
-    as they are.
+    """The search and its comparison continued with coloured noise, if something is unexplained that is not white; else
+    unchanged.
 
-    First the best sets only grow, with the colour of what the best one leaves; then, with the colour of what the set so
-    found leaves, sets near it are tried too. That set is tried with white noise as well, where it may explain all; what
-    is unexplained is what the best set with white noise leaves. `searched` are the windows, by index, in which sets are
-    looked for.
+    First, sets only grow from the best ones, with the colour of the best one's innovations. Then, with the colour of
+    the innovations of the set so found, sets near the best are tried too. The most probable set is also fitted with
+    white noise, where it may explain everything; what counts as unexplained is what the best set with white noise
+    leaves. `searched` are the indices of the windows in which sets are looked for.
     """
     colour = colour_left_by(search, comparison.best) if comparison.leftover > MIN_LEFTOVER else None
     if colour is None:
         return search, comparison
-    begin = [(each.effects, each.fits.on(searched)) for each in search.close()[:START_FROM]]
+    begin = [(each.effects, each.fits.on(searched)) for each in search.near_best()[:START_FROM]]
     rows = replace(search.rows, colour=colour)
     grown = Search(search.system, rows.select(searched), search.catalogue, jobs=search.jobs)
     grown.go_on_from(begin, exchange=False, progress=progress)
-    begin = [(each.effects, each.fits) for each in grown.close()[:START_FROM]]
+    begin = [(each.effects, each.fits) for each in grown.near_best()[:START_FROM]]
     colour = colour_left_by(search, best_on_all_rows(grown, rows, FINAL, others=0).best) or colour
     rows = replace(search.rows, colour=colour)
     found = Search(search.system, rows.select(searched), search.catalogue, jobs=search.jobs)

@@ -59,7 +59,8 @@ class RolloutErrors:
     stride: int  # rows from one start to the next
 
     def expected(self, window: int, start: int, channels: Sequence[int]) -> Tensor:
-        """(H + 1, n) one prediction: of the `channels` what sensors would read, of other states these themselves."""
+        """(H + 1, n) one prediction: in the measured `channels` the readings to be expected, in other columns the
+        states themselves."""
         states = self.predicted[window, start].clone()
         states[:, channels] = self.read[:, window, start]
         return states
@@ -207,7 +208,8 @@ def rollout_errors(
     predicted = _rollouts(model, fits.theta[0], estimated, horizon, stride, black_box)
 
     measured, shown = model.shown(fits.theta[0])
-    # A window's first state is known from what follows alone; where a joint sticks, that does not show its velocity.
+    # Predictions from the first row of a window are left out if the window is long enough: that state is estimated
+    # without earlier readings, and where a joint sticks, later ones do not show its velocity.
     others = rows.inside.sum(1) > horizon + stride
     left = model.measure(fits.theta[0], estimated) - measured
     # Rows in which the predictions of each horizon end, read all at once: late sensors take a simulation to read.

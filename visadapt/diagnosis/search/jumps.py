@@ -1,9 +1,9 @@
 """The search made with another process noise, where the usual one does not suit what is left unexplained.
 
-A load that is missing from a model moves all joints through the mass matrix, and so does process noise. But a machine
-whose parts bend, or whose motors are late, misses its model in each velocity by itself; taken for loads, that falsifies
-masses and inertias: of a real double pendulum inertias and a motor were named that closed nothing of the gap. There
-process noise is a jump of each velocity.
+The usual process noise is a load on a joint: like a load that is missing from a model, it moves all joints through the
+mass matrix. But if a machine's parts bend, or its motors are late, each velocity departs from the model independently
+of the others. Described as loads, such errors falsify masses and inertias: for a real double pendulum, inertias and a
+motor were named that closed nothing of the gap. There, process noise is an independent jump of each velocity.
 """
 
 from __future__ import annotations
@@ -14,25 +14,26 @@ from visadapt.diagnosis.search.search import Search
 from visadapt.estimation.fit_states import QUICK
 
 CLEARLY = 50.0
-"""Log posterior odds by which jumps must be likelier: with them the source of a real double pendulum is 470 and more
-ahead of every effect; that of simulated cart-poles at most 11, of a real one far behind."""
+"""Log posterior odds by which the source with jumps must lead the best set with loads as process noise. For a real
+double pendulum it leads by 470 or more, for simulated cart-poles by at most 11; for a real one it is far behind."""
 
 
 def with_jumps(search: Search) -> Search | None:
-    """The same search with jumps of the velocities as process noise, of sets of one and of two effects, where with
-    them the source alone is clearly likelier than every effect without them; else None.
+    """The same search with jumps of the velocities as process noise, over sets of one and of two effects; None unless
+    the source alone is clearly likelier with jumps than every effect is with loads as process noise.
 
-    The set to which the search grows with loads as noise is fitted with jumps too: what a transmission that gives, or a
-    late motor, does to a velocity looks like a jump, which hides it. On the double pendulum that transmission is the
-    first effect found with loads, and none of the first with jumps.
+    The set to which the search grows with loads is fitted with jumps too. A compliant transmission, or a late motor,
+    changes a velocity much as a jump does, so jumps as noise hide these effects: on the double pendulum, the
+    transmission is the first effect found with loads, and not among the first with jumps.
 
-    Where what these leave is not white, larger sets are looked for with coloured noise only (`coloured.py`). Jumps
-    describe a resonance of the machine with the power of the whole of it at every frequency, against which a third
-    effect hardly counts: of a real double pendulum six effects gained 390 in log odds, none of them the truth, and the
-    colour 1,200.
+    If the innovations of these sets are not white, larger sets are looked for with coloured noise only (`coloured.py`).
+    Jumps that are strong enough for a resonance of the machine are as strong at every other frequency, and a third
+    effect hardly counts against them: on a real double pendulum, six effects gained 390 in log odds, none of them the
+    truth, and coloured noise gained 1,200.
     """
     search.fit_singles()
-    other = Search(search.system, replace(search.rows, jumps=True), search.catalogue, jobs=search.jobs)
+    rows, rival = replace(search.rows, jumps=True), float(search.best.fits.likelihood[0])
+    other = Search(search.system, rows, search.catalogue, jobs=search.jobs, rival=rival)
     if other.source.log_odds < search.best.log_odds + CLEARLY:
         return None
     alone = sorted(other.fit_singles(), key=lambda each: -each.log_odds)

@@ -27,7 +27,8 @@ SLIGHT_SHARE = 0.05
 """Share of the best model's gain in log likelihood below which what it leaves unexplained is negligible."""
 
 CLASS_PROBABILITY = 0.93
-"""Share of the probability of all models that exchange an effect for others, up to which alternatives are listed."""
+"""Alternatives to an effect are listed, the most probable first, until they and the best model together hold this share
+of the probability of the best model and all its rivals without that effect."""
 
 
 MIN_PROBABILITY = 0.3  # Of a model with two effects in the place of one, or one for two, to be an alternative

@@ -40,14 +40,15 @@ class PreparedRecording:
 
 
 MIN_JITTER = 1e-3
-"""Deviation of stamps from even spacing, in periods, above which a fit decides whether the readings share it."""
+"""Largest deviation of time stamps from even spacing, in periods, above which fits with the recorded and with evenly
+spaced stamps decide whether the readings share the jitter."""
 
 MEMORY_TIME = 1.0
 """s before a stretch of rows whose commands are used too: what is late, or lags, remembers them."""
 
 MOST_SEARCHES, STRETCH_WINDOWS = 24, 4
-"""Most rows of a recording that are used, as a multiple of those that the search uses, and windows in a stretch of
-them: the intervals from so many rows are narrow already, and the time grows with the rows."""
+"""Most rows of a recording that are used, as a multiple of `SystemProfile.search_rows`: so many give narrow intervals
+already, and the time grows with the rows. Of a longer recording, stretches of STRETCH_WINDOWS windows are used."""
 
 
 def limited(recording: Recording, system: System) -> Recording:

@@ -28,8 +28,8 @@ MAX_CANDIDATES, MAX_EXCHANGES = 8, 5
 """Most effects that are tried with a set: when sets grow, and in the place of those that are exchanged."""
 
 TWO_FOR_ONE_UP_TO = 4
-"""Effects at most in a set of which two are exchanged for one. In larger sets, which describe what no effect explains,
-the number of pairs would be most of the search; sets of one and of two effects are widened there instead."""
+"""Effects at most in a set of which two are exchanged for one. Larger sets describe something that no effect explains;
+their many pairs would take most of the search. Instead, sets of one and of two effects then get a further effect."""
 
 LEADERS = 4  # Sets that are fitted before the others, where some fall far behind
 
@@ -85,8 +85,8 @@ class Search(FittedModels):
         self._report(progress, MAX_EFFECTS)
 
     def fit_singles(self) -> list[ScoredModel]:
-        """Every effect alone, where they are so large that the screening may mislead, else those that promise enough;
-        fitted unless any was."""
+        """The fitted sets of one effect. If there are none yet, fit them: every effect, if effects are so large that
+        the screening may mislead (FIT_ALL_ABOVE), else those whose screening promises enough."""
         return [f for f in self.ranked if len(f.effects) == 1] or self._alone() or self.extend([self.source])
 
     def go_on_from(
@@ -181,8 +181,9 @@ class Search(FittedModels):
     def try_late_sensors(self) -> None:
         """The source, the best set and the best single effects with each late sensor in addition.
 
-        The screening, which is linear in the delay, does not see a sensor that is far too late. It keeps to states that
-        follow the late readings: there a little delay gains little, and a joint stops when its late readings do.
+        The screening, which is linear in the delay, does not see a sensor that is far too late. It is made along states
+        that were fitted to the late readings as if these were on time: there a small delay gains little, and a joint
+        stops when its late readings do.
         """
         late = [e for e in self.catalogue if issubclass(e, LateSensors)]
         alone = [each for each in self.ranked if len(each.effects) == 1]
@@ -274,11 +275,11 @@ class Search(FittedModels):
     def _polish(self) -> None:
         """Fit carefully the sets close to the best, and the best set less each effect, with which it is compared, but
         for those whose best fit is a careful one already."""
-        rough = [f for f in self.close() if self._careful.get(key_of(f.effects)) is not f]
+        rough = [f for f in self.near_best() if self._careful.get(key_of(f.effects)) is not f]
         careful = self.fit([(f.effects, f.fits) for f in rough], CAREFUL)
         self._careful |= {key_of(f.effects): f for f in careful}
 
-    def close(self) -> list[ScoredModel]:
+    def near_best(self) -> list[ScoredModel]:
         """The sets close to the best, and the best set less each effect, where these were fitted."""
         best = self.best
         fewer = [f.fits.theta.shape[1] < best.fits.theta.shape[1] for f in self.ranked]

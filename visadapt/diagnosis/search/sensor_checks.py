@@ -27,9 +27,10 @@ MIN_GAIN_PER_READING = 0.1
 """Log likelihood per reading that another convention must gain to be taken for that of the recording."""
 
 EFFECTS_WITH_SIGNS, MOST_EFFECTS_WITH_SIGNS, LEADS_WITH_SIGNS = 2, 6, 3
-"""Before a convention is decided on, EFFECTS_WITH_SIGNS effects are added one by one to the source in either, since a
-large effect can look like a wrong sign; while another convention is ahead, but not clearly, up to
-MOST_EFFECTS_WITH_SIGNS. LEADS_WITH_SIGNS effects are tried for each."""
+"""Before a sign convention is decided on, EFFECTS_WITH_SIGNS effects are added one by one to the source in both, the
+source's convention and the best other one, since a large effect can look like a wrong sign. While the other one is
+ahead, but not clearly, further effects are added, up to MOST_EFFECTS_WITH_SIGNS. LEADS_WITH_SIGNS effects are tried for
+each one added."""
 
 
 def opposite_signs(

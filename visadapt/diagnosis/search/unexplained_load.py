@@ -1,10 +1,10 @@
 """The load that a motion takes beyond what a world explains, over whole episodes, and what else may explain it.
 
-Readings of positions are smoothed and differentiated twice; the accelerations less those of the world, over their
-change per unit of load, are the load in question (inverse dynamics; Khalil and Dombre 2002, chapter 12). It is linear
-in what a world may have wrong: friction, the commands' gain and delay, the parameters, the zero of a sensor, a
-compliant drive. The columns, one for each of these, are taken along the accelerations of the world, not the measured
-ones: then no factor common to all of them explains anything.
+Readings of positions are smoothed and differentiated twice. The accelerations less those of the world, divided by the
+acceleration per unit of load, are the unexplained load (inverse dynamics; Khalil and Dombre 2002, chapter 12). It is
+linear in the errors that a world may have: in friction, the commands' gain and delay, the parameters, the zero of a
+sensor, a compliant drive. For each of these there is a column of loads. Columns follow the accelerations of the world,
+not the measured ones: along these, a factor common to all columns could explain a push away.
 """
 
 from __future__ import annotations
