@@ -239,6 +239,17 @@ COMMANDS = (
         60,
         work="--work",
     ),
+    Command(
+        "ablations_diagnosis_large",
+        "ablations_diagnosis.csv",
+        (
+            "benchmarks.diagnosis_ablations",
+            *("--kinds", "large", "--count", "20"),
+            *("--parts", "every effect alone", "exchanges", "two for one"),
+        ),
+        40,
+        work="--work",
+    ),
     _blind("blind_hard", "--seed 2028 --kinds hard --count 100 --jobs 2", 20),
     _blind("blind_easy", "--seed 2028 --kinds easy --count 24 --jobs 2", 20),
     _blind(

@@ -57,7 +57,7 @@ TABLES = {
     "grounding": Table(adaptation.grounding, ("cartpole_pixels",)),
     "ablations": Table(adaptation.ablations, ("ablations",)),
     "ablations, states": Table(adaptation.ablations, ("ablations_states",)),
-    "ablations, diagnosis": Table(diagnosis.parts, ("ablations_diagnosis",)),
+    "ablations, diagnosis": Table(diagnosis.parts, ("ablations_diagnosis", "ablations_diagnosis_large")),
     "ablations, flights": Table(adaptation.flight_ablations, ("ablations_flight",)),
     "other targets": Table(adaptation.other_targets, ("other_targets",)),
     "other targets, states": Table(adaptation.other_targets, ("other_targets_states",)),

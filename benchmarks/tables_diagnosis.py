@@ -78,7 +78,9 @@ def parts(rows: Rows) -> Lines:
         ]
     ]
     for row in rows:
-        shares = [f"{row[f'{what}_right']} of {row[what]}" for what in ("named", "none", "foreign")]
+        shares = [
+            f"{row[f'{what}_right']} of {row[what]}" if int(row[what]) else "" for what in ("named", "none", "foreign")
+        ]
         covered, intervals = (float(row[key]) for key in ("covered", "intervals"))
         alone, whole = float(row["seconds"]), float(row["seconds_whole"])
         time = f"{alone:.0f} s for {whole:.0f} s" if row["without"] != WHOLE and alone else ""
