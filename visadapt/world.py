@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -18,7 +17,7 @@ from visadapt.effects.base import check_acts_on
 from visadapt.effects.camera import seen_by
 from visadapt.history import History
 from visadapt.systems import System
-from visadapt.systems.integrators import INTEGRATORS, Duration
+from visadapt.systems.integrators import INTEGRATORS, Duration, steps_within
 from visadapt.systems.stiffness import longest_step
 
 EDGE_STEP = 0.0125
@@ -29,7 +28,7 @@ def resolving(effects: Sequence[nn.Module], period: float) -> int:
     """Integration steps in a period of `period` s, each at most EDGE_STEP long, if an effect on the dynamics is abrupt
     without being dry friction; else 1."""
     edges = (e.abrupt and not e.rubs() for e in effects if isinstance(e, DynamicsEffect))
-    return math.ceil(period / EDGE_STEP - 1e-9) if any(edges) else 1
+    return steps_within(period, EDGE_STEP) if any(edges) else 1
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ class World(nn.Module):
         self.period = period
         self.integrator = integrator
         if substeps is None:
-            substeps = max(resolving(effects, period), math.ceil(period / longest_step(type(system)) - 1e-9))
+            substeps = max(resolving(effects, period), steps_within(period, longest_step(type(system))))
         self.substeps = substeps
         self.effects = nn.ModuleList(effects)
         self._arrange()

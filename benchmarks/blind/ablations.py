@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from importlib import import_module
 from typing import Any
 from unittest.mock import patch
 
-from visadapt.diagnosis.search import heldout, search
+from visadapt.diagnosis.search import fitted_models, heldout, search
 from visadapt.diagnosis.search.fitted_models import (
     MIN_BETTER,
     FittedModels,
@@ -20,7 +21,7 @@ from visadapt.diagnosis.search.fitted_models import (
 )
 from visadapt.diagnosis.search.model_comparison import MIN_LEFTOVER, ModelComparison
 from visadapt.diagnosis.search.search import TWO_FOR_ONE_UP_TO, WIDEN_ABOVE, Exchanges, Search
-from visadapt.estimation.fit_states import CAREFUL, QUICK, Effects
+from visadapt.estimation.fit_states import QUICK, Effects
 from visadapt.estimation.likelihood import FitState
 
 DIAGNOSE = import_module("visadapt.diagnosis.diagnose")
@@ -95,9 +96,8 @@ def _fit_with_noise(self: Search, starts: Sequence[tuple[Effects, FitState]], ef
 
 
 def _measure_what_is_left(self: FittedModels, sets: Sequence[ScoredModel]) -> list[WithoutProcessNoise]:
-    out = self._fits([(each.effects, each.fits) for each in sets], CAREFUL, float("-inf"), process_noise=False)
-    left = [max(0.0, float(each.fits.likelihood - fits.likelihood)) for each, fits in zip(sets, out, strict=True)]
-    return [WithoutProcessNoise(fits, rest) for fits, rest in zip(out, left, strict=True)]
+    with patch.object(fitted_models, "MIN_BETTER", math.inf):
+        return _without_process_noise(self, sets)
 
 
 def _by_noise_and_black_box(self: ModelComparison, improvable: bool) -> bool:
@@ -105,6 +105,7 @@ def _by_noise_and_black_box(self: ModelComparison, improvable: bool) -> bool:
 
 
 _fit_neighbours, _improve_while_unexplained = Search._fit_neighbours, Search._improve_while_unexplained
+_without_process_noise = FittedModels.without_process_noise
 
 PARTS = {
     "every effect alone": Part(Search, "_alone", lambda _: [], lambda out, _: bool(out)),

@@ -159,6 +159,8 @@ def test_a_wing_is_adapted_to_the_points_of_its_target():
     setup = setup_to_adapt(policy, source, va.FlightTarget(task, va.FixedWing()))
     assert setup.settings.longest_episode == task.steps
     assert setup.settings.tuning.task == task
+    with pytest.raises(ValueError, match="a renderer has no use: leave it out"):
+        setup_to_adapt(policy, source, va.FlightTarget(task, va.FixedWing()), va.shipped("renderer"))
 
 
 def test_a_source_policy_sees_as_the_settings_of_its_setup_say(tmp_path):

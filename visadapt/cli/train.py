@@ -19,7 +19,7 @@ from visadapt.cli.inputs import (
 )
 from visadapt.learning.perception import PerceptionSettings
 from visadapt.setups.base import Setup
-from visadapt.setups.training import setup_for
+from visadapt.setups.training import setup_to_train
 from visadapt.storage.atomic_files import replacing
 from visadapt.systems import CartPole, Quadrotor
 from visadapt.tasks.references import read_reference
@@ -56,14 +56,10 @@ def _setup(options: argparse.Namespace) -> Setup:
         raise InputError("--seeing is for a policy that is shown frames: give --frames or --renderer")
     if options.references and not isinstance(system, Quadrotor):
         raise InputError(f"--references is for a quadrotor, not for a {system.name}")
-    if options.with_history and not isinstance(system, CartPole):
-        raise InputError(f"--with-history is for a cart-pole on states; a {system.name}'s residual may read a history")
     references = read_reference(options.references, period) if options.references else None
     with checked():
-        setup = setup_for(world, None, renderer, references, options.with_history)
-    own = setup.settings
-    if options.iterations:
-        own = own.shortened(options.iterations)
-    if options.seeing:
-        own = replace(own, perception=replace(own.perception or PerceptionSettings(), iterations=options.seeing))
-    return replace(setup, settings=own)
+        setup = setup_to_train(world, options.iterations, renderer, references, options.with_history)
+    if not options.seeing:
+        return setup
+    perception = replace(setup.settings.perception or PerceptionSettings(), iterations=options.seeing)
+    return replace(setup, settings=replace(setup.settings, perception=perception))

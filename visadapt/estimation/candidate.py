@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -27,6 +26,7 @@ from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.estimation.unmodelled_loads import leading_loads, noise_directions, response_without_friction
 from visadapt.systems import System
+from visadapt.systems.integrators import steps_within
 from visadapt.world import World, WorldState
 
 COARSEST, COARSE, FINE = 0, 1, 2
@@ -57,7 +57,7 @@ class CandidateModel:
         integrator = "midpoint" if accuracy < FINE and rows.period <= SHORT_PERIOD else "rk4"
         placeholders = [effect(**{parameter.name: 0.0 for parameter in effect.table}) for effect in effects]
         self._world, self._smooth = (
-            World(system, placeholders, rows.period, integrator, max(1, math.ceil(longest / step - 1e-9)))
+            World(system, placeholders, rows.period, integrator, steps_within(longest, step))
             for step in (longest_step, smooth)
         )
         self._only_commands_jump = not any(e.abrupt and not issubclass(e, ActuationEffect) for e in effects)

@@ -13,8 +13,6 @@ then subtracted.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -22,6 +20,7 @@ from visadapt.estimation.linearise import integrate, linearise_step, load_effect
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments, initial_states
 from visadapt.systems import System
+from visadapt.systems.integrators import steps_within
 from visadapt.world import World
 
 LOAD_STEPS = 5
@@ -34,7 +33,7 @@ def load_response(rows: Segments, system: System) -> Tensor:
     states."""
     windows, length = rows.shape
     load = load_effect(type(system))
-    substeps = max(1, math.ceil(float(rows.held.max()) / profile_of(system).coarsest_step - 1e-9))
+    substeps = steps_within(float(rows.held.max()), profile_of(system).coarsest_step)
     nothing = load(**{parameter.name: 0.0 for parameter in load.table})
     world = World(system, [nothing], rows.period, substeps=substeps)
     (time, duration), state = rows.clock, initial_states(rows, system)[:, :-1].flatten(0, 1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from visadapt.policies import Policy
 from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, read_recording, write_recording
-from visadapt.storage.checkpoints import fitting, load_tree, load_weights, save_tree
+from visadapt.storage.checkpoints import CheckpointError, fitting, load_tree, load_weights, save_tree
 from visadapt.targets import Target, TargetError
 from visadapt.targets.rollout import run
 from visadapt.world import World
@@ -91,7 +92,10 @@ class RoundFolder:
 
 @dataclass
 class JointLearning:
-    """A run of Algorithm 1 between two rounds; policy and residual are changed in place."""
+    """A run of Algorithm 1 between two rounds; policy and residual are changed in place.
+
+    A policy that was adapted before collects the first round with the weights of the residual that it has.
+    """
 
     policy: Policy  # reads the residual
     residual: Residual
@@ -121,7 +125,10 @@ class JointLearning:
         self.first = {key: value.clone() for key, value in weights.items() if not key.startswith("residual.")}
         """weights of the policy before the first round, with its feed-forward once that is known"""
         self.untrained = copy.deepcopy(self.residual.network.state_dict())
-        """weights of the residual before the first round"""
+        """weights of a new residual, which it gets back where named causes explain the gap"""
+        if self.policy.residual is not None:
+            with suppress(CheckpointError):  # one of another architecture is dropped
+                load_weights(self.residual, self.policy.residual.state_dict(), Path("the policy's residual"))
         self.policy.residual = self.residual
 
     @property

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from visadapt.effects import Effect, Residual, Stage
 from visadapt.effects.catalogue import sized
@@ -24,7 +24,7 @@ from visadapt.learning.transitions import Observe
 from visadapt.policies import ImagePolicy, Policy
 from visadapt.progress import Report, staged
 from visadapt.setups.explained import explained
-from visadapt.setups.policy_file import describe, load_into
+from visadapt.setups.policy_file import describe, load_into, parameters_of
 from visadapt.storage.checkpoints import weights_digest
 from visadapt.storage.run_folder import open_run
 from visadapt.systems import System
@@ -177,11 +177,10 @@ class Setup:
         self.check_adaptation(policy, target)
         asked = {"target": target.name, "samples": budget, "round": round_samples, "seed": seed, "diagnose": diagnose}
         system = getattr(target, "system", None)
-        asked["machine"] = describe(World(system))["parameters"] if isinstance(system, System) else None
+        asked["machine"] = parameters_of(system) if isinstance(system, System) else None
         asked |= {"policy": weights_digest(policy), "explorer": None if explorer is None else weights_digest(explorer)}
         open_run(folder, {**asked, "known": describe(self.source), **self.settings.numbers()}, "adaptation.json")
         residual = _seeded(seed, partial(self.residual, policy, self.source)).to(next(policy.parameters()))
-        earlier = {} if policy.residual is None else policy.residual.state_dict()
         learning = JointLearning(
             policy,
             residual,
@@ -195,9 +194,6 @@ class Setup:
             explorer,
             explained(self.source, self.renderer, seed, report) if diagnose else None,
         )
-        if _sizes(residual.state_dict()) == _sizes(earlier):
-            # Only now: where there is no gap, the residual gets back the weights with which `learning` was made.
-            residual.load_state_dict(earlier)
         adapted = adapt(learning, folder, round_samples, seed)
         policy.grounded_in = describe(adapted.source)
         return adapted
@@ -251,7 +247,3 @@ def _seeded(seed: int, make: Callable[[], Made]) -> Made:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return make()
-
-
-def _sizes(weights: Mapping[str, Tensor]) -> dict[str, torch.Size]:
-    return {key: value.shape for key, value in weights.items()}

@@ -21,7 +21,7 @@ from visadapt.learning.perception import PerceptionSettings, scale
 from visadapt.policies import FlightPolicy, FollowPolicy, ImagePolicy, Policy, ReachPolicy, StatePolicy
 from visadapt.policies.networks import FlightResidualNetwork, ImageResidualNetwork, StateResidualNetwork
 from visadapt.storage.checkpoints import CheckpointError, check_sizes, fitting, load_tree, load_weights, save_network
-from visadapt.systems import SYSTEMS, RigidBody
+from visadapt.systems import SYSTEMS, RigidBody, System
 from visadapt.systems.base import NAMED
 from visadapt.world import World
 
@@ -144,15 +144,20 @@ def describe(world: World) -> dict[str, Any]:
         name = getattr(effect, "name", type(effect).__name__)
         return {"effect": name, **{each.name: getattr(effect, each.name).detach().clone() for each in effect.table}}
 
-    system: Any = world.system
     return {
-        "system": system.name,
-        "parameters": {each.name: float(getattr(system, each.name)) for each in fields(system)},
+        "system": world.system.name,
+        "parameters": parameters_of(world.system),
         "period": world.period,
         "integrator": world.integrator,
         "substeps": world.substeps,
         "effects": [values(effect) for effect in world.modules() if isinstance(effect, Effect)],
     }
+
+
+def parameters_of(system: System) -> dict[str, float]:
+    """The parameters of a system, by their names."""
+    own: Any = system
+    return {each.name: float(getattr(own, each.name)) for each in fields(own)}
 
 
 def _world(description: Mapping[str, Any], path: Path) -> World:

@@ -111,12 +111,7 @@ def train(
     >>> policy.n_action
     1
     """
-    if with_history and not isinstance(world.system, CartPole):
-        raise ValueError(f"a {world.system.name}'s policy reads no history; its residual may, where it is adapted")
-    _check_iterations(iterations)
-    setup = setup_for(copy.deepcopy(world), None, renderer, references, with_history)
-    if iterations is not None:
-        setup = replace(setup, settings=setup.settings.shortened(iterations))
+    setup = setup_to_train(copy.deepcopy(world), iterations, renderer, references, with_history)
     with tempfile.TemporaryDirectory() as temporary:
         return setup.pretrain(Path(path or Path(temporary, "policy.safetensors")), seed, report)
 
@@ -221,6 +216,25 @@ def adapt(
     return adapted if folder is not None else replace(adapted, folder=None)
 
 
+def setup_to_train(
+    world: World,
+    iterations: int | None = None,
+    renderer: Renderer | None = None,
+    references: Reference | None = None,
+    with_history: bool = False,
+) -> Setup:
+    """As `setup_for`, for a new policy, with `iterations` of its training instead of the setup's own.
+
+    Raises:
+        ValueError: as `setup_for`, or a history for a vehicle, whose policy reads none.
+    """
+    if with_history and not isinstance(world.system, CartPole):
+        raise ValueError(f"a {world.system.name}'s policy reads no history; its residual may, where it is adapted")
+    _check_iterations(iterations)
+    setup = setup_for(world, None, renderer, references, with_history)
+    return setup if iterations is None else replace(setup, settings=setup.settings.shortened(iterations))
+
+
 def setup_to_adapt(
     policy: Policy,
     source: World,
@@ -235,15 +249,16 @@ def setup_to_adapt(
         ValueError: as `setup_for`, or other references than the target's own, with a history.
     """
     task = target.task if isinstance(target, FlightTarget) else None
-    if isinstance(task, Reach) and isinstance(source.system, FixedWing):
-        return fixed_wing(source, with_history, replace(task, system=source.system))
     if isinstance(task, Follow):
         own = task.references
         if references is None:
             references = own
         elif with_history and not torch.equal(references.as_many().positions, own.positions):
             raise ValueError("the target has references of its own, from which histories start: give no others")
-    return setup_for(source, policy, renderer, references, with_history)
+    setup = setup_for(source, policy, renderer, references, with_history)
+    if isinstance(task, Reach) and isinstance(source.system, FixedWing):
+        return fixed_wing(source, with_history, replace(task, system=source.system))
+    return setup
 
 
 def _check_iterations(iterations: int | None) -> None:

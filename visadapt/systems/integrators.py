@@ -5,6 +5,7 @@ Hairer, Norsett and Wanner (1993), Solving ODEs I, section II.1.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from torch import Tensor
@@ -41,6 +42,15 @@ def rk4(f: Derivative, t: Tensor, y: Tensor, h: Duration) -> Tensor:
     k3 = f(t + h / 2, y + step / 2 * k2)
     k4 = f(t + h, y + step * k3)
     return y + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def steps_within(duration: float, longest: float) -> int:
+    """The least number of equal steps, each of at most `longest` s, that make up `duration` s.
+
+    >>> steps_within(0.1, 0.05), steps_within(0.1, 0.04)
+    (2, 3)
+    """
+    return max(1, math.ceil(duration / longest - 1e-9))
 
 
 def _column(h: Duration) -> Duration:

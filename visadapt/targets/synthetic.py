@@ -12,6 +12,7 @@ from torch import Tensor
 from renderers import DrawnCartPole
 from visadapt.effects import ConstantForce, Effect, PeriodicForce
 from visadapt.systems import CartPole, RigidBody, System
+from visadapt.systems.integrators import steps_within
 from visadapt.targets.base import Observation, Target, TargetError
 from visadapt.tasks.base import FlightTask
 from visadapt.world import World, WorldState
@@ -81,7 +82,7 @@ def fine_world(system: System, effects: Sequence[Effect], period: float) -> Worl
     10
     """
     longest = ABRUPT_STEP if any(effect.abrupt for effect in effects) else SMOOTH_STEP
-    return World(system, effects, period, "rk3", math.ceil(period / longest - 1e-9)).requires_grad_(False)
+    return World(system, effects, period, "rk3", steps_within(period, longest)).requires_grad_(False)
 
 
 class WorldTarget(Target):
