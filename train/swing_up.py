@@ -31,8 +31,8 @@ from experiments.parallel import in_processes
 from experiments.result_tables import Row, write_rows
 from experiments.swing_up import ANYWHERE, STEPS, SWING, Score, score
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
-from visadapt.learning.policy import TuneSettings, tune
 from visadapt.learning.training_state import train_or_load
+from visadapt.learning.tuning import TuneSettings, tune
 from visadapt.policies import StatePolicy
 from visadapt.progress import reporting, staged
 from visadapt.storage.checkpoints import load_network

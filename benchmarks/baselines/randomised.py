@@ -15,8 +15,8 @@ import torch
 
 from benchmarks.baselines.cartpole import CartPoleProblem
 from benchmarks.baselines.problem import Sizes, Stage, drawn, unadapted
-from visadapt.learning.policy import tune
 from visadapt.learning.training_state import train_or_load
+from visadapt.learning.tuning import tune
 from visadapt.setups.cartpole import cartpole_states
 from visadapt.tasks.balance import EPISODE_STEPS
 

@@ -14,10 +14,11 @@ from tests.scenes import (
 from visadapt.effects import ActuatorDelay, ActuatorGain, ConstantForce, CoulombFriction, DynamicsEffect, Residual
 from visadapt.evaluation import score
 from visadapt.history import HORIZON, History
+from visadapt.learning.feedforward import initialise_feedforward
 from visadapt.learning.plans import ClosedLoop, imagine
-from visadapt.learning.policy import DivergedError, TuneSettings, initialise_feedforward, tune
 from visadapt.learning.streams import Streams
 from visadapt.learning.transitions import Transitions
+from visadapt.learning.tuning import DivergedError, TuneSettings, tune
 from visadapt.policies import ImagePolicy, StatePolicy
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import Episode

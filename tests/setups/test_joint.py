@@ -9,9 +9,9 @@ from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.joint import adapt
 from visadapt.learning.ledger import BudgetExceeded, Ledger
 from visadapt.learning.perception import PerceptionSettings
-from visadapt.learning.policy import TuneSettings
 from visadapt.learning.rounds import JointLearning
 from visadapt.learning.setup_settings import SetupSettings
+from visadapt.learning.tuning import TuneSettings
 from visadapt.policies import StatePolicy
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.recordings import read_recording

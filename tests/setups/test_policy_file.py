@@ -12,8 +12,8 @@ from tests.scenes import stir
 from visadapt.effects import EFFECTS
 from visadapt.effects.own import own_effects
 from visadapt.history import LENGTH, History
-from visadapt.learning.policy import TuneSettings
 from visadapt.learning.setup_settings import SetupSettings
+from visadapt.learning.tuning import TuneSettings
 from visadapt.policies import ReachPolicy, StatePolicy
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.setups.policy_file import describe, load_policy, load_source, residual_for, save_policy

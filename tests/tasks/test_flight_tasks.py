@@ -9,9 +9,9 @@ from tests.scenes import stir
 from visadapt.effects import LinearDrag, Residual
 from visadapt.history import HORIZON, LENGTH, History
 from visadapt.learning.plans import imagine
-from visadapt.learning.policy import TuneSettings, tune
 from visadapt.learning.streams import Streams
 from visadapt.learning.transitions import Transitions
+from visadapt.learning.tuning import TuneSettings, tune
 from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.systems import FixedWing, Quadrotor

@@ -14,7 +14,7 @@ from renderers import LayeredRenderer, save_renderer
 from renderers.training import fit
 from visadapt.cli.inputs import InputError, asked_for, progress, unfinished
 from visadapt.cli.target import load_target
-from visadapt.estimation.structure import size_of, structure
+from visadapt.estimation.frame_residuals import size_of, structure
 from visadapt.progress import staged
 from visadapt.recordings.hdf5 import read_names, read_recording
 from visadapt.storage.atomic_files import replacing

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor, nn
 
 from visadapt.effects.camera import Blur, CameraEffect, seen_by
+from visadapt.estimation.frame_residuals import white_noise
 from visadapt.estimation.poses import DIFFERENCE, SPACING
-from visadapt.estimation.structure import white_noise
 
 Camera = tuple[type[CameraEffect], ...]
 

@@ -80,7 +80,7 @@ class ClosedLoop(Plans):
         return loss
 
 
-class KeptPlans(Plans):
+class ReplayedPlans(Plans):
     """Plans from states drawn from all that the streams visited: few steps are simulated and few frames rendered.
 
     The gradient flows through physics and effects alone: the residual's correction is held over a plan, and no frame is

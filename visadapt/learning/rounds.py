@@ -17,12 +17,13 @@ from torch import Tensor
 
 from visadapt.effects import Residual
 from visadapt.learning.explanation import NOT_DIAGNOSED, Explain, Explanation
+from visadapt.learning.feedforward import initialise_feedforward
 from visadapt.learning.grounding import GroundLoss, fit_named, ground, rescale
 from visadapt.learning.ledger import Ledger
-from visadapt.learning.policy import initialise_feedforward, tune
 from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.stability import stable
 from visadapt.learning.transitions import Observe, Transitions
+from visadapt.learning.tuning import tune
 from visadapt.policies import Policy
 from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.progress import Progress, Report, staged

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.perception import PerceptionSettings
-from visadapt.learning.policy import TuneSettings
+from visadapt.learning.tuning import TuneSettings
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import torch
 
-from visadapt.learning.policy import TuneSettings, plans_of
 from visadapt.learning.transitions import Observe, Transitions
+from visadapt.learning.tuning import TuneSettings, plans_of
 from visadapt.policies import Policy
 from visadapt.world import World
 
@@ -33,7 +33,7 @@ def stable(
 ) -> bool:
     """Whether the policy, from where its tuning starts, keeps the cost of its plans in `world` near that of the first.
 
-    The arguments are those of `learning.policy.tune`.
+    The arguments are those of `learning.tuning.tune`.
     """
     plans = plans_of(policy, world, observe, settings, generator, transitions)
     plans.streams.start(1.0, generator)

@@ -22,7 +22,7 @@ class Policy(nn.Module):
 
     The correction enters the plan directly as a feed-forward, which can oppose a predicted force, and in some policies
     also as an input beside the history; both have zero weights at first.
-    `learning.policy.initialise_feedforward` gives the feed-forward its weights once there is a residual.
+    `learning.feedforward.initialise_feedforward` gives the feed-forward its weights once there is a residual.
 
     >>> import torch, visadapt as va
     >>> from visadapt.history import History

@@ -16,11 +16,11 @@ from visadapt.effects.catalogue import sized
 from visadapt.estimation.effect_fit import check_fittable
 from visadapt.learning.joint import Adapted, adapt
 from visadapt.learning.ledger import Ledger
-from visadapt.learning.policy import tune
 from visadapt.learning.rounds import JointLearning, Label
 from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.training_state import train_or_load
 from visadapt.learning.transitions import Observe
+from visadapt.learning.tuning import tune
 from visadapt.policies import ImagePolicy, Policy
 from visadapt.progress import Report, staged
 from visadapt.setups.explained import explained

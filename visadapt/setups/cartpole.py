@@ -14,10 +14,10 @@ from renderers import LayeredRenderer, RendererError, load_renderer
 from visadapt.effects import CameraEffect
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.perception import PerceptionSettings, learn_to_see
-from visadapt.learning.policy import TuneSettings
 from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.tracking import Tracker
 from visadapt.learning.training_state import train_or_load
+from visadapt.learning.tuning import TuneSettings
 from visadapt.policies import ImagePolicy, Policy, StatePolicy
 from visadapt.progress import Report, staged
 from visadapt.setups.base import Setup

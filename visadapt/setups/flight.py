@@ -6,8 +6,8 @@ from functools import partial
 
 from visadapt.history import LENGTH
 from visadapt.learning.grounding import GroundSettings
-from visadapt.learning.policy import TuneSettings
 from visadapt.learning.setup_settings import SetupSettings
+from visadapt.learning.tuning import TuneSettings
 from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.setups.base import Setup
 from visadapt.setups.policy_file import residual_for

@@ -16,8 +16,8 @@ from visadapt.diagnosis.search.causes import Z_90
 from visadapt.effects import EFFECTS, Blur, Brightness, CameraEffect, CameraShift, Gamma, Occlusion
 from visadapt.effects.camera import moved
 from visadapt.estimation.camera_fit import Camera, CameraFit, fit_camera, made, through
+from visadapt.estimation.frame_residuals import MAX_FRAME_RATIO, evenly_spaced, white_noise
 from visadapt.estimation.poses import PoseFinder
-from visadapt.estimation.structure import MAX_FRAME_RATIO, evenly_spaced, white_noise
 from visadapt.progress import Progress
 
 SEARCHED: Camera = tuple(kind for kind in EFFECTS.values() if issubclass(kind, CameraEffect) and kind.in_one_frame)

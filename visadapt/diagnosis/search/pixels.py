@@ -14,7 +14,7 @@ from visadapt.diagnosis.result import Box, Pixels
 from visadapt.effects import CameraEffect, CameraShift
 from visadapt.effects.camera import moved
 from visadapt.estimation.camera_fit import within_frame
-from visadapt.estimation.structure import MAX_FRAME_RATIO, evenly_spaced, size_of, structure
+from visadapt.estimation.frame_residuals import MAX_FRAME_RATIO, evenly_spaced, size_of, structure
 
 MAX_LEFT_OUT = 0.1  # Share of the frames that may be left out because their residual is far larger than most
 

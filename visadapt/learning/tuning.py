@@ -6,7 +6,7 @@ in closed loop, the policy decides anew at each of K steps. Each stream then mov
 closed loop, by all K. A stream further than delta_div from the reference starts anew, and delta_div grows as training
 goes on, so the policy learns to recover from ever further off.
 
-Where visited states are kept (`TuneSettings.streams`, `KeptPlans`), the feed-forward is not tuned: it reads a noisy
+Where visited states are kept (`TuneSettings.streams`, `ReplayedPlans`), the feed-forward is not tuned: it reads a noisy
 estimate of the correction that acts, and would learn to oppose only a part of it.
 """
 
@@ -16,12 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
-from visadapt.effects import DynamicsEffect, Effect
-from visadapt.estimation.linearise import linearise_step
-from visadapt.history import HORIZON
-from visadapt.learning.plans import ClosedLoop, KeptPlans, Plans
+from visadapt.learning.plans import ClosedLoop, Plans, ReplayedPlans
 from visadapt.learning.streams import Streams
 from visadapt.learning.training_state import TrainingState
 from visadapt.learning.transitions import Observe, Transitions
@@ -29,11 +25,6 @@ from visadapt.policies import Policy
 from visadapt.progress import Progress
 from visadapt.tasks.base import Task
 from visadapt.world import World
-
-LASTING_COMMAND, LASTING_ROWS = 0.2, 40
-"""Command, and periods that it lasts, by which the gain of a chain of actuation effects is measured."""
-LEAST_GAIN = 0.05
-"""Gain below which a command counts as lost in a dead zone: dividing by it would ask for more than there is."""
 
 
 class DivergedError(RuntimeError):
@@ -70,37 +61,6 @@ class TuneSettings:
             raise ValueError(f"closed_loop decides at every step, so no states are kept: got streams = {self.streams}")
 
 
-def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None:
-    """Make the feed-forward cancel the correction that the residual predicts, by least squares about rest.
-
-    Effects with dry friction are left out of the linearisation, as if every joint were moving: at rest, dry friction
-    would let no small command through. `scale` (n_state,) is the residual's, the unit of the corrections that the
-    policy reads.
-    """
-    effects = [effect for effect in source.effects if isinstance(effect, Effect)]
-    source = source.with_effects([e for e in effects if not (isinstance(e, DynamicsEffect) and e.rubs())])
-    rest = torch.zeros(1, policy.n_state, dtype=torch.float64)
-    still = rest.new_zeros(1, source.substeps, policy.n_action)
-    with torch.no_grad():
-        step = linearise_step(source, source.values.to(rest), rest[:, 0], rest, still, by_state=False, by_command=True)
-        by_command = step.by_command[0] * lasting_gain(source).to(rest)
-        undo = -torch.linalg.pinv(by_command / scale.to(rest)[:, None])
-        policy.feedforward.weight.copy_(undo.repeat(HORIZON, 1))
-
-
-def lasting_gain(source: World) -> Tensor:
-    """(n_action,) steady-state gain of the actuation effects: what acts per unit of a constant command.
-
-    Measured after LASTING_ROWS periods of +-LASTING_COMMAND; 1 where its magnitude is at most LEAST_GAIN.
-    """
-    with torch.no_grad():
-        given = LASTING_COMMAND * torch.ones(2, LASTING_ROWS, len(source.system.actions), dtype=torch.float64)
-        given[1] *= -1
-        acting = source.actuate(given)[:, -1, -1]
-    gain = (acting[0] - acting[1]) / (2 * LASTING_COMMAND)
-    return torch.where(gain.abs() > LEAST_GAIN, gain, 1.0)
-
-
 def plans_of(
     policy: Policy,
     world: World,
@@ -118,7 +78,7 @@ def plans_of(
         return ClosedLoop(*given)
     if settings.streams is None:
         return Plans(*given)
-    return KeptPlans(*given, settings.batch, settings.every)
+    return ReplayedPlans(*given, settings.batch, settings.every)
 
 
 def tune(
