@@ -94,11 +94,12 @@ class TestEvaluate:
         assert all((r.episode.samples == 60) == r.survived for r in runs)
 
 
-def test_what_is_no_cart_and_no_flight_is_not_scored_as_one():
+@pytest.mark.parametrize("system", [FixedWing(), FixedWing], ids=["known", "of unknown parameters"])
+def test_what_is_no_cart_and_no_flight_is_not_scored_as_one(system):
     class Motor(SyntheticTarget):
         def __init__(self):
             super().__init__()
-            self.system = FixedWing()
+            self.system = system
 
     with pytest.raises(ValueError, match="is a fixed_wing: use run"):
         score(load_policy(shipped("cartpole_states")), Motor(), episodes=1)

@@ -99,9 +99,9 @@ def score(
         return _score_flights(runs, target)
     if policy.shown == "state and goal":
         raise ValueError(f"{target.name}: flights are scored by their task: derive the target from FlightTarget")
-    system = getattr(target, "system", None)
-    if isinstance(system, System) and not isinstance(system, CartPole):
-        raise ValueError(f"a score is that of a cart's speed or of a flight; {target.name} is a {system.name}: use run")
+    kind = type(target.system) if isinstance(target.system, System) else target.system
+    if kind is not None and not issubclass(kind, CartPole):
+        raise ValueError(f"a score is that of a cart's speed or of a flight; {target.name} is a {kind.name}: use run")
     return score_runs(run(target, policy, episodes, steps or EPISODE_STEPS, generator))
 
 

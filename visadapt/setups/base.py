@@ -176,8 +176,7 @@ class Setup:
         """
         self.check_adaptation(policy, target)
         asked = {"target": target.name, "samples": budget, "round": round_samples, "seed": seed, "diagnose": diagnose}
-        system = getattr(target, "system", None)
-        asked["machine"] = parameters_of(system) if isinstance(system, System) else None
+        asked["machine"] = parameters_of(target.system) if isinstance(target.system, System) else None
         asked |= {"policy": weights_digest(policy), "explorer": None if explorer is None else weights_digest(explorer)}
         open_run(folder, {**asked, "known": describe(self.source), **self.settings.numbers()}, "adaptation.json")
         residual = _seeded(seed, partial(self.residual, policy, self.source)).to(next(policy.parameters()))

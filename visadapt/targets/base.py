@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from visadapt.systems import System
+
 
 class TargetError(RuntimeError):
     """The target did something that no adaptation can go on from; the message says what, in one line."""
@@ -58,6 +60,8 @@ class Target(ABC):
     period: float
     """s between actions"""
     n_action: int
+    system: System | type[System] | None = None
+    """the machine's system, or its class where its parameters are not known; None where not even that is known"""
 
     @abstractmethod
     def reset(self, batch: int, generator: torch.Generator) -> Observation:

@@ -68,7 +68,7 @@ class GymnasiumTarget(Target):
         mujoco_frames.choose_backend()
         self._source = env
         self.mapping = mapping
-        self.system = system
+        self.system: type[System] = system
         self.frames = frames
         self.name = name or str(env)
         first = self._make()

@@ -89,7 +89,7 @@ class WorldTarget(Target):
     """A batch of worlds with hidden effects, as `fine_world` integrates them."""
 
     def __init__(self, system: System, period: float, draw_effects: DrawEffects) -> None:
-        self.system = system
+        self.system: System = system
         self.period = period
         self.n_action = len(system.actions)
         self.draw_effects = draw_effects
