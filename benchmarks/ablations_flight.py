@@ -40,7 +40,7 @@ def without_history(setup: Setup, policy: Policy) -> Setup:
 def without_disturbance_estimate(setup: Setup, policy: Policy) -> Setup:
     """The residual reads the history, but the policy reads the residual's correction alone."""
     assert isinstance(policy, FlightPolicy)
-    for layer in (policy.hearing, policy.answer):  # zero in the source, where there is no estimate
+    for layer in (policy.disturbance_in, policy.disturbance_out):  # zero in the source, where there is no estimate
         layer.requires_grad_(False)
     return setup
 
@@ -49,7 +49,7 @@ def with_output_layers_alone(setup: Setup, policy: Policy) -> Setup:
     """Of the policy, the maps to its commands alone are tuned."""
     assert isinstance(policy, FlightPolicy)
     policy.requires_grad_(False)
-    for layer in (policy.out, policy.straight, policy.answer):
+    for layer in (policy.out, policy.skip, policy.disturbance_out):
         layer.requires_grad_(True)
     return setup
 

@@ -116,7 +116,7 @@ class TestPolicies:
         pushed.observations[:, :-1, 3] -= torch.linspace(0.4, 0.1, LENGTH - 1).double()
         assert torch.equal(policy(pushed), policy(calm))
         with torch.no_grad():
-            policy.answer.weight.fill_(0.1)
+            policy.disturbance_out.weight.fill_(0.1)
         assert (policy(pushed) - policy(calm)).abs().min() > 1e-3
 
     def test_weights_come_back_from_a_file_as_they_were(self, kind, tmp_path):

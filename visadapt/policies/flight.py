@@ -36,14 +36,14 @@ class FlightPolicy(Policy):
         self.first = nn.Linear(n_own + self.n_state, width)
         self.rest = mlp(width, width, width)
         self.out = nn.Linear(width, HORIZON * n_action)
-        self.straight = nn.Linear(n_own, HORIZON * n_action, bias=False)
+        self.skip = nn.Linear(n_own, HORIZON * n_action, bias=False)
         # Last, so that the initial weights of the other layers do not depend on these.
-        self.hearing = nn.Linear(N_DISTURBANCE, width, bias=False)
-        self.answer = nn.Linear(N_DISTURBANCE, HORIZON * n_action, bias=False)
+        self.disturbance_in = nn.Linear(N_DISTURBANCE, width, bias=False)
+        self.disturbance_out = nn.Linear(N_DISTURBANCE, HORIZON * n_action, bias=False)
         ignore_correction(self.first, self.n_state)
         with torch.no_grad():
             self.out.weight.mul_(0.1)
-            for layer in (self.straight, self.hearing, self.answer):
+            for layer in (self.skip, self.disturbance_in, self.disturbance_out):
                 layer.weight.zero_()
 
     def own_inputs(self, state: Tensor, goal: Tensor, axes: Tensor) -> Tensor:
@@ -66,8 +66,8 @@ class FlightPolicy(Policy):
 
     def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:
         own, disturbance = inputs[:, :-N_DISTURBANCE], inputs[:, -N_DISTURBANCE:]
-        hidden = self.rest((self.first(torch.cat((own, correction), 1)) + self.hearing(disturbance)).tanh()).tanh()
-        out: Tensor = self.out(hidden) + self.straight(own) + self.answer(disturbance)
+        hidden = self.rest((self.first(torch.cat((own, correction), 1)) + self.disturbance_in(disturbance)).tanh()).tanh()
+        out: Tensor = self.out(hidden) + self.skip(own) + self.disturbance_out(disturbance)
         return out
 
     def disturbance(self, history: History) -> Tensor:
