@@ -14,6 +14,7 @@ from visadapt.effects import (
     ActuatorGain,
     ActuatorLag,
     AngleOffset,
+    CameraShift,
     CartMass,
     ConstantForce,
     Dropout,
@@ -21,7 +22,11 @@ from visadapt.effects import (
     FrictionPatch,
     Gust,
     MeasurementDelay,
+    PoleDamping,
+    PoleMass,
+    QuadraticDrag,
     Residual,
+    RotorDrag,
     RotorEfficiency,
     SensorScale,
     Spring,
@@ -299,6 +304,70 @@ class TestResidual:
         state, actions = inputs()
         with pytest.raises(ValueError, match="needs the history"):
             world.step(world.start(state), actions[0])
+
+
+@pytest.mark.parametrize(
+    ("system", "effects", "period"),
+    [
+        (Quadrotor(roll_gain=100.0), [], 0.1),
+        (CartPole(cart_mass=0.2, pole_mass=0.02), [ViscousFriction(coefficient=30.0)], 0.05),
+        (CartPole(), [QuadraticDrag(coefficient=20.0)], 0.05),
+        (CartPole(), [PoleMass(scale=0.02), PoleDamping(coefficient=0.2)], 0.05),
+    ],
+    ids=["gain", "light", "drag", "damping"],
+)
+def test_steps_follow_a_system_that_its_parameters_or_effects_make_fast(system, effects, period):
+    rigid = isinstance(system, Quadrotor)
+    state = torch.eye(13)[6:7] if rigid else torch.tensor([[0.0, 5.0, 0.1, 2.0]])
+    action = torch.tensor([[0.0, 0.5, 0.0, 0.0]]) if rigid else torch.tensor([[0.1]])
+    world, exact = World(system, effects, period), World(system, effects, period, substeps=400)
+    at, reference = world.start(state.double()), exact.start(state.double())
+    for _ in range(5):
+        at, reference = world.step(at, action.double()), exact.step(reference, action.double())
+    torch.testing.assert_close(at.state, reference.state, rtol=0.02, atol=0.01)
+    assert World(system, [], period).with_effects(effects).substeps == world.substeps
+
+
+def test_effects_may_come_from_an_iterator():
+    world = World(CartPole(), (effect for effect in [Gust(start=0.1, end=0.2, force=1.0)]))
+    assert [effect.name for effect in world.effects] == ["gust"]
+    assert world.substeps == 4
+
+
+def test_parameters_of_one_effect_may_be_one_for_all_rows_or_one_for_each():
+    state, action = torch.randn(2, 13, generator=torch.Generator().manual_seed(0)).double(), torch.zeros(2, 4).double()
+    state[:, 6:10] = torch.tensor([1.0, 0, 0, 0])
+    drags = [RotorDrag(coefficient_x=x, coefficient_y=0.3, coefficient_z=0.2) for x in (torch.tensor([0.1, 0.4]), 0.4)]
+    together, alone = (World(Quadrotor(), [drag], 0.1) for drag in drags)
+    after = together.step(together.start(state), action).state
+    torch.testing.assert_close(after[1:], alone.step(alone.start(state[1:]), action[1:]).state)
+    seen = CameraShift(dx=torch.tensor([1.0, 2.0]), dy=0.5).motion(state)
+    torch.testing.assert_close(seen[1], CameraShift(dx=2.0, dy=0.5).motion(state))
+
+
+def test_time_does_not_drift_in_single_precision():
+    world = World(Mass(), period=0.001)
+    at, action = world.start(torch.zeros(1, 4), torch.tensor([59.0])), torch.zeros(1, 1)
+    for _ in range(1000):
+        at = world.step(at, action)
+    assert float(at.time) == pytest.approx(60.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("effect", [ActuatorDelay(delay=0.07), MeasurementDelay(delay=0.12)])
+def test_a_batch_may_be_empty(effect):
+    world = World(CartPole(), [effect])
+    measured, at = world.measure(world.start(torch.zeros(0, 4)))
+    assert world.measure(world.step(at, torch.zeros(0, 1)))[0].shape == measured.shape == (0, 4)
+
+
+def test_the_states_have_the_precision_of_those_that_were_given():
+    world = World(CartPole(cart_mass=torch.tensor([1.0, 2.0], dtype=torch.float64)))
+    assert world.step(world.start(torch.zeros(2, 4)), torch.zeros(2, 1)).state.dtype == torch.float32
+
+
+def test_an_episode_cannot_start_from_states_without_the_commands_between_them():
+    with pytest.raises(ValueError, match="start with states needs the commands between them"):
+        World(CartPole()).start(torch.zeros(1, 4), torch.tensor([0.1]), states=torch.zeros(1, 3, 4))
 
 
 def test_an_effect_of_another_system_is_refused():

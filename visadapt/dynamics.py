@@ -11,6 +11,10 @@ from visadapt.effects import DynamicsEffect
 from visadapt.systems import System
 from visadapt.systems.dry_friction import Limits, sliding, stopped
 from visadapt.systems.integrators import INTEGRATORS, Duration
+from visadapt.systems.stiffness import longest_step, parameters
+
+EDGE_STEP = 0.0125
+"""s, integration step that resolves the edges of abrupt loads (`PulseLaw`, `FrictionPatch`)."""
 
 
 class Dynamics:
@@ -23,6 +27,7 @@ class Dynamics:
         self.system = system
         self.integrator = integrator
         self._effects = effects
+        self._constant = not any(isinstance(value, Tensor) for _, value in parameters(system))
         # Most effects do one of these three alone, and a step asks for them at every derivative.
         self._varying = [e for e in effects if type(e).vary is not DynamicsEffect.vary]
         self._loading = [e for e in effects if type(e).load is not DynamicsEffect.load]
@@ -35,7 +40,19 @@ class Dynamics:
         system = self.system
         for effect in self._effects:
             system = effect.alter(system)
-        return system if system is self.system else system.to(like)
+        return system if system is self.system and self._constant else system.to(like)
+
+    def longest_step(self) -> float:
+        """s, the longest Runge-Kutta step for the system under its effects, as their parameters are now."""
+        edges = any(effect.abrupt and not effect.rubs() for effect in self._effects)
+        system = self.altered(torch.zeros(0, dtype=torch.float64))
+
+        def load(state: Tensor) -> Tensor:
+            time = torch.zeros_like(state[:, 0])
+            return self._load(time, state, self.varied(system, time, state))
+
+        follows = longest_step(system, load if self._loading or self._varying else None)
+        return min(EDGE_STEP, follows) if edges else follows
 
     def varied(self, system: System, time: Tensor, state: Tensor) -> System:
         """The system with the parameters that effects give it at the time (B,) in the state (B, n_state)."""

@@ -9,8 +9,9 @@ import torch
 
 import visadapt as va
 from visadapt.diagnosis.result import Cause, Diagnosis, Estimate, Gap, RecordingSummary, Where
-from visadapt.systems import System, Variable
+from visadapt.systems import RigidBody, System, Variable
 from visadapt.systems.base import holds
+from visadapt.systems.contract import complaints
 
 RANGES = (Variable("angle", "rad", -3.0, 3.0), Variable("rate", "rad/s", -10.0, 10.0))
 SHAFT = (Variable("shaft", "N m", -1.0, 1.0),)
@@ -99,6 +100,57 @@ def test_a_machine_with_a_fast_circuit_is_simulated_in_steps_that_follow_it():
     assert found.verdict == "no_gap"
 
 
+def test_a_machine_whose_circuit_is_faster_than_the_default_one_is_diagnosed_too():
+    faster = MotorWithCoil(inductance=0.003)
+    recording = record(va.World(faster, period=0.02, substeps=100))
+    names = ("shaft.viscous_friction", "inductance.scale", "resistance.scale")
+    found = va.diagnose(recording, va.World(MotorWithCoil(), period=0.02), of(MotorWithCoil(), *names))
+    assert [cause.effect for cause in found.causes] == ["inductance.scale"]
+    assert found.causes[0].parameters["scale"].value == pytest.approx(0.3, rel=0.02)
+    assert va.diagnose(recording, va.World(faster, period=0.02), of(MotorWithCoil(), *names)).verdict == "no_gap"
+
+
+@dataclass(frozen=True)
+class Hexacopter(RigidBody):
+    """Six rotors: thrust along its own axis, and torques."""
+
+    mass: float | torch.Tensor = 2.0  # kg
+    gravity: float | torch.Tensor = 9.81  # m/s2
+
+    name = "some_hexacopter"
+    actions: ClassVar[tuple[Variable, ...]] = tuple(Variable(f"action_{k}", "1", -1.0, 1.0) for k in range(4))
+
+    def inertia(self, like):
+        return torch.diag(torch.tensor([0.02, 0.02, 0.04])).to(like)
+
+    def wrench(self, velocity, rates, command):
+        thrust = self.mass * self.gravity * (1 + command[:, 0])
+        return torch.nn.functional.pad(thrust[:, None], (2, 0)), 0.1 * command[:, 1:] - 0.05 * rates
+
+
+def test_a_rigid_body_of_ones_own_is_diagnosed_by_the_effects_on_every_vehicle():
+    assert complaints(Hexacopter) == []
+    generator, episodes = torch.Generator().manual_seed(0), []
+    world = va.World(Hexacopter(), [va.effects.ConstantForce(force=0.6)], 0.05).double()
+    for _ in range(4):
+        at, rows, commands = world.start(torch.eye(13)[6:7].double()), [], []
+        for row in range(25):
+            if row % 5 == 0:
+                command = 0.3 * torch.randn(1, 4, generator=generator).double().clamp(-1, 1)
+            rows.append(at.state + 0.005 * torch.randn(1, 13, generator=generator))
+            commands.append(command)
+            at = world.step(at, command)
+        seen, given = (torch.cat(each).detach().numpy() for each in (rows, commands))
+        episodes.append(va.Episode(0.05 * np.arange(25.0), given, seen))
+    columns = tuple(state.name for state in Hexacopter.states)
+    recording = va.Recording(tuple(episodes), columns, 0.05, tuple("abcd"))
+    pair = [va.effects.ConstantForce, va.effects.ActuatorGain]
+    found = va.diagnose(recording, va.World(Hexacopter(), period=0.05), pair)
+    assert [cause.effect for cause in found.causes] == ["constant_force"]
+    assert found.causes[0].parameters["force"].value == pytest.approx(0.6, rel=0.05)
+    assert {"constant_force", "actuator_delay"} < {effect.name for effect in va.catalogue(Hexacopter())}
+
+
 def test_a_quadrotor_s_rate_loop_is_followed_at_the_references_period():
     world, exact = va.World(va.Quadrotor(), period=0.1), va.World(va.Quadrotor(), period=0.1, substeps=100)
     at, command = world.start(torch.eye(13)[6:7]), torch.tensor([[0.0, 0.5, 0.0, 0.0]])
@@ -164,9 +216,10 @@ def test_effects_of_the_diagnosed_system_are_given_where_another_has_the_same_na
     assert va.World(Motor(), found.effects()).table[0].name == "coefficient"
 
 
-def test_a_parameter_may_not_be_called_as_a_method_of_effects_is():
-    with pytest.raises(ValueError, match="slope_drag: half is a method of every effect, so no parameter can be"):
+@pytest.mark.parametrize("taken", ["half", "order", "training"])
+def test_a_parameter_may_not_be_called_as_what_every_effect_has(taken):
+    with pytest.raises(ValueError, match=f"slope_drag: every effect has something else that is called {taken}"):
 
         class Slope(va.DynamicsEffect):
             name = "slope_drag"
-            table = (va.Parameter("half", "N", 0.0, 1.0, 0.0),)
+            table = (va.Parameter(taken, "N", 0.0, 1.0, 0.0),)

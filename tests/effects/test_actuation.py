@@ -34,6 +34,19 @@ def acting(effect, values, substep=0.01):
     return out[0, :, 0].tolist()
 
 
+def test_a_delay_remembers_enough_where_the_clock_bursts():
+    held = torch.full((1, 60), 0.01, dtype=torch.float64)
+    held[0, 20], held[0, 21:36] = 0.015, 0.004
+    commands = torch.rand(1, 60, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    effect = ActuatorDelay(delay=0.03).double()
+    world = World(CartPole(), [effect], 0.01, substeps=1)
+    whole = world.actuate(commands, held)
+    (memory,) = world.memories(torch.zeros(1, 4, dtype=torch.float64), commands, held=held)
+    for row in range(60):
+        alone, _ = effect.apply_to(commands[:, [row]], memory[:, row], held[:, [row]])
+        torch.testing.assert_close(alone[:, 0], whole[:, row, 0])
+
+
 @pytest.mark.parametrize("name", CHAIN)
 @given(data=st.data())
 @settings(max_examples=10)

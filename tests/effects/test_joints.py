@@ -47,6 +47,10 @@ def test_added_inertia_is_that_of_a_heavier_arm():
     torch.testing.assert_close(
         found.derivative(STATE, command, load), heavier.derivative(STATE, command, load), rtol=1e-6, atol=1e-6
     )
+    twice = World(FURUTA, [BY_NAME["arm_axis.added_inertia"](inertia=5e-5) for _ in range(2)]).altered(STATE)
+    torch.testing.assert_close(
+        twice.derivative(STATE, command, load), heavier.derivative(STATE, command, load), rtol=1e-6, atol=1e-6
+    )
     scaled: Any = World(FURUTA, [added, BY_NAME["half_length.scale"](scale=2.0)]).altered(STATE)
     assert scaled.half_length.item() == pytest.approx(0.129)
 

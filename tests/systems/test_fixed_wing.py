@@ -24,6 +24,15 @@ def test_trimmed_flight_stays_level_for_ten_seconds(wing):
     torch.testing.assert_close(at.state[:, 1:], state[:, 1:], rtol=0, atol=1e-6)
 
 
+def test_in_wind_the_airspeed_is_what_was_asked_for():
+    wing, still = FixedWing(wind_x=3.0, wind_y=-2.0), FixedWing()
+    (state, command), (calm, held) = (each.trim(torch.tensor([12])) for each in (wing, still))
+    torch.testing.assert_close(state - calm, torch.tensor([[0.0, 0, 0, 3, -2, 0, 0, 0, 0, 0, 0, 0, 0]]))
+    torch.testing.assert_close(command, held)
+    at = World(wing, period=0.05).step(World(wing, period=0.05).start(state), command)
+    torch.testing.assert_close(at.state[:, 3:], state[:, 3:], rtol=0, atol=1e-5)
+
+
 def test_trim_at_the_start_speed_of_the_paper():
     state, command = FixedWing().trim(torch.tensor([11.5]))
     assert state.dtype == command.dtype == torch.float32

@@ -282,7 +282,7 @@ GOOD = table_of(np.arange(0, 1.05, 0.1), circle(np.arange(0, 1.05, 0.1))[0])
             lambda text: text.replace("\n0.3,", "\n0.1,"),
             r"row 4 \(line 5\), column 'time': the clock runs backward \(from 0.2",
         ),
-        (lambda text: "\n".join(text.split("\n")[:3]), r"2 rows over 0.1 s; at least 3 rows over 0.2 s"),
+        (lambda text: "\n".join(text.split("\n")[:3]), r"2 rows over 0.1 s; at least 3 rows over 0.5 s"),
         (lambda text: text.replace("\n0.5,", "\n0.5,9"), r"it moves at .* m/s; at most 5 m/s is right"),
         (lambda text: text.replace("\n0.5,", "\n0.5,x"), r"row 6 \(line 7\), column 'x' is"),
         (lambda text: "", "is empty"),

@@ -151,7 +151,11 @@ def diagnose(
         ranking=ranking(comparison, explored.effects, system, measured.closed, repeats),
         gap=measured.gap,
         next_experiment=next_step(search, comparison, verdict, groups, measured.gap, prepared.coarse),
-        warnings=(*used.warnings, *_warnings(explored, measured, verdict, found, recording.sources[0])),
+        warnings=(
+            *used.warnings,
+            *(f"{effect.name}: {NOT_SEARCHED}" for effect in effects if _is_left_out(effect, system)),
+            *_warnings(explored, measured, verdict, found, recording.sources[0]),
+        ),
         figures=replace(
             figure_data(search, measured.source, measured.corrected, measured.errors, before, after, regions),
             # Of a film that is too long, stretches were used, whose episodes are not the film's.
@@ -238,6 +242,14 @@ def _warnings(
         yield from phases_of_episodes(comparison.best)
     carrying = {cause.effect for cause in without_slight(found)}
     yield from (f"{one.name}: {one.caveat}" for one in comparison.best.effects if one.caveat and one.name in carrying)
+
+
+NOT_SEARCHED = "what it reads depends on earlier rows, so it is not among the effects that are searched"
+
+
+def _is_left_out(effect: type[Effect], system: System) -> bool:
+    """Whether it is a sensor with memory, which is found neither by its repeated readings nor by the search."""
+    return not effect.repeats_readings and remembers(effect, system)
 
 
 def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:

@@ -66,7 +66,9 @@ class ActuatorDelay(ActuationEffect):
     def memory(self, commands: Tensor, substep: float) -> Tensor:
         # Past commands, how long each was held, and the number of substeps in a period, over twice the delay, so that
         # it suffices for substeps half as long.
-        delay = self.value("delay", commands).detach()
+        delay = self.value("delay", commands).detach().expand(len(commands))
+        if not len(delay):
+            return commands.new_zeros(0, 1, commands.shape[-1] + 2)
         if not bool((delay >= 0).all()):
             raise ValueError(f"actuator_delay: delay must not be negative, got {float(delay.min()):g} s")
         reach = 2 * math.ceil(float(delay.max()) / substep) + 1
@@ -76,6 +78,8 @@ class ActuatorDelay(ActuationEffect):
 
     def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
         batch, count, width = commands.shape
+        if not batch:
+            return commands, memory
         held = torch.as_tensor(substep, dtype=commands.dtype, device=commands.device).expand(batch, count)
         period = memory[:, -1:, -1:].expand(-1, count, -1)
         past = torch.cat((memory, torch.cat((commands, held[..., None], period), -1)), 1)

@@ -71,7 +71,7 @@ class RotorDrag(DynamicsEffect):
     def load(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         turned = rotation(state[:, ATTITUDE])
         velocity = matvec(turned.mT, airspeed(state, require_system(system, self)))
-        coefficients = torch.stack([self.value(p.name, state) for p in self.table], -1)
+        coefficients = torch.stack(torch.broadcast_tensors(*(self.value(p.name, state) for p in self.table)), -1)
         return pad(-matvec(turned, coefficients * velocity), (0, 3))
 
 

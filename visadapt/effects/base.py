@@ -123,10 +123,11 @@ class Effect(nn.Module):
             if taken is not None and taken.__qualname__ != cls.__qualname__:
                 raise ValueError(f"the effect name {cls.name!r} is taken by {taken.__module__}.{taken.__qualname__}")
             for parameter in cls.table:
-                if callable(getattr(cls, parameter.name, None)):
+                own = ("training", *Effect.__annotations__)
+                if parameter.name in own or callable(getattr(cls, parameter.name, None)):
                     raise ValueError(
-                        f"{cls.name}: {parameter.name} is a method of every effect, so no parameter can be called so: "
-                        "name it otherwise"
+                        f"{cls.name}: every effect has something else that is called {parameter.name}, so no parameter "
+                        "can be called so: name it otherwise"
                     )
             EFFECTS[cls.name] = cls
 

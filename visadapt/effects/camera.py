@@ -159,7 +159,7 @@ class CameraShift(CameraEffect):
     table = (Parameter("dx", "px", -20.0, 20.0, 0.0), Parameter("dy", "px", -20.0, 20.0, 0.0))
 
     def motion(self, like: Tensor) -> Tensor:
-        dx, dy = self.value("dx", like), self.value("dy", like)
+        dx, dy = torch.broadcast_tensors(self.value("dx", like), self.value("dy", like))
         moved_by = torch.stack((dx, dy, torch.zeros_like(dx)), -1)
         return torch.eye(3).to(like) + moved_by[..., None] * like.new_tensor([0.0, 0.0, 1.0])
 

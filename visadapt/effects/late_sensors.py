@@ -36,6 +36,8 @@ class Late(Effect):
 
     def memory(self, state: Tensor, period: float) -> Tensor:
         shift = self._shift(state, period).detach()
+        if not len(state):
+            return torch.cat((state, state[:, :1]), 1)[:, None]
         if not bool((shift >= 0).all()):
             raise ValueError(f"{self.name}: delay must not be negative, got {float(shift.min()) * period:g} s")
         # Each row carries its number, so that no row from before the episode is interpolated.

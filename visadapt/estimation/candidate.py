@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import torch
 from torch import Tensor
@@ -27,6 +28,7 @@ from visadapt.estimation.segments import Segments
 from visadapt.estimation.unmodelled_loads import leading_loads, noise_directions, response_without_friction
 from visadapt.systems import System
 from visadapt.systems.integrators import steps_within
+from visadapt.systems.stiffness import Parameters, longest_step, parameters
 from visadapt.world import World, WorldState
 
 COARSEST, COARSE, FINE = 0, 1, 2
@@ -35,6 +37,23 @@ quick fits, and for reported results."""
 
 SHORT_PERIOD = 0.005
 """s: up to it the midpoint rule is accurate enough for what is not reported, and takes half as long."""
+
+
+STABLE = 2.0
+"""Ratio, to the longest step that is accurate, of one in which Runge-Kutta is stable."""
+
+
+@lru_cache(1024)
+def stable_step(kind: type[System], values: Parameters, effect: type[Effect]) -> float:
+    """s, the longest step in which a system stays stable wherever in its range an effect alters a parameter.
+
+    In a longer one the fit of a machine near the end of the range would meet numbers that are not finite.
+    """
+    if not issubclass(effect, DynamicsEffect) or effect.alter is DynamicsEffect.alter:
+        return math.inf
+    system = kind(**dict(values))
+    ends = ({p.name: p.low for p in effect.table}, {p.name: p.high for p in effect.table})
+    return STABLE * min(longest_step(effect(**each).alter(system)) for each in ends)
 
 
 class CandidateModel:
@@ -49,16 +68,19 @@ class CandidateModel:
         self.effects = tuple(effects)
         self.rows = rows
         self.accuracy = accuracy
-        smooth = self.profile.coarsest_step if accuracy == COARSEST else self.profile.longest_step
-        longest_step = smooth
+        smooth = self.profile.coarsest_step
+        if accuracy > COARSEST:
+            own = type(system), parameters(system)
+            smooth = min([self.profile.longest_step, *(stable_step(*own, effect) for effect in effects)])  # type: ignore[arg-type]  # hashable, as types
+        resolving = smooth
         if any(effect.abrupt for effect in effects):
-            longest_step = min(longest_step, self.profile.longest_abrupt_steps[accuracy])
+            resolving = min(smooth, self.profile.longest_abrupt_steps[accuracy])
         longest = float(rows.held.max())
         integrator = "midpoint" if accuracy < FINE and rows.period <= SHORT_PERIOD else "rk4"
         placeholders = [effect(**{parameter.name: 0.0 for parameter in effect.table}) for effect in effects]
         self._world, self._smooth = (
             World(system, placeholders, rows.period, integrator, steps_within(longest, step))
-            for step in (longest_step, smooth)
+            for step in (resolving, smooth)
         )
         self._only_commands_jump = not any(e.abrupt and not issubclass(e, ActuationEffect) for e in effects)
         self.table = self._world.table

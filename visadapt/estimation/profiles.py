@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 
-from visadapt.systems import CartPole, FixedWing, Quadrotor, System
-from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY
-from visadapt.systems.stiffness import longest_step
+from visadapt.systems import SYSTEMS, CartPole, FixedWing, Quadrotor, System
+from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY, RigidBody
+from visadapt.systems.stiffness import Parameters, longest_step, parameters
 
 Columns = tuple[int, ...]
 """Indices into the state vector."""
@@ -52,7 +52,7 @@ class SystemProfile:
     """s, the longest Runge-Kutta step for smooth physics when an effect is fitted (screening takes one per period): one
     of 0.05 s errs by 3e-4 of a velocity that friction damps at 10 1/s, more than the noise of a good sensor"""
     coarsest_step: float = math.inf  # s, the longest step in the screening, beyond which Runge-Kutta is unstable
-    longest_abrupt_steps: tuple[float, float, float] = (float("inf"), 0.0125, 0.005)
+    longest_abrupt_steps: tuple[float, ...] = (float("inf"), 0.0125, 0.005)
     """s, the longest integration steps under abrupt effects, at the accuracies COARSEST, COARSE and FINE"""
     relinearise_every: int = 1
     """iterations of a fit between two computations of the derivatives by the states; more than 1 is accurate enough
@@ -135,20 +135,34 @@ PROFILES: dict[type[System], SystemProfile] = {
     # Runge-Kutta must be stable: the rate loop decays at 16.6 1/s, the wing's roll rate at 1.95 per metre flown.
     Quadrotor: replace(_VEHICLE, longest_step=0.035),
     FixedWing: replace(_VEHICLE, longest_step=0.025, longest_abrupt_steps=(0.025, 0.017, 0.0125)),
+    RigidBody: _VEHICLE,  # of one's own
 }
-"""The profile of each system class."""
+"""The profile of each system class, for its default parameters."""
 
 
 def profile_of(system: System) -> SystemProfile:
     """The profile of a system, or of the class that it derives from; of a system of one's own, made from its class.
 
+    Integration steps are those for the default parameters, shorter where these of `system` make it faster.
+
     Raises:
         ValueError: a system of one's own does not state `coordinates` for each of its loads.
     """
-    for kind, profile in PROFILES.items():
-        if isinstance(system, kind):
-            return profile
-    return _own_profile(type(system))
+    return _profile_of(type(system), parameters(system))
+
+
+@lru_cache(256)
+def _profile_of(kind: type[System], values: Parameters) -> SystemProfile:
+    profile = next((each for base, each in PROFILES.items() if issubclass(kind, base)), None) or _own_profile(kind)
+    longest = longest_step(kind(**dict(values)))
+    if kind in SYSTEMS.values() and longest >= longest_step(kind()):
+        return profile  # which says what is fast enough
+    return replace(
+        profile,
+        longest_step=min(profile.longest_step, longest),
+        coarsest_step=min(profile.coarsest_step, longest),
+        longest_abrupt_steps=tuple(min(step, longest) for step in profile.longest_abrupt_steps),
+    )
 
 
 FIRST_STATE_SHARE = 0.3
@@ -175,8 +189,6 @@ def _own_profile(system: type[System]) -> SystemProfile:
         region_variables={"s": "time", **places},
         plotted_variables=(names[velocities[0]], names[positions[0]], system.actions[0].name, "time"),
         residual_name=system.loads[0].name.replace("_", " "),
-        longest_step=min(SystemProfile.longest_step, longest_step(system)),
-        coarsest_step=longest_step(system),
         smooth_function_factors={
             load.name: (None, names[velocity]) for load, velocity in zip(system.loads, velocities, strict=True)
         },

@@ -66,7 +66,8 @@ class FlightPolicy(Policy):
 
     def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:
         own, disturbance = inputs[:, :-N_DISTURBANCE], inputs[:, -N_DISTURBANCE:]
-        hidden = self.rest((self.first(torch.cat((own, correction), 1)) + self.disturbance_in(disturbance)).tanh()).tanh()
+        first = self.first(torch.cat((own, correction), 1)) + self.disturbance_in(disturbance)
+        hidden = self.rest(first.tanh()).tanh()
         out: Tensor = self.out(hidden) + self.skip(own) + self.disturbance_out(disturbance)
         return out
 

@@ -62,7 +62,8 @@ class System(ABC):
     coordinates: ClassVar[tuple[tuple[int, int], ...]] = ()
     """For each load the columns of the position and the velocity that it acts on; dry friction needs them."""
     longest_step: ClassVar[float | None] = None
-    """s, the longest Runge-Kutta step that follows the dynamics; None: found from the derivative"""
+    """s, the longest Runge-Kutta step that follows the dynamics with the default parameters; None: found from the
+    derivative"""
 
     @abstractmethod
     def derivative(self, state: Tensor, command: Tensor, load: Tensor) -> Tensor:

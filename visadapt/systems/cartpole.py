@@ -7,7 +7,6 @@ problems", appendix, without their friction terms (friction is an effect). A pos
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -35,7 +34,6 @@ class CartPole(System):
     gravity: float | Tensor = 9.8  # m/s2
 
     name: ClassVar[str] = "cartpole"
-    longest_step: ClassVar[float | None] = math.inf
     states: ClassVar[tuple[Variable, ...]] = (
         Variable("x", "m", -1.5, 1.5),
         Variable("x_dot", "m/s", -5.0, 5.0),

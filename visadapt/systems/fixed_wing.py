@@ -158,7 +158,9 @@ class FixedWing(RigidBody):
         return force, effects[:, 3:]
 
     def trim(self, speed: Tensor) -> tuple[Tensor, Tensor]:
-        """States (B, 13) and commands (B, 4) of steady level flight along +x at airspeeds (B,) in m/s.
+        """States (B, 13) and commands (B, 4) of steady level flight, with the nose along +x, at airspeeds (B,) in m/s.
+
+        A wind carries the wing along; where it rises or sinks, its vertical part adds to the airspeed.
 
         Solves acceleration = 0 and angular acceleration = 0 for roll, pitch, and the four commands by Newton's method,
         in float64. Not differentiable.
@@ -166,13 +168,15 @@ class FixedWing(RigidBody):
         Raises:
             ValueError: there is no such flight, because it stalls or needs a command beyond [-1, 1].
         """
-        speeds = speed.detach().double()
+        speeds, like = speed.detach().double(), speed if speed.is_floating_point() else speed.float()
         system = self.to(speeds)
         still = torch.zeros(len(speeds), 12, dtype=torch.float64, device=speeds.device)
+        drift = stack_parameters((system.wind_x, system.wind_y, 0.0), still).expand(len(speeds), 3)
+        velocity = torch.cat((speeds[:, None], still[:, :2]), 1) + drift
 
         def flight(unknown: Tensor) -> tuple[Tensor, Tensor]:
             attitude = from_angles(torch.cat((unknown[:, :2], still[:, :1]), 1))
-            return torch.cat((still[:, :3], speeds[:, None], still[:, :2], attitude, still[:, :3]), 1), unknown[:, 2:]
+            return torch.cat((still[:, :3], velocity, attitude, still[:, :3]), 1), unknown[:, 2:]
 
         def imbalance(unknown: Tensor) -> Tensor:
             change = system.derivative(*flight(unknown), still[:, :6])
@@ -190,7 +194,7 @@ class FixedWing(RigidBody):
         found = (imbalance(unknown).detach().abs() < 1e-8).all(1) & (command.abs() <= 1).all(1)
         if not bool(found.all()):
             raise ValueError(f"fixed_wing: no level flight within the commands at {float(speeds[~found][0]):g} m/s")
-        return state.to(speed), command.to(speed)
+        return state.to(like), command.to(like)
 
     def coefficients(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """What one unit of each cause adds to each effect, in the body's axes, and the limit of the angles.

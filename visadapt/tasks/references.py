@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from visadapt.history import LENGTH
 from visadapt.recordings import RecordingError
 from visadapt.recordings.checks import check_finite
 from visadapt.recordings.clock import RawEpisode, check_forward
@@ -114,7 +115,7 @@ def read_reference(path: str | os.PathLike[str], period: float = 0.1, max_speed:
 
     Seconds, metres and metres per second, z up; rows may be any time apart, and other columns are ignored. They
     are interpolated by cubics onto a clock of `period`; derivatives that the file does not give are differences
-    over the period. It must last two periods at least.
+    over the period. It must last LENGTH periods at least, those of a policy's history.
 
     Raises:
         RecordingError: one line that says which file, row and column is wrong, and what would be right.
@@ -138,9 +139,9 @@ def read_reference(path: str | os.PathLike[str], period: float = 0.1, max_speed:
     check_finite(raw, ())
     check_forward(raw)
     lasts = values[-1, 0] - values[0, 0]
-    if len(values) < 3 or lasts < 2 * period * (1 - 1e-6):
+    if len(values) < 3 or lasts < LENGTH * period * (1 - 1e-6):
         raise RecordingError(
-            f"{path}: {len(values)} rows over {lasts:g} s; at least 3 rows over {2 * period:g} s are right"
+            f"{path}: {len(values)} rows over {lasts:g} s; at least 3 rows over {LENGTH * period:g} s are right"
         )
     if lasts > MAX_PERIODS * period:
         raise RecordingError(

@@ -20,11 +20,13 @@ from visadapt.effects.own.dynamics import on_joints, on_parameters, scalable
 from visadapt.effects.own.sensors import on_sensors
 from visadapt.systems import SYSTEMS, System
 from visadapt.systems.contract import equal, inputs
+from visadapt.systems.rigid_body import RigidBody
 
 
 def is_own(system: type[System]) -> bool:
-    """Whether a system is the user's own: neither one of the library's nor derived from one of these."""
-    return not issubclass(system, tuple(SYSTEMS.values()))
+    """Whether a system is a mechanism of the user's own: no rigid body, no other system of the library, and not derived
+    from one of these."""
+    return not issubclass(system, (RigidBody, *SYSTEMS.values()))
 
 
 def own_effects(system: type[System]) -> list[type[Effect]]:

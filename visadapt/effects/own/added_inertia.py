@@ -20,7 +20,8 @@ class AddedInertia(JointEffect):
     source = "Newton's second law"
 
     def alter(self, system: System) -> System:
-        values = {f"{_ADDED}{self.joint}": getattr(self, self.table[0].name)}
+        field = f"{_ADDED}{self.joint}"
+        values = {field: getattr(system, field, 0.0) + getattr(self, self.table[0].name)}
         if isinstance(system, Inertial):
             return replace(system, **values)  # type: ignore[type-var]  # a dataclass
         kept = {field.name: getattr(system, field.name) for field in fields(system)}  # type: ignore[arg-type]
