@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -56,7 +56,7 @@ class World(nn.Module):
     def __init__(
         self,
         system: System,
-        effects: Sequence[Effect] = (),
+        effects: Iterable[Effect] = (),
         period: float = 0.05,
         integrator: str = "rk4",
         substeps: int | None = None,

@@ -150,6 +150,14 @@ class TestCommand:
         assert stub["policy"].with_history == with_history
         assert all(torch.equal(a, b) for a, b in zip(stub["policy"].parameters(), policy.parameters(), strict=True))
 
+    def test_a_policy_of_another_period_is_refused(self, recording, stub, tmp_path, capsys):
+        policy, path = StatePolicy(4), tmp_path / "policy.safetensors"
+        policy.trained_in = {"period": 0.02}
+        save_policy(path, policy)
+        assert run(recording, "--policy", path) == 2
+        said = capsys.readouterr().err
+        assert "policy.safetensors was trained for 0.02 s between commands, the recording has 0.05 s" in said
+
     def test_as_a_program(self, tmp_path):
         command = [sys.executable, "-c", "import sys; from visadapt.cli.main import main; sys.exit(main())"]
         answer = subprocess.run(

@@ -23,6 +23,12 @@ def test_the_experiments_of_all_pairs_of_a_class_are_advised():
     )
 
 
+def test_one_that_no_experiment_settles_gets_a_general_one():
+    advice = separate([[ViscousFriction, ActuatorBias, ConstantForce]], CartPole())
+    assert "spring balance" in advice
+    assert "free motions with the motor off" in advice
+
+
 def test_every_member_of_a_class_is_told_apart():
     advice = separate([[ActuatorBias, ConstantForce, PeriodicForce]], CartPole())
     assert "an actuator bias is gone" in advice

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from tests.diagnosed import record
 from tests.own_systems import DoublePendulum
+from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.pushes import pushes
 from visadapt.effects.catalogue import catalogue
 from visadapt.recordings import Episode, Recording
@@ -176,3 +178,16 @@ def test_feedback_does_not_hide_a_push_and_the_pole_is_not_pushed(force, jitter,
     assert push.impulse == pytest.approx(impulse, rel=0.25)
     assert push.start == pytest.approx(8 - 2.45 * 0.11, abs=0.1)
     assert push.ci90[0] < impulse < push.ci90[1]
+
+
+@pytest.mark.parametrize("rate", [0.2, 0.5])
+def test_none_is_named_where_readings_were_lost(rate):
+    recording = record(rows=100, noise=(5e-4, 5e-4, 2e-3, 2e-3))
+    lost = [np.random.default_rng(k).random(len(e.time)) < rate for k, e in enumerate(recording.episodes)]
+    episodes = []
+    for episode, marks in zip(recording.episodes, lost, strict=True):
+        last = np.maximum.accumulate(np.where(marks, 0, np.arange(len(marks))))
+        episodes.append(Episode(episode.time, episode.action, episode.state[last]))
+    whole = prepare(dataclasses.replace(recording, episodes=tuple(episodes)), CartPole()).whole
+    with torch.inference_mode():
+        assert pushes(whole, World(CartPole())) == ()

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from visadapt.estimation.repeated_readings import find_repeats
+from visadapt.estimation.repeated_readings import find_repeats, zone
 
 COUNTS = torch.tensor([1e-4, 2 * math.pi / 4096], dtype=torch.float64)  # m and rad
 ANGLE = (2, 3)  # columns of the state
@@ -69,3 +69,12 @@ def test_a_slow_motion_through_that_zone_is_not_measured_there():
     repeats = find_repeats(episodes, (0, 2), ANGLE)
     assert not bool(repeats.used[1][held[1], 1].any())
     assert bool(repeats.silent[1][held[1]].any())  # nor do they say where the sensor stands still
+
+
+@pytest.mark.parametrize("turns", [0, -1])
+def test_a_zone_may_hold_the_hanging_pole(turns):
+    angle = 2 * math.pi * turns + torch.linspace(2.5, 3.8, 400, dtype=torch.float64)
+    first, last = 2 * math.pi * turns + 3.0, 2 * math.pi * turns + 3.4
+    edges, deviations = zone((angle > first) & (angle < last), angle, 1e-3)
+    assert edges.tolist() == pytest.approx([first, last], abs=0.005)
+    assert (deviations < 0.005).all()

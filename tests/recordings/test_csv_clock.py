@@ -31,6 +31,12 @@ class TestClock:
         assert recording.episodes[0].time[0] == 0
         np.testing.assert_allclose(np.diff(recording.episodes[0].time), recording.period)
 
+    def test_equal_stalls_are_treated_alike_whatever_their_rounding(self, file):
+        table = a_table(rows=100)
+        table["time"] = 0.05 * np.arange(100) + 0.1 * (np.arange(100)[:, None] >= range(10, 94, 12)).sum(1)
+        recording = load(write(file, table))
+        assert len(recording.episodes) in (1, 8)
+
     def test_a_missing_row_splits_the_episode(self, file):
         table = {name: np.delete(values, 30) for name, values in a_table(rows=81).items()}
         recording = load(write(file, table))

@@ -162,3 +162,16 @@ def test_a_clock_in_minutes_where_no_rate_is_measured(file, run):
 def test_a_position_of_noise_alone(file, run):
     (warning,) = load(write(file, changed(run, x=lambda x: 1e-5 * noise(1)(x)))).warnings
     assert "x jumps about from row to row and does not move" in warning
+
+
+def test_a_sensor_that_is_dead_in_one_of_several_files_is_named_with_that_file(tmp_path):
+    moves, dead = (a_run(0.05, 1e-3, seed=seed) for seed in (0, 1))
+    other = write(tmp_path / "moves.csv", moves)
+    refuses(
+        r"dead\.csv: row 1 \(line 2\), column 'theta' is .* as in every row, .* is the sensor dead",
+        other,
+        write(tmp_path / "dead.csv", dead | {"theta": still(dead["theta"])}),
+    )
+    recording = load(other, write(tmp_path / "rate.csv", dead | {"x_dot": still(dead["x_dot"])}))
+    assert recording.measured == ("x", "theta", "theta_dot")
+    assert any("rate.csv: x_dot never changes although its position does" in text for text in recording.warnings)

@@ -8,11 +8,12 @@ import torch
 
 from datasets.quadrotor_references import SPLINE_DEGREE, Settings, basis, main, make, read
 from tests.flying import states_on
+from visadapt.interpolation import cubic
 from visadapt.recordings import RecordingError
 from visadapt.systems import Quadrotor
 from visadapt.systems.rigid_body import rotation
 from visadapt.tasks.differential_flatness import commands, demanded
-from visadapt.tasks.references import LOOP_RADIUS, cubic, power_loop, read_reference, smallest_loop
+from visadapt.tasks.references import LOOP_RADIUS, power_loop, read_reference, smallest_loop
 from visadapt.world import World
 
 SMALL = Settings(train=60, test=20)

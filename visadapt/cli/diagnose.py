@@ -16,6 +16,7 @@ from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.report.html import write_report
 from visadapt.diagnosis.report.text import as_text
 from visadapt.diagnosis.result import AMBIGUOUS
+from visadapt.diagnosis.words import printable
 from visadapt.effects.own import is_own
 from visadapt.policies import StatePolicy
 from visadapt.progress import staged
@@ -25,6 +26,9 @@ from visadapt.storage.atomic_files import replacing
 from visadapt.storage.run_folder import versions
 from visadapt.systems import SYSTEMS, CartPole, System
 from visadapt.world import World
+
+PERIOD_TOLERANCE = 0.05
+"""Share by which the period of a recording, whose clock may be unsteady, may differ from that of a policy."""
 
 
 def run(options: argparse.Namespace) -> None:
@@ -37,6 +41,8 @@ def run(options: argparse.Namespace) -> None:
         raise InputError("--plan: a plan needs a recording of states, not of frames")
     with progress() as report:
         recording = load_recording(options.recording, system, options.columns, renderer is not None, report)
+        if policy is not None:
+            _check_period(Path(options.policy), policy, recording.period)
         source = World(system, period=recording.period)
         result = diagnosis.diagnose(
             recording,
@@ -88,13 +94,22 @@ def _settings(options: argparse.Namespace, system: System) -> dict[str, str]:
         "seed": str(options.seed),
         "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
     }
-    return {name: value for name, value in settings.items() if value}
+    return {name: printable(value) for name, value in settings.items() if value}
 
 
 def _renderer(path: Path, system: System) -> nn.Module:
     if not isinstance(system, CartPole):
         raise InputError(f"--renderer: renderers draw a cart-pole, not a {system.name}")
     return load_renderer(path)
+
+
+def _check_period(path: Path, policy: StatePolicy, period: float) -> None:
+    trained = policy.trained_in["period"] if policy.trained_in else period
+    if abs(trained - period) > PERIOD_TOLERANCE * trained:
+        raise InputError(
+            f"{path} was trained for {trained:g} s between commands, the recording has {period:.4g} s: one that was "
+            f"trained with --period {period:.4g} is right"
+        )
 
 
 def _state_policy(path: Path, system: System) -> StatePolicy:

@@ -43,7 +43,7 @@ from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.verdict import at_bounds, left_unexplained, next_step, verdict_of
-from visadapt.diagnosis.words import listed
+from visadapt.diagnosis.words import listed, printable
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized, twins
 from visadapt.effects.late_sensors import LateSensors
@@ -56,6 +56,12 @@ from visadapt.systems import System
 from visadapt.world import World
 
 TOO_SHORT = "too short to hold a part of it out: the gap is that of the rows to which the causes were fitted"
+
+
+MAX_UNCHANGED = 0.1
+"""Probability of the source above which a reader of the causes is told of it."""
+
+NOT_SEARCHED = "what it reads depends on earlier rows, so it is not among the effects that are searched"
 
 
 @one_thread()
@@ -138,7 +144,10 @@ def diagnose(
     found_in_motion = Diagnosis(
         system=system.name,
         recording=RecordingSummary(
-            len(recording.episodes), recording.samples, float(f"{recording.period:.9g}"), used.sources
+            len(recording.episodes),
+            recording.samples,
+            float(f"{recording.period:.9g}"),
+            tuple(printable(source) for source in used.sources),
         ),
         verdict=verdict,
         where=Where(
@@ -240,11 +249,11 @@ def _warnings(
     yield from at_bounds(comparison)
     if found:
         yield from phases_of_episodes(comparison.best)
+        bare = sum(one.probability for one in comparison.models if not one.model.effects)
+        if bare > MAX_UNCHANGED and not explored.repeats:
+            yield f"the unchanged simulator has a probability of {bare:.2f}: that there is a gap at all is not certain"
     carrying = {cause.effect for cause in without_slight(found)}
     yield from (f"{one.name}: {one.caveat}" for one in comparison.best.effects if one.caveat and one.name in carrying)
-
-
-NOT_SEARCHED = "what it reads depends on earlier rows, so it is not among the effects that are searched"
 
 
 def _is_left_out(effect: type[Effect], system: System) -> bool:

@@ -139,13 +139,15 @@ def _profile(name: str, unit: str, residual: tuple[str, str], before: Disturbanc
 
 def _spectrum(residual: tuple[str, str], before: Disturbance, after: Disturbance, period: float) -> Chart:
     """Power spectral density of the disturbance on the first load, averaged over windows (Welch 1967, one Hann window
-    each)."""
+    over the rows of each)."""
     curves = []
     for label, found in ((SOURCE, before), (CORRECTED, after)):
-        load = found.load[..., 0]
-        window = torch.hann_window(load.shape[1], dtype=load.dtype)
-        power = torch.fft.rfft(load * window, dim=1).abs().square().mean(0)
-        curves.append(Curve(label, (2 * period * power / window.square().sum()).numpy()))
+        load, rows = found.load[..., 0], found.valid > 0
+        hann = torch.zeros_like(load)
+        for window, own in zip(hann, rows, strict=True):
+            window[own] = torch.hann_window(int(own.sum()), dtype=load.dtype)
+        power = torch.fft.rfft(load * hann, dim=1).abs().square().sum(0)
+        curves.append(Curve(label, (2 * period * power / hann.square().sum()).numpy()))
     frequency = np.fft.rfftfreq(before.load.shape[1], period)
     quantity, unit = residual
     squared = f"({unit})2" if " " in unit else f"{unit}2"

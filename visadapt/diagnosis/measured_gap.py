@@ -38,7 +38,7 @@ class MeasuredGap:
     @property
     def gap(self) -> Gap:
         """The errors at the longest horizon."""
-        return self.errors.gap()
+        return self.errors.gap(self.held_out)
 
 
 def measure(
@@ -78,11 +78,11 @@ def measure(
     source = with_repeats or source
     errors = PredictionErrors(source.rms(noise), reached, corrected.floor(noise), reached, noise, rows.period)
     improvable, is_held_out = False, rows.shape[0] > 1
-    if is_held_out and errors.gap().closed < MIN_GAP_CLOSED:  # else a black box cannot close enough of what is left
+    if is_held_out and errors.gap(True).closed < MIN_GAP_CLOSED:  # else a black box cannot close enough of what is left
         black_box = heldout.beside_black_box(search.system, rows, best.effects, best.fits, jobs)
         best_reached = min((reached, black_box.rms(noise)), key=lambda error: float(heldout.overall(error)[-1]))
         errors = replace(errors, black_box=best_reached)
-        gap = errors.gap()
+        gap = errors.gap(True)
         left = heldout.closed(gap.before, gap.black_box, gap.floor) - gap.closed
         improvable = left > 1 - MIN_GAP_CLOSED and heldout.predicts_better(black_box, corrected, noise)
     done(PARTS)

@@ -43,14 +43,15 @@ def separate(classes: Sequence[Collection[type[Effect]]], system: System) -> str
     for members in classes:
         by_name = {effect.name: effect for effect in members}
         names = sorted(by_name)
-        experiments = [
-            experiment
-            for name in names
-            for other, experiment in by_name[name].settled_by.items()
-            if other in by_name and not separable(by_name[name], by_name[other], system)
-        ]
+        experiments, settled = [], set()
+        for name in names:
+            for other, experiment in by_name[name].settled_by.items():
+                if other in by_name and not separable(by_name[name], by_name[other], system):
+                    experiments.append(experiment)
+                    settled |= {name, other}
         if len(names) > 1:
-            advice = experiments or [_general(members, profile_of(system))]
+            every = settled == set(names)
+            advice = experiments if every else [*experiments, _general(members, profile_of(system))]
             parts.append(f"To tell {listed(names)} apart: " + "; ".join(advice) + ".")
     return " ".join(parts)
 

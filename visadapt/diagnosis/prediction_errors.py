@@ -28,12 +28,13 @@ class PredictionErrors:
         """Share of the gap that the set with these errors (H, m) closes."""
         return heldout.closed(_last(self.before), _last(rms), _last(self.floor))
 
-    def gap(self) -> Gap:
-        """The errors at the longest horizon, over all channels."""
+    def gap(self, held_out: bool) -> Gap:
+        """The errors at the longest horizon, over all channels; `held_out`: of episodes that were not fitted."""
         before, after, floor, box = (_last(e) for e in (self.before, self.after, self.floor, self.black_box))
         measure = (
-            f"root mean square error of predictions {len(self.before) * self.period:.2g} s ahead on held-out episodes, "
-            "in standard deviations of the measurement noise"
+            f"root mean square error of predictions {len(self.before) * self.period:.2g} s ahead on "
+            f"{'held-out episodes' if held_out else 'the rows that were fitted'}, in standard deviations of the "
+            "measurement noise"
         )
         return Gap(measure, before, after, floor, box, heldout.closed(before, after, floor))
 

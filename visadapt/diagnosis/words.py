@@ -23,7 +23,7 @@ def number(value: float, digits: int = 3) -> str:
 
 def percent(share: float) -> str:
     """A share as a percentage; "unknown" for NaN."""
-    return f"{100 * share:.0f} %" if math.isfinite(share) else UNKNOWN
+    return f"{round(100 * share)} %" if math.isfinite(share) else UNKNOWN
 
 
 def with_unit(text: str, unit: str) -> str:
@@ -51,6 +51,11 @@ def _rounded(value: float, one: Estimate) -> str:
         digits = decimals + math.floor(math.log10(abs(value))) if value else 0
         return f"{value:.{max(0, digits)}e}"
     return f"{value:.{decimals}f}" if decimals > 0 else f"{round(value, decimals):.0f}"
+
+
+def printable(text: str) -> str:
+    """The text, with question marks for the bytes of a file's name that are no characters."""
+    return text.encode("utf-8", "replace").decode()
 
 
 def plain(name: str) -> str:

@@ -9,6 +9,7 @@ than the encoder's steps explain.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -143,7 +144,11 @@ def zone(repeated: Tensor, angle: Tensor, deviation: float) -> tuple[Tensor, Ten
     error of `deviation` rad. Posterior mean over a grid of both edges, with a uniform prior; then over a finer grid
     around it.
     """
-    angle = torch.atan2(angle.sin(), angle.cos())
+    # Within half a turn of the zone's middle, which may be where the pole hangs.
+    inside = angle[repeated]
+    middle_angle = torch.atan2(inside.sin().mean(), inside.cos().mean())
+    middle_angle = middle_angle + 2 * math.pi * ((inside.median() - middle_angle) / (2 * math.pi)).round()
+    angle = middle_angle + torch.atan2((angle - middle_angle).sin(), (angle - middle_angle).cos())
     inside = angle[repeated]
     # An edge may lie anywhere between the last angle with a repeated reading and the next without.
     least, most, middle = inside.min(), inside.max(), float(inside.median())

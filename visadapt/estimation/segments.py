@@ -13,6 +13,7 @@ from torch import Tensor
 
 from visadapt.estimation.colour import Colour
 from visadapt.estimation.profiles import profile_of
+from visadapt.interpolation import cubic
 from visadapt.systems import System
 
 ROUNDING_ERROR = 1e-6
@@ -115,6 +116,22 @@ def interpolated(values: Tensor, used: Tensor, stamps: Tensor) -> Tensor:
         for column, kept in zip(values.numpy().T, used.numpy().T > 0, strict=True)
     ]
     return torch.tensor(np.stack(columns, 1))
+
+
+def smoothly_filled(values: Tensor, used: Tensor, stamps: Tensor) -> Tensor:
+    """Readings (T, m), with cubics through those that are `used` (T, m) in the place of the others.
+
+    Lines instead would bend at their ends, and a bend looks like a push.
+    """
+    out = interpolated(values, used, stamps)
+    for column, kept in zip(out.T, used.T > 0, strict=True):
+        known = kept.nonzero()[:, 0]
+        if len(known) < 3:
+            continue
+        inside = ~kept & (torch.arange(len(kept)) > known[0]) & (torch.arange(len(kept)) < known[-1])
+        slopes = torch.gradient(column[known], spacing=(stamps[known],))[0]
+        column[inside] = cubic(stamps[known], column[known, None], slopes[:, None], stamps[inside])[:, 0]
+    return out
 
 
 def initial_states(rows: Segments, system: System) -> Tensor:

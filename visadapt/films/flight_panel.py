@@ -8,13 +8,14 @@ from torch import Tensor
 
 from visadapt.evaluation.scoring import FAR
 from visadapt.films.widgets import Floats, running_mean
+from visadapt.interpolation import cubic
 from visadapt.systems import RigidBody
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, VELOCITY, continuous_quaternion, rotation
 from visadapt.targets.rollout import Run
 from visadapt.tasks.base import FlightTask
 from visadapt.tasks.follow import Follow
 from visadapt.tasks.reach import Reach
-from visadapt.tasks.references import Reference, cubic
+from visadapt.tasks.references import Reference
 
 INSTANT_PERIOD_S = 0.02
 """s between the instants at which a flight is interpolated"""

@@ -141,10 +141,10 @@ def uninterrupted(raw: RawEpisode, note: Note) -> list[RawEpisode]:
     if len(steps) == 0:
         return [raw]
     period = float(np.median(steps))
-    gaps = steps > GAP_PERIODS * period
+    gaps = steps > GAP_PERIODS * period * (1 + 1e-6)
     irregular = gaps.mean() > MOST_GAPS and gaps.sum() > 1
     longest = max(HARMLESS_GAP_S, (LONGEST_STEP_PERIODS if irregular else GAP_PERIODS) * period)
-    cuts = np.flatnonzero(steps > longest)
+    cuts = np.flatnonzero(steps > longest * (1 + 1e-6))
     for cut in cuts:
         note("rows are missing here; the episode was split", f"{raw.source}, {raw.place(int(cut) + 1)}")
     edges = [0, *(int(cut) + 1 for cut in cuts), len(raw.time)]

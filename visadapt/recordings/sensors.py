@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 import torch
@@ -131,22 +131,26 @@ def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) ->
     if all(len(raw.time) == 1 for raw in episodes):
         return [*episodes]  # too short to say
     measured = episodes[0].measured
-    still = [name for name in measured if all(_is_still(raw.states[name], system, name) for raw in episodes)]
-    if len(still) == len(measured):
+    if all(_is_still(raw.states[name], system, name) for raw in episodes for name in measured):
         raise RecordingError(
             f"{episodes[0].source}: no state ever changes; a recording of something that moves is right"
         )
     rates = {system.rate_of(name) for name in measured}
-    dead = [name for name in still if any(_must_move(raw, system, name) for raw in episodes)]
-    for name in dead:
-        raw = episodes[0]
-        if name not in rates:
-            raise RecordingError(
-                f"{raw.cell(0, name)} is {raw.states[name][0]:g}, as in every row, although what is commanded and "
-                "measured moves it: is the sensor dead, or does the machine stick? a recording in which it moves is "
-                "right"
-            )
-        note(f"{name} never changes although its position does: a dead sensor; it was left out", raw.source)
+    dead: set[str] = set()
+    for _, of_file in groupby(episodes, key=lambda raw: raw.source):
+        file = list(of_file)
+        for name in measured:
+            still = all(_is_still(raw.states[name], system, name) for raw in file)
+            if name in dead or not still or not any(_must_move(raw, system, name) for raw in file):
+                continue
+            if name not in rates:
+                raise RecordingError(
+                    f"{file[0].cell(0, name)} is {file[0].states[name][0]:g}, as in every row, although what is "
+                    "commanded and measured moves it: is the sensor dead, or does the machine stick? a recording in "
+                    "which it moves is right"
+                )
+            note(f"{name} never changes although its position does: a dead sensor; it was left out", file[0].source)
+            dead.add(name)
     kept = [column for column, name in enumerate(measured) if name not in dead]
     return [replace(raw, measured=tuple(measured[k] for k in kept), state=raw.state[:, kept]) for raw in episodes]
 

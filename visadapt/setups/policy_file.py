@@ -7,7 +7,6 @@ grounded, so a policy is loaded from the file alone.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from visadapt.policies.networks import FlightResidualNetwork, ImageResidualNetwo
 from visadapt.storage.checkpoints import CheckpointError, check_sizes, fitting, load_tree, load_weights, save_network
 from visadapt.systems import SYSTEMS, RigidBody, System
 from visadapt.systems.base import NAMED
+from visadapt.systems.stiffness import parameters
 from visadapt.world import World
 
 KINDS: dict[str, type[Policy]] = {kind.__name__: kind for kind in (ImagePolicy, StatePolicy, FollowPolicy, ReachPolicy)}
@@ -156,8 +156,7 @@ def describe(world: World) -> dict[str, Any]:
 
 def parameters_of(system: System) -> dict[str, float]:
     """The parameters of a system, by their names."""
-    own: Any = system
-    return {each.name: float(getattr(own, each.name)) for each in fields(own)}
+    return {name: float(value) for name, value in parameters(system)}
 
 
 def _world(description: Mapping[str, Any], path: Path) -> World:

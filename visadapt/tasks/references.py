@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from visadapt.history import LENGTH
+from visadapt.interpolation import cubic
 from visadapt.recordings import RecordingError
 from visadapt.recordings.checks import check_finite
 from visadapt.recordings.clock import RawEpisode, check_forward
@@ -164,20 +165,6 @@ def read_reference(path: str | os.PathLike[str], period: float = 0.1, max_speed:
             f"at most {max_speed:g} m/s is right (are lengths in m and times in s?)"
         )
     return Reference.of(torch.from_numpy(np.stack(motion)).to(torch.get_default_dtype()), period)
-
-
-def cubic(time: Tensor, values: Tensor, slopes: Tensor, at: Tensor) -> Tensor:
-    """Values (..., K, n) at times (K,) of the cubics through values and slopes (..., T, n) at rising times (T,).
-
-    Hermite's form; times beyond the ends are extrapolated.
-    """
-    row = (torch.searchsorted(time, at, right=True) - 1).clamp(0, len(time) - 2)
-    step = (time[row + 1] - time[row])[:, None]
-    s = (at - time[row])[:, None] / step
-    before, after = values[..., row, :], values[..., row + 1, :]
-    rise, fall = slopes[..., row, :] * step, slopes[..., row + 1, :] * step
-    level = before * (1 + 2 * s) * (1 - s) ** 2 + after * s**2 * (3 - 2 * s)
-    return level + rise * s * (1 - s) ** 2 - fall * s**2 * (1 - s)
 
 
 def _check_positive(**values: float) -> None:

@@ -68,7 +68,7 @@ def sentence(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == AMBIGUOUS:
         sets = explanations(carrying)
         whole = listed([_either(group, sets) for group in _alternatives(carrying)])
-        return f"{_capitalised(whole)} {_closes(diagnosis)}; this recording cannot tell which."
+        return f"{_capitalised(whole)} {_closes(diagnosis, sets)}; this recording cannot tell which."
     return _unexplained(diagnosis)
 
 
@@ -112,16 +112,15 @@ def _unexplained(diagnosis: Diagnosis) -> str:
             "The simulator predicts as well as the fitted noise allows, but a gap hides, or may hide, in that noise: "
             "see what to record next."
         )
-    closed = [ranked.gap_closed for ranked in diagnosis.ranking if ranked.effects and math.isfinite(ranked.gap_closed)]
-    best = max(closed, default=0.0)
+    best = gap.closed
     black_box = (gap.before - gap.black_box) / (gap.before - gap.floor) if gap.before != gap.floor else math.nan
-    text = "Something acts that no known effect explains: "
+    text, most = "Something acts that no known effect explains: ", "the most probable of them"
     if best <= 0:
-        text += "none of them closes any of the gap"
+        text += f"{most} close none of the gap"
     elif black_box > best:
-        text += f"the best of them close {percent(best)} of the gap, with a black box {percent(min(1.0, black_box))}"
+        text += f"{most} close {percent(best)} of the gap, with a black box {percent(min(1.0, black_box))}"
     else:
-        text += f"the best of them close {percent(best)} of the gap, and what is left is not noise"
+        text += f"{most} close {percent(best)} of the gap, and what is left is not noise"
     if diagnosis.where.regions:
         text += f"; it shows most at {region(diagnosis.where.regions[0], diagnosis.system)}"
     return f"{text}."
@@ -132,11 +131,26 @@ def _described(cause: Cause) -> str:
     return f"{plain(cause.effect)} ({values})" if values else plain(cause.effect)
 
 
-def _closes(diagnosis: Diagnosis) -> str:
+def _closes(diagnosis: Diagnosis, sets: Sequence[Sequence[Cause]] = ()) -> str:
+    """What the causes close; of several `sets` of them that explain the recording, from the least to the most."""
     many = len(_alternatives(without_slight(diagnosis.causes))) > 1
     if math.isnan(diagnosis.gap.closed):  # beside the repeated readings the source predicts as well as the noise allows
         return f"{'explain' if many else 'explains'} the readings that are repeated"
-    return f"{'close' if many else 'closes'} {percent(diagnosis.gap.closed)} of the gap to the simulator"
+    named = [frozenset(cause.effect for cause in each) for each in sets]
+    each = [one.gap_closed for one in diagnosis.ranking if frozenset(one.effects) in named]
+    least, most = (end([diagnosis.gap.closed, *filter(math.isfinite, each)]) for end in (min, max))
+    share = percent(most) if percent(least) == percent(most) else f"{round(100 * least)} to {percent(most)}"
+    return f"{'close' if many else 'closes'} {share} of the gap to the simulator"
+
+
+def alone(cause: Cause) -> str:
+    """What a cause closes by itself, and what opens again without it, where that is known."""
+    said = ""
+    if math.isfinite(cause.gap_closed):
+        said += f", closes {percent(cause.gap_closed)} alone"
+    if math.isfinite(cause.gap_reopened):
+        said += f", without it {percent(cause.gap_reopened)} opens again"
+    return said
 
 
 def _capitalised(text: str) -> str:
@@ -175,7 +189,7 @@ def rendered(template: str, diagnosis: Diagnosis, **values: Any) -> str:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    for function in (plain, number, percent, estimate, interval, effects, shares):
+    for function in (plain, number, percent, estimate, interval, effects, shares, alone):
         environment.filters[function.__name__] = function
     environment.filters["either"] = lambda names: listed(names, "or")
     environment.filters["push"] = lambda one: push(one, diagnosis.recording)

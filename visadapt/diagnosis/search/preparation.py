@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from visadapt.diagnosis.search import sensor_checks
@@ -16,7 +18,7 @@ from visadapt.effects import Effect
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import Convention, profile_of
 from visadapt.estimation.repeated_readings import RepeatedReadings, find_repeats
-from visadapt.estimation.segments import Segments, cut, interpolated
+from visadapt.estimation.segments import Segments, cut, smoothly_filled
 from visadapt.recordings import Episode, Recording
 from visadapt.recordings.thinning import spread
 from visadapt.systems import System
@@ -30,7 +32,8 @@ class PreparedRecording:
     rows: Segments  # without repeated or defective readings
     raw: Segments  # the same windows with repeated readings as they were read
     whole: Recording | None
-    """episodes from end to end, repeated readings filled in from those around; None where the angle is defective"""
+    """episodes from end to end, repeated readings filled in from those around, rows of many of them not usable; None
+    where the angle is defective"""
     searched: Tensor  # indices of the windows that the search uses, spread evenly where there are many
     repeats: RepeatedReadings
     defect: tuple[float, float] | None  # rad, between which the angle sensor is defective
@@ -42,6 +45,9 @@ class PreparedRecording:
 MIN_JITTER = 1e-3
 """Largest deviation of time stamps from even spacing, in periods, above which fits with the recorded and with evenly
 spaced stamps decide whether the readings share the jitter."""
+
+MOST_FILLED = 2
+"""Rows in a row whose readings are filled in by cubics: the acceleration in more of them would be made up."""
 
 MEMORY_TIME = 1.0
 """s before a stretch of rows whose commands are used too: what is late, or lags, remembers them."""
@@ -106,15 +112,26 @@ class _Readings:
         return [int(rows.any(1).int().argmax()) for rows in self.usable]
 
     def whole(self, convention: Convention | None) -> Recording:
-        """Episodes from their first usable row on, repeated readings filled in, in the signs of the source."""
+        """Episodes from their first usable row on, in the signs of the source. Repeated and missing readings are filled
+        in; rows of longer runs of these are marked as not usable."""
         sign, command_sign = sensor_checks.signs(convention, self.channels), convention.command if convention else 1.0
         parts = zip(self.stamps, self.commands, self.states, self.repeats.used, strict=True)
-        episodes = []
+        episodes, usable = [], []
         for rows, first in zip(parts, self.first_usable, strict=True):
             time, command, state, used = (values[first:] for values in rows)
-            action, filled = (command_sign * command).numpy(), (sign * interpolated(state, used, time)).numpy()
+            action, filled = (command_sign * command).numpy(), (sign * smoothly_filled(state, used, time)).numpy()
             episodes.append(Episode(time.numpy(), action, filled))
-        return replace(self.recording, episodes=tuple(episodes), usable=())
+            usable.append(_without_long_runs((used > 0).all(1).numpy()))
+        return replace(self.recording, episodes=tuple(episodes), usable=tuple(usable))
+
+
+def _without_long_runs(measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """False in the rows (T,) of runs of more than MOST_FILLED that were not `measured` (T,)."""
+    out = np.ones(len(measured), bool)
+    edges = [0, *(np.flatnonzero(np.diff(measured)) + 1).tolist(), len(measured)]
+    for start, end in pairwise(edges):
+        out[start:end] = measured[start] or end - start <= MOST_FILLED
+    return out
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,14 @@ not the measured ones: along these, a factor common to all columns could explain
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import conv1d, pad
 
@@ -93,7 +95,8 @@ def load_tracks(recording: Recording, world: World) -> list[LoadTrack]:
     found = [
         part
         for number, episode in enumerate(recording.episodes)
-        for part in _track(number, episode, world, measured, recording.period)
+        for stretch in _measured(episode, recording.usable[number] if recording.usable else None)
+        for part in _track(number, stretch, world, measured, recording.period)
     ]
     if not found:
         return []
@@ -112,6 +115,18 @@ def load_tracks(recording: Recording, world: World) -> list[LoadTrack]:
         )
         for track in found
     ]
+
+
+def _measured(episode: Episode, usable: NDArray[np.bool_] | None) -> Iterator[Episode]:
+    """The stretches of an episode whose rows are `usable` (T,); None: the whole episode."""
+    if usable is None or usable.all():
+        yield episode
+        return
+    for start, end in pairwise([0, *(np.flatnonzero(np.diff(usable)) + 1).tolist(), len(usable)]):
+        if usable[start] and end - start > 1:
+            rows = slice(start, end)
+            assert episode.state is not None
+            yield Episode(episode.time[rows], episode.action[rows], episode.state[rows])
 
 
 def _track(number: int, episode: Episode, world: World, measured: Sequence[int], period: float) -> list[LoadTrack]:
