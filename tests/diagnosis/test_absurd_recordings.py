@@ -7,7 +7,7 @@ from tests.recorded import STATES, a_run
 from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.search.fitted_models import NoFitError
 from visadapt.effects import EFFECTS
-from visadapt.recordings import Episode, Recording
+from visadapt.recordings import Episode, Recording, RecordingError
 from visadapt.systems import CartPole
 from visadapt.world import World
 
@@ -46,3 +46,13 @@ def test_states_of_no_noise_under_no_command():
     columns = {"x": 0.3 * np.sin(time), "theta": 0.1 * np.sin(3 * time), "command": 0 * time}
     rates = {"x_dot": 0.3 * np.cos(time), "theta_dot": 0.3 * np.cos(3 * time)}
     assert diagnosed(**columns, **rates).verdict == "unexplained"
+
+
+def test_a_recording_made_in_python_is_checked_too():
+    episode = Episode(0.05 * np.arange(50), np.zeros((50, 2)), np.zeros((50, 4)))
+    with pytest.raises(RecordingError, match="episode 0 has 4 columns of states; one for each of x, theta, the"):
+        Recording((episode,), ("x", "theta"), 0.05, ("run.csv",))
+    with pytest.raises(RecordingError, match="a recording needs at least one episode"):
+        Recording((), STATES, 0.05, ())
+    with pytest.raises(RecordingError, match="the recording has 2 commands in a row; a cartpole has 1: command"):
+        diagnose(Recording((episode,), STATES, 0.05, ("run.csv",)), World(CartPole()), CATALOGUE)

@@ -51,7 +51,7 @@ from visadapt.estimation.effect_fit import remembers
 from visadapt.estimation.profiles import profile_of
 from visadapt.processes import one_thread
 from visadapt.progress import Report, staged
-from visadapt.recordings import Recording
+from visadapt.recordings import Recording, RecordingError
 from visadapt.systems import System
 from visadapt.world import World
 
@@ -113,6 +113,12 @@ def diagnose(
         names = listed([effect.name for effect in world.effects if isinstance(effect, Effect)])
         raise ValueError(f"diagnose: the world has {names}; give the source without effects, World(world.system)")
     system = world.system
+    commands = {episode.action.shape[1] for episode in recording.episodes} - {len(system.actions)}
+    if commands:
+        raise RecordingError(
+            f"the recording has {commands.pop()} commands in a row; a {system.name} has {len(system.actions)}: "
+            f"{', '.join(action.name for action in system.actions)}"
+        )
     profile = profile_of(system)
     if policy is not None:
         policy_bound.check(policy, system)

@@ -76,6 +76,9 @@ class Episode:
 class Recording:
     """Episodes of states and actions, whose clocks may be unsteady: what counts is each row's `time`.
 
+    Raises:
+        RecordingError: no episode, or one whose states have other columns than `measured` says.
+
     >>> import numpy as np, visadapt as va
     >>> episode = va.Episode(time=0.05 * np.arange(3), action=np.zeros((3, 1)), state=np.zeros((3, 2)))
     >>> va.Recording((episode,), measured=("x", "theta"), period=0.05, sources=("run.csv",)).samples
@@ -96,6 +99,17 @@ class Recording:
     """(T,) for each episode, which rows are measurements; without it, all are"""
     resolution: tuple[float, ...] = ()
     """smallest meaningful difference of each measured state; without it, the smallest between two of its readings"""
+
+    def __post_init__(self) -> None:
+        if not self.episodes:
+            raise RecordingError("a recording needs at least one episode")
+        names = ", ".join(self.measured)
+        for number, episode in enumerate(self.episodes):
+            if self.measured and (episode.state is None or episode.state.shape[1] != len(self.measured)):
+                columns = "no states" if episode.state is None else f"{episode.state.shape[1]} columns of states"
+                raise RecordingError(
+                    f"episode {number} has {columns}; one for each of {names}, the measured ones, is right"
+                )
 
     @property
     def samples(self) -> int:
