@@ -135,7 +135,8 @@ PROFILES: dict[type[System], SystemProfile] = {
     # Runge-Kutta must be stable: the rate loop decays at 16.6 1/s, the wing's roll rate at 1.95 per metre flown.
     Quadrotor: replace(_VEHICLE, longest_step=0.035),
     FixedWing: replace(_VEHICLE, longest_step=0.025, longest_abrupt_steps=(0.025, 0.017, 0.0125)),
-    RigidBody: _VEHICLE,  # type: ignore[type-abstract]  # of one's own
+    # Of one's own, with actions of any name.
+    RigidBody: replace(_VEHICLE, plotted_variables=("x_dot", "time", "z")),  # type: ignore[type-abstract]
 }
 """The profile of each system class, for its default parameters."""
 

@@ -73,6 +73,8 @@ def _fastest_rate(system: System, load: Load | None) -> float:
         rates = system.derivative(moved, command.repeat(2 * n, 1), whole if load is None else whole + load(moved))
         above, below = rates.detach().reshape(2, n, count, n)
         by_state = ((above - below) / (2 * STATE_STEP)).movedim(0, -1)
+        if not bool(by_state.isfinite().all()):
+            return 0.0  # LAPACK crashes on numbers that are not finite
         fastest = float(torch.linalg.eigvals(by_state).abs().amax(1).median())
     except Exception:  # of the user's derivative: `contract.complaints` says what
         return 0.0
