@@ -21,13 +21,18 @@ def one_thread():
 
 
 @pytest.fixture
-def only_effects(monkeypatch):
+def only_effects():
     """Leaves the effects of these names and the camera's in the catalogue: the fewer, the shorter is a search."""
     from visadapt.effects import EFFECTS
     from visadapt.effects.base import Stage
 
+    whole = dict(EFFECTS)
+
     def keep(*names: str) -> None:
         for name in [n for n, effect in EFFECTS.items() if n not in names and effect.stage is not Stage.CAMERA]:
-            monkeypatch.delitem(EFFECTS, name)
+            del EFFECTS[name]
 
-    return keep
+    yield keep
+    # In their order, by which effects that no data tell apart are listed.
+    EFFECTS.clear()
+    EFFECTS.update(whole)

@@ -56,7 +56,7 @@ def test_the_names_of_the_effects_are_all_effects_and_what_states_them():
 
 SHORTER = {
     "source.system), source)": "source.system), source, [va.effects.ConstantForce])",
-    ", world)": ", world, iterations=60)",
+    ", world)": ", world, iterations=30)",
     "va.score(policy, target)": "va.score(policy, target, episodes=10, steps=60)",
     '"film.mp4")': '"film.mp4", seconds=0.2)',
 }

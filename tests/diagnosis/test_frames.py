@@ -136,7 +136,8 @@ class TestCamera:
     def test_a_camera_that_is_as_it_should_be_has_no_fault(self, poses):
         assert camera_of(poses).causes() == []
 
-    def test_a_turned_darker_picture(self, poses):
+    def test_a_turned_darker_picture(self, poses, only_cameras):
+        only_cameras(CameraRotation, Brightness, Gamma)
         found = camera_of(poses, CameraRotation(angle=0.1), Brightness(gain=0.8, offset=0.1))
         assert {cause.effect: values(cause) for cause in found.causes()} == {
             "camera_rotation": {"angle": pytest.approx(0.1, abs=1e-3)},
@@ -154,8 +155,8 @@ class TestCamera:
         assert cause.parameters["dx"].ci90 == (-20.0, 20.0)
 
     def test_it_is_a_cause_beside_that_of_the_motion(self, tmp_path, only_effects, only_cameras):
-        only_effects(*MOTION)
-        only_cameras(Blur, Brightness, Gamma)
+        only_effects("viscous_friction", "coulomb_friction", "actuator_gain")
+        only_cameras(Blur, Brightness)
 
         def blurred(frames):
             return through(frames.float(), [Blur(sigma=1.0)]).detach()
@@ -168,8 +169,9 @@ class TestCamera:
         assert [effect.name for effect in found.effects()] == ["blur", "viscous_friction"]
         jsonschema.Draft202012Validator(SCHEMA).validate(found.to_json())
 
-    def test_lost_frames(self, tmp_path, only_effects):
+    def test_lost_frames(self, tmp_path, only_effects, only_cameras):
         only_effects(*MOTION)
+        only_cameras(Brightness, CameraRotation)
         path = rewritten(film(tmp_path / "run.h5", episodes=1, rows=60), frame=repeat_every_fifth)
         (cause,) = diagnosed(path).causes
         assert cause.effect == "frame_drop"
@@ -177,8 +179,9 @@ class TestCamera:
 
 
 class TestPixels:
-    def test_a_shadow_is_unexplained_and_the_motion_is_told_nevertheless(self, tmp_path, only_effects):
-        only_effects(*MOTION)
+    def test_a_shadow_is_unexplained_and_the_motion_is_told_nevertheless(self, tmp_path, only_effects, only_cameras):
+        only_effects("viscous_friction", "pole_damping", "actuator_gain")
+        only_cameras(Brightness, Gamma)
 
         def shaded(frames):
             column = torch.arange(frames.shape[2])
@@ -238,7 +241,8 @@ class TestBadInput:
             capsys, path, "--renderer", RENDERER
         )
 
-    def test_another_scene(self, still, capsys):
+    def test_another_scene(self, still, capsys, only_cameras):
+        only_cameras(Brightness, Gamma)
         path = rewritten(still, frame=lambda frame: 255 - frame)
         assert "it is of another scene" in refused(capsys, path, "--renderer", RENDERER)
 

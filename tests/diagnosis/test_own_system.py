@@ -25,6 +25,13 @@ SEARCHED = [
         *("sensors.measurement_delay", "angle.sensor_offset", "joint.transmission_compliance"),
     )
 ]
+IMITATING = [
+    BY_NAME[name]
+    for name in (
+        *("joint.viscous_friction", "joint.coulomb_friction", "inertia.scale", "torque.actuator_gain"),
+        *("torque.actuator_delay", "sensors.measurement_delay", "joint.transmission_compliance"),
+    )
+]
 
 
 def recording(*effects):
@@ -56,7 +63,7 @@ def recording(*effects):
     ],
 )
 def test_what_is_there_is_found(name, values):
-    found = diagnose(recording(BY_NAME[name](**values)), World(Pendulum(), period=PERIOD), SEARCHED)
+    found = diagnose(recording(BY_NAME[name](**values)), World(Pendulum(), period=PERIOD), IMITATING)
     first = found.causes[0]
     assert first.effect == name
     ((parameter, value),) = values.items()

@@ -134,41 +134,58 @@ def test_a_joint_that_stands_still_in_one_episode_hides_no_push_of_another():
         assert {push.episode for push in pushes(both, World(CartPole()))} == {1}
 
 
-def balanced(force, jitter, seed=0):
-    """12 s of a cart-pole that is balanced by feedback, read by encoders, with a push of `force` N for about 0.5 s at
-    8 s; steps of the clock are up to `jitter` longer than 20 ms."""
-    random = np.random.default_rng(seed)
-    world = World(CartPole(), period=0.02)
-    at, time, rows, wander = torch.tensor([[0.1, 0.0, 0.03, 0.0]]).double(), 0.0, [], 0.0
-    while time < 12:
-        read = np.round(at[0].numpy()[[0, 2]] / STEPS) * STEPS
-        wander = 0.97 * wander + 0.03 * random.normal()
-        command = float(np.clip(at[0].numpy() @ [0.05, 0.12, 1.6, 0.35] + wander, -1, 1))
-        rows.append((time, *read, command))
-        step = 0.02 * (1 + jitter * random.uniform())
-        for _ in range(4):
-            push = force * math.exp(-0.5 * ((time - 8) / 0.11) ** 2) / CartPole().max_force
-            acting = torch.tensor([[[command + push]]]).double()
-            at = world.integrate(torch.zeros(1), at, acting, torch.tensor([step / 4]).double())
-            time += step / 4
-    table = np.array(rows)
-    episode = Episode(table[:, 0], table[:, 3:], table[:, 1:3])
-    return Recording((episode,), ("x", "theta"), float(np.median(np.diff(table[:, 0]))), ("run",))
-
-
 STEPS = np.array([1e-4, 2 * math.pi / 4096])
+STEADY = [(0.0, jitter, seed) for seed in range(3) for jitter in (0.0, 0.2)]
+PUSHED = [(2.0, 0.0, 0), (2.0, 0.2, 2), (2.0, 0.2, 7), (-4.0, 0.0, 3), (-4.0, 0.2, 0)]
+"""Runs of a balanced cart-pole: force in N, jitter of the clock, seed."""
 
 
-@pytest.mark.parametrize("jitter", [0.0, 0.2])
-@pytest.mark.parametrize("seed", range(3))
-def test_of_a_balanced_cart_pole_none_is_named_where_there_is_none(jitter, seed):
+@functools.cache
+def every_balanced():
+    """12 s of cart-poles that are balanced by feedback, read by encoders, with a push of `force` N for about 0.5 s at
+    8 s; steps of the clock are up to `jitter` longer than 20 ms."""
+    runs = (*STEADY, *PUSHED, (4.0, 0.0, 0))
+    force, jitter = np.array(runs)[:, 0], np.array(runs)[:, 1]
+    randoms = [np.random.default_rng(seed) for _, _, seed in runs]
+    world = World(CartPole(), period=0.02)
+    at = torch.tensor([[0.1, 0.0, 0.03, 0.0]]).double().repeat(len(runs), 1)
+    time, wander, rows = np.zeros(len(runs)), np.zeros(len(runs)), []
+    while time.min() < 12:
+        read = np.round(at.numpy()[:, [0, 2]] / STEPS) * STEPS
+        drawn = np.array([(random.normal(), random.uniform()) for random in randoms])
+        wander = 0.97 * wander + 0.03 * drawn[:, 0]
+        command = np.clip(at.numpy() @ [0.05, 0.12, 1.6, 0.35] + wander, -1, 1)
+        rows.append(np.column_stack((time, read, command)))
+        step = 0.02 * (1 + jitter * drawn[:, 1])
+        for _ in range(4):
+            push = force * np.exp(-0.5 * ((time - 8) / 0.11) ** 2) / CartPole().max_force
+            acting = torch.from_numpy(command + push)[:, None, None]
+            at = world.integrate(torch.zeros(len(runs)), at, acting, torch.from_numpy(step / 4))
+            time = time + step / 4
+    tables = [table[table[:, 0] < 12] for table in np.stack(rows, 1)]
+    return {
+        run: Recording(
+            (Episode(table[:, 0], table[:, 3:], table[:, 1:3]),),
+            ("x", "theta"),
+            float(np.median(np.diff(table[:, 0]))),
+            ("run",),
+        )
+        for run, table in zip(runs, tables, strict=True)
+    }
+
+
+def balanced(force, jitter, seed=0):
+    """One of these runs."""
+    return every_balanced()[force, jitter, seed]
+
+
+@pytest.mark.parametrize(("force", "jitter", "seed"), STEADY)
+def test_of_a_balanced_cart_pole_none_is_named_where_there_is_none(force, jitter, seed):
     with torch.inference_mode():
-        assert pushes(balanced(0.0, jitter, seed), World(CartPole())) == ()
+        assert pushes(balanced(force, jitter, seed), World(CartPole())) == ()
 
 
-@pytest.mark.parametrize(
-    ("force", "jitter", "seed"), [(2.0, 0.0, 0), (2.0, 0.2, 2), (2.0, 0.2, 7), (-4.0, 0.0, 3), (-4.0, 0.2, 0)]
-)
+@pytest.mark.parametrize(("force", "jitter", "seed"), PUSHED)
 def test_feedback_does_not_hide_a_push_and_the_pole_is_not_pushed(force, jitter, seed):
     with torch.inference_mode():
         (push,) = pushes(balanced(force, jitter, seed), World(CartPole()))

@@ -89,9 +89,9 @@ def test_an_episode_goes_on_from_any_of_its_rows(row):
 )
 def test_a_fit_finds_it_beside_another_effect(others):
     truth = [*made(joint__transmission_compliance=COMPLIANCE, **others)]
-    time = PERIOD * torch.arange(200, dtype=torch.float64)
+    time = PERIOD * torch.arange(120, dtype=torch.float64)
     torques = 0.8 * (3 * time).sin() + 0.8 * (9 * time).sin()
-    read = rows(World(Pendulum(), truth, PERIOD, substeps=10).double(), torques)[1][:-1].detach()
+    read = rows(World(Pendulum(), truth, PERIOD, substeps=4).double(), torques)[1][:-1].detach()
     noise = torch.randn(read.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     start = [*made(**dict.fromkeys(others, 0.01), joint__transmission_compliance=0.0)]
     fit = fit_effects(Pendulum(), start, [read + noise * 1e-4], [torques[:, None]], PERIOD)

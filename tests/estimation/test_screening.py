@@ -59,8 +59,9 @@ def shaken():
     return record([PeriodicForce(amplitude=0.8, frequency=each, phase=2.0, offset=0.0)], len(each), 400)
 
 
-@pytest.mark.parametrize("episodes", [1, 3])
-@pytest.mark.parametrize("frequency", FREQUENCIES)
+@pytest.mark.parametrize(
+    ("frequency", "episodes"), [(0.06, 1), (0.31, 1), (1.6, 1), (4.7, 1), (0.06, 3), (1.03, 3), (2.3, 3)]
+)
 def test_a_frequency_between_the_points_of_any_coarse_grid_is_found(frequency, episodes, shaken):
     first = 3 * FREQUENCIES.index(frequency)
     own = slice(first, first + episodes)

@@ -9,7 +9,7 @@ from tests.fuzz.readers import READERS
 @pytest.mark.parametrize("name", READERS)
 def test_damaged_files_are_read_or_refused_in_one_line(name):
     slow = name in ("hdf5", "frames")  # each file is read in a process of its own
-    _, failed = counted(name, 0, range(40 if slow else 200))
+    _, failed = counted(name, 0, range(20 if slow else 100))
     assert not failed, f"{failed[0].answer}\n{failed[0].content[:2000]!r}"
 
 

@@ -29,12 +29,13 @@ HIDDEN = {
     "wind": {"velocity_x": 3.0, "velocity_y": -2.0, "velocity_z": 1.0, "coefficient": 0.4},
     "periodic_wind": {"amplitude": 4.0, "frequency": 3.0, "phase": 0.5, "direction": 0.4, "coefficient": 0.4},
     "periodic_force": {"amplitude": 3.0, "frequency": 3.0, "phase": 0.5, "offset": 1.0},
-    "gust": {"start": 0.3, "end": 0.8, "force": 4.0},
+    "gust": {"start": 0.2, "end": 0.55, "force": 4.0},
     "spring": {"stiffness": 8.0, "rest": 0.1},
     "friction_patch": {"start": -0.1, "end": 0.2, "coefficient": 8.0},
     "ground_effect": {"radius": 0.3, "ground": 0.2},
     "quadratic_drag": {"coefficient": 0.2},
     "measurement_delay": {"delay": 0.07},
+    "dropout": {"rate": 0.2},
     "frozen_zone": {"start": -0.02, "end": 0.05},
     "sensor_scale": {"position": 1.1, "angle": 0.9},
     "position_offset": {"offset": 0.1},
@@ -66,7 +67,7 @@ def made(kind, values):
 
 
 class Cart:
-    episodes, rows, period = 16, 20, 0.05
+    episodes, rows, period = 10, 14, 0.05
     noise = torch.tensor([1e-3, 5e-3, 1e-3, 5e-3], dtype=torch.float64)
     gains = torch.tensor([0.08, 0.12, 1.3, 0.3], dtype=torch.float64)
 
@@ -79,8 +80,8 @@ class Cart:
 
 
 class Hover:
-    episodes, rows, period = 20, 16, 0.02
-    noise = torch.full((13,), 2e-3, dtype=torch.float64)
+    episodes, rows, period = 8, 10, 0.02
+    noise = torch.full((13,), 5e-4, dtype=torch.float64)
 
     def start(self, generator):
         state = torch.zeros(self.episodes, 13, dtype=torch.float64)
@@ -136,8 +137,8 @@ def held(effects, measured, last, state):
     return out
 
 
-def fitted(kind, effects, seed=0):
-    """The fit from neutral values, what is true of the parameters, and the true states."""
+def fitted(kind, *effects, seed=0):
+    """The fit from neutral values, the true states, and what sensors read."""
     measured, true, commands = record(kind, [made(each, hidden(each)) for each in effects], seed)
     starts = [made(each, dict(zip((p.name for p in each.table), neutral(each), strict=True))) for each in effects]
     return fit_effects(kind(), starts, list(measured), list(commands), SETUPS[kind.name].period), true, measured
@@ -152,7 +153,7 @@ def assert_found(fit, effect):
 
 @pytest.mark.parametrize(("name", "kind"), PAIRS)
 def test_an_effect_that_was_recorded_is_found_again(name, kind):
-    fit, true, measured = fitted(kind, [EFFECTS[name]])
+    fit, true, measured = fitted(kind, EFFECTS[name])
     assert_found(fit, EFFECTS[name])
     if name != "position_offset":
         smoothed, read = (
@@ -162,7 +163,7 @@ def test_an_effect_that_was_recorded_is_found_again(name, kind):
 
 
 def test_an_offset_that_no_data_show_is_said_to_be_unknown():
-    fit, _, _ = fitted(CartPole, [PositionOffset])
+    fit, _, _ = fitted(CartPole, PositionOffset)
     (parameter,) = PositionOffset.table
     assert float(fit.covariance[PositionOffset].sqrt()) > 0.05 * (parameter.high - parameter.low)
 
@@ -178,7 +179,7 @@ def test_an_offset_that_no_data_show_is_said_to_be_unknown():
 )
 def test_several_at_once_are_found_together(kind, names):
     effects = [EFFECTS[name] for name in names]
-    fit, _, _ = fitted(kind, effects)
+    fit, _, _ = fitted(kind, *effects)
     for effect in effects:
         assert_found(fit, effect)
 

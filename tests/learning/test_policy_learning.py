@@ -150,11 +150,11 @@ class TestOnStates:
         target = SyntheticTarget()
         before = score(policy, target, 20, 0, 100)
         task = Balance(PAPER_CARTPOLE, divergence=ANYWHERE)
-        settings = TuneSettings(task, 200, 16, learning_rate=1e-2, observation_noise=0.0, longest=100)
+        settings = TuneSettings(task, 100, 16, learning_rate=1e-2, observation_noise=0.0, longest=100)
         world = World(CartPole(), integrator="euler")
         losses = tune(policy, world, identity, settings, torch.Generator().manual_seed(0))
         after = score(policy, target, 20, 0, 100)
-        assert len(losses) == 200
+        assert len(losses) == 100
         assert sum(losses[-20:]) < 0.3 * sum(losses[:20])
         assert before.survived < 5
         assert after.survived == 20
@@ -320,7 +320,7 @@ class TestClosedLoop:
     def test_under_a_force_that_no_plan_foresees_the_cart_becomes_slower(self):
         hidden = UnevenTrack()
         setup = cartpole_states(World(CartPole(), [hidden]))
-        setup = replace(setup, settings=replace(setup.settings, named=replace(setup.settings.named, iterations=40)))
+        setup = replace(setup, settings=replace(setup.settings, named=replace(setup.settings.named, iterations=20)))
         policy, target = setup.load(shipped("cartpole_states")), SyntheticTarget(lambda batch, generator: [hidden])
         before = score(policy, target, 5, 0, 100)
         setup.tune(policy, 0)
@@ -337,9 +337,9 @@ class TestReplay:
         Stepped.steps = 0
         policy = StatePolicy(4)
         task = Stepped(PAPER_CARTPOLE, divergence=ANYWHERE)
-        settings = TuneSettings(task, 300, 32, 1e-2, 100, streams=4, every=3, observation_noise=0.0)
+        settings = TuneSettings(task, 150, 32, 1e-2, 100, streams=4, every=3, observation_noise=0.0)
         tune(policy, World(CartPole(), integrator="euler"), identity, settings, torch.Generator().manual_seed(0))
-        assert Stepped.steps == 4 * 100
+        assert Stepped.steps == 4 * 50
         assert score(policy, SyntheticTarget(), 20, 0, 100).survived == 20
 
     def test_on_frames_plans_come_to_cost_less_and_the_encoder_stays_as_it_is(self):
@@ -359,7 +359,7 @@ class TestReplay:
             return float(task.cost(states, plan, state, task_state).mean())
 
         before, eyes = cost(), {key: value.clone() for key, value in policy.encoder.state_dict().items()}
-        settings = TuneSettings(task, 200, 64, 3e-3, longest=5, streams=16, every=10, curriculum=False)
+        settings = TuneSettings(task, 100, 32, 5e-3, longest=5, streams=16, every=10, curriculum=False)
         tune(policy, world, observe, settings, torch.Generator().manual_seed(0))
         assert cost() < 0.8 * before
         for key, value in eyes.items():

@@ -14,10 +14,12 @@ from visadapt.learning.transitions import Transitions
 from visadapt.policies.networks import ResidualNetwork
 from visadapt.setups.cartpole import cartpole_states
 from visadapt.storage.checkpoints import load_tree
+from visadapt.systems import CartPole
 from visadapt.targets import SyntheticTarget
 from visadapt.targets.rollout import run
 from visadapt.targets.synthetic import constant_force
 from visadapt.weights import shipped
+from visadapt.world import World
 
 
 class LinearInHistory(ResidualNetwork):
@@ -37,8 +39,8 @@ class MlpOfHistory(LinearInHistory):
 
 
 def setup(network=LinearInHistory, **ground):
-    """The cart-pole from states with such a residual; one short iteration of tuning."""
-    made = cartpole_states()
+    """The cart-pole from states with such a residual, in Euler's steps; one short iteration of tuning."""
+    made = cartpole_states(World(CartPole(), integrator="euler"))
     tuning = replace(made.settings.tuning, iterations=1, batch=16)
     settings = replace(made.settings, tuning=tuning, ground=GroundSettings(steps=20, **ground))
     return replace(made, settings=settings, residual=lambda *_: Residual(network(), torch.ones(4)))

@@ -45,8 +45,11 @@ SETUPS = {
 
 
 def short(name):
-    """A setup with few iterations of few plans."""
+    """A setup with few iterations of few plans, of a vehicle in Euler's steps, one for each command."""
     setup = SETUPS[name]()
+    if setup.test is not None:
+        source = va.World(setup.source.system, period=setup.source.period, integrator="euler", substeps=1)
+        setup = dataclasses.replace(setup, source=source)
 
     def fewer(tuning):
         few = tuning.streams and 4

@@ -3,6 +3,7 @@ import dataclasses
 import pytest
 import torch
 
+from tests.coarse import coarse_targets
 from tests.scenes import state_residual_network
 from visadapt.effects import AngleOffset, Residual
 from visadapt.learning.grounding import GroundSettings
@@ -25,7 +26,7 @@ from visadapt.tasks.balance import PAPER_CARTPOLE, Balance
 from visadapt.world import World
 
 TUNE = TuneSettings(
-    Balance(PAPER_CARTPOLE), iterations=25, batch=4, learning_rate=3e-3, observation_noise=0.0, recorded=0.5
+    Balance(PAPER_CARTPOLE), iterations=12, batch=4, learning_rate=3e-3, observation_noise=0.0, recorded=0.5
 )
 GROUND = GroundSettings(steps=60, every=20)
 SMALL = SetupSettings(TUNE, TUNE, GROUND, longest_episode=12)
@@ -117,9 +118,9 @@ class TestSettings:
 
 @pytest.fixture(scope="module", autouse=True)
 def checkpoints():
-    """States of a training are kept after 20 iterations, not after 100."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("visadapt.learning.training_state.CHECKPOINT_ITERATIONS", 20)
+    """States of a training are kept after 6 iterations, not after 100; targets take coarser steps."""
+    with coarse_targets(0.05), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("visadapt.learning.training_state.CHECKPOINT_ITERATIONS", 6)
         yield
 
 
@@ -144,9 +145,9 @@ class TestInterruption:
         [
             ("data", 45),
             ("round 1/2: ground", 40),
-            ("round 1/2: tune", 22),
+            ("round 1/2: tune", 11),
             ("round 2/2: ground", 0),
-            ("round 2/2: tune", 10),
+            ("round 2/2: tune", 5),
         ],
     )
     def test_started_again_it_ends_with_the_same_numbers(self, whole, tmp_path, stage, after):
@@ -174,25 +175,24 @@ class TestInterruption:
             assert torch.equal(value, policy.state_dict()[key]), key
 
     def test_the_true_states_behind_a_biased_sensor_are_kept_and_read_again(self, tmp_path):
-        policies = []
-        for after in (None, 0, 2):
+        def adapted(folder, after=None):
             torch.manual_seed(0)
             policy, residual = StatePolicy(4), Residual(StateResidualNetwork(4), torch.ones(4))
-            source, where = World(CartPole(), [AngleOffset(offset=0.0)]), (tmp_path / str(after), 30, 1)
-            if after is not None:
-                report = stopping("round 2/2: tune", after)
-                about = (policy, residual, source, Counted(), QUICK, Ledger(50))
-                with pytest.raises(KeyboardInterrupt):
-                    adapt(JointLearning(*about, report=report), *where)
-                torch.manual_seed(0)
-                policy, residual = StatePolicy(4), Residual(StateResidualNetwork(4), torch.ones(4))
-            adapt(JointLearning(policy, residual, source, Counted(), QUICK, Ledger(50)), *where)
-            policies.append(policy)
-        for policy in policies[1:]:
-            for key, value in policies[0].state_dict().items():
-                assert torch.equal(value, policy.state_dict()[key]), key
-        kept = load_tree(tmp_path / "None" / "round-01" / "residual.safetensors")["windows"]["states"]
-        read = [torch.as_tensor(each.state) for each in read_recording(tmp_path / "None" / "round-01" / "recording.h5")]
+            source = World(CartPole(), [AngleOffset(offset=0.0)])
+            report = None if after is None else stopping("round 2/2: tune", after)
+            adapt(JointLearning(policy, residual, source, Counted(), QUICK, Ledger(50), report=report), folder, 30, 1)
+            return policy
+
+        whole = adapted(tmp_path / "whole")
+        for after in (0, 2):
+            with pytest.raises(KeyboardInterrupt):
+                adapted(tmp_path / "again", after)
+        again = adapted(tmp_path / "again")
+        for key, value in whole.state_dict().items():
+            assert torch.equal(value, again.state_dict()[key]), key
+        first = tmp_path / "whole" / "round-01"
+        kept = load_tree(first / "residual.safetensors")["windows"]["states"]
+        read = [torch.as_tensor(each.state) for each in read_recording(first / "recording.h5")]
         assert kept.shape == torch.cat(read).shape
         assert not torch.equal(kept, torch.cat(read))
 

@@ -8,12 +8,19 @@ import torch
 
 import visadapt as va
 from renderers import LayeredRenderer, load_renderer
+from tests.coarse import coarse_targets
 from tests.flying import waves
 from visadapt.learning.rounds import RoundFolder
 from visadapt.policies.networks import StateResidualNetwork
 from visadapt.setups.training import setup_to_adapt
 from visadapt.tasks.follow import Follow
 from visadapt.tasks.reach import Reach
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse():
+    with coarse_targets(0.05):
+        yield
 
 
 @pytest.fixture
@@ -24,9 +31,9 @@ def policy():
 def test_the_worlds_that_are_given_stay_as_they_are(policy):
     source = va.World(va.CartPole(), [va.effects.ViscousFriction(coefficient=0.0)])
     before = copy.deepcopy(source.state_dict())
-    first = va.adapt(policy, source, va.SyntheticTarget(va.constant_force(2.0)), samples=40, iterations=1)
+    first = va.adapt(policy, source, va.SyntheticTarget(va.constant_force(2.0)), samples=20, iterations=1)
     fitted = float(first.source.values[0])
-    va.adapt(policy, source, va.SyntheticTarget(), samples=40, iterations=1)
+    va.adapt(policy, source, va.SyntheticTarget(), samples=20, iterations=1)
     assert all(torch.equal(source.state_dict()[key], value) for key, value in before.items())
     assert float(first.source.values[0]) == fitted != 0.0
     va.train(source, iterations=1)
@@ -105,8 +112,8 @@ def test_a_policy_that_was_tuned_says_in_which_world(policy, tmp_path):
 def test_an_episode_of_one_sample_shows_no_frequency(policy):
     force = va.effects.PeriodicForce(amplitude=0.0, frequency=0.2, phase=0.0, offset=0.0)
     target = va.SyntheticTarget(va.sine_force)
-    run = va.adapt(policy, va.World(va.CartPole(), [force]), target, samples=81, round_samples=80, iterations=1)
-    assert run.ledger.used == 81
+    run = va.adapt(policy, va.World(va.CartPole(), [force]), target, samples=41, round_samples=40, iterations=1)
+    assert run.ledger.used == 41
 
 
 def test_a_residual_is_no_part_of_a_source(policy):

@@ -39,7 +39,7 @@ def derivative_of(system, state, command=0.0, load=(0.0, 0.0)):
 
 @pytest.mark.parametrize("system", [CartPole(), HEAVY])
 def test_energy_is_conserved_without_command_and_load(system):
-    world = World(system, period=0.05, integrator="rk4", substeps=100)
+    world = World(system, period=0.05, integrator="rk4", substeps=60)
     state = torch.tensor([[0.1, -0.3, 0.2, 0.4], [0.0, 1.0, 2.5, -6.0]], dtype=torch.float64)
     at = world.start(state)
     for _ in range(40):
@@ -61,8 +61,8 @@ def test_motion_agrees_with_the_lagrange_equations_solved_apart(system, command,
     u, load = torch.tensor([[command]], dtype=torch.float64), torch.tensor([[force, torque]], dtype=torch.float64)
     time, state = torch.zeros(1, dtype=torch.float64), torch.tensor([start], dtype=torch.float64)
     for row in expected[1:]:
-        for _ in range(100):
-            state = rk4(lambda _, s: system.derivative(s, u, load), time, state, 0.001)
+        for _ in range(50):
+            state = rk4(lambda _, s: system.derivative(s, u, load), time, state, 0.002)
         np.testing.assert_allclose(state[0], row, rtol=1e-7, atol=1e-8)
 
 

@@ -315,7 +315,7 @@ class TestStreams:
             return float(task.cost(states, plan, state, task_state).mean())
 
         before = cost()
-        settings = TuneSettings(task, 40, 8, learning_rate=1e-2, longest=5, observation_noise=0.0)
+        settings = TuneSettings(task, 15, 64, learning_rate=1e-2, longest=5, observation_noise=0.0)
         tune(policy, self.WORLD, identity, settings, seeded())
         assert cost() < 0.6 * before
 
