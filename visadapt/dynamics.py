@@ -11,7 +11,7 @@ from visadapt.effects import DynamicsEffect
 from visadapt.systems import System
 from visadapt.systems.dry_friction import Limits, sliding, stopped
 from visadapt.systems.integrators import INTEGRATORS, Duration
-from visadapt.systems.stiffness import longest_step, parameters
+from visadapt.systems.stiffness import longest_step
 
 EDGE_STEP = 0.0125
 """s, integration step that resolves the edges of abrupt loads (`PulseLaw`, `FrictionPatch`)."""
@@ -27,7 +27,6 @@ class Dynamics:
         self.system = system
         self.integrator = integrator
         self._effects = effects
-        self._constant = not any(isinstance(value, Tensor) for _, value in parameters(system))
         # Most effects do one of these three alone, and a step asks for them at every derivative.
         self._varying = [e for e in effects if type(e).vary is not DynamicsEffect.vary]
         self._loading = [e for e in effects if type(e).load is not DynamicsEffect.load]
@@ -40,7 +39,7 @@ class Dynamics:
         system = self.system
         for effect in self._effects:
             system = effect.alter(system)
-        return system if system is self.system and self._constant else system.to(like)
+        return system if system is self.system and system.is_constant else system.to(like)
 
     def longest_step(self) -> float:
         """s, the longest Runge-Kutta step for the system under its effects, as their parameters are now."""

@@ -73,7 +73,7 @@ class World(nn.Module):
         self.period = period
         self.integrator = integrator
         if substeps is None:
-            substeps = steps_within(period, _physics(system, effects, integrator).longest_step())
+            substeps = _steps(system, effects, period)
         self.substeps = substeps
         self.effects = nn.ModuleList(effects)
         self._arrange()
@@ -101,10 +101,8 @@ class World(nn.Module):
 
     def with_effects(self, effects: Sequence[Effect]) -> World:
         """The same system and clock with these effects instead, in steps that are at least as fine."""
-        made = World(self.system, effects, self.period, self.integrator)
-        if made.substeps >= self.substeps:
-            return made
-        return World(self.system, effects, self.period, self.integrator, self.substeps)
+        steps = max(self.substeps, _steps(self.system, effects, self.period))
+        return World(self.system, effects, self.period, self.integrator, steps)
 
     def with_values(self, values: Tensor) -> World:
         """The same world with other values of the parameters of its effects.
@@ -349,6 +347,11 @@ class World(nn.Module):
             state, own = effect.scene(state, own, self.period)
             remembered.append(own)
         return state, tuple(remembered)
+
+
+def _steps(system: System, effects: Sequence[nn.Module], period: float) -> int:
+    """As few integration steps in a period as follow the system under its effects."""
+    return steps_within(period, _physics(system, effects, "rk4").longest_step())
 
 
 def _physics(system: System, effects: Sequence[nn.Module], integrator: str) -> Dynamics:

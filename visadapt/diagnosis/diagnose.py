@@ -57,7 +57,6 @@ from visadapt.world import World
 
 TOO_SHORT = "too short to hold a part of it out: the gap is that of the rows to which the causes were fitted"
 
-
 MAX_UNCHANGED = 0.1
 """Probability of the source above which a reader of the causes is told of it."""
 
@@ -168,7 +167,7 @@ def diagnose(
         next_experiment=next_step(search, comparison, verdict, groups, measured.gap, prepared.coarse),
         warnings=(
             *used.warnings,
-            *(f"{effect.name}: {NOT_SEARCHED}" for effect in effects if _is_left_out(effect, system)),
+            *(f"{effect.name}: {NOT_SEARCHED}" for effect in effects if remembers(effect, system)),
             *_warnings(explored, measured, verdict, found, recording.sources[0]),
         ),
         figures=replace(
@@ -249,7 +248,7 @@ def _warnings(
     """What a reader of the diagnosis must know of the recording `source`, the comparison and the causes found."""
     comparison = explored.comparison
     yield from explored.prepared.warnings
-    if not measured.held_out:
+    if not measured.errors.held_out:
         yield f"{source}: {TOO_SHORT}"
     yield from left_unexplained(comparison, verdict, comparison.unexplained(measured.improvable))
     yield from at_bounds(comparison)
@@ -260,11 +259,6 @@ def _warnings(
             yield f"the unchanged simulator has a probability of {bare:.2f}: that there is a gap at all is not certain"
     carrying = {cause.effect for cause in without_slight(found)}
     yield from (f"{one.name}: {one.caveat}" for one in comparison.best.effects if one.caveat and one.name in carrying)
-
-
-def _is_left_out(effect: type[Effect], system: System) -> bool:
-    """Whether it is a sensor with memory, which is found neither by its repeated readings nor by the search."""
-    return not effect.repeats_readings and remembers(effect, system)
 
 
 def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:

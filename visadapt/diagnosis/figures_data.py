@@ -58,6 +58,7 @@ def figure_data(
         tuple(_profile(name, units[name], residual, before, after) for name in names),
         _growth(errors, search.rows.period),
         _spectrum(residual, before, after, search.rows.period),
+        held_out=errors.held_out,
     )
 
 

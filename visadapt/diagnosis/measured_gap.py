@@ -33,12 +33,11 @@ class MeasuredGap:
     errors: PredictionErrors
     closed: GapClosed
     improvable: bool  # whether a black box beside the best set clearly predicts better
-    held_out: bool  # whether there was a part to hold out
 
     @property
     def gap(self) -> Gap:
         """The errors at the longest horizon."""
-        return self.errors.gap(self.held_out)
+        return self.errors.gap()
 
 
 def measure(
@@ -76,18 +75,19 @@ def measure(
     rms += heldout.held_out(search.system, rows, _fitted(sets), lambda errors: errors.rms(noise), jobs)
     done(2)
     source = with_repeats or source
-    errors = PredictionErrors(source.rms(noise), reached, corrected.floor(noise), reached, noise, rows.period)
-    improvable, is_held_out = False, rows.shape[0] > 1
-    if is_held_out and errors.gap(True).closed < MIN_GAP_CLOSED:  # else a black box cannot close enough of what is left
+    source_rms, held_out = source.rms(noise), rows.shape[0] > 1
+    errors = PredictionErrors(source_rms, reached, corrected.floor(noise), reached, noise, rows.period, held_out)
+    improvable = False
+    if held_out and errors.gap().closed < MIN_GAP_CLOSED:  # else a black box cannot close enough of what is left
         black_box = heldout.beside_black_box(search.system, rows, best.effects, best.fits, jobs)
         best_reached = min((reached, black_box.rms(noise)), key=lambda error: float(heldout.overall(error)[-1]))
         errors = replace(errors, black_box=best_reached)
-        gap = errors.gap(True)
+        gap = errors.gap()
         left = heldout.closed(gap.before, gap.black_box, gap.floor) - gap.closed
         improvable = left > 1 - MIN_GAP_CLOSED and heldout.predicts_better(black_box, corrected, noise)
     done(PARTS)
     closed = {names: errors.closed_by(each) for names, each in zip([*shown, *sets], rms, strict=True)}
-    return MeasuredGap(source, corrected, errors, closed, improvable, is_held_out)
+    return MeasuredGap(source, corrected, errors, closed, improvable)
 
 
 def _fitted(sets: Mapping[frozenset[str], ScoredModel]) -> list[tuple[Effects, FitState]]:

@@ -15,7 +15,7 @@ from visadapt.systems import System
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """Root mean square errors of held-out predictions by horizon and channel (H, m), in units of `deviation`."""
+    """Root mean square errors of predictions by horizon and channel (H, m), in units of `deviation`."""
 
     before: Tensor  # of the source
     after: Tensor  # of the source with the causes
@@ -23,17 +23,18 @@ class PredictionErrors:
     black_box: Tensor  # the best that a black box reaches beside the causes
     deviation: Tensor  # (m,) standard deviations of the measurement noise, in the states' units
     period: float  # s between rows
+    held_out: bool  # whether the rows that are predicted were not fitted; False where they are too few to hold some out
 
     def closed_by(self, rms: Tensor) -> float:
         """Share of the gap that the set with these errors (H, m) closes."""
         return heldout.closed(_last(self.before), _last(rms), _last(self.floor))
 
-    def gap(self, held_out: bool) -> Gap:
-        """The errors at the longest horizon, over all channels; `held_out`: of episodes that were not fitted."""
+    def gap(self) -> Gap:
+        """The errors at the longest horizon, over all channels."""
         before, after, floor, box = (_last(e) for e in (self.before, self.after, self.floor, self.black_box))
         measure = (
             f"root mean square error of predictions {len(self.before) * self.period:.2g} s ahead on "
-            f"{'held-out episodes' if held_out else 'the rows that were fitted'}, in standard deviations of the "
+            f"{'held-out episodes' if self.held_out else 'the rows that were fitted'}, in standard deviations of the "
             "measurement noise"
         )
         return Gap(measure, before, after, floor, box, heldout.closed(before, after, floor))

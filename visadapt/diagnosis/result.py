@@ -167,7 +167,7 @@ class RecordingSummary:
 
 @dataclass(frozen=True)
 class Prediction:
-    """One held-out window, predicted from its start with the actions that were commanded."""
+    """One window, predicted from its start with the actions that were commanded."""
 
     episode: int
     time: NDArray[np.floating]  # (K,) s since the episode started
@@ -236,12 +236,13 @@ class PolicyTerms:
 class FigureData:
     """What the report plots; what is empty or None is not plotted."""
 
-    predictions: tuple[Prediction, ...] = ()  # held-out windows, that of the source's largest error first
+    predictions: tuple[Prediction, ...] = ()  # that of the source's largest error first
     profiles: tuple[Chart, ...] = ()
     """the mean residual over a variable, in bins; the variables of `Where.regions` first"""
     growth: Chart | None = None  # the errors of `Gap` by horizon
     spectrum: Chart | None = None  # power spectral density of the residual
     film: FilmFrames | None = None
+    held_out: bool = True  # whether the predictions are of rows that were not fitted
 
 
 @dataclass(frozen=True)

@@ -122,8 +122,8 @@ class Effect(nn.Module):
             taken = EFFECTS.get(cls.name)
             if taken is not None and taken.__qualname__ != cls.__qualname__:
                 raise ValueError(f"the effect name {cls.name!r} is taken by {taken.__module__}.{taken.__qualname__}")
+            own = ("training", *Effect.__annotations__)
             for parameter in cls.table:
-                own = ("training", *Effect.__annotations__)
                 if parameter.name in own or callable(getattr(cls, parameter.name, None)):
                     raise ValueError(
                         f"{cls.name}: every effect has something else that is called {parameter.name}, so no parameter "

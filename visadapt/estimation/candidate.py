@@ -27,8 +27,9 @@ from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.estimation.unmodelled_loads import leading_loads, noise_directions, response_without_friction
 from visadapt.systems import System
+from visadapt.systems.base import Parameters, parameters
 from visadapt.systems.integrators import steps_within
-from visadapt.systems.stiffness import Parameters, longest_step, parameters
+from visadapt.systems.stiffness import longest_step
 from visadapt.world import World, WorldState
 
 COARSEST, COARSE, FINE = 0, 1, 2

@@ -112,8 +112,9 @@ def fit_effects(
 
 
 def remembers(effect: type[Effect], system: System) -> bool:
-    """Whether it is a sensing effect whose reading depends on earlier rows in another way than by being late."""
-    if not issubclass(effect, SensingEffect) or issubclass(effect, LateSensors):
+    """Whether it is a sensing effect whose reading depends on earlier rows in another way than by being late or by
+    repeating them."""
+    if not issubclass(effect, SensingEffect) or issubclass(effect, LateSensors) or effect.repeats_readings:
         return False
     without_effect = effect(**dict.fromkeys((p.name for p in effect.table), 0.0))
     return without_effect.memory(torch.zeros(1, len(system.states)), 1.0).numel() > 0
@@ -123,7 +124,7 @@ def check_fittable(kinds: Sequence[type[Effect]], system: System) -> None:
     """Raise ValueError, which names it, for an effect that cannot be fitted, is given twice, or that passive data of
     the system cannot tell from another."""
     for place, kind in enumerate(kinds):
-        if not kind.repeats_readings and remembers(kind, system):
+        if remembers(kind, system):
             raise ValueError(f"{kind.name} cannot be fitted: what it measures depends on earlier rows")
         if kind.stage is Stage.CAMERA:
             raise ValueError(f"{kind.name} cannot be fitted to states: only frames show it")

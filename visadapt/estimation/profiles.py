@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 
 from visadapt.systems import SYSTEMS, CartPole, FixedWing, Quadrotor, System
+from visadapt.systems.base import Parameters, parameters
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY, RigidBody
-from visadapt.systems.stiffness import Parameters, longest_step, parameters
+from visadapt.systems.stiffness import longest_step
 
 Columns = tuple[int, ...]
 """Indices into the state vector."""

@@ -146,9 +146,9 @@ def zone(repeated: Tensor, angle: Tensor, deviation: float) -> tuple[Tensor, Ten
     """
     # Within half a turn of the zone's middle, which may be where the pole hangs.
     inside = angle[repeated]
-    middle_angle = torch.atan2(inside.sin().mean(), inside.cos().mean())
-    middle_angle = middle_angle + 2 * math.pi * ((inside.median() - middle_angle) / (2 * math.pi)).round()
-    angle = middle_angle + torch.atan2((angle - middle_angle).sin(), (angle - middle_angle).cos())
+    centre = torch.atan2(inside.sin().mean(), inside.cos().mean())
+    centre = centre + 2 * math.pi * ((inside.median() - centre) / (2 * math.pi)).round()
+    angle = centre + torch.atan2((angle - centre).sin(), (angle - centre).cos())
     inside = angle[repeated]
     # An edge may lie anywhere between the last angle with a repeated reading and the next without.
     least, most, middle = inside.min(), inside.max(), float(inside.median())

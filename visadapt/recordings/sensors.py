@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import groupby, pairwise
+from itertools import groupby
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from visadapt.recordings.clock import Note, RawEpisode
 from visadapt.recordings.episode import RecordingError
+from visadapt.recordings.runs import runs
 from visadapt.systems import System, Variable
 
 TURN = 2 * np.pi
@@ -187,8 +188,7 @@ def _check_not_frozen(raw: RawEpisode, system: System) -> None:
         # An angle that stands still in places is an effect of the catalogue.
         if rate is None or variable.unit == "rad":
             continue
-        edges = [0, *(np.flatnonzero(np.diff(values) != 0) + 1).tolist(), len(values)]
-        for start, end in pairwise(edges):
+        for start, end in runs(values):
             if end - start < FROZEN_ROWS:
                 continue
             travelled = float(np.abs(rate[start : end - 1] @ np.diff(raw.time[start:end])))

@@ -21,8 +21,7 @@ from visadapt.policies import FlightPolicy, FollowPolicy, ImagePolicy, Policy, R
 from visadapt.policies.networks import FlightResidualNetwork, ImageResidualNetwork, StateResidualNetwork
 from visadapt.storage.checkpoints import CheckpointError, check_sizes, fitting, load_tree, load_weights, save_network
 from visadapt.systems import SYSTEMS, RigidBody, System
-from visadapt.systems.base import NAMED
-from visadapt.systems.stiffness import parameters
+from visadapt.systems.base import NAMED, parameters
 from visadapt.world import World
 
 KINDS: dict[str, type[Policy]] = {kind.__name__: kind for kind in (ImagePolicy, StatePolicy, FollowPolicy, ReachPolicy)}

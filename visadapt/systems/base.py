@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import torch
@@ -105,33 +106,34 @@ class System(ABC):
         """
         return 1.0
 
+    @cached_property
+    def is_constant(self) -> bool:
+        """Whether no parameter is a tensor, so that what depends on parameters alone need be computed only once."""
+        return not any(isinstance(value, Tensor) for _, value in parameters(self))
+
     def to(self, like: Tensor) -> Self:
         """The same system; parameters that are tensors get the device and dtype of `like`."""
         itself: Any = self  # subclasses are dataclasses, this base is not
-        values = {field.name: getattr(self, field.name) for field in fields(itself)}
-        return replace(itself, **{k: value.to(like) for k, value in values.items() if isinstance(value, Tensor)})
+        return replace(itself, **{k: value.to(like) for k, value in parameters(self) if isinstance(value, Tensor)})
 
     def of_rows(self, rows: Tensor) -> Self:
         """The same system for the `rows`, a mask (B,), of a batch alone: with their parameters, where rows differ."""
         itself: Any = self  # as in `to`
-        values = {field.name: getattr(self, field.name) for field in fields(itself)}
-        differing = {k: value[rows] for k, value in values.items() if isinstance(value, Tensor) and value.dim()}
+        differing = {k: value[rows] for k, value in parameters(self) if isinstance(value, Tensor) and value.dim()}
         return replace(itself, **differing) if differing else self
 
     def check_parameters(self, either_sign: Collection[str] = (), may_be_zero: Collection[str] = ()) -> None:
         """Raise ValueError if a parameter is not finite, or is negative or 0 where it may not be."""
-        itself: Any = self
-        for field in fields(itself):
-            value, right = getattr(self, field.name), "positive"
-            least = torch.finfo(torch.float32).tiny
-            if field.name in either_sign:
+        for name, value in parameters(self):
+            right, least = "positive", torch.finfo(torch.float32).tiny
+            if name in either_sign:
                 right, least = "finite", -math.inf
-            elif field.name in may_be_zero:
+            elif name in may_be_zero:
                 right, least = "0 or positive", 0.0
             if not holds(value >= least):
-                raise ValueError(f"{self.name}: {field.name} must be {right}, got {value!r}")
+                raise ValueError(f"{self.name}: {name} must be {right}, got {value!r}")
             if not holds(abs(value) < math.inf):
-                raise ValueError(f"{self.name}: {field.name} must be finite, got {value!r}")
+                raise ValueError(f"{self.name}: {name} must be finite, got {value!r}")
 
     def __init_subclass__(cls, **kwargs: object) -> None:
         super().__init_subclass__(**kwargs)
@@ -166,6 +168,16 @@ class System(ABC):
 
 
 NAMED: dict[str, type[System]] = {}  # Every system by its name, also the user's own
+
+
+Parameters = tuple[tuple[str, Any], ...]
+"""Names and values of a system's parameters."""
+
+
+def parameters(system: System) -> Parameters:
+    """All parameters of a system, in the order of the class's fields."""
+    itself: Any = system  # a dataclass, as its base is not
+    return tuple((field.name, getattr(system, field.name)) for field in fields(itself))
 
 
 def holds(condition: bool | Tensor) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from visadapt.systems.base import System, Variable
+from visadapt.systems.base import System, Variable, parameters
 from visadapt.systems.rigid_body import RigidBody
 
 ROWS = 5  # States that the derivative is tried in, drawn from the states' ranges
@@ -208,20 +208,19 @@ def _batches(system: System) -> Iterator[str]:
     """A parameter may be one for each row: effects scale it, and fits try many values in one batch."""
     given = inputs(system)
     itself: Any = system
-    for field in fields(itself):
-        value = getattr(system, field.name)
+    for name, value in parameters(system):
         values = value * torch.linspace(1.0, 1.02, ROWS, dtype=torch.float64)
         try:
-            together = replace(itself, **{field.name: values}).derivative(*given)
+            together = replace(itself, **{name: values}).derivative(*given)
         except Exception as error:
-            yield f"{field.name} as a tensor, one value for each row ({ROWS},), raises {said(error)}"
+            yield f"{name} as a tensor, one value for each row ({ROWS},), raises {said(error)}"
             continue
         rows = [
-            replace(itself, **{field.name: float(one)}).derivative(*(each[k : k + 1] for each in given))
+            replace(itself, **{name: float(one)}).derivative(*(each[k : k + 1] for each in given))
             for k, one in enumerate(values)
         ]
         if together.shape != given[0].shape or not equal(together, torch.cat(rows)):
-            yield f"{field.name} as a tensor, one value for each row ({ROWS},), gives other rates than row by row"
+            yield f"{name} as a tensor, one value for each row ({ROWS},), gives other rates than row by row"
 
 
 def equal(one: Tensor, other: Tensor) -> bool:

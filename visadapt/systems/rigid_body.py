@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import fields
-from functools import cached_property, lru_cache
-from typing import Any, ClassVar
+from functools import lru_cache
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -96,12 +95,6 @@ class RigidBody(System):
         weight = as_column(self.gravity) * constant((0.0, 0.0, 1.0), state.dtype, state.device)
         acceleration = (matvec(turned, force) + load[:, :3]) / as_column(self.mass) - weight
         return torch.cat((velocity, acceleration, quaternion_rate(attitude, rates), matvec(inverse, whole)), 1)
-
-    @cached_property
-    def is_constant(self) -> bool:
-        """Whether no parameter is a tensor, so that what depends on parameters alone need be computed only once."""
-        parameters: Any = self
-        return not any(isinstance(getattr(parameters, each.name), Tensor) for each in fields(parameters))
 
 
 def as_column(value: float | Tensor) -> float | Tensor:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import fields
 from functools import lru_cache
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from visadapt.systems.base import System
+from visadapt.systems.base import Parameters, System, parameters
 from visadapt.systems.contract import inputs
 
 LARGEST_PRODUCT = 1.2
@@ -25,16 +23,6 @@ STATE_STEP = 1e-6  # Difference of a state, in its unit
 
 Load = Callable[[Tensor], Tensor]
 """States (B, n_state) to loads (B, n_load)."""
-
-
-Parameters = tuple[tuple[str, Any], ...]
-"""Names and values of a system's parameters."""
-
-
-def parameters(system: System) -> Parameters:
-    """All parameters of a system, in the order of the class's fields."""
-    itself: Any = system  # a dataclass
-    return tuple((field.name, getattr(system, field.name)) for field in fields(itself))
 
 
 def longest_step(system: System, load: Load | None = None) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -20,6 +19,7 @@ from visadapt.estimation.profiles import Convention, profile_of
 from visadapt.estimation.repeated_readings import RepeatedReadings, find_repeats
 from visadapt.estimation.segments import Segments, cut, smoothly_filled
 from visadapt.recordings import Episode, Recording
+from visadapt.recordings.runs import runs
 from visadapt.recordings.thinning import spread
 from visadapt.systems import System
 from visadapt.systems.rigid_body import continuous_quaternion
@@ -128,8 +128,7 @@ class _Readings:
 def _without_long_runs(measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """False in the rows (T,) of runs of more than MOST_FILLED that were not `measured` (T,)."""
     out = np.ones(len(measured), bool)
-    edges = [0, *(np.flatnonzero(np.diff(measured)) + 1).tolist(), len(measured)]
-    for start, end in pairwise(edges):
+    for start, end in runs(measured):
         out[start:end] = measured[start] or end - start <= MOST_FILLED
     return out
 

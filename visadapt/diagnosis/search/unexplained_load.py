@@ -23,6 +23,7 @@ from torch.nn.functional import conv1d, pad
 
 from visadapt.effects.own.dynamics import scalable
 from visadapt.recordings import Episode, Recording
+from visadapt.recordings.runs import runs
 from visadapt.systems import System
 from visadapt.world import World, WorldState
 
@@ -122,7 +123,7 @@ def _measured(episode: Episode, usable: NDArray[np.bool_] | None) -> Iterator[Ep
     if usable is None or usable.all():
         yield episode
         return
-    for start, end in pairwise([0, *(np.flatnonzero(np.diff(usable)) + 1).tolist(), len(usable)]):
+    for start, end in runs(usable):
         if usable[start] and end - start > 1:
             rows = slice(start, end)
             assert episode.state is not None

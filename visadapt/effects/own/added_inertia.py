@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import fields, make_dataclass, replace
+from dataclasses import make_dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from visadapt.effects.laws import JointEffect
 from visadapt.systems import System
+from visadapt.systems.base import parameters
 
 
 class AddedInertia(JointEffect):
@@ -24,8 +25,7 @@ class AddedInertia(JointEffect):
         values = {field: getattr(system, field, 0.0) + getattr(self, self.table[0].name)}
         if isinstance(system, Inertial):
             return replace(system, **values)  # type: ignore[type-var]  # a dataclass
-        kept = {field.name: getattr(system, field.name) for field in fields(system)}  # type: ignore[arg-type]
-        altered: System = _inertial(type(system))(**kept, **values)
+        altered: System = _inertial(type(system))(**dict(parameters(system)), **values)
         return altered
 
 

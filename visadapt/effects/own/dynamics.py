@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 from visadapt.effects import laws
@@ -13,6 +13,7 @@ from visadapt.effects.own.added_inertia import AddedInertia, inertia_of
 from visadapt.effects.own.statement import Made
 from visadapt.effects.parameters import ParameterScale
 from visadapt.systems import System, Variable
+from visadapt.systems.base import parameters
 
 
 def on_joints(system: type[System]) -> Iterator[Made]:
@@ -157,5 +158,4 @@ def _accepted(system: type[System], field: str, factor: float) -> float:
 
 def scalable(system: System) -> list[str]:
     """The positive parameters but gravity."""
-    names = [field.name for field in fields(system)]  # type: ignore[arg-type]  # subclasses are dataclasses
-    return [name for name in names if name != "gravity" and getattr(system, name) > 0]
+    return [name for name, value in parameters(system) if name != "gravity" and value > 0]
