@@ -127,6 +127,18 @@ def test_the_catalogue_names_the_system_and_leaves_the_librarys_effects_out():
     assert not any("." in effect.name for effect in catalogue(CartPole()))
 
 
+def test_a_system_derived_from_another_has_its_own_effects_whichever_was_asked_first():
+    class Derived(Pendulum):
+        name = "derived_pendulum"
+
+    before = {effect.name for effect in catalogue(Pendulum())}
+    derived = catalogue(Derived())
+    assert {effect.name for effect in derived} == before
+    assert len(derived) == len(before)
+    assert {effect.systems for effect in derived if "." in effect.name} == {(Derived,)}
+    assert {effect.systems for effect in catalogue(Pendulum()) if "." in effect.name} == {(Pendulum,)}
+
+
 def test_effects_that_are_the_same_are_known_to_be():
     @dataclass(frozen=True)
     class Motor(Pendulum):

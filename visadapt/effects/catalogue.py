@@ -16,7 +16,7 @@ from visadapt.effects.base import (
     with_table,
 )
 from visadapt.effects.camera import CameraEffect
-from visadapt.effects.own import is_own, own_effects
+from visadapt.effects.own import is_generated, is_own, own_effects
 from visadapt.systems import SYSTEMS, System
 
 
@@ -34,7 +34,7 @@ def catalogue(system: System | None = None) -> list[type[Effect]]:
     if system is None:
         return named
     own = own_effects(type(system)) if is_own(type(system)) else []
-    on_all = [effect for effect in named if isinstance(system, effect.systems) and effect not in own]
+    on_all = [effect for effect in named if isinstance(system, effect.systems) and not is_generated(effect)]
     on_all = [effect for effect in on_all if not any(issubclass(one, effect) for one in own)]
     return own + [sized(effect, system) for effect in on_all]
 

@@ -32,8 +32,17 @@ def is_own(system: type[System]) -> bool:
 def own_effects(system: type[System]) -> list[type[Effect]]:
     """The effects of a system of one's own; they are then found by name in `EFFECTS`."""
     made = _made(system)
+    _GENERATED.update(made)
     EFFECTS.update({effect.name: effect for effect in made})
     return list(made)
+
+
+def is_generated(effect: type[Effect]) -> bool:
+    """Whether `own_effects` made it for some system: systems derived from that one have effects of their own."""
+    return effect in _GENERATED
+
+
+_GENERATED: set[type[Effect]] = set()
 
 
 @cache
