@@ -107,3 +107,38 @@ class DoublePendulum(System):
         f2 = t2 - unit / 2 * q2.sin() * v1**2 - lower
         det = m11 * m22 - m12**2
         return torch.stack((v1, v2, (m22 * f1 - m12 * f2) / det, (m11 * f2 - m12 * f1) / det), -1)
+
+
+@dataclass(frozen=True)
+class Rover(System):
+    """A robot on two driven wheels: its forward speed is the rate of no state."""
+
+    mass: float | torch.Tensor = 10.0  # kg
+    inertia: float | torch.Tensor = 0.5  # kg m2
+    half_track: float | torch.Tensor = 0.2  # m, from the middle to a wheel
+    radius: float | torch.Tensor = 0.1  # m
+    damping: float | torch.Tensor = 4.0  # N s/m
+
+    name = "rover"
+    states: ClassVar[tuple[Variable, ...]] = (
+        Variable("x", "m", -20.0, 20.0),
+        Variable("y", "m", -20.0, 20.0),
+        Variable("yaw", "rad", -3.2, 3.2),
+        Variable("speed", "m/s", -3.0, 3.0),
+        Variable("yaw_rate", "rad/s", -6.0, 6.0),
+    )
+    actions: ClassVar[tuple[Variable, ...]] = (
+        Variable("left", "N m", -2.0, 2.0),
+        Variable("right", "N m", -2.0, 2.0),
+    )
+    loads = (Variable("forward", "N", -10.0, 10.0), Variable("turn", "N m", -3.0, 3.0))
+    coordinates: ClassVar[tuple[tuple[int | None, int], ...]] = ((None, 3), (2, 4))
+
+    def derivative(self, state, command, load):
+        _, _, yaw, speed, yaw_rate = state.unbind(-1)
+        left, right = (wheel / self.radius for wheel in command.unbind(-1))
+        force, torque = load.unbind(-1)
+        force = force + left + right - self.damping * speed
+        torque = torque + self.half_track * (right - left) - self.damping * self.half_track**2 * yaw_rate
+        rates = (speed * yaw.cos(), speed * yaw.sin(), yaw_rate, force / self.mass, torque / self.inertia)
+        return torch.stack(rates, -1)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from tests.own_systems import Pendulum, furuta
+from tests.own_systems import Pendulum, Rover, furuta
 from visadapt.systems import SYSTEMS, System, Variable
 from visadapt.systems.contract import complaints
 
 
-@pytest.mark.parametrize("system", [*SYSTEMS.values(), Pendulum, furuta()], ids=lambda system: system.name)
+@pytest.mark.parametrize("system", [*SYSTEMS.values(), Pendulum, Rover, furuta()], ids=lambda system: system.name)
 def test_the_systems_keep_it(system):
     assert complaints(system) == []
 
@@ -61,7 +61,9 @@ ANGLE, RATE = Pendulum.states
         ({"states": (Variable("time", "rad", -3.0, 3.0), RATE)}, "(time and episode are taken)"),
         ({"loads": (*Pendulum.loads, Variable("other", "N", -1.0, 1.0))}, "load (5, 2) raises ValueError: too many"),
         ({"coordinates": ()}, "coordinates is (); a pair (column of the position, column of the velocity) for each"),
-        ({"coordinates": ((1, 0),)}, "coordinates: angle is not the rate of rate that derivative returns"),
+        ({"coordinates": ((1, 0),)}, "angle is not the rate of rate that derivative returns; a velocity that"),
+        ({"coordinates": ((None, 2),)}, "coordinates holds (None, 2);"),
+        ({"coordinates": ((None, 0),)}, "loads: joint does not accelerate angle"),
         ({"coordinates": ((0, 2),)}, "coordinates holds (0, 2);"),
         ({"derivative": rates(lambda r, s, load: r[:, :1])}, "has the shape (5, 1); a tensor (5, 2), the rate of each"),
         ({"derivative": rates(lambda r, s, load: r.numpy())}, "has a ndarray; a tensor (5, 2)"),

@@ -180,16 +180,22 @@ def _own_profile(system: type[System]) -> SystemProfile:
             f"position, column of the velocity) for each of its {len(system.loads)} loads, as in ((0, 1),), is right"
         )
     names, units = [state.name for state in system.states], [state.unit for state in system.states]
-    positions, velocities = ([pair[k] for pair in system.coordinates] for k in (0, 1))
+    positions, velocities = system.velocity_of(), [velocity for _, velocity in system.coordinates]
     places = {units[p]: names[p] for p in positions if sum(units[p] == units[q] for q in positions) == 1}
+    along = system.coordinates[0][0]
     return SystemProfile(
         driven=tuple((velocity,) for velocity in velocities),
-        position_of=dict(zip(velocities, positions, strict=True)),
+        position_of={velocity: position for position, velocity in positions.items()},
         sensors=tuple((column,) for column in range(len(names))),
         quaternion=(),
         initial_variance=tuple((FIRST_STATE_SHARE * s.largest) ** 2 for s in system.states),
         region_variables={"s": "time", **places},
-        plotted_variables=(names[velocities[0]], names[positions[0]], system.actions[0].name, "time"),
+        plotted_variables=(
+            names[velocities[0]],
+            *([] if along is None else [names[along]]),
+            system.actions[0].name,
+            "time",
+        ),
         residual_name=system.loads[0].name.replace("_", " "),
         smooth_function_factors={
             load.name: (None, names[velocity]) for load, velocity in zip(system.loads, velocities, strict=True)

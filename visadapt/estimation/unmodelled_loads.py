@@ -67,7 +67,8 @@ def response_without_friction(world: World, state: Tensor, command: Tensor, dura
     out = state.new_zeros(*state.shape, by_load.shape[-1])
     for joint, (position, velocity) in enumerate(system.coordinates):
         out[:, velocity] = duration[:, None] * by_load[:, joint]
-        out[:, position] = 0.5 * duration[:, None] * out[:, velocity]
+        if position is not None:
+            out[:, position] = 0.5 * duration[:, None] * out[:, velocity]
     return out
 
 

@@ -245,9 +245,9 @@ def read_rows(
 
 
 def needed(system: System) -> tuple[str, ...]:
-    """Columns that a recording must have: time, states and actions; rates of change may be missing."""
+    """Columns that a recording must have: time, states and actions; velocities may be missing."""
     names = [variable.name for variable in system.states]
-    rates = {system.rate_of(name) for name in names}
+    rates = {system.rate_of(name) for name in names} | {names[velocity] for _, velocity in system.coordinates}
     return ("time", *(name for name in names if name not in rates), *(variable.name for variable in system.actions))
 
 

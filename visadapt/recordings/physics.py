@@ -49,7 +49,7 @@ def are_degrees(episodes: Sequence[RawEpisode], system: System) -> bool:
     """Whether the source explains the angle's acceleration if the angle is in degrees, and does not if in radians.
 
     False where that cannot be decided: the command never changes, the episodes of a file are together too short or too
-    noisy, or the system does not have exactly one angle.
+    noisy, a velocity is neither measured nor a position's rate, or the system does not have exactly one angle.
     """
     angles = [variable.name for variable in system.states if variable.unit == "rad"]
     if len(angles) != 1 or not _can_decide(episodes, system, angles):
@@ -92,8 +92,11 @@ def exchanged(episodes: Sequence[RawEpisode], system: System, one: str, other: s
 def _can_decide(episodes: Sequence[RawEpisode], system: System, names: Sequence[str]) -> bool:
     judged = _judged(episodes)
     duration = sum(float(raw.time[:MOST_ROWS][-1] - raw.time[0]) for raw in judged)
+    measured = episodes[0].measured
+    known = {*measured, *(system.rate_of(name) for name in measured)}
     return (
         all(system.rate_of(name) for name in names)
+        and known >= {state.name for state in system.states}
         and duration > LEAST_DURATION_S
         and float(np.ptp(np.vstack([raw.action[:MOST_ROWS] for raw in judged]), axis=0).max()) > 0
     )

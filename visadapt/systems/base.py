@@ -60,8 +60,9 @@ class System(ABC):
     actions: ClassVar[tuple[Variable, ...]]
     loads: ClassVar[tuple[Variable, ...]]
     """Generalised forces that a dynamics effect may add, one entry per degree of freedom."""
-    coordinates: ClassVar[tuple[tuple[int, int], ...]] = ()
-    """For each load the columns of the position and the velocity that it acts on; dry friction needs them."""
+    coordinates: ClassVar[tuple[tuple[int | None, int], ...]] = ()
+    """For each load the columns of the position and the velocity that it acts on; dry friction needs them. A velocity
+    that is the rate of no state, as the forward speed of a robot on wheels, has None for its position."""
     longest_step: ClassVar[float | None] = None
     """s, the longest Runge-Kutta step that follows the dynamics with the default parameters; None: found from the
     derivative"""
@@ -153,10 +154,15 @@ class System(ABC):
     def rate_of(cls, name: str) -> str | None:
         """The state that is the rate of change of the state `name`; None where there is none."""
         names = [variable.name for variable in cls.states]
-        for position, velocity in cls.coordinates:
+        for position, velocity in cls.velocity_of().items():
             if names[position] == name:
                 return names[velocity]
         return f"{name}_dot" if f"{name}_dot" in names else None
+
+    @classmethod
+    def velocity_of(cls) -> dict[int, int]:
+        """The column of each joint's position to the column of its velocity, for joints that have a position."""
+        return {position: velocity for position, velocity in cls.coordinates if position is not None}
 
     @classmethod
     def index(cls, name: str) -> int:

@@ -184,24 +184,27 @@ def _coordinates(system: System) -> Iterator[str]:
         return
     pairs, states, loads = system.coordinates, system.states, system.loads
     right = "a pair (column of the position, column of the velocity) for each load, as in ((0, 1), (2, 3)),"
+    no_position = "a velocity that is the rate of no state has the position None"
     if not isinstance(pairs, tuple) or len(pairs) != len(loads):
         yield f"coordinates is {pairs!r}; {right} would be right: there are {len(loads)} loads"
         return
     for pair in pairs:
-        if not isinstance(pair, tuple) or len(pair) != 2 or not all(k in range(len(states)) for k in pair):
+        columns = range(len(states))
+        if not isinstance(pair, tuple) or len(pair) != 2 or pair[0] not in (None, *columns) or pair[1] not in columns:
             yield f"coordinates holds {pair!r}; {right} would be right: there are {len(states)} states"
             return
     state, command, load = inputs(system)
     free = system.derivative(state, command, torch.zeros_like(load))
     for k, (position, velocity) in enumerate(pairs):
-        names = states[position].name, states[velocity].name
-        if not equal(free[:, position], state[:, velocity]):
-            yield f"coordinates: {names[1]} is not the rate of {names[0]} that derivative returns"
+        name = states[velocity].name
+        if position is not None and not equal(free[:, position], state[:, velocity]):
+            of = states[position].name
+            yield f"coordinates: {name} is not the rate of {of} that derivative returns; {no_position}"
         unit = torch.zeros_like(load)
         unit[:, k] = 1
         gain = (system.derivative(state, command, unit) - free)[:, velocity]
         if not bool((gain > 0).all()):
-            yield f"loads: {loads[k].name} does not accelerate {names[1]}: its coordinates, or its sign, are wrong"
+            yield f"loads: {loads[k].name} does not accelerate {name}: its coordinates, or its sign, are wrong"
 
 
 def _batches(system: System) -> Iterator[str]:

@@ -90,7 +90,7 @@ def _stopped(
         kept = torch.where(last.abs() > holds * change, moving, 0.0)
         impulse = torch.where(reverses, (kept - last) / gain[:, own], 0.0)
         moved = after + gain * impulse[:, None]
-        for position, velocity in system.coordinates:
+        for position, velocity in system.velocity_of().items():
             moved[:, position] = moved[:, position] + 0.5 * left * h * gain[:, velocity] * impulse
         moved[:, own] = torch.where(reverses, kept, last)  # exactly at rest
         after = moved

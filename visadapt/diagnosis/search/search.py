@@ -167,6 +167,8 @@ class Search(FittedModels):
             left = self.without_process_noise([before])[0].left
             if self.best is not before:
                 self._prune()
+                # Sets that were exchanged for the worse fit may be better than they seemed.
+                exchanged.clear()
                 self._settle(exchanged)
         return left
 

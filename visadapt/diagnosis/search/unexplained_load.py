@@ -246,7 +246,7 @@ class _Motion:
         driven = (torch.stack(response, -1) * commanded[:, None]).sum(-1)
         largest = torch.tensor([action.largest for action in system.actions], dtype=state.dtype)
         slack = (commanded / (SLACK * largest)).tanh()
-        for j, (position, velocity) in enumerate(system.coordinates):
+        for j, (position, velocity) in enumerate(system.velocity_of().items()):
             v = state[:, velocity]
             slip = v / (SLOW * system.states[velocity].largest)
             sign, near_rest = slip.tanh(), (-(0.2 * slip).square()).exp()

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from visadapt.effects.base import EFFECTS, Effect
+from visadapt.effects.own.added_inertia import inertia_of, with_inertia
 from visadapt.effects.own.commands import on_commands
 from visadapt.effects.own.dynamics import on_joints, on_parameters, scalable
 from visadapt.effects.own.sensors import on_sensors
@@ -47,12 +48,14 @@ _GENERATED: set[type[Effect]] = set()
 
 @cache
 def _made(system: type[System]) -> tuple[type[Effect], ...]:
+    example = system()
     every = (*on_commands(system), *on_joints(system), *on_parameters(system), *on_sensors(system))
     alike: dict[str, tuple[str, ...]] = {}
-    for one, other in _alike(system()):
+    for one, other in _alike(example):
         alike[one] = (*alike.get(one, ()), other)
         alike[other] = (*alike.get(other, ()), one)
-    return tuple(_named(system, *each, alike.get(each[0], ())) for each in every)
+    heavier = dict(_heavier(example))
+    return tuple(_named(system, *each, alike.get(each[0], ()), heavier.get(each[0], "")) for each in every)
 
 
 def _alike(system: System) -> Iterator[tuple[str, str]]:
@@ -71,25 +74,56 @@ def _alike(system: System) -> Iterator[tuple[str, str]]:
         stronger = system.derivative(state, command * (1 + unit), rest)
         for field in scalable(system):
             for factor in (2.0, 0.5):
-                try:
-                    scaled: Any = replace(system, **{field: factor * getattr(system, field)})  # type: ignore[type-var]
-                except ValueError:  # the system has no such value of this parameter beside the others
-                    continue
-                if equal(scaled.derivative(state, command, rest), stronger):
+                scaled = _scaled(system, field, factor)
+                if scaled is not None and equal(scaled.derivative(state, command, rest), stronger):
                     yield f"{action.name}.actuator_gain", f"{field}.scale"
 
 
+def _heavier(system: System) -> Iterator[tuple[str, str]]:
+    """Pairs of effects of which the first, scaling a parameter by more than 1, does what the second, added inertia,
+    does. They are not equivalent: a parameter may be smaller too, an added inertia is not negative."""
+    given = inputs(system)
+    for field in scalable(system):
+        scaled = _scaled(system, field, 2.0)
+        if scaled is None:
+            continue
+        for joint, load in enumerate(system.loads):
+            added = inertia_of(scaled, joint) - inertia_of(system, joint)
+            if added > 0 and equal(with_inertia(system, joint, added).derivative(*given), scaled.derivative(*given)):
+                yield f"{field}.scale", f"{load.name}.added_inertia"
+
+
+def _scaled(system: System, field: str, factor: float) -> System | None:
+    """The system with a factor on a parameter; None where it has no such value beside the others."""
+    itself: Any = system
+    try:
+        scaled: System = replace(itself, **{field: factor * getattr(system, field)})
+    except ValueError:
+        return None
+    return scaled
+
+
 def _named(
-    system: type[System], name: str, base: type[Effect], attributes: dict[str, Any], alike: tuple[str, ...]
+    system: type[System],
+    name: str,
+    base: type[Effect],
+    attributes: dict[str, Any],
+    alike: tuple[str, ...],
+    heavier: str,
 ) -> type[Effect]:
     # Where effects of two systems have the same name, the later ones replace the earlier in `EFFECTS`.
     own = {"__module__": system.__module__, "__qualname__": name, "name": name, "systems": (system,)}
     settled = {other: _MOTOR_OFF for other in alike if other.endswith(".constant_load")}
-    settled |= {other: _MEASURED for other in alike if other.endswith(".scale")}
+    settled |= {other: _measured(other, "an actuator's gain") for other in alike if other.endswith(".scale")}
+    settled |= {heavier: _measured(name, "inertia that is added")} if heavier else {}
     return type(name, (base,), {"indistinguishable_from": alike, "settled_by": settled, **own, **attributes})
 
 
-_MEASURED = "no motion tells an actuator's gain from that parameter: measure the parameter by itself"
+def _measured(scale: str, other: str) -> str:
+    field = scale.removesuffix(".scale")
+    return f"no motion tells another {field} from {other}: measure {field} by itself"
+
+
 _MOTOR_OFF = (
     "switch the motor off and measure the load on the joint with a balance: a constant load is still there, an "
     "actuator's bias is gone"

@@ -21,12 +21,7 @@ class AddedInertia(JointEffect):
     source = "Newton's second law"
 
     def alter(self, system: System) -> System:
-        field = f"{_ADDED}{self.joint}"
-        values = {field: getattr(system, field, 0.0) + getattr(self, self.table[0].name)}
-        if isinstance(system, Inertial):
-            return replace(system, **values)  # type: ignore[type-var]  # a dataclass
-        altered: System = _inertial(type(system))(**dict(parameters(system)), **values)
-        return altered
+        return with_inertia(system, self.joint, getattr(self, self.table[0].name))
 
 
 _ADDED = "added_inertia_"  # ... and the joint: fields of systems with added inertia
@@ -58,6 +53,16 @@ class Inertial(System):
 def _inertial(system: type[System]) -> type[Any]:
     added = [(f"{_ADDED}{joint}", Any, 0.0) for joint in range(len(system.loads))]
     return make_dataclass(system.__name__, added, bases=(Inertial, system), frozen=True)
+
+
+def with_inertia(system: System, joint: int, inertia: float | Tensor) -> System:
+    """The system with inertia added to one of its joints, beside what was added before."""
+    field = f"{_ADDED}{joint}"
+    values = {field: getattr(system, field, 0.0) + inertia}
+    if isinstance(system, Inertial):
+        return replace(system, **values)  # type: ignore[type-var]  # a dataclass
+    altered: System = _inertial(type(system))(**dict(parameters(system)), **values)
+    return altered
 
 
 def inertia_of(system: System, joint: int) -> float:

@@ -19,7 +19,7 @@ from visadapt.systems.base import parameters
 def on_joints(system: type[System]) -> Iterator[Made]:
     """The effects on each joint: loads, and added inertia."""
     for joint, (load, (position, velocity)) in enumerate(zip(system.loads, system.coordinates, strict=True)):
-        kinds = _laws(load, system.states[position], system.states[velocity])
+        kinds = _laws(load, None if position is None else system.states[position], system.states[velocity])
         for kind, (law, equation, table) in kinds.items():
             yield f"{load.name}.{kind}", law, {"joint": joint, "equation": equation, "table": table}
         most = 5 * inertia_of(system(), joint)
@@ -43,11 +43,11 @@ def _per(load: Variable, variable: Variable, power: int = 1) -> str:
 
 
 def _laws(
-    load: Variable, position: Variable, velocity: Variable
+    load: Variable, position: Variable | None, velocity: Variable
 ) -> dict[str, tuple[type[laws.JointEffect], str, tuple[Parameter, ...]]]:
-    most, fastest, farthest = (variable.largest for variable in (load, velocity, position))
+    most, fastest = load.largest, velocity.largest
     size = "torque" if load.unit == "N m" else "force"
-    q, v, unit = position.name, velocity.name, load.unit
+    v, unit = velocity.name, load.unit
 
     def linear(name: str, low: float, unit: str = unit, high: float = most) -> Parameter:
         return Parameter(name, unit, low, high, 0.0, linear=True)
@@ -56,7 +56,17 @@ def _laws(
         return tuple(Parameter(name, unit, 0.0, most, 0.0) for name in names)
 
     # A coefficient is searched up to the one with which a third of the range of motion makes the largest load.
-    per_velocity, per_position = 3 * most / fastest, 3 * most / farthest
+    per_velocity = 3 * most / fastest
+    spring: dict[str, tuple[type[laws.JointEffect], str, tuple[Parameter, ...]]] = {}
+    if position is not None:
+        spring["spring"] = (
+            laws.SpringLaw,
+            f"Q = -stiffness ({position.name} - rest)",
+            (
+                linear("stiffness", 0.0, _per(load, position), 3 * most / position.largest),
+                Parameter("rest", position.unit, position.low, position.high, None),
+            ),
+        )
     return {
         "viscous_friction": (
             laws.ViscousLaw,
@@ -88,14 +98,7 @@ def _laws(
             f"Q = -share |motor {size}| sign({v}); at rest, what holds the joint, up to share |motor {size}|",
             (Parameter("share", "1", 0.0, 0.8, 0.0),),
         ),
-        "spring": (
-            laws.SpringLaw,
-            f"Q = -stiffness ({q} - rest)",
-            (
-                linear("stiffness", 0.0, _per(load, position), per_position),
-                Parameter("rest", position.unit, position.low, position.high, None),
-            ),
-        ),
+        **spring,
         "constant_load": (laws.ConstantLaw, f"Q = {size}", (linear(size, -most),)),
         "periodic_load": (
             laws.PeriodicLaw,

@@ -16,7 +16,8 @@ from visadapt.systems.contract import ROUNDING, inputs
 
 def on_sensors(system: type[System]) -> Iterator[Made]:
     """Offset, scale and delay of each sensor (velocities share scale and delay of positions), and a delay of all."""
-    rates = dict(system.coordinates)
+    rates = system.velocity_of()
+    velocities = [velocity for _, velocity in system.coordinates]
     moving = {"positions": list(rates), "velocities": list(rates.values())}
     yield (
         f"{ALL_SENSORS}.measurement_delay",
@@ -38,7 +39,7 @@ def on_sensors(system: type[System]) -> Iterator[Made]:
                 "order": sensing.AngleOffset.order,
             },
         )
-        if column in rates.values():
+        if column in velocities:
             continue
         scaled = [column, rates[column]] if column in rates else [column]
         both = ", ".join(system.states[one].name for one in scaled)
@@ -75,7 +76,7 @@ def _transmissions(system: type[System]) -> Iterator[Made]:
     state, command, _ = inputs(example)
     moved = example.motor_loads(state, command).abs() > ROUNDING * largest
     for joint, (load, (column, rate)) in enumerate(zip(system.loads, system.coordinates, strict=True)):
-        if bool(moved[:, joint].any()):
+        if column is not None and bool(moved[:, joint].any()):
             position, velocity = system.states[column], system.states[rate]
             per = f"({load.unit})" if " " in load.unit else load.unit
             most = LARGEST_TWIST * position.largest / load.largest

@@ -1,0 +1,153 @@
+"""Velocities that are the rate of no state: a robot on wheels of which poses are seen, a motor that shows its speed."""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+from tests.own_systems import Rover
+from visadapt.diagnosis import diagnose
+from visadapt.effects.catalogue import catalogue
+from visadapt.recordings import Episode, Recording, load_recording
+from visadapt.systems import System, Variable
+from visadapt.world import World
+
+PERIOD, ROWS = 0.05, 120
+BY_NAME = {effect.name: effect for effect in catalogue(Rover())}
+SEARCHED = [
+    BY_NAME[name]
+    for name in (
+        *("left.actuator_gain", "right.actuator_gain", "mass.scale", "inertia.scale", "yaw.sensor_offset"),
+        *("forward.viscous_friction", "forward.coulomb_friction", "turn.coulomb_friction", "forward.added_inertia"),
+    )
+]
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """Writes and reads a recording of a rover with other values, integrated by scipy."""
+
+    def of(left=1.0, mass=1.0):
+        generator, rover = np.random.default_rng(0), Rover()
+        lines = ["episode,time,x,y,yaw,left,right"]
+        for episode in range(2):
+            state = np.zeros(5)
+            for row in range(ROWS):
+                t = row * PERIOD
+                torques = 0.4 + 0.8 * math.sin(1.1 * t + episode), 0.4 + 0.8 * math.sin(1.7 * t + 2 * episode)
+                seen = state[:3] + 1e-3 * generator.normal(size=3)
+                lines.append(",".join(str(one) for one in (episode, t, *seen, *torques)))
+                forces = left * torques[0] / rover.radius, torques[1] / rover.radius
+
+                def rates(_, s, forces=forces):
+                    turning = rover.half_track * (forces[1] - forces[0] - rover.damping * rover.half_track * s[4])
+                    forward = sum(forces) - rover.damping * s[3]
+                    speeds = s[3] * math.cos(s[2]), s[3] * math.sin(s[2]), s[4]
+                    return [*speeds, forward / (mass * rover.mass), turning / rover.inertia]
+
+                state = solve_ivp(rates, (0, PERIOD), state, rtol=1e-6, atol=1e-8, method="LSODA").y[:, -1]
+        path = tmp_path / "rover.csv"
+        path.write_text("\n".join(lines))
+        return load_recording(path, rover)
+
+    return of
+
+
+@pytest.mark.parametrize(
+    ("target", "name", "value"),
+    [
+        ({"left": 0.7}, "left.actuator_gain", 0.7),
+        ({}, "", 0.0),
+    ],
+)
+def test_what_is_there_is_found_without_measured_velocities(recorded, target, name, value):
+    recording = recorded(**target)
+    assert recording.measured == ("x", "y", "yaw")
+    found = diagnose(recording, World(Rover(), period=PERIOD), SEARCHED)
+    assert found.verdict == ("identified" if name else "no_gap")
+    assert [cause.effect for cause in found.causes if not cause.slight] == ([name] if name else [])
+    if name:
+        (estimate,) = found.causes[0].parameters.values()
+        assert estimate.value == pytest.approx(value, rel=0.02)
+
+
+def test_a_larger_mass_and_added_inertia_are_told_apart_by_a_balance(recorded):
+    found = diagnose(recorded(mass=1.5), World(Rover(), period=PERIOD), SEARCHED)
+    assert found.verdict == "ambiguous"
+    assert {cause.effect for cause in found.causes} == {"mass.scale", "forward.added_inertia"}
+    assert found.next_experiment.endswith(
+        "apart: no motion tells another mass from inertia that is added: measure mass by itself."
+    )
+
+
+def test_dry_friction_stops_it_where_the_closed_form_does():
+    rover, force, start, period = Rover(), 2.0, 0.5, 0.01
+    friction = BY_NAME["forward.coulomb_friction"](force=force)
+    world = World(rover, [friction], period).double().requires_grad_(False)
+    at = world.start(torch.tensor([[0.0, 0.0, 0.0, start, 0.0]], dtype=torch.float64))
+    rate, slowest = rover.damping / rover.mass, force / rover.damping
+    stops = math.log1p(start / slowest) / rate
+    way = (start + slowest) / rate * -math.expm1(-rate * stops) - slowest * stops
+    for _ in range(math.ceil(stops / period)):
+        at = world.step(at, torch.zeros(1, 2, dtype=torch.float64))
+    assert at.state[0, 3] == 0
+    assert at.state[0, 0].item() == pytest.approx(way, abs=1e-4)
+
+
+def test_a_speed_without_a_position_has_no_spring_and_no_transmission():
+    lacking = {"forward.spring", "forward.transmission_compliance"}
+    assert not lacking & BY_NAME.keys()
+    assert {one.replace("forward", "turn") for one in lacking} <= BY_NAME.keys()
+
+
+@dataclass(frozen=True)
+class Motor(System):
+    inertia: float = 0.01  # kg m2
+    resistance: float = 1.0  # ohm
+    constant: float = 0.05  # N m/A
+    damping: float = 0.002  # N m s/rad
+
+    name = "motor_of_a_wheel"
+    states: ClassVar[tuple[Variable, ...]] = (Variable("speed", "rad/s", -150.0, 150.0),)
+    actions: ClassVar[tuple[Variable, ...]] = (Variable("voltage", "V", -12.0, 12.0),)
+    loads = (Variable("shaft", "N m", -0.2, 0.2),)
+    coordinates = ((None, 0),)
+
+    def __post_init__(self):
+        self.check_parameters(may_be_zero=("damping",))
+
+    def derivative(self, state, command, load):
+        current = (command[:, 0] - self.constant * state[:, 0]) / self.resistance
+        torque = self.constant * current + load[:, 0] - self.damping * state[:, 0]
+        return torch.stack((torque / self.inertia,), -1)
+
+
+@pytest.mark.parametrize(
+    ("damping", "verdict", "named"),
+    [
+        (0.002, "identified", {"resistance.scale"}),
+        # Whatever divides the only acceleration that is left is the same.
+        (0.0, "ambiguous", {"resistance.scale", "inertia.scale", "shaft.added_inertia"}),
+    ],
+)
+def test_a_motor_whose_speed_alone_is_measured(damping, verdict, named):
+    motor, resistance, volts = Motor(damping=damping), 1.4, 6.0
+    # Under a constant voltage the speed approaches its end exponentially.
+    slowing = motor.constant**2 / resistance + damping
+    end, rate = volts * motor.constant / resistance / slowing, slowing / motor.inertia
+    time = PERIOD * np.arange(ROWS)
+    forth, back = end * -np.expm1(-rate * time), -end + 2 * end * np.exp(-rate * (time - 3))
+    back -= end * np.exp(-rate * time)
+    voltage, speed = np.where(time < 3, volts, -volts), np.where(time < 3, forth, back)
+    generator = np.random.default_rng(0)
+    episodes = tuple(
+        Episode(time, voltage[:, None], (speed + 0.2 * generator.normal(size=ROWS))[:, None]) for _ in range(2)
+    )
+    found = diagnose(Recording(episodes, ("speed",), PERIOD, ("one", "two")), World(motor, period=PERIOD))
+    causes = {cause.effect: cause.parameters for cause in found.causes if not cause.slight}
+    assert (found.verdict, set(causes)) == (verdict, named)
+    assert causes["resistance.scale"]["scale"].value == pytest.approx(resistance, rel=0.02)
