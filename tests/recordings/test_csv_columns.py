@@ -63,6 +63,16 @@ class TestColumns:
         del table[missing]
         refuses(f"run.csv: column '{missing}' is missing; it has .*--columns {missing}=", write(file, table))
 
+    def test_states_that_were_not_measured(self, file):
+        table = a_table()
+        path = write(file, {name: table[name] for name in ("time", "theta", "theta_dot", "command")})
+        refuses("column 'x' is missing; .*; if it was not measured: --columns x=$", path)
+        recording = load(path, columns={"x": "", "theta_dot": ""})
+        assert recording.measured == ("theta",)
+        assert recording.warnings == ("x, theta_dot: not measured; the simulator tells it from what was",)
+        refuses("one of x, x_dot, theta, theta_dot at least must be measured", path, columns=dict.fromkeys(STATES, ""))
+        refuses("--columns command=: command is needed; --columns command=... names it", path, columns={"command": ""})
+
     def test_what_the_user_names_is_not_there(self, file):
         write(file, a_table())
         refuses("no column 'pos' for x; it has time, x", file, columns={"x": "pos"})

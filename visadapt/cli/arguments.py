@@ -26,7 +26,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("recording", nargs="+", metavar="RECORDING", help="CSV or HDF5 files, logs of ROS or PX4, or folders of these")
     _add_system(parser)
-    columns_help = "our name=the name in the file, as in x=position,theta=phi"
+    columns_help = "our name=the name in the file, as in x=position,theta=phi; theta= is a state that was not measured"
     add("--columns", metavar="A=B,...", type=_columns, default={}, help=columns_help)
     add("--effects", metavar="FILE.py", help="a file that defines effects of your own")
     renderer_help = "for a film without states: draws its scene from cart position and pole angle (`visadapt renderer`)"
@@ -281,8 +281,8 @@ def _columns(text: str) -> dict[str, str]:
     """The file's names of columns by ours."""
     columns: dict[str, str] = {}
     for pair in text.split(","):
-        ours, _, theirs = (part.strip() for part in pair.partition("="))
-        if not ours or not theirs:
+        ours, equals, theirs = (part.strip() for part in pair.partition("="))
+        if not ours or not equals:
             raise argparse.ArgumentTypeError(f"{pair!r} is not of the form x=position")
         if ours in columns:
             raise argparse.ArgumentTypeError(f"{ours} is given twice")

@@ -24,7 +24,7 @@ from visadapt.progress import Progress
 from visadapt.recordings.clock import Note, RawEpisode
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.thinning import STRETCH, thinned
-from visadapt.systems import System
+from visadapt.systems import RigidBody, System
 
 SEPARATORS = ",;\t"
 
@@ -245,23 +245,30 @@ def read_rows(
 
 
 def needed(system: System) -> tuple[str, ...]:
-    """Columns that a recording must have: time, states and actions; velocities may be missing."""
+    """Columns that a recording must have, unless `given` says that one was not measured: time, all states but
+    velocities, and actions."""
     names = [variable.name for variable in system.states]
     rates = {system.rate_of(name) for name in names} | {names[velocity] for _, velocity in system.coordinates}
     return ("time", *(name for name in names if name not in rates), *(variable.name for variable in system.actions))
 
 
 def check_given(given: Mapping[str, str], ours: Sequence[str], system: System) -> None:
-    """Raises RecordingError where `given` maps a name that is none of `ours`."""
-    for name in given:
+    """Raises RecordingError where `given` maps a name that is none of `ours`, or leaves out what must be measured."""
+    states = [state.name for state in system.states]
+    for name, theirs in given.items():
         if name not in ours:
             raise RecordingError(f"--columns {name}=...: {system.name} has no {name!r}; it has {', '.join(ours)}")
+        if not theirs and (name not in states or (isinstance(system, RigidBody) and name in needed(system))):
+            raise RecordingError(f"--columns {name}=: {name} is needed; --columns {name}=... names it")
+    if all(given.get(name) == "" for name in states):
+        raise RecordingError(f"--columns: one of {', '.join(states)} at least must be measured")
 
 
 def match(
     path: Path, header: tuple[str, ...], system: System, given: Mapping[str, str], states: bool = True
 ) -> dict[str, int]:
-    """The index of each of our variables in a file's header; `given` maps our names to the file's.
+    """The index of each of our variables in a file's header; `given` maps our names to the file's, or to "" where a
+    state was not measured.
 
     Without `states` it has no states, as where frames are read in their place.
 
@@ -275,6 +282,8 @@ def match(
     check_given(given, ours, system)
     found: dict[str, int] = {}
     for name in ours:
+        if given.get(name) == "":
+            continue
         candidates: list[int] = []
         for names in ([given[name]],) if name in given else ([name], others.get(name, ())):
             lower = [wanted.lower() for wanted in names]
@@ -297,9 +306,15 @@ def match(
         elif name in needed(system):
             raise RecordingError(
                 f"{path}: column {name!r} is missing; it has {', '.join(header)}; "
-                f"if one of them is {name}: --columns {name}=..."
+                f"if one of them is {name}: --columns {name}=...{if_unmeasured(system, name)}"
             )
     return found
+
+
+def if_unmeasured(system: System, name: str) -> str:
+    """The end of a message that a column is missing: what to say where it is a state that was not measured."""
+    states = [] if isinstance(system, RigidBody) else [state.name for state in system.states]
+    return f"; if it was not measured: --columns {name}=" if name in states else ""
 
 
 def _number(cell: str) -> float:

@@ -56,7 +56,7 @@ def load_recording(
     Args:
         paths: one or several: files, bags of ROS 2, or folders whose recordings are taken in the order of their names.
         system: the source, which defines names and units.
-        columns: our names of columns to the file's, where these are not evident.
+        columns: our names of columns to the file's, where these are not evident; "" for a state that was not measured.
         frames: whether to read frames in place of states.
         progress: called with (stage, MB done, MB in all, nan).
 
@@ -77,6 +77,8 @@ def load_recording(
     def note(text: str, where: str) -> None:
         places.setdefault(text, []).append(where)
 
+    if unmeasured := [name for name, theirs in (columns or {}).items() if not theirs]:
+        note("not measured; the simulator tells it from what was", ", ".join(unmeasured))
     whole: list[RawEpisode] = []
     files = _files([paths] if isinstance(paths, str | os.PathLike) else paths, note)
     sizes = [path.stat().st_size for path in files]

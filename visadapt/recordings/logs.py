@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from visadapt.recordings.clock import Note, RawEpisode
-from visadapt.recordings.csv import check_given, needed
+from visadapt.recordings.csv import check_given, if_unmeasured, needed
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.topics import Read, Topic
 from visadapt.systems import RigidBody, System
@@ -36,9 +36,9 @@ def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], n
     if missing := [name for name in needed(system) if name not in ("time", *given)]:
         raise RecordingError(
             f"{path}: say where {', '.join(missing)} are: --columns {missing[0]}=TOPIC.FIELD,... "
-            "(`ros2 bag info` and `ulog_info` list topics)"
+            f"(`ros2 bag info` and `ulog_info` list topics){if_unmeasured(system, missing[0])}"
         )
-    places = {name: _place(path, given[name]) for name in ours if name in given}
+    places = {name: _place(path, given[name]) for name in ours if given.get(name)}
     wanted: dict[str, set[str]] = {}
     for topic, field in places.values():
         wanted.setdefault(topic, set()).add(field)

@@ -1,4 +1,4 @@
-"""Velocities that are the rate of no state: a robot on wheels of which poses are seen, a motor that shows its speed."""
+"""Machines of which little is measured: poses of a robot on wheels, a motor's speed, a pendulum by its arm."""
 
 import math
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from tests.own_systems import Rover
+from tests.own_systems import Rover, furuta
 from visadapt.diagnosis import diagnose
 from visadapt.effects.catalogue import catalogue
 from visadapt.recordings import Episode, Recording, load_recording
@@ -82,6 +82,31 @@ def test_a_larger_mass_and_added_inertia_are_told_apart_by_a_balance(recorded):
     assert found.next_experiment.endswith(
         "apart: no motion tells another mass from inertia that is added: measure mass by itself."
     )
+
+
+def test_a_friction_is_found_by_the_sensor_of_another_joint():
+    rotary = furuta()()
+    named = {effect.name: effect for effect in catalogue(rotary)}
+    machine = World(rotary, [named["hinge.viscous_friction"](coefficient=1e-4)], 0.02, substeps=10)
+    machine.double().requires_grad_(False)
+    generator, time = np.random.default_rng(0), 0.02 * np.arange(ROWS)
+    episodes = []
+    for episode in range(2):
+        volts = 1.5 * np.sin((4 + episode) * time) + np.sin(11 * time + episode)
+        at, arm = machine.start(torch.zeros(1, 4, dtype=torch.float64)), []
+        for command in torch.from_numpy(volts)[:, None, None]:
+            arm.append(at.state[0, :1].numpy() + 1e-3 * generator.normal())
+            at = machine.step(at, command)
+        episodes.append(Episode(time, volts[:, None], np.array(arm)))
+    recording = Recording(tuple(episodes), ("arm",), 0.02, ("one", "two"))
+    searched = [
+        named[name]
+        for joint in ("arm_axis", "hinge")
+        for name in (f"{joint}.viscous_friction", f"{joint}.coulomb_friction", f"{joint}.added_inertia")
+    ]
+    found = diagnose(recording, World(rotary, period=0.02), searched)
+    assert (found.verdict, [cause.effect for cause in found.causes]) == ("identified", ["hinge.viscous_friction"])
+    assert found.causes[0].parameters["coefficient"].value == pytest.approx(1e-4, rel=0.02)
 
 
 def test_dry_friction_stops_it_where_the_closed_form_does():
