@@ -31,16 +31,16 @@ def a_table(rows=41, period=0.05, seed=0, noise=1e-3):
     return table
 
 
-def a_run(start, noise, rows=200, period=0.05, seed=0):
-    """The cart-pole itself under a controller and excitation, from an angle `start`; wrapped, noisy."""
-    values = a_motion(start, rows, period, seed).copy()
+def a_run(start, noise, rows=200, period=0.05, seed=0, push=0.2):
+    """The cart-pole itself under a controller and excitation of up to `push`, from an angle `start`; wrapped, noisy."""
+    values = a_motion(start, rows, period, seed, push).copy()
     values[:, :4] += noise * np.random.default_rng((seed, 1)).normal(size=(rows, 4)) * [0.5, 3, 1, 3]
     values[:, 2] = (values[:, 2] + np.pi) % (2 * np.pi) - np.pi
     return {"time": np.arange(rows) * period, **dict(zip(HEADER[1:], values.T, strict=True))}
 
 
 @cache
-def a_motion(start, rows, period, seed):
+def a_motion(start, rows, period, seed, largest):
     """States and commands (rows, 5) of such a run; many tests begin with the same one."""
     rng = np.random.default_rng(seed)
     world = World(CartPole(), period=period, substeps=2).double()
@@ -49,7 +49,7 @@ def a_motion(start, rows, period, seed):
     gains = torch.tensor([0.05, 0.1, 1.5, 0.3], dtype=torch.float64)
     for row in range(rows):
         if row % 3 == 0:
-            push = rng.uniform(-0.2, 0.2)
+            push = rng.uniform(-largest, largest)
         balance = float(now.state[0] @ gains) if start < 1 else 0.0
         command = float(np.clip(balance + push, -1, 1))
         log.append([*now.state[0].tolist(), command])

@@ -3,7 +3,7 @@ import os
 import numpy as np
 import pytest
 
-from tests.recorded import HEADER, STATES, a_table, load, refuses, write
+from tests.recorded import HEADER, STATES, a_run, a_table, load, refuses, write
 
 
 class TestColumns:
@@ -111,7 +111,17 @@ class TestColumns:
     def test_a_force_that_never_exceeds_one_is_the_command(self, file):
         table = a_table()
         table["force"] = table.pop("command")
-        assert load(write(file, table)).warnings == ()
+        recording = load(write(file, table))
+        np.testing.assert_array_equal(recording.episodes[0].action[:, 0], table["force"])
+        (warning,) = recording.warnings
+        assert "'force' stays within [-1, 1] and is taken to be a share of max_force" in warning
+
+    def test_a_force_in_newton_that_is_small_is_told_by_what_it_does(self, file):
+        table = a_run(start=0.003, noise=1e-5, push=0.01)
+        table["force"] = 30 * table.pop("command")
+        assert np.abs(table["force"]).max() < 1
+        recording = load(write(file, table))
+        np.testing.assert_allclose(recording.episodes[0].action[:, 0], table["force"] / 30)
 
 
 class TestPaths:

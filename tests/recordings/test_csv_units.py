@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from tests.diagnosis.test_diagnosis_flights import record as a_flight
 from tests.own_systems import Winch
 from tests.recorded import a_run, a_table, load, refuses, write
 from visadapt.recordings import RecordingError, load_recording
@@ -124,6 +125,54 @@ class TestUnits:
         table["theta"], table["x"] = table["x"], (angle + np.pi) % (2 * np.pi) - np.pi
         del table["x_dot"], table["theta_dot"]
         refuses("column 'x' jumps by .*are two columns exchanged", write(file, table))
+
+    @pytest.mark.parametrize("turn", [np.pi, -np.pi])
+    @pytest.mark.parametrize("rates", [False, True])
+    def test_an_angle_from_hanging(self, file, turn, rates):
+        table = a_run(start=0.2, noise=1e-3)
+        table["theta"] = table["theta"] + turn
+        if not rates:
+            del table["x_dot"], table["theta_dot"]
+        refuses(
+            "column 'theta' answers the command as it should half a turn further; 0 upright is right",
+            write(file, table),
+        )
+
+    @pytest.mark.parametrize("start", [0.03, 0.2, 3.0])
+    def test_the_other_sign_of_an_angle_is_not_half_a_turn(self, file, start):
+        table = a_run(start=start, noise=1e-3)
+        table["theta"], table["theta_dot"] = -table["theta"], -table["theta_dot"]
+        load(write(file, table))
+
+    @pytest.mark.parametrize(
+        ("factor", "said"), [(100, "is 100 times"), (0.001, "is 1000 times"), (-1, "opposite sign")]
+    )
+    def test_a_speed_in_another_unit_or_of_the_other_sign(self, file, factor, said):
+        table = a_table(rows=200)
+        table["x"], table["x_dot"] = 0.05 * table["x"], 0.05 * factor * table["x_dot"]
+        refuses(said, write(file, table))
+
+    @pytest.mark.parametrize(
+        ("change", "said"),
+        [
+            (lambda s: s * ([1] * 6 + [1.3] * 4 + [1] * 3), "quaternion's length is 1.3"),
+            (lambda s: s[:, [0, 1, 2, 3, 4, 5, 7, 8, 9, 6, 10, 11, 12]], "in the order x, y, z, w; q_w, the scalar"),
+            (lambda s: s * ([1] * 7 + [-1] * 3 + [1] * 3), "rotates body into world axes is right"),
+            (lambda s: s * ([1] * 10 + [180 / np.pi] * 3), "rad/s are right"),
+            (lambda s: s * [1, 1, -1, 1, 1, -1, *[1] * 7], "column 'z' accelerates against the thrust"),
+        ],
+    )
+    def test_an_attitude_that_is_told_otherwise(self, file, change, said):
+        recorded = a_flight(Quadrotor(), rows=60, episodes=1)
+        (episode,) = recorded.episodes
+        names = (*recorded.measured, *(action.name for action in Quadrotor.actions))
+
+        def written(states):
+            return write(file, dict(zip(("time", *names), (episode.time, *states.T, *episode.action.T), strict=True)))
+
+        load_recording(written(episode.state), Quadrotor())
+        with pytest.raises(RecordingError, match=said):
+            load_recording(written(change(episode.state)), Quadrotor())
 
     def test_noise_is_no_reason_to_refuse(self, file):
         load(write(file, a_table(rows=400, noise=9e-3)))

@@ -11,11 +11,20 @@ from itertools import combinations, product
 import numpy as np
 from numpy.typing import NDArray
 
+from visadapt.recordings.attitude import check_attitude
 from visadapt.recordings.clock import GAP_PERIODS, UNITS_S, Note, RawEpisode
 from visadapt.recordings.episode import RecordingError
-from visadapt.recordings.physics import DEGREE, DIFFERENCE_S, are_degrees, correlation, exchanged
+from visadapt.recordings.physics import (
+    DEGREE,
+    DIFFERENCE_S,
+    are_degrees,
+    correlation,
+    exchanged,
+    is_half_a_turn_off,
+    is_turned_round,
+)
 from visadapt.recordings.sensors import TURN, differences
-from visadapt.systems import System, Variable
+from visadapt.systems import CartPole, RigidBody, System, Variable
 
 MOST_RATE_RANGES = 3.0
 """Rates above this multiple of the system's stated range are taken to be in another unit."""
@@ -76,7 +85,8 @@ def check_units(episodes: Sequence[RawEpisode], system: System) -> None:
     """Check the columns of a file's episodes, all of which have the same.
 
     Raises:
-        RecordingError: angles are evidently in degrees, lengths in cm or mm, or columns exchanged.
+        RecordingError: angles are evidently in degrees or measured from another zero, lengths in cm or mm, signs
+            wrong, or columns exchanged.
     """
     variables = {variable.name: variable for variable in system.states}
     judged = [raw for raw in episodes if len(raw.time) >= LEAST_ROWS]
@@ -101,7 +111,17 @@ def check_units(episodes: Sequence[RawEpisode], system: System) -> None:
         for name in columns:
             if (rate := system.rate_of(name)) is not None:
                 _check_rate(raw, variables[name], variables[rate])
+        check_attitude(raw, system)
     whole = judged[0]
+    if isinstance(system, RigidBody) and is_turned_round(judged, system, "z"):
+        raise RecordingError(
+            f"{whole.source}: {whole.column('z')} accelerates against the thrust, as if it pointed down; up is right"
+        )
+    if is_half_a_turn_off(judged, system):
+        raise RecordingError(
+            f"{whole.source}: {whole.column(angles[0])} answers the command as it should half a turn further; "
+            f"{_zero(system)} is right"
+        )
     if are_degrees(judged, system):
         name, values = angles[0], np.concatenate([raw.states[angles[0]] for raw in judged])
         raise RecordingError(
@@ -115,6 +135,11 @@ def check_units(episodes: Sequence[RawEpisode], system: System) -> None:
                 f"{whole.column(other)} as {name}: they are exchanged "
                 f"(or the command's sign is wrong: positive pushes towards +x)"
             )
+
+
+def _zero(system: System) -> str:
+    """Where the system's angle is 0, in words."""
+    return "0 upright" if isinstance(system, CartPole) else "the source's zero"
 
 
 def _rates(time: NDArray[np.float64], values: NDArray[np.float64], angle: bool) -> NDArray[np.float64]:
@@ -164,15 +189,26 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable) -> None:
         row = int(np.abs(measured).argmax())
         raise RecordingError(f"{raw.cell(row, rate.name)} is {measured[row]:g} {rate.unit}; {right}")
     between = 0.5 * (measured[1:] + measured[:-1])
-    if angle and correlation(change, between) > IS_RATE_CORRELATION:
-        ratio = float(change.std() / between.std()) * DEGREE
-        for wrong, factor in ((variable, ratio), (rate, DEGREE**2 / ratio)):
-            if 0.5 < factor < 2:
+    if _is_opposite(change, between):
+        raise RecordingError(
+            f"{raw.source}: {raw.column(rate.name)} has the opposite sign of the change of {variable.name}"
+        )
+    if correlation(change, between) < IS_RATE_CORRELATION:
+        return
+    ratio = float(change.std() / between.std())
+    for times in (1 / DEGREE,) if angle else (100.0, 1000.0):
+        for wrong, factor in ((variable, ratio), (rate, 1 / ratio)):
+            if 0.5 < factor / times < 2:
                 raise RecordingError(
-                    f"{raw.source}: {raw.column(wrong.name)} is {1 / DEGREE:.0f} times what the other says "
+                    f"{raw.source}: {raw.column(wrong.name)} is {times:.0f} times what the other says "
                     f"({variable.name} changes by {change.std():.3g} {rate.unit}, {rate.name} is {between.std():.3g} "
                     f"{rate.unit}, root mean square); {right}"
                 )
+
+
+def _is_opposite(change: NDArray[np.float64], rate: NDArray[np.float64]) -> bool:
+    """Whether a rate is that of the change with the other sign."""
+    return correlation(change, rate) < -IS_RATE_CORRELATION and 0.8 < float(change.std() / rate.std()) < 1.25
 
 
 def _check_exchanged(
@@ -191,7 +227,8 @@ def _check_exchanged(
     measured = {name: later(rate) for name, rate in rates.items() if rate in raw.states}
     for name, rate in measured.items():
         crossed = correlation(changes(rates[name], False), later(name))
-        if crossed > IS_RATE_CORRELATION and correlation(change[name], rate) < NOT_RATE_CORRELATION:
+        own = correlation(change[name], rate)
+        if crossed > IS_RATE_CORRELATION and own < NOT_RATE_CORRELATION and not _is_opposite(change[name], rate):
             raise RecordingError(
                 f"{raw.source}: {raw.column(name)} and {raw.column(rates[name])} are evidently exchanged: "
                 "the first is the second's rate of change"

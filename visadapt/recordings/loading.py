@@ -20,7 +20,7 @@ from visadapt.recordings.csv import match, read_rows
 from visadapt.recordings.episode import Episode, Recording, RecordingError
 from visadapt.recordings.hdf5 import read_names, read_stretches
 from visadapt.recordings.logs import read_log
-from visadapt.recordings.physics import turns
+from visadapt.recordings.physics import is_in_newtons, turns
 from visadapt.recordings.sensors import check_sensors, without_outliers
 from visadapt.recordings.thinning import thinned
 from visadapt.recordings.topics import reader
@@ -236,7 +236,11 @@ def _commands(episodes: list[RawEpisode], system: System, note: Note) -> list[Ra
     ]
     largest = max((np.abs(raw.action).max() for raw, force in zip(episodes, forces, strict=True) if force), default=0)
     limit = getattr(system, "max_force", None)
-    if limit is None or largest <= 1:
+    if limit is None or not any(forces):
+        return episodes
+    if largest <= 1 and not is_in_newtons(episodes, system, limit):
+        within = "the column 'force' stays within [-1, 1] and is taken to be a share of max_force"
+        note(f"{within}; a force in N is to be divided by it, {limit:g} N", "the recording")
         return episodes
     note(f"the column 'force' is taken to be in N and was divided by max_force, {limit:g} N", "the recording")
     return [

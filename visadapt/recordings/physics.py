@@ -26,6 +26,9 @@ LEAST_DURATION_S = 2.0
 """s that the episodes must last together for their units and order to be judged."""
 MOST_ROWS = 20_000
 """Rows of an episode that are used, for speed."""
+MOST_ERROR, CLEARLY = 0.75, 1.5
+"""Error of predicted accelerations, as a share of their mean square, below which an angle half a turn further explains
+them, and how many times as large the errors of its other readings must be."""
 EXPLAINED_CORRELATION = 0.5
 """Correlation of measured and predicted accelerations above which the source explains them."""
 
@@ -62,6 +65,44 @@ def are_degrees(episodes: Sequence[RawEpisode], system: System) -> bool:
     radians, radian_slope = _fits(episodes, system)[angles[0]]
     degrees, slope = _fits(episodes, system, scaled)[angles[0]]
     return degrees > EXPLAINED_CORRELATION and 1 / 3 < slope < 3 and (degrees > radians + 0.2 or radian_slope > 10)
+
+
+def is_half_a_turn_off(episodes: Sequence[RawEpisode], system: System) -> bool:
+    """Whether the source explains the angle's acceleration half a turn further, and neither as it is nor with the other
+    sign; False where that cannot be decided, as in `are_degrees`."""
+    angles = [variable.name for variable in system.states if variable.unit == "rad"]
+    if len(angles) != 1 or not _can_decide(episodes, system, angles):
+        return False
+    (angle,), rate = angles, system.rate_of(angles[0])
+
+    def further(columns: Columns) -> Columns:
+        return {name: values + math.pi if name == angle else values for name, values in columns.items()}
+
+    def negated(columns: Columns) -> Columns:
+        return {name: -values if name in (angle, rate) else values for name, values in columns.items()}
+
+    there, *here = (_error(*_fits(episodes, system, changed)[angle]) for changed in (further, _unchanged, negated))
+    return there < MOST_ERROR and min(here) > CLEARLY * there
+
+
+def is_turned_round(episodes: Sequence[RawEpisode], system: System, name: str) -> bool:
+    """Whether the source explains a variable's acceleration with the other sign, and not as it is; False where that
+    cannot be decided, as in `are_degrees`."""
+    if not _can_decide(episodes, system, [name]):
+        return False
+    fit, slope = _fits(episodes, system)[name]
+    there = _error(-fit, -slope)
+    return there < MOST_ERROR and _error(fit, slope) > CLEARLY * there
+
+
+def is_in_newtons(episodes: Sequence[RawEpisode], system: System, largest: float) -> bool:
+    """Whether a command that stays within [-1, 1] moves the system as a force in N does, instead of as a share of the
+    `largest` force in N; False where that cannot be decided."""
+    names = [variable.name for variable in system.states if system.rate_of(variable.name)]
+    if not _can_decide(episodes, system, names):
+        return False
+    slopes = [slope for fit, slope in _fits(episodes, system).values() if fit > EXPLAINED_CORRELATION]
+    return bool(slopes) and all(1 / 3 < slope * largest < 3 for slope in slopes)
 
 
 def exchanged(episodes: Sequence[RawEpisode], system: System, one: str, other: str) -> bool:
@@ -176,6 +217,12 @@ def _fit(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> tuple
     """Correlation and slope of measured over predicted values."""
     found = correlation(measured, predicted)
     return found, found * float(measured.std() / predicted.std()) if found else 0.0
+
+
+def _error(fit: float, slope: float) -> float:
+    """Mean square of what the prediction misses, over that of the measured values, from the `_fit` of both."""
+    size = fit / slope if slope else 0.0  # of the predicted over the measured values
+    return 1 - 2 * fit * size + size**2
 
 
 def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
