@@ -3,6 +3,7 @@ import os
 import numpy as np
 import pytest
 
+from tests.logs import ROS, ros_bag
 from tests.recorded import HEADER, STATES, a_run, a_table, load, refuses, write
 
 
@@ -77,6 +78,13 @@ class TestColumns:
         write(file, a_table())
         refuses("no column 'pos' for x; it has time, x", file, columns={"x": "pos"})
         refuses("cartpole has no 'speed'; it has episode, time, x", file, columns={"speed": "x_dot"})
+
+    @pytest.mark.parametrize("letter", ["T", "t"])
+    def test_a_single_letter_in_the_other_case_is_another_quantity(self, file, letter):
+        table = a_table()
+        refused = {"T": "column 'time' is missing; it has T, x", "t": ""}[letter]
+        path = write(file, {letter: table.pop("time"), **table})
+        refuses(refused, path) if refused else load(path)
 
     def test_two_columns_that_could_be_one(self, file):
         table = a_table()
@@ -155,6 +163,23 @@ class TestPaths:
 
     def test_a_folder_without_recordings(self, tmp_path):
         refuses("a folder without recordings; files that end in .csv", tmp_path)
+
+    def test_what_is_not_read_of_a_folder_is_said(self, tmp_path):
+        write(tmp_path / "a.csv", a_table())
+        write(tmp_path / "b.txt", a_table())
+        (tmp_path / "older").mkdir()
+        (warning,) = load(tmp_path).warnings
+        assert warning == f"{tmp_path / 'b.txt'} and 1 more: is not read: name it beside the folder"
+
+    def test_a_folder_of_bags(self, tmp_path):
+        for name, late in (("one", False), ("two", True)):
+            ros_bag(tmp_path / name, 2, stamped=late)
+        columns = ROS | {"command": "/motor/command.data"}
+        refuses("two.* has no 'data'", tmp_path, columns=columns)
+
+    def test_rows_of_episodes_in_turn(self, tmp_path):
+        path = write(tmp_path / "a.csv", {"episode": [0, 1] * 20 + [0], **a_table()})
+        refuses("a.csv: the rows of episodes are mixed, 0 and 1 in turn", path)
 
     def test_a_path_that_is_not_there(self, tmp_path):
         refuses("none.csv: there is no such file or folder", tmp_path / "none.csv")

@@ -40,12 +40,20 @@ class TestText:
             {"encoding": "utf-8-sig"},
             {"before": "# a rig\n\n# 0.05 s\n"},
             {"separator": ";", "end": "\r\n", "encoding": "utf-8-sig", "before": "# a; b, c\r\n"},
+            {"separator": ";", "end": "\r\n", "encoding": "utf-8-sig", "before": "sep=;\r\n"},
         ],
     )
     def test_forms_of_the_same_table(self, file, form):
         table = a_table()
         state = load(write(file, table, **form)).episodes[0].state
         np.testing.assert_array_equal(state, np.column_stack([table[name] for name in STATES]))
+
+    @pytest.mark.parametrize("quote", ['"', ""])
+    def test_commas_within_names_are_no_separators(self, file, quote):
+        table = a_table()
+        names = {name: f"{quote}{name}, SI{quote}" for name in table}
+        write(file, {names[name]: values for name, values in table.items()}, separator=";")
+        assert load(file, columns={name: f"{name}, SI" for name in names}).measured == STATES
 
     def test_comments_between_rows_and_quotes(self, file):
         lines = write(file, a_table()).read_text().splitlines()

@@ -1,9 +1,12 @@
 """Logs of robots: the same motion as a bag of ROS 1, as one of ROS 2 and as ULog, each topic with its own stamps."""
 
+import sqlite3
+from contextlib import closing
+
 import numpy as np
 import pytest
 from rosbags import rosbag2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tests.cli.commands import refused
 from tests.logs import LATE, PERIOD, PX4, ROS, ROWS, START, motion, ros_bag, ulog
@@ -77,6 +80,24 @@ def test_a_topic_with_a_single_reading_is_refused(alone, tmp_path):
         load_recording(numbers(tmp_path / "run", stamps), CartPole(), FIELDS)
 
 
+@pytest.mark.parametrize("sent", [[0.0], [0.0, 0.01, 0.02, 1.0]])
+def test_a_command_that_is_sent_when_it_changes_holds_to_the_end(sent, tmp_path):
+    steady = np.arange(0, 3, 0.05)
+    stamps = {"/x": steady, "/theta": steady, "/u": np.array(sent)}
+    (episode,) = load_recording(numbers(tmp_path / "run", stamps), CartPole(), FIELDS).episodes
+    assert len(episode.time) == len(steady)
+    np.testing.assert_allclose(episode.action, 0.5)
+
+
+def test_rows_before_the_first_command_that_is_a_number_are_left_out(tmp_path):
+    early = np.arange(-1, 3, 0.05)
+    found = load_recording(numbers(tmp_path / "run", dict.fromkeys(["/x", "/theta", "/u"], early)), CartPole(), FIELDS)
+    (episode,) = found.episodes
+    assert episode.time[0] == 0
+    assert episode.state[0, 0] == pytest.approx(-0.1, abs=1e-6)
+    assert "18 rows before the first or after the last whole set of numbers are left out" in " ".join(found.warnings)
+
+
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_bag_and_the_file_in_it_count_once(turned, tmp_path):
     path = ros_bag(tmp_path / "run", 2, stamped=False)
@@ -110,6 +131,20 @@ def test_what_a_bag_does_not_have(changed, says, tmp_path):
     path = ros_bag(tmp_path / "run", 2, stamped=False)
     with pytest.raises(RecordingError, match=says):
         load_recording(path, CartPole(), ROS | changed)
+
+
+def test_a_bag_without_the_definition_of_its_messages(tmp_path):
+    path, store = tmp_path / "run", get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg("float64 place\n", "rig_msgs/msg/Cart"))
+    with rosbag2.Writer(path, version=8) as writer:
+        cart = writer.add_connection("/cart", "rig_msgs/msg/Cart", typestore=store)
+        writer.write(cart, int(1e9 * START), store.serialize_cdr(store.types["rig_msgs/msg/Cart"](0.1), cart.msgtype))
+    (storage,) = path.glob("*.db3")
+    with closing(sqlite3.connect(storage)) as table, table:
+        table.execute("DELETE FROM message_definitions")
+    says = "run: the bag does not define rig_msgs/msg/Cart, the type of /cart; a bag of ROS 2 Iron or later"
+    with pytest.raises(RecordingError, match=says):
+        load_recording(path, CartPole(), dict.fromkeys(FIELDS, "/cart.place"))
 
 
 def test_columns_that_are_not_given_and_damaged_logs_are_one_line(tmp_path, capsys, monkeypatch):

@@ -168,6 +168,11 @@ class TestBadFiles:
             del file["episode_00000/state"].attrs["sha256"]
         assert len(read_recording(recording)) == 3
 
+    def test_attributes_of_fixed_length_as_other_programs_write_them(self, recording):
+        with h5py.File(recording, "a") as file:
+            file.attrs["format"] = np.bytes_(file.attrs["format"])
+        assert len(read_recording(recording)) == 3
+
     @pytest.mark.parametrize("name", ["state", "frame"])
     def test_values_that_are_not_those_written(self, recording, name):
         with h5py.File(recording, "a") as file:

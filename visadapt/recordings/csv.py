@@ -10,6 +10,7 @@ import csv
 import io
 import math
 import os
+import re
 import string
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -26,7 +27,8 @@ from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.thinning import STRETCH, thinned
 from visadapt.systems import RigidBody, System
 
-SEPARATORS = ",;\t"
+SEPARATORS = "\t;,"
+"""The first that is as often in the line of names as in the next line separates: names and numbers may have commas."""
 
 UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 
@@ -79,12 +81,15 @@ class Table:
         """
         with closing(_lines(path)) as lines:
             number, first = next(lines, (0, ""))
+            _, second = next(lines, (0, ""))
         if not number:
             raise RecordingError(f"{path}: is empty; a line of names and rows of numbers below it are right")
         if "\0" in first:
             raise RecordingError(f"{path}: line {number} holds NUL bytes, as no text in UTF-8; CSV in UTF-8 is right")
-        separator = max(SEPARATORS, key=first.count)
-        if separator not in first:
+        names, cells = (re.sub(r'"[^"]*"', "", line) for line in (first, second))
+        as_often = [one for one in SEPARATORS if 0 < names.count(one) == cells.count(one)]
+        separator = as_often[0] if as_often else max(SEPARATORS, key=names.count)
+        if separator not in names:
             raise RecordingError(f"{path}: line {number}: names separated by commas, semicolons or tabs are right")
         try:
             header = tuple(name.strip() for name in next(csv.reader([first], delimiter=separator, strict=True)))
@@ -93,7 +98,7 @@ class Table:
         if all(_is_number(name) for name in header):
             raise RecordingError(
                 f"{path}: line {number} holds numbers where the columns' names belong "
-                "(say episode,time,x,theta,command)"
+                "(say episode,time,x,theta,command, without # before it)"
             )
         return cls(path, header, separator)
 
@@ -199,7 +204,7 @@ def _lines(path: Path, progress: Progress | None = None) -> Generator[tuple[int,
                 for number, line in enumerate(file, 1):
                     if progress is not None and number % STRETCH == 0:
                         progress(raw.tell() // 10**6, size // 10**6 + 1, math.nan)
-                    if (text := line.strip()) and not text.startswith("#"):
+                    if (text := line.strip()) and not text.startswith("#") and not _says_separator(number, text):
                         yield number, line.removesuffix("\n")
             except UnicodeDecodeError as error:
                 byte = raw.tell() - len(error.object) + error.start
@@ -207,6 +212,11 @@ def _lines(path: Path, progress: Progress | None = None) -> Generator[tuple[int,
                 raise RecordingError(f"{path}: not text in UTF-8{coded}; CSV in UTF-8 is right") from error
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _says_separator(number: int, text: str) -> bool:
+    """Whether this is Excel's first line, which names the separator."""
+    return number == 1 and re.fullmatch("sep=.", text) is not None
 
 
 def read_rows(
@@ -241,6 +251,11 @@ def read_rows(
     if np.isnan(label).any():
         raise RecordingError(f"{path}: {rows.place(int(np.isnan(label).argmax()))}, column 'episode' is not a number")
     edges = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), len(label)]
+    if len(edges) > max(len(label) / 2, 2 * len(np.unique(label)) + 1):
+        raise RecordingError(
+            f"{path}: the rows of episodes are mixed, {label[0]:g} and {label[edges[1]]:g} in turn; all rows of an "
+            "episode one below the other are right"
+        )
     return [replace(whole.part(start, end), number=float(label[start])) for start, end in pairwise(edges)]
 
 
@@ -279,15 +294,17 @@ def match(
     others = {"time": ("t", "timestamp"), **OTHER_NAMES.get(system.name, {})}
     wanted_states = [state.name for state in system.states] if states else []
     ours = ["episode", "time", *wanted_states, *(action.name for action in system.actions)]
+    if unread := [state.name for state in system.states if not states and state.name in given]:
+        raise RecordingError(f"--columns {unread[0]}=...: no states are read where frames are")
     check_given(given, ours, system)
     found: dict[str, int] = {}
     for name in ours:
         if given.get(name) == "":
             continue
         candidates: list[int] = []
-        for names in ([given[name]],) if name in given else ([name], others.get(name, ())):
-            lower = [wanted.lower() for wanted in names]
-            alike = [index for index, there in enumerate(header) if there.lower() in lower]
+        named = [(given[name],)] if name in given else [(name,), others.get(name, ())]
+        for k, names in enumerate(named):
+            alike = [index for index, there in enumerate(header) if any(_is(there, one, k > 0) for one in names)]
             exact = [index for index in alike if name in given and header[index] == given[name]]
             candidates = candidates or exact or alike
         if len(candidates) > 1:
@@ -309,6 +326,12 @@ def match(
                 f"if one of them is {name}: --columns {name}=...{if_unmeasured(system, name)}"
             )
     return found
+
+
+def _is(there: str, name: str, other: bool) -> bool:
+    """Whether a column has a name, whatever the case; but of another common name (`OTHER_NAMES`) that is a single
+    letter, the case counts: t is the time, T a temperature."""
+    return there == name if other and len(name) == 1 else there.lower() == name.lower()
 
 
 def if_unmeasured(system: System, name: str) -> str:
@@ -333,6 +356,8 @@ def _is_number(cell: str) -> bool:
 
 
 def _complaint(cell: str) -> str:
+    if not cell.isascii() and _is_number(cell.strip()):
+        return f"is {cell!r}, with a space that is not ASCII; a plain number is right"
     cell = cell.strip()
     if not cell:
         return "is empty; a number is right (leave out rows without a measurement)"

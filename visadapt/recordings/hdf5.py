@@ -218,6 +218,8 @@ def _opened(path: Path) -> Iterator[h5py.File]:
 
 def _is(value: object, wanted: str | int) -> bool:
     """Whether an attribute, which may have any type and shape, is `wanted`."""
+    if isinstance(value, bytes):  # a string of fixed length, as other programs write
+        value = value.decode(errors="replace")
     return isinstance(value, str if isinstance(wanted, str) else np.integer) and value == wanted
 
 

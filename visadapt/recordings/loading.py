@@ -32,6 +32,8 @@ MOST_BYTES = 2**28
 """Most bytes of the values of all files: 4.8 million rows of a cart-pole. The checks make a few copies of them."""
 SUFFIXES = (".csv", ".h5", ".hdf5", ".bag", ".mcap", ".db3", ".ulg")
 """Suffixes of the files that are read from a folder."""
+TABLES = (".txt", ".tsv", ".dat")
+"""Suffixes of files in a folder that may be tables, and are not read with the folder."""
 UPRIGHT_RAD = 1.0
 """rad from 0 up to which an angle counts as upright when it is unwrapped."""
 
@@ -123,8 +125,11 @@ def _files(paths: Sequence[str | os.PathLike[str]], note: Note) -> list[Path]:
     for path in map(Path, paths):
         found = [path]
         if path.is_dir() and reader(path) is None:
-            inside = (file for file in path.iterdir() if not file.name.startswith(".") and file.is_file())
-            found = sorted(file for file in inside if file.suffix.lower() in SUFFIXES)
+            inside = sorted(file for file in path.iterdir() if not file.name.startswith("."))
+            found = [each for each in inside if _is_recording(each)]
+            for other in inside:
+                if found and other not in found and (other.is_dir() or other.suffix.lower() in TABLES):
+                    note("is not read: name it beside the folder", str(other))
             if not found:
                 right = ", ".join(SUFFIXES)
                 raise RecordingError(f"{path}: a folder without recordings; files that end in {right} are right")
@@ -142,6 +147,11 @@ def _files(paths: Sequence[str | os.PathLike[str]], note: Note) -> list[Path]:
     if not files:
         raise RecordingError("no recording was given")
     return [*files.values()]
+
+
+def _is_recording(path: Path) -> bool:
+    """Whether something in a folder is a recording: a file, or the folder of a bag of ROS 2."""
+    return reader(path) is not None if path.is_dir() else path.is_file() and path.suffix.lower() in SUFFIXES
 
 
 def _the_same(file: Path, place: Path, files: Mapping[Path, Path]) -> Path | None:

@@ -7,6 +7,7 @@ was commanded until the next row, each command being held until the next one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -71,7 +72,10 @@ def _rows(
     commanded = list(dict.fromkeys(places[action.name][0] for action in system.actions))
     slowest = max(read, key=lambda name: _interval(topics[name].time))
     first = max(topics[name].time[0] for name in (*read, *commanded))
-    last = min(topics[name].time[-1] for name in (*read, *commanded))
+    ends = {
+        name: topics[name].time[-1] if name in read else _held_until(topics[name].time) for name in (*read, *commanded)
+    }
+    last = min(ends.values())
     time = topics[slowest].time
     used = (time >= first) & (time <= last)
     for name in read:
@@ -85,7 +89,7 @@ def _rows(
     every = (*read, *commanded)
     for when, edge, outside in (
         ("before the first", [topics[name].time[0] for name in every], topics[slowest].time < first),
-        ("after the last", [-topics[name].time[-1] for name in every], topics[slowest].time > last),
+        ("after the last", [-ends[name] for name in every], topics[slowest].time > last),
     ):
         if dropped := int(outside.sum()):
             note(f"{dropped} rows {when} message of {every[int(np.argmax(edge))]} are left out", str(path))
@@ -107,13 +111,20 @@ def _rows(
         topic, field = places[name]
         return _held(time, topics[topic].time, topics[topic].values[field])
 
+    action = np.column_stack([command(one.name) for one in system.actions])
+    states = np.column_stack([state(name) for name in measured])
+    known = np.isfinite(np.column_stack([action, states]).sum(1))
+    kept = slice(int(known.argmax()), len(known) - int(known[::-1].argmax())) if known.any() else slice(None)
+    if dropped := len(known) - len(known[kept]):
+        note(f"{dropped} rows before the first or after the last whole set of numbers are left out", str(path))
+    time, rows = time[kept], rows[kept]
     others = "".join(f"; {name} is interpolated to them" for name in read if name != slowest)
     note(f"rows are the readings of {slowest}{others}; a command is the mean until the next row", str(path))
     return RawEpisode(
         path,
         time - time[0],
-        np.column_stack([command(action.name) for action in system.actions]),
-        np.column_stack([state(name) for name in measured]),
+        action[kept],
+        states[kept],
         measured,
         lambda row: f"message {rows[row] + 1} of {slowest}",
         {name: ".".join(place) for name, place in places.items()},
@@ -125,6 +136,15 @@ def _interval(stamps: NDArray[np.float64]) -> float:
     return float(np.median(np.diff(stamps)))
 
 
+def _held_until(stamps: NDArray[np.float64]) -> float:
+    """The time in s up to which a topic's last command holds: to the end where commands come only when they change,
+    else for GAP intervals, since one that comes steadily has then been lost."""
+    intervals = np.diff(stamps)
+    if not len(intervals) or intervals.max() > GAP * np.median(intervals):
+        return math.inf
+    return float(stamps[-1] + GAP * np.median(intervals))
+
+
 def _between_readings(time: NDArray[np.float64], stamps: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether each time (T,) lies between two readings that are not far apart."""
     after = np.searchsorted(stamps, time).clip(1, len(stamps) - 1)
@@ -134,12 +154,17 @@ def _between_readings(time: NDArray[np.float64], stamps: NDArray[np.float64]) ->
 
 
 def _held(time: NDArray[np.float64], stamps: NDArray[np.float64], commands: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The mean of the held commands (N,) from each time (T,) to the next; for the last time, the command held there."""
-    first = max(0, int(np.searchsorted(stamps, time[0], side="right")) - 1)  # a command that was replaced may be NaN
-    stamps, commands = stamps[first:], commands[first:]
-    total = np.concatenate(([0.0], np.cumsum(commands[:-1] * np.diff(stamps))))
-    mean = np.diff(np.interp(time, stamps, total)) / np.maximum(np.diff(time), 1e-12)
-    return np.append(mean, commands[np.searchsorted(stamps, time[-1], side="right") - 1])
+    """The mean of the held commands (N,) from each time (T,) to the next, NaN where one of them is; for the last time,
+    the command held there."""
+
+    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        total = np.concatenate(([0.0], np.cumsum(values[:-1] * np.diff(stamps))))
+        after = np.maximum(time - stamps[-1], 0.0) * values[-1]  # a command goes on after the last message
+        held: NDArray[np.float64] = np.diff(np.interp(time, stamps, total) + after) / np.maximum(np.diff(time), 1e-12)
+        return np.append(held, values[np.searchsorted(stamps, time[-1], side="right") - 1])
+
+    missing = mean(np.isnan(commands).astype(float))
+    return np.where(missing > 1e-9, np.nan, mean(np.nan_to_num(commands)))
 
 
 def _place(path: Path, column: str) -> tuple[str, str]:

@@ -92,7 +92,14 @@ def _read_bag(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
         for name in wanted:
             _check(path, name, {each.topic for each in bag.connections})
         for connection, stamp, raw in bag.messages([each for each in bag.connections if each.topic in wanted]):
-            name, message = connection.topic, bag.deserialize(raw, connection.msgtype)
+            name = connection.topic
+            try:
+                message = bag.deserialize(raw, connection.msgtype)
+            except KeyError:
+                raise RecordingError(
+                    f"{path}: the bag does not define {connection.msgtype}, the type of {name}; a bag of ROS 2 "
+                    "Iron or later, which stores definitions, or a standard type is right"
+                ) from None
             numbers = [_number(path, message, name, field) for field in fields[name]]
             rows[name].append([1e-9 * stamp, _header(message), *numbers])
     tables = {name: np.array(each).reshape(-1, 2 + len(fields[name])) for name, each in rows.items()}
