@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 from tests.own_systems import Rover, furuta
 from visadapt.diagnosis import diagnose
@@ -109,6 +110,36 @@ def test_a_friction_is_found_by_the_sensor_of_another_joint():
     assert found.causes[0].parameters["coefficient"].value == pytest.approx(1e-4, rel=0.02)
 
 
+def test_a_delay_is_no_lag_and_of_one_sensor_it_is_that_of_all():
+    """Commands act 6 ms late; rows are 10 to 12 ms apart, and the motor's encoder is read alone."""
+    drive, generator = Drive(), np.random.default_rng(1)
+    episodes = []
+    for episode in range(3):
+        state, before, time, rows, torques = np.zeros(4), 0.0, [0.0], [], []
+        for _ in range(250):
+            t = time[-1]
+            rows.append([round(state[0] * 8192 / math.tau) * math.tau / 8192])
+            torques.append(0.15 * math.sin((3 + episode) * t) + 0.15 * math.sin(11 * t + episode))
+            step = 0.01 * (1 + 0.2 * generator.random())
+            for torque, duration in ((before, 0.006), (torques[-1], step - 0.006)):
+                state = drive.after(duration, state, torque)
+            before = torques[-1]
+            time.append(t + step)
+        episodes.append(Episode(np.array(time[:-1]), np.array(torques)[:, None], np.array(rows)))
+    recording = Recording(tuple(episodes), ("motor",), 0.011, ("one", "two", "three"))
+    commands = [f"torque.actuator_{name}" for name in ("lag", "backlash", "gain", "delay")]
+    late = ("sensors.measurement_delay", "motor.sensor_delay")
+    scaled = [f"{name}.scale" for name in ("load_inertia", "motor_inertia", "stiffness", "friction")]
+    pushed = ("motor_axis.push", "load_axis.push", "motor_axis.periodic_load")
+    effects = [effect for effect in catalogue(drive) if effect.name in (*commands, *late, *scaled, *pushed)]
+    found = diagnose(recording, World(drive, period=0.011), effects)
+    assert (found.verdict, {cause.effect for cause in found.causes}) == (
+        "ambiguous",
+        {"torque.actuator_delay", "sensors.measurement_delay"},
+    )
+    assert found.causes[0].parameters["delay"].value == pytest.approx(0.006, rel=0.03)
+
+
 def test_dry_friction_stops_it_where_the_closed_form_does():
     rover, force, start, period = Rover(), 2.0, 0.5, 0.01
     friction = BY_NAME["forward.coulomb_friction"](force=force)
@@ -149,6 +180,45 @@ class Motor(System):
         current = (command[:, 0] - self.constant * state[:, 0]) / self.resistance
         torque = self.constant * current + load[:, 0] - self.damping * state[:, 0]
         return torch.stack((torque / self.inertia,), -1)
+
+
+@dataclass(frozen=True)
+class Drive(System):
+    """A motor and what it turns, on a shaft that twists."""
+
+    motor_inertia: float = 0.002  # kg m2
+    load_inertia: float = 0.004  # kg m2
+    stiffness: float = 2.0  # N m/rad
+    friction: float = 0.005  # N m s/rad, of the motor
+
+    name = "drive_with_a_shaft"
+    states: ClassVar[tuple[Variable, ...]] = (
+        *(Variable(name, "rad", -20.0, 20.0) for name in ("motor", "load")),
+        *(Variable(name, "rad/s", -30.0, 30.0) for name in ("motor_rate", "load_rate")),
+    )
+    actions: ClassVar[tuple[Variable, ...]] = (Variable("torque", "N m", -0.5, 0.5),)
+    loads = (Variable("motor_axis", "N m", -0.2, 0.2), Variable("load_axis", "N m", -0.2, 0.2))
+    coordinates = ((0, 2), (1, 3))
+
+    def derivative(self, state, command, load):
+        motor, turned, motor_rate, load_rate = state.unbind(-1)
+        twist = self.stiffness * (motor - turned)
+        on_motor = command[:, 0] + load[:, 0] - twist - self.friction * motor_rate
+        return torch.stack(
+            (motor_rate, load_rate, on_motor / self.motor_inertia, (load[:, 1] + twist) / self.load_inertia), -1
+        )
+
+    def after(self, duration, state, torque):
+        """The state (4,) after `duration` s under a constant torque: exact, since the drive is linear."""
+        command, load = torch.tensor([[torque]]).double(), torch.zeros(1, 2).double()
+        zero = torch.zeros(1, 4).double()
+        free = self.derivative(zero, command, load)[0].numpy()
+        columns = [
+            self.derivative(row[None], torch.zeros(1, 1).double(), load)[0].numpy() for row in torch.eye(4).double()
+        ]
+        whole = np.zeros((5, 5))
+        whole[:4, :4], whole[:4, 4] = np.array(columns).T, free
+        return (expm(duration * whole) @ np.append(state, 1.0))[:4]
 
 
 @pytest.mark.parametrize(

@@ -46,7 +46,7 @@ from visadapt.diagnosis.verdict import at_bounds, left_unexplained, next_step, v
 from visadapt.diagnosis.words import listed, printable
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized, twins
-from visadapt.effects.late_sensors import LateSensors
+from visadapt.effects.late_sensors import LateSensors, MeasurementDelay
 from visadapt.estimation.effect_fit import remembers
 from visadapt.estimation.profiles import profile_of
 from visadapt.processes import one_thread
@@ -124,7 +124,7 @@ def diagnose(
     effects = all_effects(system) if catalogue is None else [sized(effect, system) for effect in catalogue]
     film = None
     if recording.measured:
-        effects = [effect for effect in effects if effect.stage is not Stage.CAMERA]
+        effects = _of_readings(effects, {system.index(name) for name in recording.measured})
     else:
         if renderer is None:
             raise FramesError(
@@ -273,6 +273,20 @@ def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effec
         if fitted_here and not twins(effect, out, system):
             out.append(effect)
     return out
+
+
+def _of_readings(effects: Sequence[type[Effect]], measured: set[int]) -> list[type[Effect]]:
+    """The effects that readings of these columns may show, without those of a camera, and without the delay of some
+    sensors where it is that of none or, if that is searched too, of all that were read."""
+    all_late = any(issubclass(effect, MeasurementDelay) for effect in effects)
+
+    def shows(effect: type[Effect]) -> bool:
+        if not issubclass(effect, LateSensors) or issubclass(effect, MeasurementDelay):
+            return effect.stage is not Stage.CAMERA
+        late = measured & set(effect.late)
+        return bool(late) and not (all_late and late == measured)
+
+    return [effect for effect in effects if shows(effect)]
 
 
 def _regions(

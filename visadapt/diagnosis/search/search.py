@@ -14,6 +14,7 @@ from dataclasses import replace
 from itertools import combinations
 
 from visadapt.diagnosis.search.fitted_models import FittedModels, ScoredModel, key_of, less
+from visadapt.effects import ActuationEffect, Effect
 from visadapt.effects.late_sensors import LateSensors
 from visadapt.estimation.episode_phases import has_episode_phases, with_episode_phases
 from visadapt.estimation.fit_states import CAREFUL, QUICK, Effects, neutral, with_effect
@@ -187,14 +188,18 @@ class Search(FittedModels):
         that were fitted to the late readings as if these were on time: there a small delay gains little, and a joint
         stops when its late readings do.
         """
-        late = [e for e in self.catalogue if issubclass(e, LateSensors)]
         alone = [each for each in self.ranked if len(each.effects) == 1]
         bases = {each.names: each for each in (self.source, self.best, *alone[:LATE_BASES])}
+        self._fit_late([(base.effects, base.fits) for base in bases.values()])
+
+    def _fit_late(self, bases: Sequence[tuple[Effects, FitState]]) -> None:
+        """Fit sets, each with its states, with each late sensor in addition."""
+        late = [e for e in self.catalogue if issubclass(e, LateSensors)]
         starts = [
-            ((*base.effects, e), with_effect(base.fits, [LATE_SHARE * e.table[0].high]))
-            for base in bases.values()
+            ((*effects, e), with_effect(fits, [LATE_SHARE * e.table[0].high]))
+            for effects, fits in bases
             for e in late
-            if e not in base.effects
+            if e not in effects
         ]
         self._fit_from_quiet(starts, QUICK)
 
@@ -258,7 +263,7 @@ class Search(FittedModels):
         for exchanges made before."""
         # Also sets that were fitted before: from the larger set's parameters a fit may reach a better optimum.
         self.fit([less(centre, [removed]) for removed in centre.effects], QUICK)
-        exchanges = []
+        exchanges, slow = [], []
         pairs = combinations(centre.effects, 2) if len(centre.effects) <= TWO_FOR_ONE_UP_TO else ()
         for removed in (*combinations(centre.effects, 1), *pairs):
             # Along the states of the whole set a removed effect shows as a disturbance, without a fit of the rest.
@@ -266,6 +271,8 @@ class Search(FittedModels):
             if key_of(kept) in exchanged:
                 continue
             exchanged.add(key_of(kept))
+            if any(_is_slow(effect) for effect in removed):
+                slow.append((kept, fits))
             rest = [e for e in self.catalogue if e not in centre.effects]
             screened = screen(self.system, kept, fits, self.rows, rest, self.jobs)
             for candidate in self._promising(screened)[:MAX_EXCHANGES]:
@@ -273,6 +280,8 @@ class Search(FittedModels):
                 start = replace(with_effect(fits, candidate.values), log_process=process, log_noise=noise)
                 exchanges.append(((*kept, candidate.effect), start))
         self.fit(exchanges, QUICK)
+        # A lag and a few more effects imitate a delay, which the screening does not see (`try_late_sensors`).
+        self._fit_late(slow)
 
     def _polish(self) -> None:
         """Fit carefully the sets close to the best, and the best set less each effect, with which it is compared, but
@@ -290,3 +299,8 @@ class Search(FittedModels):
         close = close[:POLISH_MODELS]
         smaller = [self.fitted.get(frozenset(best.names) - {name}) for name in best.names]
         return close + [f for f in smaller if f is not None and all(f is not other for other in close)]
+
+
+def _is_slow(effect: type[Effect]) -> bool:
+    """Whether a motor under the effect follows its commands late: it depends on earlier ones."""
+    return issubclass(effect, ActuationEffect) and effect.memory is not ActuationEffect.memory
