@@ -27,6 +27,16 @@ def test_the_score_is_that_of_the_library_with_failed_episodes_apart(here, train
     assert SEED == SCORE_SEED
 
 
+def test_a_target_that_does_not_say_its_system(here, trained, capsys):
+    """As docs/own_rig.md says what a target has to have."""
+    policy = ("--policy", trained / "states.safetensors", "--target", "rig:bare")
+    assert run(*score(*policy)) == 0
+    printed = capsys.readouterr().out
+    assert run(*score(*policy[:3], "rig:states")) == 0
+    assert printed == capsys.readouterr().out
+    assert run("adapt", *policy, "--samples", 20, "--round", 20, "--iterations", 1, "--out", "run") == 0
+
+
 def test_shipped_policies_balance(here, capsys):
     assert run(*score("--policy", va.shipped("cartpole_states"), "--target", "rig:states")) == 0
     assert "2 of 2 episodes up" in capsys.readouterr().out

@@ -84,7 +84,7 @@ def _check(path: str, policy: Policy, source: World, target: Target) -> None:
             f"{path}: a policy of a {system.name}, with {policy.n_action} commands; {target.name} takes "
             f"{target.n_action}: it is another system"
         )
-    own = getattr(target, "system", system)
+    own = system if target.system is None else target.system
     if own.name != system.name:
         raise InputError(f"{path}: a policy of a {system.name}; {target.name} is a {own.name}")
     # Only what is observed says how large it is. A reset is no step: it is not counted.
