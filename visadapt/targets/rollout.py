@@ -125,14 +125,24 @@ def checked(target: Target, observation: Any, batch: int) -> Observation:
     if not isinstance(observation, Observation):
         what = type(observation).__name__
         raise TargetError(f"{target.name}: reset and step return a visadapt.Observation, not a {what}")
-    right = {"state": f"({batch}, n_state)", "alive": f"({batch},) and bool"}
+    right = {
+        "state": f"({batch}, n_state)",
+        "alive": f"({batch},) and bool",
+        "frame": f"({batch}, H, W) and uint8, grey,",
+    }
     copies: dict[str, Any] = {}
     for field in fields(observation):
         name, value = field.name, getattr(observation, field.name)
-        if value is None and name not in right:
+        if value is None and name not in ("state", "alive"):
             continue
         fits = isinstance(value, Tensor) and value.shape[:1] == (batch,)
-        if not fits or (name == "state" and value.dim() != 2) or (name == "alive" and value.dtype != torch.bool):
+        if fits and name == "state":
+            fits = value.dim() == 2
+        elif fits and name == "alive":
+            fits = value.dtype == torch.bool
+        elif fits and name == "frame":
+            fits = value.dim() == 3 and value.dtype == torch.uint8
+        if not fits:
             what = f"{tuple(value.shape)} and {value.dtype}" if isinstance(value, Tensor) else type(value).__name__
             needed = right.get(name, f"({batch}, ...)")
             raise TargetError(f"{target.name}: {name} is {what}; a torch tensor that is {needed} is right")
