@@ -104,6 +104,43 @@ def test_an_environment_that_does_not_do_is_one_clear_line(toy, says):
     assert "\n" not in str(error.value)
 
 
+def returning(reset=None, step=None):
+    """A target whose environment's reset or step returns, or raises, something else."""
+
+    class Other(Toy):
+        def reset(self, seed=None, options=None):
+            super().reset(seed, options)
+            return reset if reset is not None else (self.seen, {})
+
+        def step(self, action):
+            if isinstance(step, Exception):
+                raise step
+            return step
+
+    return GymnasiumTarget(Other, MAP, name="toy")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"reset": np.zeros(4)}, r"toy: reset\(\) returned a ndarray; observation, info are right"),
+        ({"reset": (np.zeros(2), {})}, r"reset\(\) returned an observation of shape \(2,\); .* says \(4,\)"),
+        # gymnasium's predecessor gym returned four values.
+        ({"step": (np.zeros(4), 0.0, False, {})}, r"step\(\) returned 4 values; observation, reward, term"),
+        ({"step": (np.zeros(2), 0.0, False, False, {})}, r"step\(\) returned an observation of shape \(2,\)"),
+        ({"step": (None, 0.0, False, False, {})}, r"step\(\) returned an observation of shape \(\)"),
+        (
+            {"step": OSError("the port is gone")},
+            r"toy: step\(\) failed: OSError: the port is gone \(.*test_gymnasium.py, line \d+\)$",
+        ),
+    ],
+)
+def test_an_environment_that_raises_or_returns_something_else_is_one_line(wrong, says):
+    env = returning(**wrong)
+    with pytest.raises(TargetError, match=says):
+        env.reset(1, generator()), env.step(torch.zeros(1, 1))
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [

@@ -22,6 +22,12 @@ from visadapt.targets import mujoco_frames
 from visadapt.targets.base import Observation, Target, TargetError
 from visadapt.targets.env_map import EnvMap
 
+RETURNED = {
+    "reset": ("observation", "info"),
+    "step": ("observation", "reward", "terminated", "truncated", "info"),
+}
+"""What these methods of an environment return."""
+
 
 class _Shown(NamedTuple):
     """What one environment shows."""
@@ -100,9 +106,9 @@ class GymnasiumTarget(Target):
             mujoco_frames.share_viewer(self._envs)
         self._steps, self._shown = 0, []
         for b, env in enumerate(self._envs[:batch]):
-            seen, _ = env.reset(seed=seeds[b])
+            seen, _ = self._call(env, "reset", seed=seeds[b])
             if starts is not None:
-                seen = self._place(env, np.asarray(seen, dtype=float), starts[b])
+                seen = self._place(env, seen, starts[b])
             self._shown.append(self._see(seen, b))
         return self._observe()
 
@@ -110,8 +116,9 @@ class GymnasiumTarget(Target):
         """Execute the action (B, n_action) for one period; an episode that has ended stays as it was.
 
         Raises:
-            TargetError: step before reset, an action of another shape or not finite, an observation that is not
-                finite, a frame that the crop does not fit, or an episode that the environment truncates.
+            TargetError: step before reset, an action of another shape or not finite, an environment that raises, an
+                observation that is not finite or does not fit its space, a frame that the crop does not fit, or an
+                episode that the environment truncates.
         """
         batch = len(self._shown)
         if action.shape != (batch, self.n_action) or not batch:
@@ -126,7 +133,7 @@ class GymnasiumTarget(Target):
                 continue
             ours = self.mapping.action(commands[b], self._n_env_action)
             for _ in range(self._held):
-                seen, _, terminated, truncated, _ = env.step(ours.astype(env.action_space.dtype))
+                seen, _, terminated, truncated, _ = self._call(env, "step", ours.astype(env.action_space.dtype))
                 if terminated or truncated:
                     break
             if truncated and not terminated:
@@ -153,7 +160,7 @@ class GymnasiumTarget(Target):
             TargetError: this environment cannot be put into a state: it is neither one of MuJoCo's whose observation
                 is all positions, then all velocities, nor one that keeps what it observes as `unwrapped.state`.
         """
-        seen = np.asarray(self._envs[0].reset(seed=0)[0], dtype=float)
+        seen, _ = self._call(self._envs[0], "reset", seed=0)
         pictures = []
         for state in states:
             seen = self._place(self._envs[0], seen, state)
@@ -179,6 +186,28 @@ class GymnasiumTarget(Target):
             if "/mujoco/__init__.py" in "".join(traceback.format_tb(error.__traceback__)).replace(os.sep, "/"):
                 raise mujoco_frames.cannot_render(self.name, error) from error
             raise TargetError(f"{self.name}: cannot be made: {_line(error)}") from error
+
+    def _call(self, env: Any, method: str, *arguments: object, **named: object) -> tuple[Any, ...]:
+        """What the environment's `reset` or `step` returns, with the observation in floating point."""
+        try:
+            returned = getattr(env, method)(*arguments, **named)
+        except Exception as error:  # whatever the environment raises becomes one line
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            raise TargetError(
+                f"{self.name}: {method}() failed: {type(error).__name__}: {_line(error)} "
+                f"({last.filename}, line {last.lineno})"
+            ) from error
+        right = RETURNED[method]
+        if not isinstance(returned, tuple) or len(returned) != len(right):
+            got = f"{len(returned)} values" if isinstance(returned, tuple) else f"a {type(returned).__name__}"
+            raise TargetError(f"{self.name}: {method}() returned {got}; {', '.join(right)} are right")
+        seen, shape = np.asarray(returned[0]), env.observation_space.shape
+        if seen.shape != shape:
+            raise TargetError(
+                f"{self.name}: {method}() returned an observation of shape {seen.shape}; its observation_space says "
+                f"{shape}"
+            )
+        return seen.astype(float), *returned[1:]
 
     def _check(self, env: Any) -> int:
         """The length of the environment's action; raises TargetError where it cannot be a target."""
@@ -243,16 +272,15 @@ class GymnasiumTarget(Target):
         body.state = wanted.astype(kept.dtype)
         return wanted
 
-    def _see(self, seen: Any, episode: int, ended: bool = False) -> _Shown:
+    def _see(self, seen: NDArray[np.floating], episode: int, ended: bool = False) -> _Shown:
         """What an environment that observes `seen` shows."""
-        numbers = np.asarray(seen, dtype=float)
-        broken = np.flatnonzero(~np.isfinite(numbers))
+        broken = np.flatnonzero(~np.isfinite(seen))
         if len(broken):
             raise TargetError(
-                f"{self.name}: observation entry {broken[0]} is {numbers[broken[0]]} after step {self._steps} "
+                f"{self.name}: observation entry {broken[0]} is {seen[broken[0]]} after step {self._steps} "
                 f"(episode {episode}); the environment must stay finite until it ends the episode"
             )
-        state = self.mapping.state(numbers, self.system)
+        state = self.mapping.state(seen, self.system)
         limits = self.mapping.limits.items()
         inside = all(abs(state[self.system.index(name)]) <= limit for name, limit in limits)
         return _Shown(state, not ended and inside, self._draw(self._envs[episode]) if self.frames else None)
