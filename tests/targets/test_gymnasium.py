@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from visadapt.systems import CartPole
+from visadapt.systems import CartPole, Quadrotor
 from visadapt.targets.base import TargetError
 from visadapt.targets.env_map import Entry, EnvMap
 from visadapt.targets.gymnasium import GymnasiumTarget
@@ -147,6 +147,8 @@ def test_an_environment_that_raises_or_returns_something_else_is_one_line(wrong,
         ({"states": {**STATES, "x": Entry(4)}}, "takes x from observation entry 4; there are 4, counted from 0"),
         ({"actions": (Entry(2),)}, "sets action entry 2; there are 2"),
         ({"actions": (Entry(0), Entry(1))}, "has 2 actions, cartpole has 1"),
+        ({"actions": (Entry(0, 1.5, offset=1.0),)}, "entry 0 from -0.5 to 2.5, the environment takes -2 to 2: change"),
+        ({"options": {"width": 120}}, "toy: the map's options are for gymnasium.make, but a function makes this"),
         ({"states": {"x": Entry(0)}}, "ours are x, x_dot, theta, theta_dot"),
         ({"limits": {"height": 1.0}}, "limits 'height'"),
         ({"start": {"height": 1.0}}, "starts 'height'"),
@@ -155,6 +157,13 @@ def test_an_environment_that_raises_or_returns_something_else_is_one_line(wrong,
 def test_a_map_that_does_not_fit_the_environment(change, says):
     with pytest.raises(TargetError, match=says):
         target(dataclasses.replace(MAP, **change))
+
+
+def test_two_commands_cannot_set_the_same_entry():
+    states = {variable.name: Entry(i) for i, variable in enumerate(Quadrotor.states)}
+    mapping = EnvMap(states, tuple(Entry(index) for index in (0, 1, 1, 2)))
+    with pytest.raises(TargetError, match="toy: the map sets action entry 1 more than once"):
+        mapping.check("toy", Quadrotor, 13, 4)
 
 
 @pytest.mark.parametrize(

@@ -71,6 +71,11 @@ class GymnasiumTarget(Target):
         frames: bool = True,
         name: str | None = None,
     ) -> None:
+        if mapping.options and not isinstance(env, str):
+            raise TargetError(
+                f"{name or env}: the map's options are for gymnasium.make, but a function makes this environment: "
+                "leave them out"
+            )
         mujoco_frames.choose_backend()
         self._source = env
         self.mapping = mapping
@@ -229,6 +234,7 @@ class GymnasiumTarget(Target):
             )
         n_action = int(env.action_space.shape[0])
         self.mapping.check(self.name, self.system, int(env.observation_space.shape[0]), n_action)
+        self.mapping.check_range(self.name, env.action_space.low, env.action_space.high)
         return n_action
 
     def _period(self, env: Any) -> tuple[float, str]:
