@@ -37,6 +37,15 @@ def test_a_target_that_does_not_say_its_system(here, trained, capsys):
     assert run("adapt", *policy, "--samples", 20, "--round", 20, "--iterations", 1, "--out", "run") == 0
 
 
+def test_a_command_that_is_held_for_several_steps_of_an_environment_is_said_to_be(here, trained, capsys):
+    (here / "held.toml").write_text("period = 0.05\n" + (here / "map.toml").read_text())
+    (here / "fine.py").write_text("import rig\n\n\nclass Fine(rig.Pushed):\n    dt = 0.025\n")
+    target = ("--target", "fine:Fine", "--map", "held.toml")
+    assert run(*score("--policy", trained / "states.safetensors", *target)) == 0
+    said = "visadapt: fine:Fine: each command is held for 2 of its steps of 0.025 s\n"
+    assert capsys.readouterr().err == said
+
+
 def test_shipped_policies_balance(here, capsys):
     assert run(*score("--policy", va.shipped("cartpole_states"), "--target", "rig:states")) == 0
     assert "2 of 2 episodes up" in capsys.readouterr().out

@@ -284,6 +284,33 @@ class Kept(Toy):
         return np.full(self.size, round(100 * abs(self.state[0])), np.uint8)
 
 
+def test_an_environment_that_a_function_makes_is_held_for_all_steps_of_the_period_too():
+    toy = clocked(0.06)
+    toy.reset(1, generator())
+    assert toy.held == 3
+    torch.testing.assert_close(toy.step(torch.full((1, 1), 0.1)).state[:, 0], torch.tensor([-0.6]))
+
+
+class Repeating(gymnasium.Wrapper):
+    """A wrapper that says how long its step is, of an environment whose tau and dt are others."""
+
+    dt = 0.06
+
+
+class Motor(Clocked):
+    """tau is the time constant of its motor."""
+
+    tau = 0.3
+    dt = 0.05
+
+
+@pytest.mark.parametrize(
+    ("make", "period", "held"), [(Motor, 0.05, 1), (Motor, 0.1, 2), (lambda: Repeating(Clocked()), 0.06, 1)]
+)
+def test_the_step_is_that_of_what_the_environment_states_which_fits_the_period(make, period, held):
+    assert GymnasiumTarget(make, dataclasses.replace(MAP, period=period), name="toy").held == held
+
+
 def test_an_environment_that_keeps_its_observation_as_its_state_shows_and_starts_in_any():
     mapping = dataclasses.replace(MAP, start={"x": 0.5, "theta": 0.2}, contrast=(0.0, 255.0))
     toy = GymnasiumTarget(Kept, mapping, name="kept")

@@ -63,6 +63,9 @@ def load_target(options: argparse.Namespace, source: World, frames: bool) -> Tar
         target = GymnasiumTarget(env, mapping, type(source.system), frames=frames, name=name)
     if target.period_origin != "as given":
         print(f"visadapt: {name}: {target.period:g} s between actions, from {target.period_origin}", file=sys.stderr)
+    if target.held > 1:
+        step = target.period / target.held
+        print(f"visadapt: {name}: each command is held for {target.held} of its steps of {step:g} s", file=sys.stderr)
     return target
 
 

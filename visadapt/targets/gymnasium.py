@@ -47,7 +47,7 @@ class GymnasiumTarget(Target):
         mapping: the map between its numbers and frames and ours; `mapping.options` are for gymnasium.make alone.
             Without `mapping.period` the period is the environment's `tau` or `dt`, or else 1 / `render_fps` of its
             metadata, with a warning, since that may be the playback speed of its films alone. If `mapping.period` is
-            several steps of an environment that is given by its id, each action is held for that many steps.
+            several of these, each action is held for that many steps.
             `mapping.start` works only with environments that `show` can put into a state.
         system: the system whose states and actions the mapping gives.
         frames: whether frames are drawn.
@@ -86,10 +86,10 @@ class GymnasiumTarget(Target):
         self.name = name or (first.spec.id if first.spec is not None else type(first.unwrapped).__name__)
         self.n_action = len(mapping.actions)
         self._n_env_action = self._check(first)
-        self.period, self.period_origin = self._period(first)
-        own = _own_step(first)
-        # One that a function makes may be wrapped so that it repeats actions by itself.
-        self._held = round(self.period / own[1]) if own and isinstance(env, str) else 1
+        own = _own_step(first, mapping.period)
+        self.period, self.period_origin = self._period(first, own)
+        self.held = _steps(self.period, own[1]) if own else 1
+        """steps of the environment for which each action is held"""
         self._mujoco = frames and mujoco_frames.is_mujoco(first)
         if self._mujoco:
             mujoco_frames.probe(self.name)
@@ -137,7 +137,7 @@ class GymnasiumTarget(Target):
             if not self._shown[b].alive:
                 continue
             ours = self.mapping.action(commands[b], self._n_env_action)
-            for _ in range(self._held):
+            for _ in range(self.held):
                 seen, _, terminated, truncated, _ = self._call(env, "step", ours.astype(env.action_space.dtype))
                 if terminated or truncated:
                     break
@@ -237,12 +237,12 @@ class GymnasiumTarget(Target):
         self.mapping.check_range(self.name, env.action_space.low, env.action_space.high)
         return n_action
 
-    def _period(self, env: Any) -> tuple[float, str]:
-        """s between actions, and where that number comes from."""
-        given, own, rate = self.mapping.period, _own_step(env), env.metadata.get("render_fps")
+    def _period(self, env: Any, own: tuple[str, float] | None) -> tuple[float, str]:
+        """s between actions, and where that number comes from; `own`: what the environment calls its step, in s."""
+        given, rate = self.mapping.period, env.metadata.get("render_fps")
         if given is not None:
             # No environment is stepped for a part of its step.
-            if own and (given < 0.99 * own[1] or abs(given / own[1] - round(given / own[1])) > 0.01):
+            if own and not _steps(given, own[1]):
                 raise TargetError(
                     f"{self.name}: its {own[0]} says {own[1]:g} s a step, so that the period given, {given:g} s, is no "
                     "whole number of steps"
@@ -316,10 +316,22 @@ class GymnasiumTarget(Target):
         )
 
 
-def _own_step(env: Any) -> tuple[str, float] | None:
-    """What an environment calls the length of its step, and that length in s; None where it states none."""
-    names = (name for name in ("tau", "dt") if isinstance(getattr(env.unwrapped, name, None), Real))
-    return next(((name, float(getattr(env.unwrapped, name))) for name in names), None)
+def _own_step(env: Any, period: float | None) -> tuple[str, float] | None:
+    """What an environment calls the length of its step, and that length in s; None where it states none.
+
+    Of one that states both, the longest of which the period is a whole number: the other may be a motor's time
+    constant or the step of its physics. A wrapper that repeats actions may state its own.
+    """
+    values = {name: env.get_wrapper_attr(name) for name in ("tau", "dt") if env.has_wrapper_attr(name)}
+    stated = [(name, float(value)) for name, value in values.items() if isinstance(value, Real) and float(value) > 0]
+    fitting = [each for each in stated if period is not None and _steps(period, each[1])]
+    return max(fitting or stated[:1], key=lambda each: each[1], default=None)
+
+
+def _steps(period: float, step: float) -> int:
+    """Steps in s that make up a period; 0 where it is no whole number of them."""
+    count = round(period / step)
+    return count if abs(period / step - count) <= 0.01 else 0
 
 
 def _close(target: weakref.ref[GymnasiumTarget]) -> None:
