@@ -458,6 +458,17 @@ def test_pendulums_of_two_targets_do_not_draw_into_each_other(pendulum):
     assert 0 < (alone - finer).abs().mean() < 1 < alone.mean()
 
 
+def test_with_the_euler_integrator_a_frame_is_that_of_the_state_beside_it(pendulum):
+    options = pendulum._envs[0].unwrapped.model.opt
+    kept, options.integrator = options.integrator, 0
+    pendulum.reset(1, generator())
+    for _ in range(5):
+        seen = pendulum.step(torch.full((1, 1), 0.6))
+    options.integrator = kept
+    assert seen.state[0, 1] > 0.4
+    assert (pendulum.show(seen.state.numpy())[0] == seen.frame[0].numpy()).mean() > 0.999
+
+
 def test_pendulum_keeps_its_own_reset_and_leaves_nothing_at_exit(pendulum):
     script = (
         "import dataclasses, torch, visadapt\n"
