@@ -100,6 +100,17 @@ def test_targets_that_it_refuses(here, trained, capsys, arguments, says):
     assert not (here / "s.json").exists()
 
 
+def test_code_of_one_s_own_in_another_file_than_the_factory_s_is_named_where_it_raises(here, capsys):
+    (here / "driver.py").write_text(
+        "import rig\n\n\nclass Driven(rig.Bare):\n    def step(self, action):\n"
+        "        raise RuntimeError('the driver reports over-current')\n"
+    )
+    (here / "mine").mkdir()
+    (here / "mine" / "parts.py").write_text("import driver\n\n\ndef make():\n    return driver.Driven()\n")
+    line = refused(capsys, *score("--policy", va.shipped("cartpole_states"), "--target", "mine.parts:make"))
+    assert line.endswith("driver.py: line 6: RuntimeError: the driver reports over-current")
+
+
 def test_policies_that_it_refuses(here, trained, capsys):
     def line(policy, target):
         return refused(capsys, *score("--policy", policy, "--target", target))

@@ -10,8 +10,9 @@ import importlib
 import importlib.util
 import shutil
 import sys
+import sysconfig
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -34,6 +35,13 @@ from visadapt.world import World
 
 OWN_FILES: set[str] = set()
 """Files of the user's whose code is run."""
+OWN_FOLDERS: set[Path] = set()
+"""Folders where these may have imported other files of the user's from."""
+LIBRARIES = (
+    *(Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib")),
+    *(Path(__file__).parents[2] / package for package in ("visadapt", "renderers")),
+)
+"""Folders in whose code an error is not the user's, wherever they lie."""
 
 
 class InputError(ValueError):
@@ -195,6 +203,7 @@ def import_file(given: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     OWN_FILES.add(str(path))
+    OWN_FOLDERS.add(path.parent)
     with own_code(lambda error: f"{path}: {describe(error, str(path))}"):
         spec.loader.exec_module(module)
     sys.modules.setdefault(path.stem, module)  # so that another file of the user's that imports it gets these classes
@@ -228,6 +237,7 @@ def find_factory(name: str) -> Callable[[], Any]:
             raise InputError(f"{name}: there is no module {missing!r}, installed or in {here}") from error
         raise InputError(f"{name}: {describe(error)}") from error
     OWN_FILES.add(str(module.__file__))
+    OWN_FOLDERS.update((Path(here), Path(str(module.__file__)).parent))
     factory = getattr(module, attribute, None)
     if not callable(factory):
         what = "nothing" if factory is None else f"a {type(factory).__name__}, not a function,"
@@ -237,8 +247,15 @@ def find_factory(name: str) -> Callable[[], Any]:
 
 def own_line(error: BaseException) -> str | None:
     """The message for an error that the user's own code raised; None where it was ours."""
-    files = [frame.filename for frame in traceback.extract_tb(error.__traceback__) if frame.filename in OWN_FILES]
+    files = [frame.filename for frame in traceback.extract_tb(error.__traceback__) if _is_own(frame.filename)]
     return f"{files[-1]}: {describe(error, files[-1])}" if files else None
+
+
+def _is_own(file: str) -> bool:
+    def lies_in(folders: Iterable[Path]) -> bool:
+        return any(folder in Path(file).parents for folder in folders)
+
+    return file in OWN_FILES or (lies_in(OWN_FOLDERS) and not lies_in(LIBRARIES))
 
 
 def describe(error: BaseException, path: str | None = None) -> str:
