@@ -111,6 +111,19 @@ def test_code_of_one_s_own_in_another_file_than_the_factory_s_is_named_where_it_
     assert line.endswith("driver.py: line 6: RuntimeError: the driver reports over-current")
 
 
+def test_a_quadrotor_of_one_s_own_without_a_task_has_no_score(here, capsys):
+    (here / "quad.py").write_text(
+        "import torch\nimport visadapt as va\n\n\n"
+        "class Quad(va.Target):\n    name, period, n_action = 'quad', 0.1, 4\n\n"
+        "    def reset(self, batch, generator):\n"
+        "        return va.Observation(torch.eye(13)[6].expand(batch, 13), torch.ones(batch, dtype=torch.bool),\n"
+        "                              goal=torch.zeros(batch, 60))\n\n"
+        "    def step(self, action):\n        return self.reset(len(action), None)\n"
+    )
+    line = refused(capsys, *score("--policy", va.shipped("quadrotor"), "--target", "quad:Quad"))
+    assert line == "visadapt: quad: flights are scored by their task: derive the target from FlightTarget"
+
+
 def test_policies_that_it_refuses(here, trained, capsys):
     def line(policy, target):
         return refused(capsys, *score("--policy", policy, "--target", target))

@@ -50,11 +50,14 @@ class InputError(ValueError):
 
 @contextmanager
 def checked() -> Iterator[None]:
-    """Turn the ValueError or TypeError by which the library refuses an argument into an InputError."""
+    """Turn the ValueError or TypeError by which the library refuses an argument into an InputError.
+
+    One that the user's own code raised names the line there.
+    """
     try:
         yield
     except (ValueError, TypeError) as error:
-        raise InputError(str(error)) from error
+        raise InputError(own_line(error) or str(error)) from error
 
 
 @contextmanager
