@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import io
 import os
 import signal
 import sys
@@ -33,6 +34,8 @@ RESUMED = ("adapt", "train", "renderer")  # Subcommands that go on where an inte
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command: 0 done; 2 bad input, described by one line on stderr; 130 interrupted."""
     command = ""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr: a file's name may not fit the encoding
     with suppress(ValueError):  # outside the main thread
         signal.signal(signal.SIGTERM, _terminated)
     try:
