@@ -101,14 +101,14 @@ def test_targets_that_it_refuses(here, trained, capsys, arguments, says):
 
 
 def test_code_of_one_s_own_in_another_file_than_the_factory_s_is_named_where_it_raises(here, capsys):
-    (here / "driver.py").write_text(
+    (here / "motor_driver.py").write_text(
         "import rig\n\n\nclass Driven(rig.Bare):\n    def step(self, action):\n"
         "        raise RuntimeError('the driver reports over-current')\n"
     )
-    (here / "mine").mkdir()
-    (here / "mine" / "parts.py").write_text("import driver\n\n\ndef make():\n    return driver.Driven()\n")
-    line = refused(capsys, *score("--policy", va.shipped("cartpole_states"), "--target", "mine.parts:make"))
-    assert line.endswith("driver.py: line 6: RuntimeError: the driver reports over-current")
+    (here / "workshop").mkdir()
+    (here / "workshop" / "parts.py").write_text("import motor_driver\n\n\ndef make():\n    return motor_driver.Driven()\n")
+    line = refused(capsys, *score("--policy", va.shipped("cartpole_states"), "--target", "workshop.parts:make"))
+    assert line.endswith("motor_driver.py: line 6: RuntimeError: the driver reports over-current")
 
 
 def test_a_quadrotor_of_one_s_own_without_a_task_has_no_score(here, capsys):
