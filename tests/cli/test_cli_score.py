@@ -106,7 +106,7 @@ def test_code_of_one_s_own_in_another_file_than_the_factory_s_is_named_where_it_
         "        raise RuntimeError('the driver reports over-current')\n"
     )
     (here / "workshop").mkdir()
-    (here / "workshop" / "parts.py").write_text("import motor_driver\n\n\ndef make():\n    return motor_driver.Driven()\n")
+    (here / "workshop" / "parts.py").write_text("import motor_driver\n\nmake = motor_driver.Driven\n")
     line = refused(capsys, *score("--policy", va.shipped("cartpole_states"), "--target", "workshop.parts:make"))
     assert line.endswith("motor_driver.py: line 6: RuntimeError: the driver reports over-current")
 
