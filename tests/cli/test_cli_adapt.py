@@ -107,6 +107,20 @@ def test_without_a_gap_the_policy_is_left_as_it_is(here, capsys):
     assert json.loads((here / "run" / "ledger.json").read_text())["rounds"][0]["policy_loss"] is None
 
 
+def test_episodes_that_are_too_short_for_a_diagnosis_are_said_to_be(here, trained, capsys):
+    (here / "slippery.py").write_text(
+        "import rig\nfrom dataclasses import replace\n\n\nclass Slippery(rig.Bare):\n"
+        "    def reset(self, batch, generator):\n"
+        "        self.steps = 0\n        return super().reset(batch, generator)\n\n"
+        "    def step(self, action):\n        self.steps += 1\n        seen = super().step(action)\n"
+        "        return replace(seen, alive=seen.alive & (self.steps < 4))\n"
+    )
+    policy = ("--policy", trained / "states.safetensors", "--target", "slippery:Slippery", "--diagnose")
+    assert run("adapt", *policy, "--samples", 20, "--round", 20, "--iterations", 1, "--out", "run") == 0
+    said = "all 5 episodes are shorter than 0.5 s, not diagnosed: a residual learnt the gap\n"
+    assert capsys.readouterr().out.startswith(said)
+
+
 def test_interrupted_it_goes_on(here, trained, monkeypatch, capsys):
     command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL[:-1])
     assert run(*command, "whole") == 0

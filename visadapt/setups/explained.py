@@ -41,7 +41,8 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
     def explain(episodes: Sequence[Episode], path: Path) -> Explanation:
         long = tuple(e for e in episodes if e.time[-1] - e.time[0] >= SHORTEST_EPISODE_S)
         if not long:
-            return Explanation(UNEXPLAINED, [], complete=False)
+            none = f"all {len(episodes)} episodes are shorter than {SHORTEST_EPISODE_S:g} s, not diagnosed"
+            return Explanation(none, [], complete=False)
         sources = tuple(f"episode {number}" for number in range(len(long)))
         recording = Recording(long, measured, source.period, sources)
         diagnosed = partial(diagnose, recording, source, seed=seed, progress=report, renderer=renderer)
