@@ -161,6 +161,15 @@ def test_a_file_in_the_place_of_the_folder(here, trained, capsys):
     assert (here / "kept.txt").read_text() == "notes"
 
 
+def test_warnings_of_a_diagnosis_are_said_where_its_effects_are_used(here, trained, diagnosis, capsys):
+    path = diagnosis()
+    warning = "the angle has the opposite sign of the source's; it was inverted"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "warnings": [warning]}))
+    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL)
+    assert run(*command, "--diagnosis", path, "--round", 100) == 2
+    assert f"visadapt: {path}: {warning}\n" in capsys.readouterr().err
+
+
 def test_a_diagnosis_that_named_nothing(here, trained, diagnosis, capsys):
     command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL)
     line = refused(capsys, *command, "--diagnosis", diagnosis((), "no_gap"))

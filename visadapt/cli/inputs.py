@@ -22,12 +22,12 @@ import torch
 
 from visadapt.cli.own_effects import complaints as complaints_of_effect
 from visadapt.diagnosis.saved import load_effects
-from visadapt.diagnosis.words import with_unit
+from visadapt.diagnosis.words import printable, with_unit
 from visadapt.effects import EFFECTS, Effect
 from visadapt.effects.base import require_system
 from visadapt.effects.catalogue import catalogue, sized
 from visadapt.progress import Report, reporting
-from visadapt.storage.run_folder import open_run
+from visadapt.storage.run_folder import open_run, read_json
 from visadapt.systems import SYSTEMS, System
 from visadapt.systems.contract import complaints
 from visadapt.systems.parameter_file import load_parameters
@@ -125,6 +125,8 @@ def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
         diagnosed, effects = load_effects(options.diagnosis)
         if diagnosed != system.name:
             raise InputError(f"{options.diagnosis}: a diagnosis of a {diagnosed}, where a {system.name} is given")
+        for warning in read_json(Path(options.diagnosis)).get("warnings") or ():
+            print(f"visadapt: {options.diagnosis}: {printable(str(warning))}", file=sys.stderr)
     return effects + [_effect(text, system) for text in options.effect]
 
 
