@@ -14,7 +14,8 @@ SMALL = ("--samples", 40, "--round", 20, "--iterations", 2, "--out", "run")
 
 
 def test_a_policy_on_states(here, trained, capsys):
-    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL)
+    policy = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states")
+    command = (*policy, *SMALL)
     assert run(*command) == 0
     assert capsys.readouterr().out == "40 samples of synthetic cart-pole used; the policy is run/policy.safetensors\n"
     ledger = json.loads((here / "run" / "ledger.json").read_text())
@@ -32,7 +33,7 @@ def test_a_policy_on_states(here, trained, capsys):
     kept = (here / "run" / "policy.safetensors").read_bytes()
     assert run(*command) == 0
     assert (here / "run" / "policy.safetensors").read_bytes() == kept
-    assert "run holds a run with other settings (samples)" in refused(capsys, *command, "--samples", 60)
+    assert "run holds a run with other settings (samples)" in refused(capsys, *policy, "--samples", 60, *SMALL[2:])
 
 
 def test_a_policy_on_frames_of_any_shape(here, trained):
@@ -58,6 +59,13 @@ def test_effects_of_a_diagnosis_are_fitted_to_the_target(here, trained, diagnosi
     (force,) = va.load_source("run/policy.safetensors").effects
     assert force.name == "constant_force"
     assert float(force.get_parameter("force").detach()) == pytest.approx(1.0, abs=0.2)
+
+
+def test_an_effect_that_is_given_replaces_that_of_the_diagnosis(here, trained, diagnosis):
+    policy = ("--policy", trained / "states.safetensors", "--target", "rig:states")
+    effect = ("--diagnosis", diagnosis([("constant_force", {"force": 0.0})]), "--effect", "constant_force:force=1")
+    assert run("adapt", *policy, *effect, *SMALL) == 0
+    assert [effect.name for effect in va.load_source("run/policy.safetensors").effects] == ["constant_force"]
 
 
 def test_the_causes_of_the_gap_are_named_and_put_into_the_simulator(here, capsys, only_effects, monkeypatch):
@@ -142,7 +150,7 @@ def test_interrupted_it_goes_on(here, trained, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("--round", 50), "--round 50 is more than --samples 40"),
+        (("--effect", "viscous_friction:coefficient=1,coefficient=2"), "coefficient=2: coefficient is given twice"),
         (("--renderer", "r.safetensors"), "states.safetensors: is shown states, for which --renderer has no use"),
         (("--effect", "rotor_drag:x=1"), "rotor_drag acts on a quadrotor, not on a cartpole"),
         (("--diagnosis", "none.json"), "none.json: cannot be read"),
@@ -154,10 +162,17 @@ def test_what_it_refuses(here, trained, capsys, arguments, says):
     assert not (here / "run").exists()
 
 
+def test_a_round_of_more_samples_than_there_are(here, trained, capsys):
+    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", "--out", "run")
+    line = refused(capsys, *command, "--samples", 40, "--round", 50)
+    assert "--round 50 is more than --samples 40" in line
+    assert not (here / "run").exists()
+
+
 def test_a_file_in_the_place_of_the_folder(here, trained, capsys):
-    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL)
+    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL[:-1])
     (here / "kept.txt").write_text("notes")
-    assert "--out: kept.txt is a file; name a folder" in refused(capsys, *command, "--out", "kept.txt")
+    assert "--out: kept.txt is a file; name a folder" in refused(capsys, *command, "kept.txt")
     assert (here / "kept.txt").read_text() == "notes"
 
 
@@ -165,8 +180,8 @@ def test_warnings_of_a_diagnosis_are_said_where_its_effects_are_used(here, train
     path = diagnosis()
     warning = "the angle has the opposite sign of the source's; it was inverted"
     path.write_text(json.dumps({**json.loads(path.read_text()), "warnings": [warning]}))
-    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL)
-    assert run(*command, "--diagnosis", path, "--round", 100) == 2
+    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", "--out", "run")
+    assert run(*command, "--diagnosis", path, "--samples", 40, "--round", 50) == 2
     assert f"visadapt: {path}: {warning}\n" in capsys.readouterr().err
 
 

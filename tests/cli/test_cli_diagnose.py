@@ -100,7 +100,7 @@ class TestCommand:
 
     def test_columns(self, recording, stub):
         recording.write_text(recording.read_text().replace("theta", "phi").replace("command", "volts"))
-        assert run(recording, "--columns", "theta=phi, command=volts") == 0
+        assert run(recording, "--columns", "theta=phi", "--columns", " x=x, command=volts") == 0
         assert stub["recording"].measured == ("x", "theta")
 
     def test_json_and_report(self, recording, stub, tmp_path):

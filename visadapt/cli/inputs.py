@@ -114,10 +114,11 @@ def the_system(options: argparse.Namespace) -> System:
 
 
 def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
-    """The effects of --diagnosis, then those of --effect.
+    """The effects of --diagnosis but those that --effect gives too, then those of --effect.
 
     Raises:
-        InputError: an unknown effect, one without its parameters, or one that does not act on the system.
+        InputError: an unknown effect, one given twice or without its parameters, or one that does not act on the
+            system.
         DiagnosisFileError: a diagnosis that named nothing.
     """
     effects: list[Effect] = []
@@ -127,7 +128,11 @@ def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
             raise InputError(f"{options.diagnosis}: a diagnosis of a {diagnosed}, where a {system.name} is given")
         for warning in read_json(Path(options.diagnosis)).get("warnings") or ():
             print(f"visadapt: {options.diagnosis}: {printable(str(warning))}", file=sys.stderr)
-    return effects + [_effect(text, system) for text in options.effect]
+    given = [_effect(text, system) for text in options.effect]
+    names = [effect.name for effect in given]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"--effect: {twice[0]} is given more than once")
+    return [effect for effect in effects if effect.name not in names] + given
 
 
 def _effect(text: str, system: System) -> Effect:
@@ -143,6 +148,8 @@ def _effect(text: str, system: System) -> Effect:
     values: dict[str, float] = {}
     for part in rest.split(",") if rest else ():
         asked, _, number = part.partition("=")
+        if asked in values:
+            raise InputError(f"--effect {text}: {asked} is given twice")
         try:
             values[asked] = float(number)
         except ValueError:
