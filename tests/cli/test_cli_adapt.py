@@ -176,6 +176,15 @@ def test_a_file_in_the_place_of_the_folder(here, trained, capsys):
     assert (here / "kept.txt").read_text() == "notes"
 
 
+def test_a_folder_with_files_that_are_no_run_is_left_as_it_is(here, trained, capsys):
+    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL)
+    (here / "run").mkdir()
+    (here / "run" / "policy.safetensors").write_text("mine")
+    assert "run has files in it that are no run of visadapt: name another by --out" in refused(capsys, *command)
+    assert (here / "run" / "policy.safetensors").read_text() == "mine"
+    assert len([*(here / "run").iterdir()]) == 1
+
+
 def test_warnings_of_a_diagnosis_are_said_where_its_effects_are_used(here, trained, diagnosis, capsys):
     path = diagnosis()
     warning = "the angle has the opposite sign of the source's; it was inverted"

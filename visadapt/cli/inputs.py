@@ -72,15 +72,22 @@ def unfinished(out: Path, settings: Mapping[str, Any]) -> Iterator[Path]:
     """The folder `<out>.unfinished` that a training works in, and goes on from; removed when the block ends.
 
     Raises:
-        InputError: `out` is there already, or is a folder.
+        InputError: `out` is there already, or is a folder; or what lies in the folder is no training.
         RunError: the folder holds a training with other settings.
     """
     if out.exists():
         raise InputError(f"{out} is there already: remove it, or name another file by --out")
     folder = out.with_name(out.name + ".unfinished")
+    check_run_folder(folder)
     open_run(folder, settings)
     yield folder
     shutil.rmtree(folder)
+
+
+def check_run_folder(folder: Path) -> None:
+    """Raises InputError where files lie in the folder of a run that are not a run's, and would be replaced."""
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "settings.json").exists():
+        raise InputError(f"{folder} has files in it that are no run of visadapt: name another by --out")
 
 
 def asked_for(options: argparse.Namespace, *files: str) -> dict[str, Any]:
