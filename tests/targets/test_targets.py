@@ -257,6 +257,7 @@ class Rig(Target):
 
 def test_a_machine_may_write_every_instant_into_the_same_arrays():
     (found,) = run(Rig(), Feedback(), 1, 4, seeded())
+    assert found.force is None  # which it does not tell
     np.testing.assert_allclose(found.episode.state[:, 0], 0.001 * np.arange(1, 6), rtol=1e-5)
 
 

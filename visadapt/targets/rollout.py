@@ -55,8 +55,8 @@ class Run:
 
     episode: Episode
     survived: bool
-    force: np.ndarray
-    """(T,), or of vehicles (T, 3), the disturbance in N as the target tells it, zeros where it does not: for films"""
+    force: np.ndarray | None
+    """(T,), or of vehicles (T, 3), the disturbance in N as the target tells it, None where it does not: for films"""
 
 
 @torch.no_grad()
@@ -161,7 +161,7 @@ def _cut(rows: list[tuple[Observation, Tensor]], b: int, length: int, survived: 
 
     def column(name: str) -> NDArray[Any] | None:
         each = [getattr(seen, name) for seen, _ in kept]
-        return None if each[0] is None else np.stack([values[b].numpy() for values in each])
+        return None if any(values is None for values in each) else np.stack([values[b].numpy() for values in each])
 
     action = np.stack([action[b].numpy() for _, action in kept])
     action[-1] = 0.0
@@ -169,5 +169,4 @@ def _cut(rows: list[tuple[Observation, Tensor]], b: int, length: int, survived: 
     if task_state is not None:
         task_state = task_state.astype(float)
     episode = Episode(time, action, column("state"), column("frame"), task_state)
-    force = np.array([0.0 if seen.force is None else seen.force[b].numpy() for seen, _ in kept])
-    return Run(episode, survived, force)
+    return Run(episode, survived, column("force"))
