@@ -52,7 +52,7 @@ class CartPolePanel:
     for which the track is shown as far as the carts go"""
     position_limit: float | None = None
     """m; an episode that ended early without a fall counts as having left the frame if its last position is beyond
-    this. None: the limit is as far as `drawn` shows"""
+    this. None: the limit is as far as `drawn` shows; infinite: there is no frame"""
 
     def __post_init__(self) -> None:
         if self.run.episode.state is None:
@@ -135,6 +135,8 @@ class CartPoleFilm(Film):
         wide = float(np.abs([x, x + length * np.sin(theta)]).max()) + 0.4
         self.reach = max(wide, 1.15 * length * PANEL_WIDTH / SCENE_HEIGHT)
         """m to either side of the middle, such that neither carts nor poles that swing up leave the scene"""
+        self.roams = any(bool((np.abs(panel.state[:-1, 0]) > panel.drawn.camera.reach).any()) for panel in panels)
+        """whether a cart went on beyond what `drawn` shows, so that the track is shown as far as the carts go"""
 
     @property
     def times(self) -> list[float]:
@@ -171,7 +173,7 @@ class CartPoleFilm(Film):
         """The track with its metres, cart and pole, and the disturbance as an arrow; or the cone and earlier poses."""
         sizes, camera = panel.drawn, panel.drawn.camera
         left, bottom, wide = -self.reach, -self.reach * SCENE_HEIGHT / PANEL_WIDTH, 2 * self.reach
-        if not panel.swings_up:
+        if not panel.swings_up and not self.roams:
             left, bottom = (-0.5 - camera.column) / camera.scale, (camera.row - camera.height + 0.5) / camera.scale
             wide = camera.width / camera.scale
         scene.set(xlim=(left, left + wide), ylim=(bottom, bottom + wide * SCENE_HEIGHT / PANEL_WIDTH))
