@@ -81,7 +81,8 @@ def score(
 
     Raises:
         ValueError: more steps than the task of a flight has, no episode or step, a policy that is shown a goal on a
-            target that is no `FlightTarget`, or a target whose system is neither a vehicle nor a cart-pole.
+            target that is no `FlightTarget`, or a target whose system is neither a vehicle nor a cart-pole, or that
+            shows no cart speed.
 
     >>> import visadapt as va
     >>> found = va.score(va.load_policy(va.shipped("cartpole_states")), va.SyntheticTarget(), episodes=2, steps=20)
@@ -95,14 +96,18 @@ def score(
     if isinstance(target, FlightTarget):
         if steps is not None and steps > target.task.steps:
             raise ValueError(f"a flight of this task has {target.task.steps} steps, got steps = {steps}")
-        runs = run(target, policy, episodes, steps or target.task.steps, generator, strict=False)
+        runs = run(target, policy, episodes, steps or target.task.steps, generator, strict=False, keep_frames=False)
         return _score_flights(runs, target)
     if policy.shown == "state and goal":
         raise ValueError(f"{target.name}: flights are scored by their task: derive the target from FlightTarget")
     kind = type(target.system) if isinstance(target.system, System) else target.system
     if kind is not None and not issubclass(kind, CartPole):
         raise ValueError(f"a score is that of a cart's speed or of a flight; {target.name} is a {kind.name}: use run")
-    return score_runs(run(target, policy, episodes, steps or EPISODE_STEPS, generator))
+    runs = run(target, policy, episodes, steps or EPISODE_STEPS, generator, keep_frames=False)
+    state = runs[0].episode.state
+    if state is None or state.shape[1] < 2:
+        raise ValueError(f"{target.name}: shows no cart speed; a score needs it, as the second of the states")
+    return score_runs(runs)
 
 
 def score_runs(runs: Sequence[Run]) -> CartPoleScore:
