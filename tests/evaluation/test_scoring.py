@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from visadapt.evaluation.scoring import score, score_runs
+from visadapt.films import film
 from visadapt.policies import Policy
 from visadapt.recordings import Episode
 from visadapt.setups.policy_file import load_policy
@@ -119,19 +120,21 @@ def test_what_is_no_cart_and_no_flight_is_not_scored_as_one(system):
 
 
 class Seen(Target):
-    """A machine that shows frames; `kept` is how many of them the process holds at the last step."""
+    """A machine that shows frames; `kept` is how many of them the process holds at the 20th step."""
 
     name, period, n_action = "seen", 0.05, 1
 
     def __init__(self, columns=4):
-        self.columns = columns
+        self.columns, self.steps = columns, 0
 
     def reset(self, batch, generator):
         alive = torch.ones(batch, dtype=torch.bool)
         return Observation(torch.zeros(batch, self.columns), alive, torch.ones(batch, 7, 9).byte())
 
     def step(self, action):
-        self.kept = sum(isinstance(each, torch.Tensor) and each.shape[1:] == (7, 9) for each in gc.get_objects())
+        self.steps += 1
+        if self.steps == 20:
+            self.kept = sum(isinstance(each, torch.Tensor) and each.shape[1:] == (7, 9) for each in gc.get_objects())
         return self.reset(len(action), None)
 
 
@@ -139,6 +142,13 @@ def test_frames_are_not_kept_for_a_score():
     target = Seen()
     assert score(Steady(), target, episodes=2, steps=20).survived == 2
     assert target.kept < 5
+
+
+def test_a_policy_of_another_period_is_neither_scored_nor_filmed(tmp_path):
+    policy, target = load_policy(shipped("cartpole_states")), SyntheticTarget(period=0.1)
+    for shown in (lambda: score(policy, target, 1), lambda: film(policy, target, tmp_path / "film.mp4", seconds=0.5)):
+        with pytest.raises(ValueError, match=r"cart-pole has 0.1 s between actions, the policy was trained for 0.05 s"):
+            shown()
 
 
 def test_a_target_without_states_has_no_score():

@@ -13,7 +13,7 @@ import torch
 from visadapt.policies import Policy
 from visadapt.systems import CartPole, System
 from visadapt.targets import FlightTarget, Target
-from visadapt.targets.rollout import Run, run
+from visadapt.targets.rollout import Run, check_period, run
 from visadapt.tasks.balance import EPISODE_STEPS
 
 SCORE_SEED = 2026
@@ -80,9 +80,9 @@ def score(
         steps: of an episode; without it, those of the task, or 250.
 
     Raises:
-        ValueError: more steps than the task of a flight has, no episode or step, a policy that is shown a goal on a
-            target that is no `FlightTarget`, or a target whose system is neither a vehicle nor a cart-pole, or that
-            shows no cart speed.
+        ValueError: more steps than the task of a flight has, no episode or step, a policy that was trained for another
+            period or is shown a goal on a target that is no `FlightTarget`, or a target whose system is neither a
+            vehicle nor a cart-pole, or that shows no cart speed.
 
     >>> import visadapt as va
     >>> found = va.score(va.load_policy(va.shipped("cartpole_states")), va.SyntheticTarget(), episodes=2, steps=20)
@@ -91,6 +91,7 @@ def score(
     """
     if episodes < 1 or (steps is not None and steps < 1):
         raise ValueError(f"{episodes} episodes of {steps} steps; at least one of each is right")
+    check_period(policy, target)
     policy.eval()
     generator = torch.Generator().manual_seed(seed)
     if isinstance(target, FlightTarget):

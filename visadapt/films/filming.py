@@ -17,7 +17,7 @@ from visadapt.progress import Progress
 from visadapt.systems import CartPole
 from visadapt.targets import FlightTarget, SyntheticTarget, Target
 from visadapt.targets.gymnasium import GymnasiumTarget
-from visadapt.targets.rollout import Run, See, run, see_within_a_turn
+from visadapt.targets.rollout import Run, See, check_period, run, see_within_a_turn
 from visadapt.tasks.follow import Follow
 
 
@@ -51,7 +51,8 @@ def film(
         progress: called after each frame.
 
     Raises:
-        ValueError: states of neither a cart-pole nor a vehicle, or a run that does not fit the target.
+        ValueError: states of neither a cart-pole nor a vehicle, a run that does not fit the target, or a policy that
+            was trained for another period.
         TargetError: the target shows no frames to a policy that sees frames.
         DiskFullError: the disk is full; a file that was at `path` before is unchanged.
         FilmError: ffmpeg failed for another reason; a file that was at `path` before is unchanged.
@@ -71,6 +72,7 @@ def film(
 
 
 def _run(policy: Policy, target: Target, seconds: float, seed: int, see: See | None) -> Run:
+    check_period(policy, target)
     steps = round(seconds / target.period)
     if isinstance(target, FlightTarget):
         steps = min(steps, target.task.steps)

@@ -119,6 +119,16 @@ def run(
     return [_cut(rows, b, int(length[b]), bool(running[b]), target.period) for b in range(batch)]
 
 
+def check_period(policy: Policy, target: Target) -> None:
+    """Raises ValueError where the policy is known to be trained for another period than the target's."""
+    trained = policy.trained_in["period"] if policy.trained_in else target.period
+    if abs(trained - target.period) > 1e-6:
+        raise ValueError(
+            f"{target.name} has {target.period:g} s between actions, the policy was trained for {trained:g} s: give "
+            "the target that period, or train a policy for its own"
+        )
+
+
 def checked(target: Target, observation: Any, batch: int) -> Observation:
     """A copy of what a target shows of `batch` episodes, since it may write the next instant over it.
 
