@@ -62,7 +62,7 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
             if inverted:
                 raise TargetError(
                     f"{path}: {name} of the target{OPPOSITE}, so that the policy would drive it the wrong way: negate "
-                    "it in the target, by scale = -1.0 in a map"
+                    "it in the target, by scale = -1.0 in a map, and begin in another folder"
                 )
         verdict = content["verdict"]
         slight = frozenset(cause["effect"] for cause in content["causes"] if cause["slight"])
