@@ -52,6 +52,28 @@ def nonsense():
     return "a robot"
 
 
+class Bare(va.Target):
+    \"\"\"A target that sets no more than a target must.\"\"\"
+
+    name, period, n_action = "bare", 0.05, 1
+
+    def __init__(self):
+        self.inner = states()
+
+    def reset(self, batch, generator):
+        return self.shown(self.inner.reset(batch, generator))
+
+    def step(self, action):
+        return self.shown(self.inner.step(action))
+
+    def shown(self, seen):
+        return va.Observation(seen.state, seen.alive)
+
+
+def bare():
+    return Bare()
+
+
 class Pushed(gymnasium.ActionWrapper):
     \"\"\"gymnasium's own cart-pole, whose action is a force here and drawn by us: its picture needs pygame.\"\"\"
 

@@ -14,7 +14,8 @@ SMALL = ("--samples", 40, "--round", 20, "--iterations", 2, "--out", "run")
 
 
 def test_a_policy_on_states(here, trained, capsys):
-    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL)
+    policy = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states")
+    command = (*policy, *SMALL)
     assert run(*command) == 0
     assert capsys.readouterr().out == "40 samples of synthetic cart-pole used; the policy is run/policy.safetensors\n"
     ledger = json.loads((here / "run" / "ledger.json").read_text())
@@ -32,7 +33,7 @@ def test_a_policy_on_states(here, trained, capsys):
     kept = (here / "run" / "policy.safetensors").read_bytes()
     assert run(*command) == 0
     assert (here / "run" / "policy.safetensors").read_bytes() == kept
-    assert "run holds a run with other settings (samples)" in refused(capsys, *command, "--samples", 60)
+    assert "run holds a run with other settings (samples)" in refused(capsys, *policy, "--samples", 60, *SMALL[2:])
 
 
 def test_a_policy_on_frames_of_any_shape(here, trained):
@@ -58,6 +59,13 @@ def test_effects_of_a_diagnosis_are_fitted_to_the_target(here, trained, diagnosi
     (force,) = va.load_source("run/policy.safetensors").effects
     assert force.name == "constant_force"
     assert float(force.get_parameter("force").detach()) == pytest.approx(1.0, abs=0.2)
+
+
+def test_an_effect_that_is_given_replaces_that_of_the_diagnosis(here, trained, diagnosis):
+    policy = ("--policy", trained / "states.safetensors", "--target", "rig:states")
+    effect = ("--diagnosis", diagnosis([("constant_force", {"force": 0.0})]), "--effect", "constant_force:force=1")
+    assert run("adapt", *policy, *effect, *SMALL) == 0
+    assert [effect.name for effect in va.load_source("run/policy.safetensors").effects] == ["constant_force"]
 
 
 def test_the_causes_of_the_gap_are_named_and_put_into_the_simulator(here, capsys, only_effects, monkeypatch):
@@ -107,6 +115,20 @@ def test_without_a_gap_the_policy_is_left_as_it_is(here, capsys):
     assert json.loads((here / "run" / "ledger.json").read_text())["rounds"][0]["policy_loss"] is None
 
 
+def test_episodes_that_are_too_short_for_a_diagnosis_are_said_to_be(here, trained, capsys):
+    (here / "slippery.py").write_text(
+        "import rig\nfrom dataclasses import replace\n\n\nclass Slippery(rig.Bare):\n"
+        "    def reset(self, batch, generator):\n"
+        "        self.steps = 0\n        return super().reset(batch, generator)\n\n"
+        "    def step(self, action):\n        self.steps += 1\n        seen = super().step(action)\n"
+        "        return replace(seen, alive=seen.alive & (self.steps < 4))\n"
+    )
+    policy = ("--policy", trained / "states.safetensors", "--target", "slippery:Slippery", "--diagnose")
+    assert run("adapt", *policy, "--samples", 20, "--round", 20, "--iterations", 1, "--out", "run") == 0
+    said = "all 5 episodes are shorter than 0.5 s, not diagnosed: a residual learnt the gap\n"
+    assert capsys.readouterr().out.startswith(said)
+
+
 def test_interrupted_it_goes_on(here, trained, monkeypatch, capsys):
     command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL[:-1])
     assert run(*command, "whole") == 0
@@ -128,7 +150,7 @@ def test_interrupted_it_goes_on(here, trained, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("--round", 50), "--round 50 is more than --samples 40"),
+        (("--effect", "viscous_friction:coefficient=1,coefficient=2"), "coefficient=2: coefficient is given twice"),
         (("--renderer", "r.safetensors"), "states.safetensors: is shown states, for which --renderer has no use"),
         (("--effect", "rotor_drag:x=1"), "rotor_drag acts on a quadrotor, not on a cartpole"),
         (("--diagnosis", "none.json"), "none.json: cannot be read"),
@@ -140,11 +162,36 @@ def test_what_it_refuses(here, trained, capsys, arguments, says):
     assert not (here / "run").exists()
 
 
+def test_a_round_of_more_samples_than_there_are(here, trained, capsys):
+    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", "--out", "run")
+    line = refused(capsys, *command, "--samples", 40, "--round", 50)
+    assert "--round 50 is more than --samples 40" in line
+    assert not (here / "run").exists()
+
+
 def test_a_file_in_the_place_of_the_folder(here, trained, capsys):
-    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL)
+    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL[:-1])
     (here / "kept.txt").write_text("notes")
-    assert "--out: kept.txt is a file; name a folder" in refused(capsys, *command, "--out", "kept.txt")
+    assert "--out: kept.txt is a file; name a folder" in refused(capsys, *command, "kept.txt")
     assert (here / "kept.txt").read_text() == "notes"
+
+
+def test_a_folder_with_files_that_are_no_run_is_left_as_it_is(here, trained, capsys):
+    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", *SMALL)
+    (here / "run").mkdir()
+    (here / "run" / "policy.safetensors").write_text("mine")
+    assert "run has files in it that are no run of visadapt: name another by --out" in refused(capsys, *command)
+    assert (here / "run" / "policy.safetensors").read_text() == "mine"
+    assert len([*(here / "run").iterdir()]) == 1
+
+
+def test_warnings_of_a_diagnosis_are_said_where_its_effects_are_used(here, trained, diagnosis, capsys):
+    path = diagnosis()
+    warning = "the angle has the opposite sign of the source's; it was inverted"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "warnings": [warning]}))
+    command = ("adapt", "--policy", trained / "states.safetensors", "--target", "rig:states", "--out", "run")
+    assert run(*command, "--diagnosis", path, "--samples", 40, "--round", 50) == 2
+    assert f"visadapt: {path}: {warning}\n" in capsys.readouterr().err
 
 
 def test_a_diagnosis_that_named_nothing(here, trained, diagnosis, capsys):

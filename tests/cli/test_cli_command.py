@@ -38,6 +38,21 @@ def test_help_says_what_a_subcommand_does_and_every_option(name, capsys):
         assert following.startswith("        "), line
 
 
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--effects", "a.py", "--effects", "b.py"), "argument --effects: given twice; one is right"),
+        (("--columns", "x=a", "--columns", "theta=b,x=c"), "argument --columns: x is given twice"),
+        (("--effect", "viscous_friction:coefficient=1"), "unrecognized arguments: --effect"),  # no --effects
+    ],
+)
+def test_no_option_is_dropped_or_guessed(arguments, says, capsys):
+    with pytest.raises(SystemExit) as caught:
+        run("diagnose", "run.csv", "--system", "cartpole", *arguments)
+    assert caught.value.code == 2
+    assert says in capsys.readouterr().err
+
+
 def test_help_needs_no_torch():
     script = "import sys; sys.modules['torch'] = None; from visadapt.cli.main import main; main()"
     for arguments in (["--help"], ["train", "--help"]):

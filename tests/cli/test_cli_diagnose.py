@@ -1,4 +1,6 @@
+import io
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -98,7 +100,7 @@ class TestCommand:
 
     def test_columns(self, recording, stub):
         recording.write_text(recording.read_text().replace("theta", "phi").replace("command", "volts"))
-        assert run(recording, "--columns", "theta=phi, command=volts") == 0
+        assert run(recording, "--columns", "theta=phi", "--columns", " x=x, command=volts") == 0
         assert stub["recording"].measured == ("x", "theta")
 
     def test_json_and_report(self, recording, stub, tmp_path):
@@ -117,6 +119,22 @@ class TestCommand:
             assert run(recording, "--json", tmp_path / "a.json", "--report", tmp_path / "a.html") == 0
             written.append([(tmp_path / name).read_bytes() for name in ("a.json", "a.html")])
         assert written[0] == written[1]
+
+    def test_whoever_stops_reading_the_verdict_still_gets_the_files(self, recording, stub, tmp_path, monkeypatch):
+        reading, writing = os.pipe()
+        os.close(reading)
+        files = [tmp_path / "found.json", tmp_path / "found.html"]
+        with os.fdopen(writing, "w", buffering=1) as closed, monkeypatch.context() as patched:
+            patched.setattr(sys, "stdout", closed)
+            assert run(recording, "--json", files[0], "--report", files[1]) == 0
+        assert all(file.exists() for file in files)
+
+    def test_a_name_that_the_terminal_s_encoding_lacks_is_escaped(self, recording, stub, tmp_path, monkeypatch):
+        terminal = io.TextIOWrapper(io.BytesIO(), encoding="cp1252")
+        with monkeypatch.context() as patched:
+            patched.setattr(sys, "stdout", terminal)
+            assert run(recording, "--plan", tmp_path / "θ.csv") == 0
+        assert rb"\u03b8.csv was not written" in terminal.buffer.getvalue()
 
     def test_a_plan_where_nothing_is_open(self, recording, stub, tmp_path, capsys):
         path = tmp_path / "plan.csv"

@@ -27,6 +27,25 @@ def test_the_score_is_that_of_the_library_with_failed_episodes_apart(here, train
     assert SEED == SCORE_SEED
 
 
+def test_a_target_that_does_not_say_its_system(here, trained, capsys):
+    """As docs/own_rig.md says what a target has to have."""
+    policy = ("--policy", trained / "states.safetensors", "--target", "rig:bare")
+    assert run(*score(*policy)) == 0
+    printed = capsys.readouterr().out
+    assert run(*score(*policy[:3], "rig:states")) == 0
+    assert printed == capsys.readouterr().out
+    assert run("adapt", *policy, "--samples", 20, "--round", 20, "--iterations", 1, "--out", "run") == 0
+
+
+def test_a_command_that_is_held_for_several_steps_of_an_environment_is_said_to_be(here, trained, capsys):
+    (here / "held.toml").write_text("period = 0.05\n" + (here / "map.toml").read_text())
+    (here / "fine.py").write_text("import rig\n\n\nclass Fine(rig.Pushed):\n    dt = 0.025\n")
+    target = ("--target", "fine:Fine", "--map", "held.toml")
+    assert run(*score("--policy", trained / "states.safetensors", *target)) == 0
+    said = "visadapt: fine:Fine: each command is held for 2 of its steps of 0.025 s\n"
+    assert capsys.readouterr().err == said
+
+
 def test_shipped_policies_balance(here, capsys):
     assert run(*score("--policy", va.shipped("cartpole_states"), "--target", "rig:states")) == 0
     assert "2 of 2 episodes up" in capsys.readouterr().out
@@ -79,6 +98,30 @@ def test_targets_that_it_refuses(here, trained, capsys, arguments, says):
     command = score("--policy", trained / "states.safetensors", "--json", "s.json", "--target", *arguments)
     assert says in refused(capsys, *command)
     assert not (here / "s.json").exists()
+
+
+def test_code_of_one_s_own_in_another_file_than_the_factory_s_is_named_where_it_raises(here, capsys):
+    (here / "motor_driver.py").write_text(
+        "import rig\n\n\nclass Driven(rig.Bare):\n    def step(self, action):\n"
+        "        raise RuntimeError('the driver reports over-current')\n"
+    )
+    (here / "workshop").mkdir()
+    (here / "workshop" / "parts.py").write_text("import motor_driver\n\nmake = motor_driver.Driven\n")
+    line = refused(capsys, *score("--policy", va.shipped("cartpole_states"), "--target", "workshop.parts:make"))
+    assert line.endswith("motor_driver.py: line 6: RuntimeError: the driver reports over-current")
+
+
+def test_a_quadrotor_of_one_s_own_without_a_task_has_no_score(here, capsys):
+    (here / "quad.py").write_text(
+        "import torch\nimport visadapt as va\n\n\n"
+        "class Quad(va.Target):\n    name, period, n_action = 'quad', 0.1, 4\n\n"
+        "    def reset(self, batch, generator):\n"
+        "        return va.Observation(torch.eye(13)[6].expand(batch, 13), torch.ones(batch, dtype=torch.bool),\n"
+        "                              goal=torch.zeros(batch, 60))\n\n"
+        "    def step(self, action):\n        return self.reset(len(action), None)\n"
+    )
+    line = refused(capsys, *score("--policy", va.shipped("quadrotor"), "--target", "quad:Quad"))
+    assert line == "visadapt: quad: flights are scored by their task: derive the target from FlightTarget"
 
 
 def test_policies_that_it_refuses(here, trained, capsys):

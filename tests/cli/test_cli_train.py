@@ -169,3 +169,11 @@ def test_a_policy_that_is_there_is_not_overwritten(here, capsys):
     (here / "p.safetensors").write_text("mine")
     assert "p.safetensors is there already" in refused(capsys, *TINY)
     assert (here / "p.safetensors").read_text() == "mine"
+
+
+def test_a_folder_of_the_name_that_it_works_in_is_left_as_it_is(here, capsys):
+    """It removes that folder at the end."""
+    (here / "p.safetensors.unfinished").mkdir()
+    (here / "p.safetensors.unfinished" / "notes.txt").write_text("mine")
+    assert "p.safetensors.unfinished has files in it that are no run of visadapt" in refused(capsys, *TINY)
+    assert (here / "p.safetensors.unfinished" / "notes.txt").exists()

@@ -1,15 +1,17 @@
 import dataclasses
+import gc
 
 import numpy as np
 import pytest
 import torch
 
 from visadapt.evaluation.scoring import score, score_runs
+from visadapt.films import film
 from visadapt.policies import Policy
 from visadapt.recordings import Episode
 from visadapt.setups.policy_file import load_policy
 from visadapt.systems import FixedWing
-from visadapt.targets import SyntheticTarget, sine_force
+from visadapt.targets import Observation, SyntheticTarget, Target, sine_force
 from visadapt.targets.rollout import Run, run
 from visadapt.weights import shipped
 
@@ -52,6 +54,16 @@ class Steady(Policy):
         _, x_dot, theta, theta_dot = history.observations[:, -1].unbind(1)
         command = self.gains[0] * x_dot + self.gains[1] * theta + self.gains[2] * theta_dot
         return command.clamp(-1, 1)[:, None, None].expand(-1, 10, 1)
+
+
+class Blind(Policy):
+    """Commands nothing."""
+
+    def __init__(self):
+        super().__init__(4, 1)
+
+    def forward(self, history):
+        return history.actions.new_zeros(len(history.actions), 10, 1)
 
 
 class TestEvaluate:
@@ -105,6 +117,43 @@ def test_what_is_no_cart_and_no_flight_is_not_scored_as_one(system):
         score(load_policy(shipped("cartpole_states")), Motor(), episodes=1)
     with pytest.raises(ValueError, match="flights are scored by their task: derive the target from FlightTarget"):
         score(load_policy(shipped("fixed_wing")), SyntheticTarget(), episodes=1)
+
+
+class Seen(Target):
+    """A machine that shows frames; `kept` is how many of them the process holds at the 20th step."""
+
+    name, period, n_action = "seen", 0.05, 1
+
+    def __init__(self, columns=4):
+        self.columns, self.steps = columns, 0
+
+    def reset(self, batch, generator):
+        alive = torch.ones(batch, dtype=torch.bool)
+        return Observation(torch.zeros(batch, self.columns), alive, torch.ones(batch, 7, 9).byte())
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 20:
+            self.kept = sum(isinstance(each, torch.Tensor) and each.shape[1:] == (7, 9) for each in gc.get_objects())
+        return self.reset(len(action), None)
+
+
+def test_frames_are_not_kept_for_a_score():
+    target = Seen()
+    assert score(Steady(), target, episodes=2, steps=20).survived == 2
+    assert target.kept < 5
+
+
+def test_a_policy_of_another_period_is_neither_scored_nor_filmed(tmp_path):
+    policy, target = load_policy(shipped("cartpole_states")), SyntheticTarget(period=0.1)
+    for shown in (lambda: score(policy, target, 1), lambda: film(policy, target, tmp_path / "film.mp4", seconds=0.5)):
+        with pytest.raises(ValueError, match=r"cart-pole has 0.1 s between actions, the policy was trained for 0.05 s"):
+            shown()
+
+
+def test_a_target_without_states_has_no_score():
+    with pytest.raises(ValueError, match="seen: shows no cart speed; a score needs it"):
+        score(Blind(), Seen(columns=0), episodes=1, steps=2)
 
 
 @pytest.mark.parametrize("size", [{"episodes": 0}, {"steps": 0}, {"steps": -5}])

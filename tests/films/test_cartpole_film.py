@@ -1,4 +1,5 @@
 import resource
+from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -83,6 +84,15 @@ def test_the_panel_says_how_an_episode_ended(survived: bool, angle: float, place
 def test_the_limit_of_the_angle_decides_what_a_fall_is():
     run = make_run(9, False, 0.25)
     assert CartPolePanel("target", run, angle_limit=0.2).failure(8, 5.0).startswith("FELL")
+
+
+def test_a_force_that_the_target_does_not_tell_is_a_dash():
+    run = make_run()
+    written = []
+    for force in (np.zeros(len(run.episode.time)), None):
+        numbers = CartPoleFilm([CartPolePanel("t", replace(run, force=force))], PERIOD).still(0.5)[490:]
+        written.append(((numbers[..., 0] > 200) & (numbers[..., 2] < 60)).sum())
+    assert 0 < written[1] < 0.3 * written[0]  # a dash in place of +0.00 N
 
 
 def test_the_force_is_drawn_at_the_cart_on_the_side_it_pushes_from():

@@ -7,6 +7,7 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
+from matplotlib.colors import to_rgb
 
 from experiments.flights import flight_target
 from renderers import DrawnCartPole
@@ -15,8 +16,10 @@ from visadapt.films import film
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.films.flight_film import FlightFilm
 from visadapt.films.flight_panel import FlightPanel
+from visadapt.films.widgets import INK
 from visadapt.policies import ImagePolicy, StatePolicy
 from visadapt.recordings import Episode
+from visadapt.systems import CartPole
 from visadapt.targets import Observation, Start, SyntheticTarget, Target, TargetError, sine_force
 from visadapt.targets.rollout import Run, run
 from visadapt.tasks.balance import within_a_turn
@@ -86,6 +89,21 @@ def test_a_target_of_ones_own_is_shown_in_its_own_frames_or_drawn_from_its_state
     np.testing.assert_allclose(scene.mean((1, 2, 3)), [20, 40, 60, 80, 100], atol=3)
     film(state_policy(), Camera(frames=False), tmp_path / "drawn.mp4", seconds=0.2)
     assert imageio.imread(tmp_path / "drawn.mp4", plugin="FFMPEG")[0, 100:400, 100:400].mean() > 200
+
+
+def test_without_a_camera_the_pole_has_its_length_and_the_cart_is_seen_wherever_it_goes(tmp_path: Path):
+    target = SyntheticTarget(system=CartPole(pole_half_length=0.15))
+    time = np.arange(3) * 0.05
+    states = np.array([[1.0, 1, 0, 0], [2.0, 1, 0, 0], [2.47, 1, 0.1, 0]])
+    far = Run(Episode(time, np.zeros((3, 1)), states), False, None)
+    film(far, target, tmp_path / "film.mp4")
+    panel = CartPolePanel("synthetic cart-pole", far, drawn=DrawnCartPole(pole_length=0.3), position_limit=math.inf)
+    assert panel.failure(2, 5.0) == "ENDED at t = 0.10 s"
+    expected = CartPoleFilm([panel], 0.05)
+    assert_shows(tmp_path / "film.mp4", expected)
+    for t in (0.0, 0.05):
+        scene = expected.still(t)[56:456, 28:508]
+        assert (np.abs(scene - 255 * np.array(to_rgb(INK))).max(-1) < 30).sum() > 500  # the cart
 
 
 def test_a_cart_pole_without_an_angle_limit_is_filmed_as_a_swing_up(tmp_path: Path):

@@ -1,4 +1,5 @@
 import resource
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -52,6 +53,11 @@ def flown(state: np.ndarray, survived: bool = True, force: np.ndarray | None = N
     return FlightPanel("a flight", run, Quadrotor(), along(), torch.tensor([0, 0]))
 
 
+def beside_with(force: np.ndarray | None) -> FlightPanel:
+    panel = following()
+    return FlightPanel("a flight", replace(panel.run, force=force), Quadrotor(), along(), torch.tensor([0, 0]))
+
+
 def following(aside: tuple[float, float, float] = (0.0, 0.0, 0.0), rows: int = 11, survived: bool = True):
     return flown(beside(aside, rows), survived)
 
@@ -61,7 +67,7 @@ def reaching(miss: float) -> FlightPanel:
     time = np.arange(140) * 0.05
     state = np.zeros((140, 13))
     state[:, 0], state[:, 1], state[:, 3], state[:, 6] = 11.5 * time, miss, 11.5, 1.0
-    run = Run(Episode(time, np.zeros((140, 4)), state), True, np.zeros(140))
+    run = Run(Episode(time, np.zeros((140, 4)), state), True, None)
     return FlightPanel("a flight", run, FixedWing(), Reach(), torch.tensor([50.0, 0.0, 0.0]))
 
 
@@ -139,6 +145,12 @@ def test_a_hidden_force_is_drawn_towards_where_it_pushes():
     assert columns[0] > 260
     assert columns[1] < 220
     assert count(FlightFilm([following()]).still(0.5)[56:416], VIOLET) == 0
+
+
+def test_a_force_that_the_target_does_not_tell_is_a_dash():
+    known, unknown = beside_with(np.zeros((11, 3))), beside_with(None)
+    written = [count(FlightFilm([panel]).still(0.5)[416:], VIOLET) for panel in (known, unknown)]
+    assert 0 < written[1] < 0.3 * written[0]  # a dash in place of 0.00 N
 
 
 def test_outlines_have_the_vehicles_sizes():

@@ -1,4 +1,7 @@
+from dataclasses import replace
+
 import numpy as np
+import pytest
 import torch
 
 import visadapt as va
@@ -8,7 +11,7 @@ from visadapt.effects import EFFECTS
 from visadapt.recordings import read_recording
 from visadapt.setups.explained import explained
 from visadapt.storage.run_folder import read_json
-from visadapt.targets import synthetic
+from visadapt.targets import TargetError, synthetic
 
 NOISE = torch.tensor([0.005, 0.02, 0.009, 0.05])
 
@@ -40,6 +43,17 @@ def test_what_a_file_names_on_a_system_of_ones_own_is_known_before_it_is_read():
     assert "knee.viscous_friction" not in EFFECTS
     explained(va.World(Knee()))
     assert "knee.viscous_friction" in EFFECTS
+
+
+def test_an_angle_of_the_opposite_sign_is_refused_since_the_policy_would_drive_the_wrong_way(tmp_path, only_effects):
+    only_effects("viscous_friction")
+    policy, generator = va.load_policy(va.shipped("cartpole_states")), torch.Generator().manual_seed(0)
+    (found,) = va.run(va.SyntheticTarget(), policy, 1, 150, generator, exploration=0.05)
+    turned = replace(found.episode, state=found.episode.state * np.array([1, 1, -1, -1]))
+    explain = explained(va.World(va.CartPole()))
+    assert explain([found.episode], tmp_path / "as it is.json").verdict == "no_gap"
+    with pytest.raises(TargetError, match=r"the angle of the target has the opposite sign .* scale = -1\.0"):
+        explain([turned], tmp_path / "turned.json")
 
 
 def test_what_two_causes_explain_is_settled_by_an_experiment_in_the_next_round(tmp_path, monkeypatch, only_effects):

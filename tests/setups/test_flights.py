@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import nn
 
 import visadapt as va
 from tests.coarse import coarse_targets
@@ -30,7 +29,7 @@ class Still(Policy):
     """Commands nothing; the flight `broken` gets NaN from step `at` on."""
 
     def __init__(self, broken=None, at=3):
-        nn.Module.__init__(self)
+        super().__init__(13, 4)
         self.broken = broken
         self.at = at
         self.steps = 0

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from visadapt.systems import CartPole
+from visadapt.systems import CartPole, Quadrotor
 from visadapt.targets.base import TargetError
 from visadapt.targets.env_map import Entry, EnvMap
 from visadapt.targets.gymnasium import GymnasiumTarget
@@ -104,12 +104,51 @@ def test_an_environment_that_does_not_do_is_one_clear_line(toy, says):
     assert "\n" not in str(error.value)
 
 
+def returning(reset=None, step=None):
+    """A target whose environment's reset or step returns, or raises, something else."""
+
+    class Other(Toy):
+        def reset(self, seed=None, options=None):
+            super().reset(seed, options)
+            return reset if reset is not None else (self.seen, {})
+
+        def step(self, action):
+            if isinstance(step, Exception):
+                raise step
+            return step
+
+    return GymnasiumTarget(Other, MAP, name="toy")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"reset": np.zeros(4)}, r"toy: reset\(\) returned a ndarray; observation, info are right"),
+        ({"reset": (np.zeros(2), {})}, r"reset\(\) returned an observation of shape \(2,\); .* says \(4,\)"),
+        # gymnasium's predecessor gym returned four values.
+        ({"step": (np.zeros(4), 0.0, False, {})}, r"step\(\) returned 4 values; observation, reward, term"),
+        ({"step": (np.zeros(2), 0.0, False, False, {})}, r"step\(\) returned an observation of shape \(2,\)"),
+        ({"step": (None, 0.0, False, False, {})}, r"step\(\) returned an observation of shape \(\)"),
+        (
+            {"step": OSError("the port is gone")},
+            r"toy: step\(\) failed: OSError: the port is gone \(.*test_gymnasium.py, line \d+\)$",
+        ),
+    ],
+)
+def test_an_environment_that_raises_or_returns_something_else_is_one_line(wrong, says):
+    env = returning(**wrong)
+    with pytest.raises(TargetError, match=says):
+        env.reset(1, generator()), env.step(torch.zeros(1, 1))
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
         ({"states": {**STATES, "x": Entry(4)}}, "takes x from observation entry 4; there are 4, counted from 0"),
         ({"actions": (Entry(2),)}, "sets action entry 2; there are 2"),
         ({"actions": (Entry(0), Entry(1))}, "has 2 actions, cartpole has 1"),
+        ({"actions": (Entry(0, 1.5, offset=1.0),)}, "entry 0 from -0.5 to 2.5, the environment takes -2 to 2: change"),
+        ({"options": {"width": 120}}, "toy: the map's options are for gymnasium.make, but a function makes this"),
         ({"states": {"x": Entry(0)}}, "ours are x, x_dot, theta, theta_dot"),
         ({"limits": {"height": 1.0}}, "limits 'height'"),
         ({"start": {"height": 1.0}}, "starts 'height'"),
@@ -118,6 +157,13 @@ def test_an_environment_that_does_not_do_is_one_clear_line(toy, says):
 def test_a_map_that_does_not_fit_the_environment(change, says):
     with pytest.raises(TargetError, match=says):
         target(dataclasses.replace(MAP, **change))
+
+
+def test_two_commands_cannot_set_the_same_entry():
+    states = {variable.name: Entry(i) for i, variable in enumerate(Quadrotor.states)}
+    mapping = EnvMap(states, tuple(Entry(index) for index in (0, 1, 1, 2)))
+    with pytest.raises(TargetError, match="toy: the map sets action entry 1 more than once"):
+        mapping.check("toy", Quadrotor, 13, 4)
 
 
 @pytest.mark.parametrize(
@@ -236,6 +282,33 @@ class Kept(Toy):
 
     def render(self):
         return np.full(self.size, round(100 * abs(self.state[0])), np.uint8)
+
+
+def test_an_environment_that_a_function_makes_is_held_for_all_steps_of_the_period_too():
+    toy = clocked(0.06)
+    toy.reset(1, generator())
+    assert toy.held == 3
+    torch.testing.assert_close(toy.step(torch.full((1, 1), 0.1)).state[:, 0], torch.tensor([-0.6]))
+
+
+class Repeating(gymnasium.Wrapper):
+    """A wrapper that says how long its step is, of an environment whose tau and dt are others."""
+
+    dt = 0.06
+
+
+class Motor(Clocked):
+    """tau is the time constant of its motor."""
+
+    tau = 0.3
+    dt = 0.05
+
+
+@pytest.mark.parametrize(
+    ("make", "period", "held"), [(Motor, 0.05, 1), (Motor, 0.1, 2), (lambda: Repeating(Clocked()), 0.06, 1)]
+)
+def test_the_step_is_that_of_what_the_environment_states_which_fits_the_period(make, period, held):
+    assert GymnasiumTarget(make, dataclasses.replace(MAP, period=period), name="toy").held == held
 
 
 def test_an_environment_that_keeps_its_observation_as_its_state_shows_and_starts_in_any():
@@ -383,6 +456,17 @@ def test_pendulums_of_two_targets_do_not_draw_into_each_other(pendulum):
     other.close()
     assert torch.equal(frames(pendulum), alone)
     assert 0 < (alone - finer).abs().mean() < 1 < alone.mean()
+
+
+def test_with_the_euler_integrator_a_frame_is_that_of_the_state_beside_it(pendulum):
+    options = pendulum._envs[0].unwrapped.model.opt
+    kept, options.integrator = options.integrator, 0
+    pendulum.reset(1, generator())
+    for _ in range(5):
+        seen = pendulum.step(torch.full((1, 1), 0.6))
+    options.integrator = kept
+    assert seen.state[0, 1] > 0.4
+    assert (pendulum.show(seen.state.numpy())[0] == seen.frame[0].numpy()).mean() > 0.999
 
 
 def test_pendulum_keeps_its_own_reset_and_leaves_nothing_at_exit(pendulum):

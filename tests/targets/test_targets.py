@@ -257,6 +257,7 @@ class Rig(Target):
 
 def test_a_machine_may_write_every_instant_into_the_same_arrays():
     (found,) = run(Rig(), Feedback(), 1, 4, seeded())
+    assert found.force is None  # which it does not tell
     np.testing.assert_allclose(found.episode.state[:, 0], 0.001 * np.arange(1, 6), rtol=1e-5)
 
 
@@ -266,7 +267,11 @@ def test_a_machine_may_write_every_instant_into_the_same_arrays():
         ({"state": torch.zeros(4)}, r"rig: state is \(4,\) and torch.float32; a torch tensor that is \(1, n_state\)"),
         ({"state": np.zeros((1, 4))}, r"rig: state is ndarray; a torch tensor that is \(1, n_state\) is right"),
         ({"alive": True}, r"rig: alive is bool; a torch tensor that is \(1,\) and bool is right"),
-        ({"frame": torch.zeros(3, 100, 120)}, r"rig: frame is \(3, 100, 120\) and torch.float32; .* \(1, ...\) is"),
+        ({"force": torch.zeros(3)}, r"rig: force is \(3,\) and torch.float32; a torch tensor that is \(1, ...\) is"),
+        ({"frame": torch.zeros(3, 100, 120)}, r"rig: frame is \(3, 100, 120\) and torch.float32"),
+        # Divided by 255 again, frames in [0, 1] would be black; colour has an axis too many.
+        ({"frame": torch.rand(1, 100, 120)}, r"float32; a torch tensor that is \(1, H, W\) and uint8, grey, is right"),
+        ({"frame": torch.zeros(1, 100, 120, 3).byte()}, r"\(1, 100, 120, 3\) and torch.uint8; .* grey, is right"),
     ],
 )
 def test_what_is_no_observation_of_the_batch_is_an_error(shown, said):

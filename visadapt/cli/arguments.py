@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from visadapt.systems import System
@@ -26,8 +26,11 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("recording", nargs="+", metavar="RECORDING", help="CSV or HDF5 files, logs of ROS or PX4, or folders of these")
     _add_system(parser)
-    columns_help = "our name=the name in the file, as in x=position,theta=phi; theta= is a state that was not measured"
-    add("--columns", metavar="A=B,...", type=_columns, default={}, help=columns_help)
+    columns_help = (
+        "our name=the name in the file, as in x=position,theta=phi; theta= is a state that was not measured; may be "
+        "repeated"
+    )
+    add("--columns", metavar="A=B,...", type=_columns, default={}, action=_Merged, help=columns_help)
     add("--effects", metavar="FILE.py", help="a file that defines effects of your own")
     renderer_help = "for a film without states: draws its scene from cart position and pole angle (`visadapt renderer`)"
     add("--renderer", metavar="R.safetensors", help=renderer_help)
@@ -198,7 +201,7 @@ def _add_effects(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         help="put an effect into the simulator, as in viscous_friction:coefficient=2.1 (`visadapt effects` lists them "
-        "with their units), in place of those it has; may be repeated",
+        "with their units), in place of those it has and of the one of its name in --diagnosis; may be repeated",
     )
     parser.add_argument("--effects", metavar="FILE.py", help="a file that defines effects of your own")
 
@@ -275,6 +278,18 @@ def _system(text: str) -> type[System]:
         return find_system(text)
     except InputError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
+
+
+class _Merged(argparse.Action):
+    """Columns of an option that may be repeated."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
+        columns = getattr(namespace, self.dest)
+        if twice := columns.keys() & values:
+            raise argparse.ArgumentError(self, f"{min(twice)} is given twice")
+        setattr(namespace, self.dest, {**columns, **values})
 
 
 def _columns(text: str) -> dict[str, str]:

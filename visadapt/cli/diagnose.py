@@ -54,31 +54,34 @@ def run(options: argparse.Namespace) -> None:
             announce=print,
             renderer=renderer,
         )
-    print(as_text(result))
-    if options.json:
-        with replacing(options.json) as temporary:
-            temporary.write_text(json.dumps(result.to_json(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    if options.report:
-        write_report(options.report, result, _settings(options, system))
-    if options.plan:
-        _plan(options, result, recording, source, policy)
+    said = [as_text(result)]
+    try:
+        if options.json:
+            with replacing(options.json) as temporary:
+                temporary.write_text(json.dumps(result.to_json(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        if options.report:
+            write_report(options.report, result, _settings(options, system))
+        if options.plan:
+            said.append(_plan(options, result, recording, source, policy))
+    finally:
+        print(*said, sep="\n")  # last, since whoever reads it may stop reading
 
 
 def _plan(
     options: argparse.Namespace, result: Diagnosis, recording: Recording, source: World, policy: StatePolicy | None
-) -> None:
+) -> str:
+    """Design and write the plan; what became of it, in a line."""
     if result.verdict != AMBIGUOUS:
-        print(f"--plan: nothing to settle, the verdict is {result.verdict}; {options.plan} was not written")
-        return
+        return f"--plan: nothing to settle, the verdict is {result.verdict}; {options.plan} was not written"
     try:
         with progress() as report:
             planned = plan(result, recording, source, policy, seed=options.seed, progress=staged(report, "plan"))
     except ValueError as error:
-        print(f"--plan: {error}; {options.plan} was not written")
-        return
-    if planned.settles:
-        planned.write(options.plan)
-    print(planned if planned.settles else f"--plan: {planned}; {options.plan} was not written")
+        return f"--plan: {error}; {options.plan} was not written"
+    if not planned.settles:
+        return f"--plan: {planned}; {options.plan} was not written"
+    planned.write(options.plan)
+    return str(planned)
 
 
 def _settings(options: argparse.Namespace, system: System) -> dict[str, str]:

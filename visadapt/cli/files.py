@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from visadapt.cli.inputs import InputError
+from visadapt.cli.inputs import InputError, check_run_folder
 from visadapt.storage.atomic_files import check_writable
 from visadapt.systems import SYSTEMS
 
@@ -21,7 +21,7 @@ def check_files(options: argparse.Namespace) -> None:
     """Check every file that the options name.
 
     Raises:
-        InputError: an option is empty, or an output is an input or another output.
+        InputError: an option is empty, an output is an input or another output, or the folder of a run has other files.
         NotWrittenError: an output cannot be written.
     """
     for name, value in vars(options).items():
@@ -39,7 +39,9 @@ def check_files(options: argparse.Namespace) -> None:
                     raise InputError(f"--{name}: {path} is {where} of {flag}, which would be lost; name another")
             if is_folder and Path(path).is_file():
                 raise InputError(f"--{name}: {path} is a file; name a folder")
-            if not is_folder:
+            if is_folder:
+                check_run_folder(Path(path))
+            else:
                 check_writable(path)
             taken.append((f"--{name}", path))
 

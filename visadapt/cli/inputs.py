@@ -10,8 +10,9 @@ import importlib
 import importlib.util
 import shutil
 import sys
+import sysconfig
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -21,12 +22,12 @@ import torch
 
 from visadapt.cli.own_effects import complaints as complaints_of_effect
 from visadapt.diagnosis.saved import load_effects
-from visadapt.diagnosis.words import with_unit
+from visadapt.diagnosis.words import printable, with_unit
 from visadapt.effects import EFFECTS, Effect
 from visadapt.effects.base import require_system
 from visadapt.effects.catalogue import catalogue, sized
 from visadapt.progress import Report, reporting
-from visadapt.storage.run_folder import open_run
+from visadapt.storage.run_folder import open_run, read_json
 from visadapt.systems import SYSTEMS, System
 from visadapt.systems.contract import complaints
 from visadapt.systems.parameter_file import load_parameters
@@ -34,6 +35,13 @@ from visadapt.world import World
 
 OWN_FILES: set[str] = set()
 """Files of the user's whose code is run."""
+OWN_FOLDERS: set[Path] = set()
+"""Folders where these may have imported other files of the user's from."""
+LIBRARIES = (
+    *(Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib")),
+    *(Path(__file__).parents[2] / package for package in ("visadapt", "renderers")),
+)
+"""Folders in whose code an error is not the user's, wherever they lie."""
 
 
 class InputError(ValueError):
@@ -42,11 +50,14 @@ class InputError(ValueError):
 
 @contextmanager
 def checked() -> Iterator[None]:
-    """Turn the ValueError or TypeError by which the library refuses an argument into an InputError."""
+    """Turn the ValueError or TypeError by which the library refuses an argument into an InputError.
+
+    One that the user's own code raised names the line there.
+    """
     try:
         yield
     except (ValueError, TypeError) as error:
-        raise InputError(str(error)) from error
+        raise InputError(own_line(error) or str(error)) from error
 
 
 @contextmanager
@@ -61,15 +72,22 @@ def unfinished(out: Path, settings: Mapping[str, Any]) -> Iterator[Path]:
     """The folder `<out>.unfinished` that a training works in, and goes on from; removed when the block ends.
 
     Raises:
-        InputError: `out` is there already, or is a folder.
+        InputError: `out` is there already, or is a folder; or what lies in the folder is no training.
         RunError: the folder holds a training with other settings.
     """
     if out.exists():
         raise InputError(f"{out} is there already: remove it, or name another file by --out")
     folder = out.with_name(out.name + ".unfinished")
+    check_run_folder(folder)
     open_run(folder, settings)
     yield folder
     shutil.rmtree(folder)
+
+
+def check_run_folder(folder: Path) -> None:
+    """Raises InputError where files lie in the folder of a run that are not a run's, and would be replaced."""
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "settings.json").exists():
+        raise InputError(f"{folder} has files in it that are no run of visadapt: name another by --out")
 
 
 def asked_for(options: argparse.Namespace, *files: str) -> dict[str, Any]:
@@ -103,10 +121,11 @@ def the_system(options: argparse.Namespace) -> System:
 
 
 def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
-    """The effects of --diagnosis, then those of --effect.
+    """The effects of --diagnosis but those that --effect gives too, then those of --effect.
 
     Raises:
-        InputError: an unknown effect, one without its parameters, or one that does not act on the system.
+        InputError: an unknown effect, one given twice or without its parameters, or one that does not act on the
+            system.
         DiagnosisFileError: a diagnosis that named nothing.
     """
     effects: list[Effect] = []
@@ -114,7 +133,13 @@ def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
         diagnosed, effects = load_effects(options.diagnosis)
         if diagnosed != system.name:
             raise InputError(f"{options.diagnosis}: a diagnosis of a {diagnosed}, where a {system.name} is given")
-    return effects + [_effect(text, system) for text in options.effect]
+        for warning in read_json(Path(options.diagnosis)).get("warnings") or ():
+            print(f"visadapt: {options.diagnosis}: {printable(str(warning))}", file=sys.stderr)
+    given = [_effect(text, system) for text in options.effect]
+    names = [effect.name for effect in given]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"--effect: {twice[0]} is given more than once")
+    return [effect for effect in effects if effect.name not in names] + given
 
 
 def _effect(text: str, system: System) -> Effect:
@@ -130,6 +155,8 @@ def _effect(text: str, system: System) -> Effect:
     values: dict[str, float] = {}
     for part in rest.split(",") if rest else ():
         asked, _, number = part.partition("=")
+        if asked in values:
+            raise InputError(f"--effect {text}: {asked} is given twice")
         try:
             values[asked] = float(number)
         except ValueError:
@@ -195,6 +222,7 @@ def import_file(given: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     OWN_FILES.add(str(path))
+    OWN_FOLDERS.add(path.parent)
     with own_code(lambda error: f"{path}: {describe(error, str(path))}"):
         spec.loader.exec_module(module)
     sys.modules.setdefault(path.stem, module)  # so that another file of the user's that imports it gets these classes
@@ -228,6 +256,7 @@ def find_factory(name: str) -> Callable[[], Any]:
             raise InputError(f"{name}: there is no module {missing!r}, installed or in {here}") from error
         raise InputError(f"{name}: {describe(error)}") from error
     OWN_FILES.add(str(module.__file__))
+    OWN_FOLDERS.update((Path(here), Path(str(module.__file__)).parent))
     factory = getattr(module, attribute, None)
     if not callable(factory):
         what = "nothing" if factory is None else f"a {type(factory).__name__}, not a function,"
@@ -237,8 +266,15 @@ def find_factory(name: str) -> Callable[[], Any]:
 
 def own_line(error: BaseException) -> str | None:
     """The message for an error that the user's own code raised; None where it was ours."""
-    files = [frame.filename for frame in traceback.extract_tb(error.__traceback__) if frame.filename in OWN_FILES]
+    files = [frame.filename for frame in traceback.extract_tb(error.__traceback__) if _is_own(frame.filename)]
     return f"{files[-1]}: {describe(error, files[-1])}" if files else None
+
+
+def _is_own(file: str) -> bool:
+    def lies_in(folders: Iterable[Path]) -> bool:
+        return any(folder in Path(file).parents for folder in folders)
+
+    return file in OWN_FILES or (lies_in(OWN_FOLDERS) and not lies_in(LIBRARIES))
 
 
 def describe(error: BaseException, path: str | None = None) -> str:

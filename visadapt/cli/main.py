@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import io
 import os
 import signal
 import sys
@@ -33,6 +34,8 @@ RESUMED = ("adapt", "train", "renderer")  # Subcommands that go on where an inte
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command: 0 done; 2 bad input, described by one line on stderr; 130 interrupted."""
     command = ""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr: a file's name may not fit the encoding
     with suppress(ValueError):  # outside the main thread
         signal.signal(signal.SIGTERM, _terminated)
     try:
@@ -68,10 +71,28 @@ def _terminated(number: int, _frame: object) -> NoReturn:
 
 
 class _Parser(argparse.ArgumentParser):
-    """The usual parser, whose error messages hold no control characters of an argument."""
+    """The usual parser, which drops nothing and guesses nothing, and prints no control characters of an argument."""
+
+    def __init__(self, **named: Any) -> None:
+        super().__init__(allow_abbrev=False, **named)
+        self.register("action", None, _Once)
 
     def error(self, message: str) -> NoReturn:
         super().error(printable(message))
+
+
+class _Once(argparse.Action):
+    """Keeps the value of an option that may be given once; a second value would replace the first unnoticed."""
+
+    given = False
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
+        if self.given:
+            raise argparse.ArgumentError(self, "given twice; one is right")
+        self.given = True
+        setattr(namespace, self.dest, values)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -17,11 +17,14 @@ def run(options: argparse.Namespace) -> None:
     """Score, print, write what was asked for."""
     import_effects(options)
     policy, _, target = load_both(options)
-    found = score(policy, target, options.episodes, options.seed)
-    print(found)
+    with checked():
+        found = score(policy, target, options.episodes, options.seed)
     if options.json:
         about = {"policy": options.policy, "target": target.name, "seed": options.seed, "versions": versions()}
         write_json(Path(options.json), {**asdict(found), **about})
-    if options.film:
-        with checked():
-            film(policy, target, options.film, seed=options.seed)
+    try:
+        if options.film:
+            with checked():
+                film(policy, target, options.film, seed=options.seed)
+    finally:
+        print(found)  # last, since whoever reads it may stop reading

@@ -63,6 +63,9 @@ def load_target(options: argparse.Namespace, source: World, frames: bool) -> Tar
         target = GymnasiumTarget(env, mapping, type(source.system), frames=frames, name=name)
     if target.period_origin != "as given":
         print(f"visadapt: {name}: {target.period:g} s between actions, from {target.period_origin}", file=sys.stderr)
+    if target.held > 1:
+        step = target.period / target.held
+        print(f"visadapt: {name}: each command is held for {target.held} of its steps of {step:g} s", file=sys.stderr)
     return target
 
 
@@ -84,7 +87,7 @@ def _check(path: str, policy: Policy, source: World, target: Target) -> None:
             f"{path}: a policy of a {system.name}, with {policy.n_action} commands; {target.name} takes "
             f"{target.n_action}: it is another system"
         )
-    own = getattr(target, "system", system)
+    own = system if target.system is None else target.system
     if own.name != system.name:
         raise InputError(f"{path}: a policy of a {system.name}; {target.name} is a {own.name}")
     # Only what is observed says how large it is. A reset is no step: it is not counted.

@@ -13,7 +13,7 @@ import torch
 from visadapt.policies import Policy
 from visadapt.systems import CartPole, System
 from visadapt.targets import FlightTarget, Target
-from visadapt.targets.rollout import Run, run
+from visadapt.targets.rollout import Run, check_period, run
 from visadapt.tasks.balance import EPISODE_STEPS
 
 SCORE_SEED = 2026
@@ -80,8 +80,9 @@ def score(
         steps: of an episode; without it, those of the task, or 250.
 
     Raises:
-        ValueError: more steps than the task of a flight has, no episode or step, a policy that is shown a goal on a
-            target that is no `FlightTarget`, or a target whose system is neither a vehicle nor a cart-pole.
+        ValueError: more steps than the task of a flight has, no episode or step, a policy that was trained for another
+            period or is shown a goal on a target that is no `FlightTarget`, or a target whose system is neither a
+            vehicle nor a cart-pole, or that shows no cart speed.
 
     >>> import visadapt as va
     >>> found = va.score(va.load_policy(va.shipped("cartpole_states")), va.SyntheticTarget(), episodes=2, steps=20)
@@ -90,19 +91,24 @@ def score(
     """
     if episodes < 1 or (steps is not None and steps < 1):
         raise ValueError(f"{episodes} episodes of {steps} steps; at least one of each is right")
+    check_period(policy, target)
     policy.eval()
     generator = torch.Generator().manual_seed(seed)
     if isinstance(target, FlightTarget):
         if steps is not None and steps > target.task.steps:
             raise ValueError(f"a flight of this task has {target.task.steps} steps, got steps = {steps}")
-        runs = run(target, policy, episodes, steps or target.task.steps, generator, strict=False)
+        runs = run(target, policy, episodes, steps or target.task.steps, generator, strict=False, keep_frames=False)
         return _score_flights(runs, target)
     if policy.shown == "state and goal":
         raise ValueError(f"{target.name}: flights are scored by their task: derive the target from FlightTarget")
     kind = type(target.system) if isinstance(target.system, System) else target.system
     if kind is not None and not issubclass(kind, CartPole):
         raise ValueError(f"a score is that of a cart's speed or of a flight; {target.name} is a {kind.name}: use run")
-    return score_runs(run(target, policy, episodes, steps or EPISODE_STEPS, generator))
+    runs = run(target, policy, episodes, steps or EPISODE_STEPS, generator, keep_frames=False)
+    state = runs[0].episode.state
+    if state is None or state.shape[1] < 2:
+        raise ValueError(f"{target.name}: shows no cart speed; a score needs it, as the second of the states")
+    return score_runs(runs)
 
 
 def score_runs(runs: Sequence[Run]) -> CartPoleScore:

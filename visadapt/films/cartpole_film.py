@@ -52,7 +52,7 @@ class CartPolePanel:
     for which the track is shown as far as the carts go"""
     position_limit: float | None = None
     """m; an episode that ended early without a fall counts as having left the frame if its last position is beyond
-    this. None: the limit is as far as `drawn` shows"""
+    this. None: the limit is as far as `drawn` shows; infinite: there is no frame"""
 
     def __post_init__(self) -> None:
         if self.run.episode.state is None:
@@ -127,13 +127,16 @@ class CartPoleFilm(Film):
         upright = [float(panel.speed.max()) for panel in panels if panel.run.survived]
         self.full_speed = max(widgets.ceiling(min(fastest, max(*upright, 0.5)) if upright else fastest), 0.1)
         """m/s, at the top of all charts; the speed of a fall may exceed it, so that the other runs stay legible"""
-        self.full_force = max(widgets.ceiling(max(float(np.abs(panel.run.force).max()) for panel in panels)), 1.0)
+        forces = [float(np.abs(panel.run.force).max()) for panel in panels if panel.run.force is not None]
+        self.full_force = max(widgets.ceiling(max(forces, default=0.0)), 1.0)
         """N, at the end of all force bars"""
         x, _, theta, _ = np.concatenate([panel.state for panel in panels]).T
         length = panels[0].drawn.pole_length
         wide = float(np.abs([x, x + length * np.sin(theta)]).max()) + 0.4
         self.reach = max(wide, 1.15 * length * PANEL_WIDTH / SCENE_HEIGHT)
         """m to either side of the middle, such that neither carts nor poles that swing up leave the scene"""
+        self.roams = any(bool((np.abs(panel.state[:-1, 0]) > panel.drawn.camera.reach).any()) for panel in panels)
+        """whether a cart went on beyond what `drawn` shows, so that the track is shown as far as the carts go"""
 
     @property
     def times(self) -> list[float]:
@@ -170,7 +173,7 @@ class CartPoleFilm(Film):
         """The track with its metres, cart and pole, and the disturbance as an arrow; or the cone and earlier poses."""
         sizes, camera = panel.drawn, panel.drawn.camera
         left, bottom, wide = -self.reach, -self.reach * SCENE_HEIGHT / PANEL_WIDTH, 2 * self.reach
-        if not panel.swings_up:
+        if not panel.swings_up and not self.roams:
             left, bottom = (-0.5 - camera.column) / camera.scale, (camera.row - camera.height + 0.5) / camera.scale
             wide = camera.width / camera.scale
         scene.set(xlim=(left, left + wide), ylim=(bottom, bottom + wide * SCENE_HEIGHT / PANEL_WIDTH))
@@ -201,7 +204,7 @@ class CartPoleFilm(Film):
             if panel.swings_up:
                 rows = range(row - 2, max(row - 34, -1), -2)
                 earlier.set_verts([_pole(sizes, *panel.state[each, [0, 2]]) for each in rows])
-            force = float(panel.run.force[row]) / self.full_force
+            force = 0.0 if panel.run.force is None else float(panel.run.force[row]) / self.full_force
             tip = x - math.copysign(sizes.cart_width / 2 + 0.03, force)
             arrow.set_positions((tip - 0.19 * wide * force, -base / 2), (tip, -base / 2))
             arrow.set_visible(abs(force) > 0.02 and not ended)
@@ -228,8 +231,7 @@ class CartPoleFilm(Film):
             ):
                 text.set(text=value.replace("-", MINUS), color=MUTED if ended else INK)
             set_command(None if row == len(episode.time) - 1 else float(episode.action[row, 0]))
-            known = not ended and panel.pictures is None  # cameras of real machines show no force
-            set_force(float(panel.run.force[row]) if known else None)
+            set_force(None if ended or panel.run.force is None else float(panel.run.force[row]))
             for part in parts:
                 part(row, ended)
 

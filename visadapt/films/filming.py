@@ -17,7 +17,7 @@ from visadapt.progress import Progress
 from visadapt.systems import CartPole
 from visadapt.targets import FlightTarget, SyntheticTarget, Target
 from visadapt.targets.gymnasium import GymnasiumTarget
-from visadapt.targets.rollout import Run, See, run, see_within_a_turn
+from visadapt.targets.rollout import Run, See, check_period, run, see_within_a_turn
 from visadapt.tasks.follow import Follow
 
 
@@ -51,7 +51,8 @@ def film(
         progress: called after each frame.
 
     Raises:
-        ValueError: states of neither a cart-pole nor a vehicle, or a run that does not fit the target.
+        ValueError: states of neither a cart-pole nor a vehicle, a run that does not fit the target, or a policy that
+            was trained for another period.
         TargetError: the target shows no frames to a policy that sees frames.
         DiskFullError: the disk is full; a file that was at `path` before is unchanged.
         FilmError: ffmpeg failed for another reason; a file that was at `path` before is unchanged.
@@ -71,6 +72,7 @@ def film(
 
 
 def _run(policy: Policy, target: Target, seconds: float, seed: int, see: See | None) -> Run:
+    check_period(policy, target)
     steps = round(seconds / target.period)
     if isinstance(target, FlightTarget):
         steps = min(steps, target.task.steps)
@@ -88,7 +90,7 @@ def _run(policy: Policy, target: Target, seconds: float, seed: int, see: See | N
 def _film(runs: Mapping[str, Run], target: Target, due: float) -> Film:
     if isinstance(target, FlightTarget):
         return FlightFilm([_flight_panel(title, each, target) for title, each in runs.items()])
-    drawn = target.camera if isinstance(target, SyntheticTarget) and target.camera is not None else DrawnCartPole()
+    drawn = _drawn(target)
     limit, reach = target.angle_limit if isinstance(target, SyntheticTarget) else 0.3, None
     if isinstance(target, GymnasiumTarget):
         limit, reach = target.mapping.limits.get("theta", limit), target.mapping.limits.get("x")
@@ -98,8 +100,18 @@ def _film(runs: Mapping[str, Run], target: Target, due: float) -> Film:
         if state is None or state.shape[1] != len(CartPole.states):
             raise ValueError(f"panel {title!r}: a cart-pole's states (rows, 4) are needed to film {target.name}")
         pictures = None if isinstance(target, SyntheticTarget) else each.episode.frame
-        panels.append(CartPolePanel(title, each, pictures, drawn, limit, reach))
+        limits = (limit, math.inf if reach is None and each.episode.frame is None else reach)
+        panels.append(CartPolePanel(title, each, pictures, drawn, *limits))
     return CartPoleFilm(panels, target.period, due)
+
+
+def _drawn(target: Target) -> DrawnCartPole:
+    """Sizes and view in which a cart-pole is drawn: its camera's, or with its system's pole where that is known."""
+    if isinstance(target, SyntheticTarget) and target.camera is not None:
+        return target.camera
+    if isinstance(target.system, CartPole):
+        return DrawnCartPole(pole_length=2 * float(target.system.pole_half_length))
+    return DrawnCartPole()
 
 
 def _flight_panel(title: str, flown: Run, target: FlightTarget) -> FlightPanel:

@@ -233,8 +233,9 @@ class FlightFilm(Film):
             bars.append(widgets.bar(page, left, BARS_TOP + middle, half - 7, label, 1.0, "", BLUE))
 
         def move(i: int) -> None:
-            words = (f"{panel.speed[i]:.2f} m/s", length(panel.away[i]), length(panel.score[i]))
-            for text, value in zip(readings, (*words, f"{np.linalg.norm(panel.force[i]):.2f} N"), strict=True):
+            force = "\N{EN DASH}" if panel.run.force is None else f"{np.linalg.norm(panel.force[i]):.2f} N"
+            words = (f"{panel.speed[i]:.2f} m/s", length(panel.away[i]), length(panel.score[i]), force)
+            for text, value in zip(readings, words, strict=True):
                 text.set_text(value)
             command = panel.command(i)
             for k, set_bar in enumerate(bars):

@@ -41,7 +41,8 @@ class FlightPanel:
         states: (rows, 13) that are shown.
         times: (N,) s, the instants, INSTANT_PERIOD_S apart.
         rows: (N,) the last row at or before each instant.
-        position, speed, attitude, force: (N, 3) m, (N,) m/s, (N, 3, 3) from body to world axes, (N, 3) N.
+        position, speed, attitude, force: (N, 3) m, (N,) m/s, (N, 3, 3) from body to world axes, (N, 3) N, zeros where
+            the run does not know its force.
         reference: (M, 3) m, the whole reference at instants; or (2, 3), start and end of the line to the point.
         goal: (N, 3) m, where the reference is, or the point.
         away: (N,) m, to the goal; at the instant nearest to a point, the distance by which it was missed.
@@ -81,8 +82,8 @@ class FlightPanel:
         self.speed = self._between(np.linalg.norm(states[:, VELOCITY], axis=1))
         turns = continuous_quaternion(torch.from_numpy(states[:, ATTITUDE])).numpy()
         self.attitude: Floats = rotation(torch.from_numpy(self._between(turns))).numpy()
-        force = run.force[: len(states)].clip(-LARGEST_DRAWN, LARGEST_DRAWN)
-        self.force = self._between(force if force.ndim == 2 else np.zeros((len(states), 3)))
+        force = np.zeros((len(states), 3)) if run.force is None else run.force[: len(states)]
+        self.force = self._between(force.clip(-LARGEST_DRAWN, LARGEST_DRAWN))
         lost = None if run.survived else self.end
         if isinstance(task, Follow):
             self._along(task.references, int(task_state[0]), int(task_state[1]), lost)

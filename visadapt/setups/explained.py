@@ -20,7 +20,11 @@ from visadapt.progress import Report, staged
 from visadapt.recordings import Episode, Recording
 from visadapt.recordings.loading import SHORTEST_EPISODE_S
 from visadapt.storage.run_folder import read_json, write_json
+from visadapt.targets.base import TargetError
 from visadapt.world import World
+
+OPPOSITE = " has the opposite sign of the source's"
+"""What a diagnosis warns of, after the quantity's name, where it inverted a sign of the recording."""
 
 
 def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, report: Report | None = None) -> Explain:
@@ -32,6 +36,8 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
 
     Raises:
         ValueError: the source has effects, which a diagnosis would have to know.
+        TargetError: from what is returned: the target shows or takes something with the opposite sign, with which the
+            policy would drive it the wrong way.
     """
     if len(source.effects):
         raise ValueError("a diagnosis starts from the bare system: give the source without effects")
@@ -41,7 +47,8 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
     def explain(episodes: Sequence[Episode], path: Path) -> Explanation:
         long = tuple(e for e in episodes if e.time[-1] - e.time[0] >= SHORTEST_EPISODE_S)
         if not long:
-            return Explanation(UNEXPLAINED, [], complete=False)
+            none = f"all {len(episodes)} episodes are shorter than {SHORTEST_EPISODE_S:g} s, not diagnosed"
+            return Explanation(none, [], complete=False)
         sources = tuple(f"episode {number}" for number in range(len(long)))
         recording = Recording(long, measured, source.period, sources)
         diagnosed = partial(diagnose, recording, source, seed=seed, progress=report, renderer=renderer)
@@ -50,6 +57,13 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
             found = diagnosed()
             write_json(path, found.to_json())
         content = read_json(path)
+        for warning in content["warnings"]:
+            name, inverted, _ = warning.partition(OPPOSITE)
+            if inverted:
+                raise TargetError(
+                    f"{path}: {name} of the target{OPPOSITE}, so that the policy would drive it the wrong way: negate "
+                    "it in the target, by scale = -1.0 in a map, and begin in another folder"
+                )
         verdict = content["verdict"]
         slight = frozenset(cause["effect"] for cause in content["causes"] if cause["slight"])
         effects = load_effects(path)[1] if verdict in (IDENTIFIED, AMBIGUOUS) else []

@@ -162,10 +162,27 @@ class EnvMap:
         read = [entry.index for entry in self.states.values()]
         if twice := [name for name, entry in self.states.items() if read.count(entry.index) > 1]:
             raise TargetError(f"{name}: the map takes {' and '.join(twice)} from the same entry of the observation")
+        written = [entry.index for entry in self.actions]
+        if again := [index for index in written if written.count(index) > 1]:
+            raise TargetError(f"{name}: the map sets action entry {again[0]} more than once")
         taken = [(f"takes {state} from observation", entry, n_observation) for state, entry in self.states.items()]
         for does, entry, count in (*taken, *(("sets action", entry, n_action) for entry in self.actions)):
             if entry.index >= count:
                 raise TargetError(f"{name}: the map {does} entry {entry.index}; there are {count}, counted from 0")
+
+    def check_range(self, name: str, low: NDArray[np.floating], high: NDArray[np.floating]) -> None:
+        """Raises TargetError where a command in [-1, 1] leaves the actions (n_action,) that the environment takes.
+
+        It would clip them, and the machine would do less than what is recorded.
+        """
+        for entry in self.actions:
+            least, most = entry.offset - abs(entry.scale), entry.offset + abs(entry.scale)
+            rounding = 1e-6 * max(abs(least), abs(most))
+            if least < low[entry.index] - rounding or most > high[entry.index] + rounding:
+                raise TargetError(
+                    f"{name}: the map sets action entry {entry.index} from {least:g} to {most:g}, the environment "
+                    f"takes {low[entry.index]:g} to {high[entry.index]:g}: change scale or offset"
+                )
 
     def state(self, observation: NDArray[np.floating], system: type[System]) -> NDArray[np.floating]:
         """Our state (n_state,), in our system's order, for an observation."""

@@ -22,6 +22,12 @@ from visadapt.targets import mujoco_frames
 from visadapt.targets.base import Observation, Target, TargetError
 from visadapt.targets.env_map import EnvMap
 
+RETURNED = {
+    "reset": ("observation", "info"),
+    "step": ("observation", "reward", "terminated", "truncated", "info"),
+}
+"""What these methods of an environment return."""
+
 
 class _Shown(NamedTuple):
     """What one environment shows."""
@@ -41,7 +47,7 @@ class GymnasiumTarget(Target):
         mapping: the map between its numbers and frames and ours; `mapping.options` are for gymnasium.make alone.
             Without `mapping.period` the period is the environment's `tau` or `dt`, or else 1 / `render_fps` of its
             metadata, with a warning, since that may be the playback speed of its films alone. If `mapping.period` is
-            several steps of an environment that is given by its id, each action is held for that many steps.
+            several of these, each action is held for that many steps.
             `mapping.start` works only with environments that `show` can put into a state.
         system: the system whose states and actions the mapping gives.
         frames: whether frames are drawn.
@@ -65,6 +71,11 @@ class GymnasiumTarget(Target):
         frames: bool = True,
         name: str | None = None,
     ) -> None:
+        if mapping.options and not isinstance(env, str):
+            raise TargetError(
+                f"{name or env}: the map's options are for gymnasium.make, but a function makes this environment: "
+                "leave them out"
+            )
         mujoco_frames.choose_backend()
         self._source = env
         self.mapping = mapping
@@ -75,10 +86,10 @@ class GymnasiumTarget(Target):
         self.name = name or (first.spec.id if first.spec is not None else type(first.unwrapped).__name__)
         self.n_action = len(mapping.actions)
         self._n_env_action = self._check(first)
-        self.period, self.period_origin = self._period(first)
-        own = _own_step(first)
-        # One that a function makes may be wrapped so that it repeats actions by itself.
-        self._held = round(self.period / own[1]) if own and isinstance(env, str) else 1
+        own = _own_step(first, mapping.period)
+        self.period, self.period_origin = self._period(first, own)
+        self.held = _steps(self.period, own[1]) if own else 1
+        """steps of the environment for which each action is held"""
         self._mujoco = frames and mujoco_frames.is_mujoco(first)
         if self._mujoco:
             mujoco_frames.probe(self.name)
@@ -100,9 +111,9 @@ class GymnasiumTarget(Target):
             mujoco_frames.share_viewer(self._envs)
         self._steps, self._shown = 0, []
         for b, env in enumerate(self._envs[:batch]):
-            seen, _ = env.reset(seed=seeds[b])
+            seen, _ = self._call(env, "reset", seed=seeds[b])
             if starts is not None:
-                seen = self._place(env, np.asarray(seen, dtype=float), starts[b])
+                seen = self._place(env, seen, starts[b])
             self._shown.append(self._see(seen, b))
         return self._observe()
 
@@ -110,8 +121,9 @@ class GymnasiumTarget(Target):
         """Execute the action (B, n_action) for one period; an episode that has ended stays as it was.
 
         Raises:
-            TargetError: step before reset, an action of another shape or not finite, an observation that is not
-                finite, a frame that the crop does not fit, or an episode that the environment truncates.
+            TargetError: step before reset, an action of another shape or not finite, an environment that raises, an
+                observation that is not finite or does not fit its space, a frame that the crop does not fit, or an
+                episode that the environment truncates.
         """
         batch = len(self._shown)
         if action.shape != (batch, self.n_action) or not batch:
@@ -125,8 +137,8 @@ class GymnasiumTarget(Target):
             if not self._shown[b].alive:
                 continue
             ours = self.mapping.action(commands[b], self._n_env_action)
-            for _ in range(self._held):
-                seen, _, terminated, truncated, _ = env.step(ours.astype(env.action_space.dtype))
+            for _ in range(self.held):
+                seen, _, terminated, truncated, _ = self._call(env, "step", ours.astype(env.action_space.dtype))
                 if terminated or truncated:
                     break
             if truncated and not terminated:
@@ -153,7 +165,7 @@ class GymnasiumTarget(Target):
             TargetError: this environment cannot be put into a state: it is neither one of MuJoCo's whose observation
                 is all positions, then all velocities, nor one that keeps what it observes as `unwrapped.state`.
         """
-        seen = np.asarray(self._envs[0].reset(seed=0)[0], dtype=float)
+        seen, _ = self._call(self._envs[0], "reset", seed=0)
         pictures = []
         for state in states:
             seen = self._place(self._envs[0], seen, state)
@@ -180,6 +192,28 @@ class GymnasiumTarget(Target):
                 raise mujoco_frames.cannot_render(self.name, error) from error
             raise TargetError(f"{self.name}: cannot be made: {_line(error)}") from error
 
+    def _call(self, env: Any, method: str, *arguments: object, **named: object) -> tuple[Any, ...]:
+        """What the environment's `reset` or `step` returns, with the observation in floating point."""
+        try:
+            returned = getattr(env, method)(*arguments, **named)
+        except Exception as error:  # whatever the environment raises becomes one line
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            raise TargetError(
+                f"{self.name}: {method}() failed: {type(error).__name__}: {_line(error)} "
+                f"({last.filename}, line {last.lineno})"
+            ) from error
+        right = RETURNED[method]
+        if not isinstance(returned, tuple) or len(returned) != len(right):
+            got = f"{len(returned)} values" if isinstance(returned, tuple) else f"a {type(returned).__name__}"
+            raise TargetError(f"{self.name}: {method}() returned {got}; {', '.join(right)} are right")
+        seen, shape = np.asarray(returned[0]), env.observation_space.shape
+        if seen.shape != shape:
+            raise TargetError(
+                f"{self.name}: {method}() returned an observation of shape {seen.shape}; its observation_space says "
+                f"{shape}"
+            )
+        return seen.astype(float), *returned[1:]
+
     def _check(self, env: Any) -> int:
         """The length of the environment's action; raises TargetError where it cannot be a target."""
         box = gymnasium.spaces.Box
@@ -200,14 +234,15 @@ class GymnasiumTarget(Target):
             )
         n_action = int(env.action_space.shape[0])
         self.mapping.check(self.name, self.system, int(env.observation_space.shape[0]), n_action)
+        self.mapping.check_range(self.name, env.action_space.low, env.action_space.high)
         return n_action
 
-    def _period(self, env: Any) -> tuple[float, str]:
-        """s between actions, and where that number comes from."""
-        given, own, rate = self.mapping.period, _own_step(env), env.metadata.get("render_fps")
+    def _period(self, env: Any, own: tuple[str, float] | None) -> tuple[float, str]:
+        """s between actions, and where that number comes from; `own`: what the environment calls its step, in s."""
+        given, rate = self.mapping.period, env.metadata.get("render_fps")
         if given is not None:
             # No environment is stepped for a part of its step.
-            if own and (given < 0.99 * own[1] or abs(given / own[1] - round(given / own[1])) > 0.01):
+            if own and not _steps(given, own[1]):
                 raise TargetError(
                     f"{self.name}: its {own[0]} says {own[1]:g} s a step, so that the period given, {given:g} s, is no "
                     "whole number of steps"
@@ -243,16 +278,15 @@ class GymnasiumTarget(Target):
         body.state = wanted.astype(kept.dtype)
         return wanted
 
-    def _see(self, seen: Any, episode: int, ended: bool = False) -> _Shown:
+    def _see(self, seen: NDArray[np.floating], episode: int, ended: bool = False) -> _Shown:
         """What an environment that observes `seen` shows."""
-        numbers = np.asarray(seen, dtype=float)
-        broken = np.flatnonzero(~np.isfinite(numbers))
+        broken = np.flatnonzero(~np.isfinite(seen))
         if len(broken):
             raise TargetError(
-                f"{self.name}: observation entry {broken[0]} is {numbers[broken[0]]} after step {self._steps} "
+                f"{self.name}: observation entry {broken[0]} is {seen[broken[0]]} after step {self._steps} "
                 f"(episode {episode}); the environment must stay finite until it ends the episode"
             )
-        state = self.mapping.state(numbers, self.system)
+        state = self.mapping.state(seen, self.system)
         limits = self.mapping.limits.items()
         inside = all(abs(state[self.system.index(name)]) <= limit for name, limit in limits)
         return _Shown(state, not ended and inside, self._draw(self._envs[episode]) if self.frames else None)
@@ -282,10 +316,22 @@ class GymnasiumTarget(Target):
         )
 
 
-def _own_step(env: Any) -> tuple[str, float] | None:
-    """What an environment calls the length of its step, and that length in s; None where it states none."""
-    names = (name for name in ("tau", "dt") if isinstance(getattr(env.unwrapped, name, None), Real))
-    return next(((name, float(getattr(env.unwrapped, name))) for name in names), None)
+def _own_step(env: Any, period: float | None) -> tuple[str, float] | None:
+    """What an environment calls the length of its step, and that length in s; None where it states none.
+
+    Of one that states both, the longest of which the period is a whole number: the other may be a motor's time
+    constant or the step of its physics. A wrapper that repeats actions may state its own.
+    """
+    values = {name: env.get_wrapper_attr(name) for name in ("tau", "dt") if env.has_wrapper_attr(name)}
+    stated = [(name, float(value)) for name, value in values.items() if isinstance(value, Real) and float(value) > 0]
+    fitting = [each for each in stated if period is not None and _steps(period, each[1])]
+    return max(fitting or stated[:1], key=lambda each: each[1], default=None)
+
+
+def _steps(period: float, step: float) -> int:
+    """Steps in s that make up a period; 0 where it is no whole number of them."""
+    count = round(period / step)
+    return count if abs(period / step - count) <= 0.01 else 0
 
 
 def _close(target: weakref.ref[GymnasiumTarget]) -> None:

@@ -56,14 +56,21 @@ def share_viewer(envs: Sequence[Any]) -> None:
 
 
 def aim_viewer(env: Any) -> None:
-    """Point the shared viewer at this environment.
+    """Point the shared viewer at this environment, in the state that it shows.
+
+    MuJoCo's Euler integrator moves the coordinates last in a step, so that the bodies, the camera and the light, which
+    follow from them, would be drawn where they were a step of the physics earlier.
 
     gymnasium makes a viewer's GL context current only once. With two viewers in a process frames would come from the
     wrong one, or from none, unless the context is made current before every frame.
     """
+    import mujoco
+
     viewer = env.unwrapped.mujoco_renderer._get_viewer("rgb_array")
     viewer.model, viewer.data = env.unwrapped.model, env.unwrapped.data
     viewer.make_context_current()
+    mujoco.mj_kinematics(viewer.model, viewer.data)
+    mujoco.mj_camlight(viewer.model, viewer.data)
 
 
 def close_all(envs: Sequence[Any]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -55,8 +55,8 @@ class Run:
 
     episode: Episode
     survived: bool
-    force: np.ndarray
-    """(T,), or of vehicles (T, 3), the disturbance in N as the target tells it, zeros where it does not: for films"""
+    force: np.ndarray | None
+    """(T,), or of vehicles (T, 3), the disturbance in N as the target tells it, None where it does not: for films"""
 
 
 @torch.no_grad()
@@ -70,6 +70,7 @@ def run(
     added: Tensor | None = None,
     strict: bool = True,
     see: See | None = None,
+    keep_frames: bool = True,
 ) -> list[Run]:
     """Run `batch` episodes of at most `steps` steps each; one that ends earlier is cut there, and not `survived`.
 
@@ -78,6 +79,7 @@ def run(
         added: (steps, n_action) or more of them, added to the policy's commands, such as those of a `Plan`.
         strict: whether a state that is not finite is an error; if not, its episode ends before it.
         see: what the policy is shown, where that is not what `policy.shown` names.
+        keep_frames: whether the runs hold the target's frames, which take 3 MB for an episode of 250 of 120 x 100 px.
 
     Raises:
         TargetError: the target shows a state that is not finite while its episode goes on, or no frame.
@@ -104,7 +106,7 @@ def run(
             action = (action + exploration * torch.randn(action.shape, generator=generator).to(action)).clamp(-1, 1)
         if added is not None:
             action = (action + added[len(rows)].to(action)).clamp(-1, 1)
-        rows.append((observation, action))
+        rows.append((observation if keep_frames else replace(observation, frame=None), action))
         observation = checked(target, target.step(action), batch)
         finite = observation.state.isfinite().all(1)
         if strict:
@@ -112,8 +114,19 @@ def run(
         length += running & finite
         running &= observation.alive & finite
         history = history.acting(action.to(like)).observing(see(observation).to(like))
-    rows.append((observation, torch.zeros(batch, target.n_action)))
+    last = observation if keep_frames else replace(observation, frame=None)
+    rows.append((last, torch.zeros(batch, target.n_action)))
     return [_cut(rows, b, int(length[b]), bool(running[b]), target.period) for b in range(batch)]
+
+
+def check_period(policy: Policy, target: Target) -> None:
+    """Raises ValueError where the policy is known to be trained for another period than the target's."""
+    trained = policy.trained_in["period"] if policy.trained_in else target.period
+    if abs(trained - target.period) > 1e-6:
+        raise ValueError(
+            f"{target.name} has {target.period:g} s between actions, the policy was trained for {trained:g} s: give "
+            "the target that period, or train a policy for its own"
+        )
 
 
 def checked(target: Target, observation: Any, batch: int) -> Observation:
@@ -125,14 +138,24 @@ def checked(target: Target, observation: Any, batch: int) -> Observation:
     if not isinstance(observation, Observation):
         what = type(observation).__name__
         raise TargetError(f"{target.name}: reset and step return a visadapt.Observation, not a {what}")
-    right = {"state": f"({batch}, n_state)", "alive": f"({batch},) and bool"}
+    right = {
+        "state": f"({batch}, n_state)",
+        "alive": f"({batch},) and bool",
+        "frame": f"({batch}, H, W) and uint8, grey,",
+    }
     copies: dict[str, Any] = {}
     for field in fields(observation):
         name, value = field.name, getattr(observation, field.name)
-        if value is None and name not in right:
+        if value is None and name not in ("state", "alive"):
             continue
         fits = isinstance(value, Tensor) and value.shape[:1] == (batch,)
-        if not fits or (name == "state" and value.dim() != 2) or (name == "alive" and value.dtype != torch.bool):
+        if fits and name == "state":
+            fits = value.dim() == 2
+        elif fits and name == "alive":
+            fits = value.dtype == torch.bool
+        elif fits and name == "frame":
+            fits = value.dim() == 3 and value.dtype == torch.uint8
+        if not fits:
             what = f"{tuple(value.shape)} and {value.dtype}" if isinstance(value, Tensor) else type(value).__name__
             needed = right.get(name, f"({batch}, ...)")
             raise TargetError(f"{target.name}: {name} is {what}; a torch tensor that is {needed} is right")
@@ -151,7 +174,7 @@ def _cut(rows: list[tuple[Observation, Tensor]], b: int, length: int, survived: 
 
     def column(name: str) -> NDArray[Any] | None:
         each = [getattr(seen, name) for seen, _ in kept]
-        return None if each[0] is None else np.stack([values[b].numpy() for values in each])
+        return None if any(values is None for values in each) else np.stack([values[b].numpy() for values in each])
 
     action = np.stack([action[b].numpy() for _, action in kept])
     action[-1] = 0.0
@@ -159,5 +182,4 @@ def _cut(rows: list[tuple[Observation, Tensor]], b: int, length: int, survived: 
     if task_state is not None:
         task_state = task_state.astype(float)
     episode = Episode(time, action, column("state"), column("frame"), task_state)
-    force = np.array([0.0 if seen.force is None else seen.force[b].numpy() for seen, _ in kept])
-    return Run(episode, survived, force)
+    return Run(episode, survived, column("force"))
