@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -295,7 +296,7 @@ class _Merged(argparse.Action):
 def _columns(text: str) -> dict[str, str]:
     """The file's names of columns by ours."""
     columns: dict[str, str] = {}
-    for pair in text.split(","):
+    for pair in re.split(r",(?=[^,=]+=)", text):  # a name in the file may have commas
         ours, equals, theirs = (part.strip() for part in pair.partition("="))
         if not ours or not equals:
             raise argparse.ArgumentTypeError(f"{pair!r} is not of the form x=position")

@@ -9,6 +9,9 @@ from visadapt.diagnosis.result import Estimate
 
 UNKNOWN = "unknown"
 
+OPPOSITE = " has the opposite sign of the source's"
+"""What a diagnosis warns of, after the quantity's name, where it inverted a sign of the recording."""
+
 
 def number(value: float, digits: int = 3) -> str:
     """A number with this many significant digits; with an exponent below 1e-4 and from 1e6 on."""

@@ -13,6 +13,7 @@ from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED
 from visadapt.diagnosis.saved import load_effects
+from visadapt.diagnosis.words import OPPOSITE
 from visadapt.effects.catalogue import catalogue
 from visadapt.learning.explanation import Explain, Explanation
 from visadapt.policies import Policy
@@ -22,9 +23,6 @@ from visadapt.recordings.loading import SHORTEST_EPISODE_S
 from visadapt.storage.run_folder import read_json, write_json
 from visadapt.targets.base import TargetError
 from visadapt.world import World
-
-OPPOSITE = " has the opposite sign of the source's"
-"""What a diagnosis warns of, after the quantity's name, where it inverted a sign of the recording."""
 
 
 def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, report: Report | None = None) -> Explain:

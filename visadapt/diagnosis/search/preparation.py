@@ -13,6 +13,7 @@ from torch import Tensor
 from visadapt.diagnosis.search import sensor_checks
 from visadapt.diagnosis.search.heldout import PREDICTION_TIME
 from visadapt.diagnosis.search.search import Search
+from visadapt.diagnosis.words import OPPOSITE
 from visadapt.effects import Effect
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import Convention, profile_of
@@ -254,7 +255,7 @@ def _in_signs_of_source(draft: _Draft, first: FitState, catalogue: Sequence[type
         return draft
     if band is not None and profile_of(system).angle_sensor[0] in convention.columns:
         band = (-band[1], -band[0])
-    told = f"{convention.name} has the opposite sign of the source's; it was inverted"
+    told = f"{convention.name}{OPPOSITE}; it was inverted"
     rows, raw = (sensor_checks.to_source(each, convention) for each in (draft.rows, draft.raw))
     return replace(draft, convention=convention, defect=band).changed(rows, raw, told)
 
