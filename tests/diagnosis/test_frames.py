@@ -1,5 +1,6 @@
 """A film and its commands are diagnosed as recordings of states are; what cannot be is refused by one clear line."""
 
+import copy
 from pathlib import Path
 
 import jsonschema
@@ -153,6 +154,19 @@ class TestCamera:
         (cause,) = camera_of(poses, CameraShift(dx=4.0, dy=-3.0)).causes()
         assert cause.parameters["dy"].value == pytest.approx(-3.0, abs=0.05)
         assert cause.parameters["dx"].ci90 == (-20.0, 20.0)
+
+    def test_a_camera_moved_along_a_wall_with_posts_is_found_beside_another_fault(self, poses, only_cameras):
+        only_cameras(CameraShift, Brightness, Blur)
+        renderer, frames = copy.deepcopy(poses[0]), poses[2].clone()
+        for post in ((slice(88, 98), slice(20, 32)), (slice(4, 14), slice(95, 110))):
+            renderer.background[post] = -2.0
+            frames[:, *post] = 0.12
+        scene = renderer, PoseFinder(renderer, 1.5), frames
+        found = camera_of(scene, CameraShift(dx=4.0, dy=0.0), Brightness(gain=0.5, offset=0.0))
+        assert {cause.effect: values(cause) for cause in found.causes()} == {
+            "camera_shift": {"dx": pytest.approx(4.0, abs=0.05), "dy": pytest.approx(0.0, abs=0.05)},
+            "brightness": {"gain": pytest.approx(0.5, abs=5e-3), "offset": pytest.approx(0.0, abs=5e-3)},
+        }
 
     def test_it_is_a_cause_beside_that_of_the_motion(self, tmp_path, only_effects, only_cameras):
         only_effects("viscous_friction", "coulomb_friction", "actuator_gain")
