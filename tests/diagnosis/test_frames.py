@@ -120,6 +120,17 @@ def poses():
     return renderer, PoseFinder(renderer, 1.5), drawn
 
 
+class WiderThan(torch.nn.Module):
+    """A renderer with 30 px more to either side, which repeat the edge."""
+
+    def __init__(self, renderer):
+        super().__init__()
+        self.renderer, self.wide = renderer, torch.nn.ReplicationPad2d((30, 30, 0, 0))
+
+    def forward(self, x, theta):
+        return self.wide(self.renderer(x, theta))
+
+
 def camera_of(poses, *effects):
     """The camera found in frames with effects and noise."""
     renderer, finder, drawn = poses
@@ -149,6 +160,14 @@ class TestCamera:
         box = {"left": 20.0, "top": 30.0, "right": 45.0, "bottom": 60.0, "grey": 0.35}
         (cause,) = camera_of(poses, Occlusion(**box)).causes()
         assert values(cause) == pytest.approx(box, abs=0.1)
+
+    def test_a_box_in_front_of_a_wide_frame(self, poses, only_cameras):
+        only_cameras(Occlusion, Blur)
+        seen = WiderThan(poses[0])
+        box = {"left": 140.0, "top": 10.0, "right": 165.0, "bottom": 50.0, "grey": 0.2}
+        (cause,) = camera_of((seen, PoseFinder(seen, 1.5), seen.wide(poses[2])), Occlusion(**box)).causes()
+        assert values(cause) == pytest.approx(box, abs=0.1)
+        assert all(low <= one.value <= high for one in cause.parameters.values() for low, high in [one.ci90])
 
     def test_a_camera_moved_along_a_featureless_track_is_a_cart_elsewhere(self, poses):
         (cause,) = camera_of(poses, CameraShift(dx=4.0, dy=-3.0)).causes()

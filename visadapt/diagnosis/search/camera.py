@@ -70,7 +70,7 @@ class CameraFindings:
         out = []
         for kind, effect in zip(self.best.camera, self.best.effects, strict=True):
             parameters = {}
-            for p in kind.table:
+            for p in kind.table_in(*self.best.residual.shape[1:]):
                 value, reach = getattr(effect, p.name).item(), Z_90 * next(deviations)
                 low, high = max(p.low, value - reach), min(p.high, value + reach)
                 parameters[p.name] = Estimate(value, p.unit, (p.low, p.high) if p.name in self.fixed else (low, high))
