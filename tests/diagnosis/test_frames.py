@@ -202,6 +202,20 @@ class TestCamera:
         assert [effect.name for effect in found.effects()] == ["blur", "viscous_friction"]
         jsonschema.Draft202012Validator(SCHEMA).validate(found.to_json())
 
+    def test_a_strength_at_the_end_of_its_range_may_lie_beyond_it(self, tmp_path, only_effects, only_cameras):
+        only_effects("actuator_gain")
+        only_cameras(Brightness, Gamma, Blur)
+
+        def dark(frames):
+            return through(frames.float(), [Brightness(gain=0.25, offset=0.1)]).detach()
+
+        found = diagnosed(film(tmp_path / "run.h5", seen=dark, episodes=1, rows=30))
+        gain = found.causes[0].parameters["gain"]
+        assert gain.value == pytest.approx(0.3)
+        assert np.isnan(gain.ci90[0])
+        assert gain.ci90[1] > 0.3
+        assert any(line.startswith("brightness: gain is at 0.3, the end of the range") for line in found.warnings)
+
     def test_lost_frames(self, tmp_path, only_effects, only_cameras):
         only_effects(*MOTION)
         only_cameras(Brightness, CameraRotation)

@@ -19,7 +19,7 @@ from visadapt.diagnosis import next_experiment
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Diagnosis, Gap, Pixels
 from visadapt.diagnosis.search.camera import CameraFindings, find_camera
 from visadapt.diagnosis.search.pixels import judged, left_over, usual
-from visadapt.diagnosis.verdict import CLOSES_BUT
+from visadapt.diagnosis.verdict import CLOSES_BUT, at_bound
 from visadapt.diagnosis.words import estimate
 from visadapt.effects import (
     EFFECTS,
@@ -114,7 +114,11 @@ def with_camera(motion: Diagnosis, film: Film, system: System) -> Diagnosis:
     causes = camera.causes()
     if motion.gap.before < MIN_MOTION_ERROR:
         motion = _without_gap(motion, bool(causes), system)
-    motion = replace(motion, where=replace(motion.where, pixels=film.pixels))
+    motion = replace(
+        motion,
+        where=replace(motion.where, pixels=film.pixels),
+        warnings=(*motion.warnings, *_at_bounds(causes)),
+    )
     if film.pixels.unexplained:
         return _unexplained_in_pixels(motion, causes)
     names = tuple(cause.effect for cause in causes)
@@ -175,6 +179,16 @@ def _unexplained_in_pixels(motion: Diagnosis, camera: Sequence[Cause]) -> Diagno
         next_experiment=next_experiment.LOOK,
         warnings=(*motion.warnings, *found),
     )
+
+
+def _at_bounds(camera: Sequence[Cause]) -> list[str]:
+    """A warning for each strength of a camera's effects that is at an end of the range searched."""
+    return [
+        at_bound(cause.effect, name, one.value, one.unit)
+        for cause in camera
+        for name, one in cause.parameters.items()
+        if any(math.isnan(side) for side in one.ci90)
+    ]
 
 
 def _values(causes: Sequence[Cause]) -> str:

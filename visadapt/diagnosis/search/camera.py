@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from visadapt.diagnosis.result import Cause, Estimate
-from visadapt.diagnosis.search.causes import Z_90
+from visadapt.diagnosis.search.causes import Z_90, is_at_end
 from visadapt.effects import EFFECTS, Blur, Brightness, CameraEffect, CameraShift, Gamma, Occlusion
 from visadapt.effects.camera import moved
 from visadapt.estimation.camera_fit import Camera, CameraFit, fit_camera, made, through
@@ -73,6 +73,9 @@ class CameraFindings:
             for p in kind.table_in(*self.best.residual.shape[1:]):
                 value, reach = getattr(effect, p.name).item(), Z_90 * next(deviations)
                 low, high = max(p.low, value - reach), min(p.high, value + reach)
+                if kind is not Occlusion:  # what a box covers beyond the frame does not matter
+                    low = math.nan if is_at_end(p, value, p.low) else low
+                    high = math.nan if is_at_end(p, value, p.high) else high
                 parameters[p.name] = Estimate(value, p.unit, (p.low, p.high) if p.name in self.fixed else (low, high))
             closed = (self.unchanged.misfit - self.alone[kind].misfit) / whole
             reopened = (self.without[kind].misfit - self.best.misfit) / whole
