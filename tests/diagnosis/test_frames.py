@@ -1,6 +1,7 @@
 """A film and its commands are diagnosed as recordings of states are; what cannot be is refused by one clear line."""
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -12,6 +13,7 @@ import visadapt as va
 from renderers import DrawnCartPole, load_renderer
 from tests.diagnosis.test_report import SCHEMA
 from visadapt.cli import main as cli
+from visadapt.diagnosis.frames import watch
 from visadapt.diagnosis.search import camera
 from visadapt.effects import (
     Blur,
@@ -96,6 +98,16 @@ class TestMotion:
         assert found.verdict == "identified"
         assert [cause.effect for cause in found.causes] == ["viscous_friction"]
         assert found.causes[0].parameters["coefficient"].value == pytest.approx(3.0, rel=0.02)
+
+    def test_an_episode_of_one_frame_is_left_out(self, still, only_cameras):
+        only_cameras(Brightness, Gamma, Blur)
+        recording = va.load_recording(still, va.CartPole(), frames=True)
+        first = recording.episodes[0]
+        alone = va.Episode(first.time[:1], first.action[:1], frame=first.frame[:1])
+        recording = replace(recording, episodes=(first, alone))
+        with torch.inference_mode():
+            shown = watch(recording, va.CartPole(), load_renderer(Path(RENDERER))).positions
+        assert [len(episode.time) for episode in shown.episodes] == [len(first.time)]
 
     def test_frames_that_are_not_explained_are_left_out_with_a_warning(self, still, only_effects, only_cameras):
         only_effects(*MOTION)

@@ -266,7 +266,8 @@ def _seen(episode: Episode, poses: Poses) -> _Seen:
     original = np.flatnonzero(new)[np.cumsum(new) - 1]  # the row that each row is a copy of
     # A late camera repeats its first frame, until it has seen another one: no frame was lost.
     usual = np.ones(len(new), dtype=bool)
-    usual[1 : 1 + int(new[1:].argmax())] = False
+    if len(new) > 1:
+        usual[1 : 1 + int(new[1:].argmax())] = False
     deviation = poses.covariance.diagonal(dim1=1, dim2=2).sqrt().nan_to_num(torch.inf).numpy()
     place, explained = poses.place.nan_to_num().numpy(), poses.explained.numpy()
     return _Seen(place[original], explained[original], deviation[original], usual)
