@@ -13,7 +13,8 @@ import visadapt as va
 from renderers import DrawnCartPole, load_renderer
 from tests.diagnosis.test_report import SCHEMA
 from visadapt.cli import main as cli
-from visadapt.diagnosis.frames import watch
+from visadapt.diagnosis.frames import watch, with_camera
+from visadapt.diagnosis.result import Gap, RecordingSummary, Region, Where
 from visadapt.diagnosis.search import camera
 from visadapt.effects import (
     Blur,
@@ -26,6 +27,7 @@ from visadapt.effects import (
 )
 from visadapt.estimation.camera_fit import through
 from visadapt.estimation.poses import PoseFinder
+from visadapt.targets import Start
 
 RENDERER = va.shipped("renderer")
 MOTION = ("viscous_friction", "coulomb_friction", "pole_damping", "actuator_gain", "actuator_delay", "angle_offset")
@@ -43,11 +45,11 @@ def only_cameras(monkeypatch):
     return lambda *kinds: monkeypatch.setattr(camera, "SEARCHED", kinds)
 
 
-def film(path, effects=(), seen=lambda frames: frames, episodes=3, rows=40, seed=2):
+def film(path, effects=(), seen=lambda frames: frames, episodes=3, rows=40, seed=2, exploration=0.4, **options):
     """A film of the drawn cart-pole, kept upright with some noise in the command; two grey levels of noise."""
-    target = va.SyntheticTarget(lambda batch, generator: effects, camera=DrawnCartPole())
+    target = va.SyntheticTarget(lambda batch, generator: effects, camera=DrawnCartPole(), **options)
     policy = va.load_policy(va.shipped("cartpole_frames"))
-    runs = va.run(target, policy, episodes, rows, torch.Generator().manual_seed(seed), exploration=0.4)
+    runs = va.run(target, policy, episodes, rows, torch.Generator().manual_seed(seed), exploration)
     noise = np.random.default_rng(seed)
     shown = []
     for one in runs:
@@ -90,6 +92,14 @@ def diagnosed(path, **options):
     return va.diagnose(recording, world, renderer=load_renderer(Path(RENDERER)), **options)
 
 
+@torch.inference_mode()
+def watched(recording, renderer=None):
+    """What a recording, or a file of one, was found to show."""
+    if isinstance(recording, Path):
+        recording = va.load_recording(recording, va.CartPole(), frames=True)
+    return watch(recording, va.CartPole(), renderer or load_renderer(Path(RENDERER)))
+
+
 class TestMotion:
     def test_friction_is_found_in_a_film(self, tmp_path, only_effects, only_cameras):
         only_effects(*MOTION)
@@ -104,9 +114,7 @@ class TestMotion:
         recording = va.load_recording(still, va.CartPole(), frames=True)
         first = recording.episodes[0]
         alone = va.Episode(first.time[:1], first.action[:1], frame=first.frame[:1])
-        recording = replace(recording, episodes=(first, alone))
-        with torch.inference_mode():
-            shown = watch(recording, va.CartPole(), load_renderer(Path(RENDERER))).positions
+        shown = watched(replace(recording, episodes=(first, alone))).positions
         assert [len(episode.time) for episode in shown.episodes] == [len(first.time)]
 
     def test_frames_that_are_not_explained_are_left_out_with_a_warning(self, still, only_effects, only_cameras):
@@ -235,6 +243,34 @@ class TestCamera:
         (cause,) = diagnosed(path).causes
         assert cause.effect == "frame_drop"
         assert values(cause)["rate"] == pytest.approx(0.2, abs=0.03)
+
+    def test_lost_frames_beside_a_darker_picture_where_motion_shows_no_gap(self, tmp_path, only_effects, only_cameras):
+        only_effects("constant_force")
+        only_cameras(Brightness, Gamma, Blur)
+
+        def dark(frames):
+            return through(frames.float(), [Brightness(gain=0.7, offset=0.1)]).detach()
+
+        nearly_at_rest = {"start": Start(0.02, 0.0, 0.01, 0.0), "exploration": 0.0}
+        path = film(tmp_path / "run.h5", seen=dark, episodes=1, rows=30, **nearly_at_rest)
+        found = diagnosed(rewritten(path, frame=repeat_every_fifth))
+        assert [cause.effect for cause in found.causes] == ["brightness", "frame_drop"]
+        assert "grey levels" in found.gap.measure
+        assert found.gap.closed == pytest.approx(1, abs=0.01)
+
+    def test_no_region_of_a_gap_that_motion_does_not_show(self, tmp_path, only_cameras):
+        only_cameras(Brightness, Gamma, Blur)
+
+        def dark(frames):
+            return through(frames.float(), [Brightness(gain=0.7, offset=0.1)]).detach()
+
+        seen = watched(film(tmp_path / "run.h5", seen=dark, episodes=1, rows=20))
+        where = Where({"camera": 0.0}, {}, (Region("x", 0.01, 0.05, 0.6, 0.015),))
+        gap = Gap("error", 0.5, 0.5, 0.5, 0.5, np.nan)
+        motion = va.Diagnosis("cartpole", RecordingSummary(1, 19, 0.05), "no_gap", where, (), (), gap, "")
+        found = with_camera(motion, seen, va.CartPole())
+        assert [cause.effect for cause in found.causes] == ["brightness"]
+        assert found.where.regions == ()
 
 
 class TestPixels:

@@ -130,17 +130,19 @@ def with_camera(motion: Diagnosis, film: Film, system: System) -> Diagnosis:
         return replace(motion, warnings=(*motion.warnings, f"found in the pixels, and corrected: {_values(causes)}"))
     doubtful = [[EFFECTS[name] for name in (one.effect, *one.indistinguishable_from)] for one in causes]
     settled = next_experiment.separate(doubtful, system)
-    gap, following = motion.gap, motion.next_experiment
-    if motion.verdict == NO_GAP:
+    gap, following, where = motion.gap, motion.next_experiment, motion.where
+    if motion.verdict == NO_GAP or math.isnan(gap.closed):  # frames may have been lost nevertheless
         before, after = 255 * camera.unchanged.misfit, 255 * camera.best.misfit
         floor = min(255 * camera.noise, after)
         gap, following = Gap(MISFIT, before, after, floor, after, (before - after) / (before - floor)), ""
+        where = replace(where, regions=())  # of a gap that is none
     return replace(
         motion,
         verdict=AMBIGUOUS if settled or motion.verdict == AMBIGUOUS else IDENTIFIED,
         causes=(*causes, *motion.causes),
         ranking=tuple(replace(one, effects=(*names, *one.effects)) for one in motion.ranking),
         gap=gap,
+        where=where,
         next_experiment=" ".join(text for text in (settled, along, following) if text),
     )
 
@@ -160,7 +162,7 @@ def _without_gap(motion: Diagnosis, seen_by_a_faulty_camera: bool, system: Syste
             for warning in motion.warnings
             if warning.partition(":")[0] not in (CLOSES_BUT, *(cause.effect for cause in motion.causes))
         ),
-        where=replace(motion.where, stages=stages | ({Stage.CAMERA.value: 1.0} if drops else {})),
+        where=replace(motion.where, stages=stages | ({Stage.CAMERA.value: 1.0} if drops else {}), regions=()),
         next_experiment="" if drops else next_experiment.more(profile_of(system)),
     )
 
