@@ -100,6 +100,13 @@ def watched(recording, renderer=None):
     return watch(recording, va.CartPole(), renderer or load_renderer(Path(RENDERER)))
 
 
+class Drawn(torch.nn.Module):
+    """A renderer of one's own, without parameters: the drawing itself."""
+
+    def forward(self, x, theta):
+        return torch.from_numpy(DrawnCartPole()(x.numpy(), theta.numpy())).to(x) / 255
+
+
 class TestMotion:
     def test_friction_is_found_in_a_film(self, tmp_path, only_effects, only_cameras):
         only_effects(*MOTION)
@@ -116,6 +123,15 @@ class TestMotion:
         alone = va.Episode(first.time[:1], first.action[:1], frame=first.frame[:1])
         shown = watched(replace(recording, episodes=(first, alone))).positions
         assert [len(episode.time) for episode in shown.episodes] == [len(first.time)]
+
+    @pytest.mark.parametrize("renderer", [Drawn(), load_renderer(Path(RENDERER)).double()])
+    def test_a_renderer_without_parameters_or_in_double_precision(self, still, only_cameras, renderer):
+        only_cameras(Brightness, Gamma, Blur)
+        places, expected = (
+            np.concatenate([episode.state for episode in watched(still, each).positions.episodes])
+            for each in (renderer, None)
+        )
+        assert places == pytest.approx(expected, abs=2e-3)
 
     def test_frames_that_are_not_explained_are_left_out_with_a_warning(self, still, only_effects, only_cameras):
         only_effects(*MOTION)

@@ -5,6 +5,7 @@ Velocities are never differentiated: they are unknowns of the fits, as of any re
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -88,6 +89,8 @@ def watch(recording: Recording, system: System, renderer: nn.Module, report: Rep
     Raises:
         FramesError: frames of another size or scene than the renderer's, or that never change.
     """
+    # Frames and poses are in single precision on the CPU, whatever the renderer was trained in.
+    renderer = copy.deepcopy(renderer).to("cpu", torch.float32)
     reach = system.states[system.index("x")].largest
     finder = PoseFinder(renderer, reach)
     check_frames(recording, finder.size)

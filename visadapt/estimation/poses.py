@@ -57,7 +57,7 @@ class PoseFinder:
 
     def __init__(self, renderer: nn.Module, reach: float) -> None:
         self.renderer = renderer
-        self._like = next(renderer.parameters()).detach()
+        self._like = next(renderer.parameters(), torch.zeros(())).detach()
         axes = [
             torch.linspace(-limit, limit, 2 * max(1, round(limit / SPACING)) + 1, dtype=self._like.dtype)
             for limit in (reach, LEAN)
