@@ -192,6 +192,18 @@ class TestCamera:
             "brightness": {"gain": pytest.approx(0.8, abs=5e-3), "offset": pytest.approx(0.1, abs=5e-3)},
         }
 
+    def test_effects_that_explain_the_frames_as_well_are_causes_with_values_and_share_the_probability(
+        self, poses, only_cameras
+    ):
+        only_cameras(Gamma, Brightness, Blur)
+        gamma, brightness = camera_of(poses, Gamma(exponent=1.03)).causes()
+        assert (gamma.effect, gamma.indistinguishable_from, gamma.probability) == ("gamma", ("brightness",), 0.5)
+        assert (brightness.indistinguishable_from, brightness.probability) == (("gamma",), 0.5)
+        assert values(brightness) == {
+            "gain": pytest.approx(1.015, abs=0.005),
+            "offset": pytest.approx(-0.015, abs=0.005),
+        }
+
     def test_a_box_in_front(self, poses):
         box = {"left": 20.0, "top": 30.0, "right": 45.0, "bottom": 60.0, "grey": 0.35}
         (cause,) = camera_of(poses, Occlusion(**box)).causes()

@@ -17,7 +17,17 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from visadapt.diagnosis import next_experiment
-from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Diagnosis, Gap, Pixels
+from visadapt.diagnosis.result import (
+    AMBIGUOUS,
+    IDENTIFIED,
+    NO_GAP,
+    UNEXPLAINED,
+    Cause,
+    Diagnosis,
+    Gap,
+    Pixels,
+    first_explanation,
+)
 from visadapt.diagnosis.search.camera import CameraFindings, find_camera
 from visadapt.diagnosis.search.pixels import judged, left_over, usual
 from visadapt.diagnosis.verdict import CLOSES_BUT, at_bound
@@ -122,16 +132,17 @@ def with_camera(motion: Diagnosis, film: Film, system: System) -> Diagnosis:
         where=replace(motion.where, pixels=film.pixels),
         warnings=(*motion.warnings, *_at_bounds(causes)),
     )
+    best = first_explanation(causes)
     if film.pixels.unexplained:
-        return _unexplained_in_pixels(motion, causes)
-    names = tuple(cause.effect for cause in causes)
+        return _unexplained_in_pixels(motion, best)
+    names = tuple(cause.effect for cause in best)
     along = next_experiment.ALONG if camera.fixed and {CameraShift.name}.issuperset(names) else ""
     if not names:
         open_too = along if motion.verdict == NO_GAP else ""
         return replace(motion, next_experiment=" ".join(text for text in (motion.next_experiment, open_too) if text))
     if motion.verdict == UNEXPLAINED:
-        return replace(motion, warnings=(*motion.warnings, f"found in the pixels, and corrected: {_values(causes)}"))
-    doubtful = [[EFFECTS[name] for name in (one.effect, *one.indistinguishable_from)] for one in causes]
+        return replace(motion, warnings=(*motion.warnings, f"found in the pixels, and corrected: {_values(best)}"))
+    doubtful = [[EFFECTS[name] for name in (one.effect, *one.indistinguishable_from)] for one in best]
     settled = next_experiment.separate(doubtful, system)
     gap, following, where = motion.gap, motion.next_experiment, motion.where
     if motion.verdict == NO_GAP or math.isnan(gap.closed):  # frames may have been lost nevertheless

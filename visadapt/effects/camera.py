@@ -6,7 +6,7 @@ al. 2020, WACV, 3674), with the extra `camera`: both are exact where nothing is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
 from typing import Any, ClassVar
@@ -229,6 +229,12 @@ class Gamma(CameraEffect):
     equation = "grey seen = grey^exponent"
     source = "Farid (2001), Blind inverse gamma correction, IEEE Transactions on Image Processing 10(10)"
     table = (Parameter("exponent", "1", 0.3, 3.0, 1.0),)
+    settled_by: ClassVar[Mapping[str, str]] = {
+        "brightness": (
+            "film a card with several known grey levels: brightness changes them along a straight line, gamma along a "
+            "curve"
+        )
+    }
 
     def apply_to(self, frame: Tensor, memory: Tensor, generator: torch.Generator | None) -> Reading:
         seen = frame > FAINTEST
