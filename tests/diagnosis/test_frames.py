@@ -250,6 +250,12 @@ class TestCamera:
         assert [effect.name for effect in found.effects()] == ["blur", "viscous_friction"]
         jsonschema.Draft202012Validator(SCHEMA).validate(found.to_json())
 
+    def test_an_effect_without_which_hardly_any_misfit_opens_again_is_slight(self, poses, only_cameras):
+        only_cameras(Brightness, Blur, Gamma)
+        causes = camera_of(poses, Brightness(gain=0.4, offset=0.1), Blur(sigma=0.6)).causes()
+        assert {cause.effect: cause.slight for cause in causes} == {"brightness": False, "blur": True}
+        assert all(cause.slight == (cause.gap_reopened < 0.01) for cause in causes)
+
     def test_a_strength_at_the_end_of_its_range_may_lie_beyond_it(self, tmp_path, only_effects, only_cameras):
         only_effects("actuator_gain")
         only_cameras(Brightness, Gamma, Blur)

@@ -27,6 +27,7 @@ from visadapt.diagnosis.result import (
     Gap,
     Pixels,
     first_explanation,
+    without_slight,
 )
 from visadapt.diagnosis.search.camera import CameraFindings, find_camera
 from visadapt.diagnosis.search.pixels import judged, left_over, usual
@@ -142,7 +143,7 @@ def with_camera(motion: Diagnosis, film: Film, system: System) -> Diagnosis:
         return replace(motion, next_experiment=" ".join(text for text in (motion.next_experiment, open_too) if text))
     if motion.verdict == UNEXPLAINED:
         return replace(motion, warnings=(*motion.warnings, f"found in the pixels, and corrected: {_values(best)}"))
-    doubtful = [[EFFECTS[name] for name in (one.effect, *one.indistinguishable_from)] for one in best]
+    doubtful = [[EFFECTS[name] for name in (one.effect, *one.indistinguishable_from)] for one in without_slight(best)]
     settled = next_experiment.separate(doubtful, system)
     gap, following, where = motion.gap, motion.next_experiment, motion.where
     if motion.verdict == NO_GAP or math.isnan(gap.closed):  # frames may have been lost nevertheless

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from visadapt.diagnosis.result import Cause, Estimate
-from visadapt.diagnosis.search.causes import Z_90, is_at_end
+from visadapt.diagnosis.search.causes import SLIGHT, Z_90, is_at_end
 from visadapt.effects import EFFECTS, Blur, Brightness, CameraEffect, CameraShift, Gamma, Occlusion
 from visadapt.effects.camera import moved
 from visadapt.estimation.camera_fit import Camera, CameraFit, fit_camera, made, through
@@ -70,19 +70,26 @@ class CameraFindings:
     def causes(self) -> list[Cause]:
         """The effects of the best camera, each followed by those that explain the frames as well in its place, as the
         result states them; shares are those of the pixels' misfit."""
+        if not self.best.camera:
+            return []
         whole = self.unchanged.misfit - self.best.misfit
+        closes = {kind: (self.unchanged.misfit - fit.misfit) / whole for kind, fit in self.alone.items()}
+        reopens = {kind: (fit.misfit - self.best.misfit) / whole for kind, fit in self.without.items()}
+        carrying = {kind for kind in self.best.camera if reopens[kind] >= SLIGHT}
+        if not carrying:  # they stand in for each other
+            carrying = {max(self.best.camera, key=lambda kind: closes[kind])}
         out: dict[str, Cause] = {}
         for kind in self.best.camera:
             group = {kind: self.best, **self.alike[kind]}
             for one, fit in group.items():
-                others = tuple(other.name for other in group if other is not one)
-                if known := out.get(one.name):  # in the place of two effects of the best camera
-                    out[one.name] = replace(known, indistinguishable_from=(*known.indistinguishable_from, *others))
+                name, slight = one.name, kind not in carrying
+                alike = tuple(other.name for other in group if other is not one)
+                if known := out.get(name):  # in the place of two effects of the best camera
+                    alike = (*known.indistinguishable_from, *alike)
+                    out[name] = replace(known, slight=known.slight and slight, indistinguishable_from=alike)
                     continue
-                closed = (self.unchanged.misfit - self.alone[one].misfit) / whole
-                reopened = (self.without[kind].misfit - fit.misfit) / whole
-                parameters = self._estimates(one, fit)
-                out[one.name] = Cause(one.name, parameters, 1 / len(group), closed, reopened, False, others)
+                found = self._estimates(one, fit)
+                out[name] = Cause(name, found, 1 / len(group), closes[one], reopens[kind], slight, alike)
         return list(out.values())
 
     def _estimates(self, kind: type[CameraEffect], fit: CameraFit) -> dict[str, Estimate]:
@@ -108,6 +115,7 @@ def find_camera(
     grown, alone, alike = search.grow()
     needed, without = search.drop_idle(grown)
     best, without = search.sharpen(needed, without)
+    alone = {kind: alone.get(kind, search.unchanged) for kind in SEARCHED}
     return CameraFindings(search.unchanged, best, alone, without, search.exchanged(best, alike), search.fixed)
 
 
