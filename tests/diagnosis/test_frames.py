@@ -12,6 +12,7 @@ import torch
 import visadapt as va
 from renderers import DrawnCartPole, load_renderer
 from tests.diagnosis.test_report import SCHEMA
+from tests.scenes import small_renderer
 from visadapt.cli import main as cli
 from visadapt.diagnosis.frames import watch, with_camera
 from visadapt.diagnosis.result import Gap, RecordingSummary, Region, Where
@@ -132,6 +133,16 @@ class TestMotion:
             for each in (renderer, None)
         )
         assert places == pytest.approx(expected, abs=2e-3)
+
+    def test_a_cart_is_found_as_far_as_the_renderer_shows_it(self, only_cameras):
+        only_cameras(Brightness, Gamma, Blur)
+        time = 0.05 * np.arange(60)
+        places = np.stack([4.5 * np.sin(time), 0.1 * np.cos(3 * time)], 1)
+        renderer = small_renderer(width=80)  # 8 px a metre
+        frame = (255 * renderer(*torch.from_numpy(places).float().T)).round().to(torch.uint8).numpy()
+        episode = va.Episode(time, np.zeros((60, 1)), frame=frame)
+        (shown,) = watched(va.Recording((episode,), (), 0.05, ("run.h5",)), renderer).positions.episodes
+        assert shown.state == pytest.approx(places, abs=0.02)
 
     def test_frames_that_are_not_explained_are_left_out_with_a_warning(self, still, only_effects, only_cameras):
         only_effects(*MOTION)

@@ -45,7 +45,7 @@ from visadapt.effects import (
     Stage,
 )
 from visadapt.estimation.camera_fit import SeenBy, within_frame
-from visadapt.estimation.poses import HIDDEN, PoseFinder, Poses
+from visadapt.estimation.poses import HIDDEN, PoseFinder, Poses, reach_of
 from visadapt.estimation.profiles import profile_of
 from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, Recording
@@ -102,7 +102,7 @@ def watch(recording: Recording, system: System, renderer: nn.Module, report: Rep
     """
     # Frames and poses are in single precision on the CPU, whatever the renderer was trained in.
     renderer = copy.deepcopy(renderer).to("cpu", torch.float32)
-    reach = system.states[system.index("x")].largest
+    reach = reach_of(renderer, system)
     finder = PoseFinder(renderer, reach)
     check_frames(recording, finder.size)
     every = torch.cat([torch.from_numpy(np.ascontiguousarray(episode.frame)) for episode in recording.episodes])

@@ -16,9 +16,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from visadapt.systems import System
+
 LEAN = 0.5  # rad, largest |theta| of the grid searched
 
 SPACING = 0.05  # m and rad between the poses of the grid: about 2 px for a camera that sees 3 m in 120 px
+
+LONGEST_REACH = 10.0  # m, largest |x| that is looked at, whatever a renderer says that it shows
 
 DIFFERENCE = 0.0125
 """m and rad, half-width of the central differences: half a pixel, so that the kinks of interpolated pictures, which
@@ -44,6 +48,12 @@ class Poses:
     """(T,) misfit where cart and pole are drawn, over how much these differ from the mean picture there: small where
     the frame shows them, whatever light or shadow does to the rest of it"""
     explained: Tensor  # (T,) whether the frame shows cart and pole where they are drawn
+
+
+def reach_of(renderer: nn.Module, system: System) -> float:
+    """m, largest |x| at which a cart is looked for: that of the system's range or, where it is farther, that at which
+    the renderer says that it still shows the hinge (`farthest`)."""
+    return max(system.states[system.index("x")].largest, min(LONGEST_REACH, getattr(renderer, "farthest", 0.0)))
 
 
 class PoseFinder:
