@@ -32,7 +32,7 @@ from visadapt.diagnosis.result import (
 from visadapt.diagnosis.search.camera import CameraFindings, find_camera
 from visadapt.diagnosis.search.pixels import judged, left_over, usual
 from visadapt.diagnosis.verdict import CLOSES_BUT, at_bound
-from visadapt.diagnosis.words import estimate
+from visadapt.diagnosis.words import MISFIT, estimate
 from visadapt.effects import (
     EFFECTS,
     AngleDelay,
@@ -57,8 +57,6 @@ RESOLUTION = (0.002, 0.005)
 """m and rad, the smallest meaningful differences of poses (0.08 px, and 0.2 px at the pole's tip). The errors of a
 renderer are alike in neighbouring frames, so the scatter of poses underestimates them. Poses by the shipped renderer
 are off by 0.14 mm and 0.23 mrad (root mean square), with scales off by up to 0.1 %."""
-
-MISFIT = "root mean square of frames less those drawn by the renderer, in grey levels of 255"
 
 UNSEEN = (Dropout, FrozenZone, MeasurementDelay, PositionDelay, AngleDelay)
 """Faults of separate sensors, which a camera cannot have: one frame shows cart and pole at the same instant."""
