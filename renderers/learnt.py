@@ -126,6 +126,12 @@ class LayeredRenderer(nn.Module):
         self.cart = Layer((-0.35 * length, 0.35 * length, -0.2 * length, 0.35 * length), False, detail)
         self.pole = Layer((-across, across, -length, 0.2 * length), True, detail)
 
+    @property
+    def farthest(self) -> float:
+        """Largest |x| in m at which the hinge is in the frame."""
+        column = float(self.origin[0].detach())
+        return max(column, self.size[1] - 1 - column) / max(1e-9, abs(float(self.gain[0].detach())))
+
     @torch.no_grad()
     def start_from(self, frames: Tensor) -> None:
         """Initialise the background with the median of frames (N, H, W) uint8, which shows what does not move."""

@@ -11,10 +11,10 @@ HEIGHT, WIDTH = 20, 24
 CONTRAST = 0.2
 
 
-def small_renderer(seed=0, dtype=torch.float32):
+def small_renderer(seed=0, dtype=torch.float32, width=WIDTH):
     """Cart and pole clearly seen on a background of noise, 8 px per m."""
     generator = torch.Generator().manual_seed(seed)
-    renderer = LayeredRenderer(HEIGHT, WIDTH, column=11.5, row=14.5, scale=8.0, reach=1.0)
+    renderer = LayeredRenderer(HEIGHT, width, column=(width - 1) / 2, row=14.5, scale=8.0, reach=1.0)
     with torch.no_grad():
         for values, mean, spread in (
             (renderer.background, 1.0, 0.5),

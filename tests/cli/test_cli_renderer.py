@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from renderers import Camera, load_renderer
+import visadapt as va
+from renderers import Camera, DrawnCartPole, load_renderer
 from renderers.training import KEEP_EVERY
 from tests.cli.commands import CAMERA, GUESS, refused, run, write_frames
 from visadapt import progress
@@ -15,7 +18,7 @@ def test_from_recorded_frames_and_states(here, capsys):
     write_frames(here / "a.h5")
     write_frames(here / "b.h5", names=("x", "x_dot", "theta", "theta_dot"))
     assert run("renderer", "a.h5", "b.h5", *GUESS, "--iterations", 60, *OUT) == 0
-    assert "grey levels of 255 off" in capsys.readouterr().out
+    assert "grey levels of 255 off where cart and pole are" in capsys.readouterr().out
     renderer = load_renderer(here / "r.safetensors")
     assert renderer.size == (40, 48)
     # Nearer to the camera than the guess, 1.5 px to the left of it.
@@ -60,6 +63,16 @@ def write_states(path):
     write_recording(path, [Episode(0.05 * np.arange(30), np.zeros((30, 1)), np.zeros((30, 4)))])
 
 
+def write_degrees(path, exploration):
+    """Frames of a pole that is kept upright, with its angle in degrees."""
+    target = va.SyntheticTarget(camera=DrawnCartPole(CAMERA))
+    policy = va.load_policy(va.shipped("cartpole_states"))
+    runs = va.run(target, policy, 2, 60, torch.Generator().manual_seed(1), exploration)
+    unit = np.array([1, 1, 180 / np.pi, 180 / np.pi])
+    episodes = [replace(run.episode, state=run.episode.state * unit) for run in runs]
+    write_recording(path, episodes, ["x", "x_dot", "theta", "theta_dot"], ["command"])
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -76,6 +89,8 @@ def write_states(path):
         ),
         (("names.h5",), "names.h5: has no state 'theta'; it has x, v, phi, w"),
         (("a.h5", "--iterations", 2), "--iterations 2: at least 3"),
+        (("degrees.h5",), "radians are right (these look like degrees)"),
+        (("small.h5",), "answers the command as if in degrees; radians are right"),
     ],
 )
 def test_what_it_refuses(here, capsys, arguments, says):
@@ -84,6 +99,8 @@ def test_what_it_refuses(here, capsys, arguments, says):
     write_frames(here / "larger.h5", 30, Camera())
     write_frames(here / "names.h5", 30, names=("x", "v", "phi", "w"))
     write_states(here / "states.h5")
+    write_degrees(here / "degrees.h5", exploration=0.3)
+    write_degrees(here / "small.h5", exploration=0.15)
     assert says in refused(capsys, "renderer", *arguments, *GUESS, *OUT)
     assert not list(here.glob("r.safetensors*"))
 
@@ -101,3 +118,16 @@ def test_guesses(here, capsys, guess):
         run("renderer", "a.h5", *GUESS, *guess, *OUT)
     assert caught.value.code == 2
     assert f"argument {guess[0]}" in capsys.readouterr().err
+
+
+def test_a_hinge_far_outside_the_frames_is_refused(here, capsys):
+    write_frames(here / "a.h5", 30)
+    line = refused(capsys, "renderer", "a.h5", *GUESS, "--hinge", "6000,28.5", *OUT)
+    assert "--hinge 6000,28.5: more than a frame's size outside the frames, which are 48 px wide and 40 px high" in line
+
+
+def test_a_pole_that_is_not_drawn_yet_shows_in_the_error(here, capsys):
+    write_frames(here / "a.h5", 30)
+    assert run("renderer", "a.h5", *GUESS, "--iterations", 3, *OUT) == 0
+    error = float(capsys.readouterr().out.split()[1])
+    assert error > 50

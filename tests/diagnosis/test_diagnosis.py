@@ -338,3 +338,9 @@ def test_error_grows_with_the_horizon(pushed):
     before, after, _, floor = (curve.values for curve in growth.curves)
     assert before[-1] > 3 * before[0]
     assert after[-1] == pytest.approx(floor[-1], rel=0.1)
+
+
+@pytest.mark.parametrize(("episodes", "held_out"), [(1, "on held-out stretches,"), (2, "on held-out episodes,")])
+def test_the_gap_says_what_was_held_out(episodes, held_out):
+    result = diagnose(record([ConstantForce(force=1.0)], episodes), SOURCE, catalogue=[ConstantForce])
+    assert held_out in result.gap.measure

@@ -1,5 +1,7 @@
 """A film and its commands are diagnosed as recordings of states are; what cannot be is refused by one clear line."""
 
+import copy
+from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -10,7 +12,10 @@ import torch
 import visadapt as va
 from renderers import DrawnCartPole, load_renderer
 from tests.diagnosis.test_report import SCHEMA
+from tests.scenes import small_renderer
 from visadapt.cli import main as cli
+from visadapt.diagnosis.frames import watch, with_camera
+from visadapt.diagnosis.result import Gap, RecordingSummary, Region, Where
 from visadapt.diagnosis.search import camera
 from visadapt.effects import (
     Blur,
@@ -23,6 +28,7 @@ from visadapt.effects import (
 )
 from visadapt.estimation.camera_fit import through
 from visadapt.estimation.poses import PoseFinder
+from visadapt.targets import Start
 
 RENDERER = va.shipped("renderer")
 MOTION = ("viscous_friction", "coulomb_friction", "pole_damping", "actuator_gain", "actuator_delay", "angle_offset")
@@ -40,11 +46,11 @@ def only_cameras(monkeypatch):
     return lambda *kinds: monkeypatch.setattr(camera, "SEARCHED", kinds)
 
 
-def film(path, effects=(), seen=lambda frames: frames, episodes=3, rows=40, seed=2):
+def film(path, effects=(), seen=lambda frames: frames, episodes=3, rows=40, seed=2, exploration=0.4, **options):
     """A film of the drawn cart-pole, kept upright with some noise in the command; two grey levels of noise."""
-    target = va.SyntheticTarget(lambda batch, generator: effects, camera=DrawnCartPole())
+    target = va.SyntheticTarget(lambda batch, generator: effects, camera=DrawnCartPole(), **options)
     policy = va.load_policy(va.shipped("cartpole_frames"))
-    runs = va.run(target, policy, episodes, rows, torch.Generator().manual_seed(seed), exploration=0.4)
+    runs = va.run(target, policy, episodes, rows, torch.Generator().manual_seed(seed), exploration)
     noise = np.random.default_rng(seed)
     shown = []
     for one in runs:
@@ -87,6 +93,21 @@ def diagnosed(path, **options):
     return va.diagnose(recording, world, renderer=load_renderer(Path(RENDERER)), **options)
 
 
+@torch.inference_mode()
+def watched(recording, renderer=None):
+    """What a recording, or a file of one, was found to show."""
+    if isinstance(recording, Path):
+        recording = va.load_recording(recording, va.CartPole(), frames=True)
+    return watch(recording, va.CartPole(), renderer or load_renderer(Path(RENDERER)))
+
+
+class Drawn(torch.nn.Module):
+    """A renderer of one's own, without parameters: the drawing itself."""
+
+    def forward(self, x, theta):
+        return torch.from_numpy(DrawnCartPole()(x.numpy(), theta.numpy())).to(x) / 255
+
+
 class TestMotion:
     def test_friction_is_found_in_a_film(self, tmp_path, only_effects, only_cameras):
         only_effects(*MOTION)
@@ -95,6 +116,33 @@ class TestMotion:
         assert found.verdict == "identified"
         assert [cause.effect for cause in found.causes] == ["viscous_friction"]
         assert found.causes[0].parameters["coefficient"].value == pytest.approx(3.0, rel=0.02)
+
+    def test_an_episode_of_one_frame_is_left_out(self, still, only_cameras):
+        only_cameras(Brightness, Gamma, Blur)
+        recording = va.load_recording(still, va.CartPole(), frames=True)
+        first = recording.episodes[0]
+        alone = va.Episode(first.time[:1], first.action[:1], frame=first.frame[:1])
+        shown = watched(replace(recording, episodes=(first, alone))).positions
+        assert [len(episode.time) for episode in shown.episodes] == [len(first.time)]
+
+    @pytest.mark.parametrize("renderer", [Drawn(), load_renderer(Path(RENDERER)).double()])
+    def test_a_renderer_without_parameters_or_in_double_precision(self, still, only_cameras, renderer):
+        only_cameras(Brightness, Gamma, Blur)
+        places, expected = (
+            np.concatenate([episode.state for episode in watched(still, each).positions.episodes])
+            for each in (renderer, None)
+        )
+        assert places == pytest.approx(expected, abs=2e-3)
+
+    def test_a_cart_is_found_as_far_as_the_renderer_shows_it(self, only_cameras):
+        only_cameras(Brightness, Gamma, Blur)
+        time = 0.05 * np.arange(60)
+        places = np.stack([4.5 * np.sin(time), 0.1 * np.cos(3 * time)], 1)
+        renderer = small_renderer(width=80)  # 8 px a metre
+        frame = (255 * renderer(*torch.from_numpy(places).float().T)).round().to(torch.uint8).numpy()
+        episode = va.Episode(time, np.zeros((60, 1)), frame=frame)
+        (shown,) = watched(va.Recording((episode,), (), 0.05, ("run.h5",)), renderer).positions.episodes
+        assert shown.state == pytest.approx(places, abs=0.02)
 
     def test_frames_that_are_not_explained_are_left_out_with_a_warning(self, still, only_effects, only_cameras):
         only_effects(*MOTION)
@@ -117,6 +165,17 @@ def poses():
     places = np.random.default_rng(0).uniform((-0.8, -0.2), (0.8, 0.2), (8, 2))
     drawn = torch.from_numpy(DrawnCartPole()(*places.T)).float() / 255
     return renderer, PoseFinder(renderer, 1.5), drawn
+
+
+class WiderThan(torch.nn.Module):
+    """A renderer with 30 px more to either side, which repeat the edge."""
+
+    def __init__(self, renderer):
+        super().__init__()
+        self.renderer, self.wide = renderer, torch.nn.ReplicationPad2d((30, 30, 0, 0))
+
+    def forward(self, x, theta):
+        return self.wide(self.renderer(x, theta))
 
 
 def camera_of(poses, *effects):
@@ -144,15 +203,48 @@ class TestCamera:
             "brightness": {"gain": pytest.approx(0.8, abs=5e-3), "offset": pytest.approx(0.1, abs=5e-3)},
         }
 
+    def test_effects_that_explain_the_frames_as_well_are_causes_with_values_and_share_the_probability(
+        self, poses, only_cameras
+    ):
+        only_cameras(Gamma, Brightness, Blur)
+        gamma, brightness = camera_of(poses, Gamma(exponent=1.03)).causes()
+        assert (gamma.effect, gamma.indistinguishable_from, gamma.probability) == ("gamma", ("brightness",), 0.5)
+        assert (brightness.indistinguishable_from, brightness.probability) == (("gamma",), 0.5)
+        assert values(brightness) == {
+            "gain": pytest.approx(1.015, abs=0.005),
+            "offset": pytest.approx(-0.015, abs=0.005),
+        }
+
     def test_a_box_in_front(self, poses):
         box = {"left": 20.0, "top": 30.0, "right": 45.0, "bottom": 60.0, "grey": 0.35}
         (cause,) = camera_of(poses, Occlusion(**box)).causes()
         assert values(cause) == pytest.approx(box, abs=0.1)
 
+    def test_a_box_in_front_of_a_wide_frame(self, poses, only_cameras):
+        only_cameras(Occlusion, Blur)
+        seen = WiderThan(poses[0])
+        box = {"left": 140.0, "top": 10.0, "right": 165.0, "bottom": 50.0, "grey": 0.2}
+        (cause,) = camera_of((seen, PoseFinder(seen, 1.5), seen.wide(poses[2])), Occlusion(**box)).causes()
+        assert values(cause) == pytest.approx(box, abs=0.1)
+        assert all(low <= one.value <= high for one in cause.parameters.values() for low, high in [one.ci90])
+
     def test_a_camera_moved_along_a_featureless_track_is_a_cart_elsewhere(self, poses):
         (cause,) = camera_of(poses, CameraShift(dx=4.0, dy=-3.0)).causes()
         assert cause.parameters["dy"].value == pytest.approx(-3.0, abs=0.05)
         assert cause.parameters["dx"].ci90 == (-20.0, 20.0)
+
+    def test_a_camera_moved_along_a_wall_with_posts_is_found_beside_another_fault(self, poses, only_cameras):
+        only_cameras(CameraShift, Brightness, Blur)
+        renderer, frames = copy.deepcopy(poses[0]), poses[2].clone()
+        for post in ((slice(88, 98), slice(20, 32)), (slice(4, 14), slice(95, 110))):
+            renderer.background[post] = -2.0
+            frames[:, *post] = 0.12
+        scene = renderer, PoseFinder(renderer, 1.5), frames
+        found = camera_of(scene, CameraShift(dx=4.0, dy=0.0), Brightness(gain=0.5, offset=0.0))
+        assert {cause.effect: values(cause) for cause in found.causes()} == {
+            "camera_shift": {"dx": pytest.approx(4.0, abs=0.05), "dy": pytest.approx(0.0, abs=0.05)},
+            "brightness": {"gain": pytest.approx(0.5, abs=5e-3), "offset": pytest.approx(0.0, abs=5e-3)},
+        }
 
     def test_it_is_a_cause_beside_that_of_the_motion(self, tmp_path, only_effects, only_cameras):
         only_effects("viscous_friction", "coulomb_friction", "actuator_gain")
@@ -169,6 +261,26 @@ class TestCamera:
         assert [effect.name for effect in found.effects()] == ["blur", "viscous_friction"]
         jsonschema.Draft202012Validator(SCHEMA).validate(found.to_json())
 
+    def test_an_effect_without_which_hardly_any_misfit_opens_again_is_slight(self, poses, only_cameras):
+        only_cameras(Brightness, Blur, Gamma)
+        causes = camera_of(poses, Brightness(gain=0.4, offset=0.1), Blur(sigma=0.6)).causes()
+        assert {cause.effect: cause.slight for cause in causes} == {"brightness": False, "blur": True}
+        assert all(cause.slight == (cause.gap_reopened < 0.01) for cause in causes)
+
+    def test_a_strength_at_the_end_of_its_range_may_lie_beyond_it(self, tmp_path, only_effects, only_cameras):
+        only_effects("actuator_gain")
+        only_cameras(Brightness, Gamma, Blur)
+
+        def dark(frames):
+            return through(frames.float(), [Brightness(gain=0.25, offset=0.1)]).detach()
+
+        found = diagnosed(film(tmp_path / "run.h5", seen=dark, episodes=1, rows=30))
+        gain = found.causes[0].parameters["gain"]
+        assert gain.value == pytest.approx(0.3)
+        assert np.isnan(gain.ci90[0])
+        assert gain.ci90[1] > 0.3
+        assert any(line.startswith("brightness: gain is at 0.3, the end of the range") for line in found.warnings)
+
     def test_lost_frames(self, tmp_path, only_effects, only_cameras):
         only_effects(*MOTION)
         only_cameras(Brightness, CameraRotation)
@@ -176,6 +288,34 @@ class TestCamera:
         (cause,) = diagnosed(path).causes
         assert cause.effect == "frame_drop"
         assert values(cause)["rate"] == pytest.approx(0.2, abs=0.03)
+
+    def test_lost_frames_beside_a_darker_picture_where_motion_shows_no_gap(self, tmp_path, only_effects, only_cameras):
+        only_effects("constant_force")
+        only_cameras(Brightness, Gamma, Blur)
+
+        def dark(frames):
+            return through(frames.float(), [Brightness(gain=0.7, offset=0.1)]).detach()
+
+        nearly_at_rest = {"start": Start(0.02, 0.0, 0.01, 0.0), "exploration": 0.0}
+        path = film(tmp_path / "run.h5", seen=dark, episodes=1, rows=30, **nearly_at_rest)
+        found = diagnosed(rewritten(path, frame=repeat_every_fifth))
+        assert [cause.effect for cause in found.causes] == ["brightness", "frame_drop"]
+        assert "grey levels" in found.gap.measure
+        assert found.gap.closed == pytest.approx(1, abs=0.01)
+
+    def test_no_region_of_a_gap_that_motion_does_not_show(self, tmp_path, only_cameras):
+        only_cameras(Brightness, Gamma, Blur)
+
+        def dark(frames):
+            return through(frames.float(), [Brightness(gain=0.7, offset=0.1)]).detach()
+
+        seen = watched(film(tmp_path / "run.h5", seen=dark, episodes=1, rows=20))
+        where = Where({"camera": 0.0}, {}, (Region("x", 0.01, 0.05, 0.6, 0.015),))
+        gap = Gap("error", 0.5, 0.5, 0.5, 0.5, np.nan)
+        motion = va.Diagnosis("cartpole", RecordingSummary(1, 19, 0.05), "no_gap", where, (), (), gap, "")
+        found = with_camera(motion, seen, va.CartPole())
+        assert [cause.effect for cause in found.causes] == ["brightness"]
+        assert found.where.regions == ()
 
 
 class TestPixels:

@@ -4,8 +4,10 @@ from visadapt.diagnosis.next_experiment import explain, separate
 from visadapt.diagnosis.search.unexplained import SmoothFunction
 from visadapt.effects import (
     ActuatorBias,
+    Brightness,
     ConstantForce,
     CoulombFriction,
+    Gamma,
     PeriodicForce,
     QuadraticDrag,
     Spring,
@@ -33,6 +35,10 @@ def test_every_member_of_a_class_is_told_apart():
     advice = separate([[ActuatorBias, ConstantForce, PeriodicForce]], CartPole())
     assert "an actuator bias is gone" in advice
     assert "a periodic force comes and goes" in advice
+
+
+def test_gamma_and_brightness_are_told_apart_by_known_grey_levels():
+    assert "a card with several known grey levels" in separate([[Brightness, Gamma]], CartPole())
 
 
 def test_an_experiment_for_a_cart_is_not_advised_on_a_vehicle_which_needs_none():

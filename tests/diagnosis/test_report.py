@@ -35,7 +35,7 @@ from visadapt.diagnosis.result import (
     Region,
     Where,
 )
-from visadapt.diagnosis.words import estimate, interval, number
+from visadapt.diagnosis.words import MISFIT, estimate, interval, number
 
 DATA_URL = re.compile(r"data:image/png;base64,([\w+/=]+)")
 STATES = ("x", "x_dot", "theta", "theta_dot")
@@ -104,6 +104,8 @@ MASS = Cause(
     0.9,
     indistinguishable_from=("actuator_gain",),
 )
+MASS_ALONE = replace(MASS, indistinguishable_from=())
+DARKER = Cause("brightness", {"gain": Estimate(0.7, "1", (math.nan, 0.71))}, 1.0, 0.999, 0.999)
 REGION = Region("x", 0.1, 0.4, 0.8, 0.0004)
 
 
@@ -263,6 +265,26 @@ class TestWords:
         dropout = Cause("dropout", {"rate": Estimate(0.013, "1", (0.005, 0.03))}, 1.0, math.nan)
         text = sentence(a_diagnosis("identified", causes=(dropout,), gap=gap))
         assert text == "Dropout (rate 0.013) explains the readings that are repeated."
+
+    def test_a_camera_s_causes_explain_pixels_and_the_others_the_gap_of_the_motion(self):
+        where = replace(a_diagnosis("identified").where, pixels=Pixels(0.17, 0.3, False))
+        found = a_diagnosis("identified", causes=(DARKER, MASS_ALONE), where=where)
+        assert sentence(found) == (
+            "Brightness (gain 0.700) explains the pixels to within 0.17 grey levels; cart mass (scale 1.27) closes "
+            "96 % of the gap to the simulator."
+        )
+        assert "closes 100 % of the pixels' misfit alone" in as_text(found)
+        assert "gap closed in the motion" in as_text(found)
+
+    def test_lost_frames_beside_a_camera_s_fault_explain_readings_where_the_gap_is_the_pixels(self):
+        drop = Cause("frame_drop", {"rate": Estimate(0.2, "1", (0.156, 0.253))}, 1.0, math.nan)
+        where = replace(a_diagnosis("identified").where, pixels=Pixels(0.17, 0.3, False))
+        gap = Gap(MISFIT, 47.0, 0.3, 0.1, 0.3, 0.995)
+        text = sentence(a_diagnosis("identified", causes=(DARKER, drop), where=where, gap=gap))
+        assert text == (
+            "Brightness (gain 0.700) closes 100 % of the gap to the simulator; frame drop (rate 0.200) explains the "
+            "readings that are repeated."
+        )
 
     def test_one_cause_is_sure_and_two_are_open(self):
         text = sentence(a_diagnosis("ambiguous", causes=(PATCH, GAIN, MASS)))

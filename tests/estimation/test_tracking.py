@@ -6,6 +6,7 @@ import torch
 
 from renderers import Camera, DrawnCartPole
 from renderers.drawn import AXLE_GREY, CART_GREY, POLE_GREY, SKY_GREY, TRACK_GREY
+from tests.scenes import small_renderer
 from visadapt.effects import EFFECTS, CameraDelay, CameraRotation, ConstantForce
 from visadapt.estimation.poses import PoseFinder
 from visadapt.learning.tracking import Tracker, TrackingError, TrackingWarning
@@ -96,6 +97,12 @@ class TestPoses:
         error = poses.place.numpy() - np.stack([x, theta], 1)
         assert (rms(error) < [1e-3, 3e-3]).all()
         assert (np.abs(error).max(0) < [3e-3, 1e-2]).all()
+
+    def test_found_as_far_as_a_renderer_shows_the_cart(self):
+        renderer = small_renderer(width=80)  # 8 px a metre
+        places = torch.tensor([[-4.6, 0.1], [-2.1, -0.1], [3.3, 0.0], [4.6, 0.1]])
+        frames = (255 * renderer(*places.T)).round().to(torch.uint8)
+        assert Tracker(renderer, WORLD).poses(frames).place.numpy() == pytest.approx(places.numpy(), abs=0.02)
 
     def test_the_renderers_own_frames_are_explained_to_rounding(self, tracker):
         place = torch.tensor([[0.313, -0.121], [-0.878, 0.333]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,12 @@ from visadapt.cli.inputs import InputError, asked_for, progress, unfinished
 from visadapt.cli.target import load_target
 from visadapt.estimation.frame_residuals import size_of, structure
 from visadapt.progress import staged
+from visadapt.recordings import Episode
+from visadapt.recordings.checks import LEAST_ROWS, check_units
+from visadapt.recordings.clock import RawEpisode
 from visadapt.recordings.hdf5 import read_names, read_recording
+from visadapt.recordings.physics import are_degrees
+from visadapt.recordings.sensors import TURN
 from visadapt.storage.atomic_files import replacing
 from visadapt.storage.checkpoints import load_tree, save_tree
 from visadapt.systems import CartPole
@@ -26,6 +32,9 @@ from visadapt.world import World
 
 SHOWN, WITHIN = 4000, (1.0, 0.35)
 """States that an environment is put into, and the largest |x| in m and |theta| in rad of these."""
+
+FAINT = 20 / 255
+"""Difference from the background up to which a pixel shows neither cart nor pole."""
 
 HELD_OUT = 10
 """Every tenth frame is left out of the training and compared with what the renderer makes of its state."""
@@ -43,6 +52,11 @@ def run(options: argparse.Namespace) -> None:
     if options.iterations < 3:
         raise InputError(f"--iterations {options.iterations}: at least 3 are right")
     (height, width), (column, row) = frames.shape[1:], options.hinge
+    if not (-width <= column <= 2 * width and -height <= row <= 2 * height):
+        raise InputError(
+            f"--hinge {column:g},{row:g}: more than a frame's size outside the frames, which are {width} px wide and "
+            f"{height} px high; the column and row at which the hinge is seen at x = 0 are right"
+        )
     torch.manual_seed(options.seed)
     renderer = LayeredRenderer(height, width, column, row, options.scale, options.pole)
     held = torch.arange(len(frames)) % HELD_OUT == 0
@@ -66,11 +80,14 @@ def run(options: argparse.Namespace) -> None:
         residual = frames[held] / 255 - drawn
         with replacing(out) as temporary:
             save_renderer(temporary, renderer, {**settings, "error": size_of(structure(residual))})
-    error = 255 * residual.abs().mean()
+    # Almost all of a frame is background, which says nothing of a pole that is missing.
+    background = renderer.background.detach().sigmoid()
+    moves = torch.maximum((frames[held] / 255 - background).abs(), (drawn - background).abs()) > FAINT
+    error = 255 * residual[moves].abs().mean()
     column, row = renderer.origin.tolist()
     print(
-        f"{out}: {error:.2f} grey levels of 255 off, on average, in {len(drawn)} frames left out of the training; "
-        f"hinge at {column:.1f},{row:.1f} px, {renderer.gain[0]:.1f} px a metre"
+        f"{out}: {error:.2f} grey levels of 255 off where cart and pole are, on average, in {len(drawn)} frames left "
+        f"out of the training; hinge at {column:.1f},{row:.1f} px, {renderer.gain[0]:.1f} px a metre"
     )
 
 
@@ -93,7 +110,9 @@ def _read(paths: list[str]) -> tuple[Tensor, Tensor, Tensor]:
         for name in ("x", "theta"):
             if name not in names:
                 raise InputError(f"{path}: has no state {name!r}; it has {', '.join(names)}")
-        for number, episode in enumerate(read_recording(path)):
+        pose = [names.index("x"), names.index("theta")]
+        episodes = read_recording(path)
+        for number, episode in enumerate(episodes):
             where = f"{path}, episode {number}"
             if episode.state is None or episode.frame is None:
                 alone = "frames" if episode.state is None else "states"
@@ -101,7 +120,32 @@ def _read(paths: list[str]) -> tuple[Tensor, Tensor, Tensor]:
             size, wanted = (each.shape[1:] for each in (episode.frame, frames[0] if frames else episode.frame))
             if size != wanted:
                 raise InputError(f"{where}: frames of {size} rows and columns; those before have {wanted}")
-            states.append(episode.state[:, [names.index("x"), names.index("theta")]])
+            states.append(episode.state[:, pose])
             frames.append(episode.frame)
+        _check_angles(path, episodes, states[-len(episodes) :])
     x, theta = torch.from_numpy(np.concatenate(states)).float().unbind(1)
     return x, theta, torch.from_numpy(np.concatenate(frames))
+
+
+def _check_angles(path: str, episodes: Sequence[Episode], poses: Sequence[NDArray[np.floating]]) -> None:
+    """Raises an error where the angles of a file's poses (T, 2) are evidently in degrees.
+
+    Poses may have been set by hand, in any order. So how fast they change is judged only where an angle is larger than
+    a turn: only a pole that turns on has such an angle, in radians.
+    """
+    judged = []
+    for number, (episode, pose) in enumerate(zip(episodes, poses, strict=True)):
+        if len(pose) >= LEAST_ROWS and episode.action.shape[1] == 1:
+            time, action, state = (each.astype(float) for each in (episode.time, episode.action, pose))
+            place = lambda row: f"row {row + 1}"  # noqa: E731
+            judged.append(RawEpisode(Path(path), time, action, state, ("x", "theta"), place, number=number))
+    if not judged:
+        return
+    theta = np.concatenate([pose[:, 1] for pose in poses])
+    if np.abs(theta).max() > TURN:
+        check_units(judged, CartPole())
+    elif are_degrees(judged, CartPole()):
+        raise InputError(
+            f"{path}: theta goes from {theta.min():.3g} to {theta.max():.3g} and answers the command as if in degrees; "
+            "radians are right"
+        )

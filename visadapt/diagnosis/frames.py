@@ -5,6 +5,7 @@ Velocities are never differentiated: they are unknowns of the fits, as of any re
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,11 +17,22 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from visadapt.diagnosis import next_experiment
-from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Diagnosis, Gap, Pixels
+from visadapt.diagnosis.result import (
+    AMBIGUOUS,
+    IDENTIFIED,
+    NO_GAP,
+    UNEXPLAINED,
+    Cause,
+    Diagnosis,
+    Gap,
+    Pixels,
+    first_explanation,
+    without_slight,
+)
 from visadapt.diagnosis.search.camera import CameraFindings, find_camera
 from visadapt.diagnosis.search.pixels import judged, left_over, usual
-from visadapt.diagnosis.verdict import CLOSES_BUT
-from visadapt.diagnosis.words import estimate
+from visadapt.diagnosis.verdict import CLOSES_BUT, at_bound
+from visadapt.diagnosis.words import MISFIT, estimate
 from visadapt.effects import (
     EFFECTS,
     AngleDelay,
@@ -33,7 +45,7 @@ from visadapt.effects import (
     Stage,
 )
 from visadapt.estimation.camera_fit import SeenBy, within_frame
-from visadapt.estimation.poses import HIDDEN, PoseFinder, Poses
+from visadapt.estimation.poses import HIDDEN, PoseFinder, Poses, reach_of
 from visadapt.estimation.profiles import profile_of
 from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, Recording
@@ -45,8 +57,6 @@ RESOLUTION = (0.002, 0.005)
 """m and rad, the smallest meaningful differences of poses (0.08 px, and 0.2 px at the pole's tip). The errors of a
 renderer are alike in neighbouring frames, so the scatter of poses underestimates them. Poses by the shipped renderer
 are off by 0.14 mm and 0.23 mrad (root mean square), with scales off by up to 0.1 %."""
-
-MISFIT = "root mean square of frames less those drawn by the renderer, in grey levels of 255"
 
 UNSEEN = (Dropout, FrozenZone, MeasurementDelay, PositionDelay, AngleDelay)
 """Faults of separate sensors, which a camera cannot have: one frame shows cart and pole at the same instant."""
@@ -88,7 +98,9 @@ def watch(recording: Recording, system: System, renderer: nn.Module, report: Rep
     Raises:
         FramesError: frames of another size or scene than the renderer's, or that never change.
     """
-    reach = system.states[system.index("x")].largest
+    # Frames and poses are in single precision on the CPU, whatever the renderer was trained in.
+    renderer = copy.deepcopy(renderer).to("cpu", torch.float32)
+    reach = reach_of(renderer, system)
     finder = PoseFinder(renderer, reach)
     check_frames(recording, finder.size)
     every = torch.cat([torch.from_numpy(np.ascontiguousarray(episode.frame)) for episode in recording.episodes])
@@ -114,29 +126,36 @@ def with_camera(motion: Diagnosis, film: Film, system: System) -> Diagnosis:
     causes = camera.causes()
     if motion.gap.before < MIN_MOTION_ERROR:
         motion = _without_gap(motion, bool(causes), system)
-    motion = replace(motion, where=replace(motion.where, pixels=film.pixels))
+    motion = replace(
+        motion,
+        where=replace(motion.where, pixels=film.pixels),
+        warnings=(*motion.warnings, *_at_bounds(causes)),
+    )
+    best = first_explanation(causes)
     if film.pixels.unexplained:
-        return _unexplained_in_pixels(motion, causes)
-    names = tuple(cause.effect for cause in causes)
+        return _unexplained_in_pixels(motion, best)
+    names = tuple(cause.effect for cause in best)
     along = next_experiment.ALONG if camera.fixed and {CameraShift.name}.issuperset(names) else ""
     if not names:
         open_too = along if motion.verdict == NO_GAP else ""
         return replace(motion, next_experiment=" ".join(text for text in (motion.next_experiment, open_too) if text))
     if motion.verdict == UNEXPLAINED:
-        return replace(motion, warnings=(*motion.warnings, f"found in the pixels, and corrected: {_values(causes)}"))
-    doubtful = [[EFFECTS[name] for name in (one.effect, *one.indistinguishable_from)] for one in causes]
+        return replace(motion, warnings=(*motion.warnings, f"found in the pixels, and corrected: {_values(best)}"))
+    doubtful = [[EFFECTS[name] for name in (one.effect, *one.indistinguishable_from)] for one in without_slight(best)]
     settled = next_experiment.separate(doubtful, system)
-    gap, following = motion.gap, motion.next_experiment
-    if motion.verdict == NO_GAP:
+    gap, following, where = motion.gap, motion.next_experiment, motion.where
+    if motion.verdict == NO_GAP or math.isnan(gap.closed):  # frames may have been lost nevertheless
         before, after = 255 * camera.unchanged.misfit, 255 * camera.best.misfit
         floor = min(255 * camera.noise, after)
         gap, following = Gap(MISFIT, before, after, floor, after, (before - after) / (before - floor)), ""
+        where = replace(where, regions=())  # of a gap that is none
     return replace(
         motion,
         verdict=AMBIGUOUS if settled or motion.verdict == AMBIGUOUS else IDENTIFIED,
         causes=(*causes, *motion.causes),
         ranking=tuple(replace(one, effects=(*names, *one.effects)) for one in motion.ranking),
         gap=gap,
+        where=where,
         next_experiment=" ".join(text for text in (settled, along, following) if text),
     )
 
@@ -156,7 +175,7 @@ def _without_gap(motion: Diagnosis, seen_by_a_faulty_camera: bool, system: Syste
             for warning in motion.warnings
             if warning.partition(":")[0] not in (CLOSES_BUT, *(cause.effect for cause in motion.causes))
         ),
-        where=replace(motion.where, stages=stages | ({Stage.CAMERA.value: 1.0} if drops else {})),
+        where=replace(motion.where, stages=stages | ({Stage.CAMERA.value: 1.0} if drops else {}), regions=()),
         next_experiment="" if drops else next_experiment.more(profile_of(system)),
     )
 
@@ -175,6 +194,16 @@ def _unexplained_in_pixels(motion: Diagnosis, camera: Sequence[Cause]) -> Diagno
         next_experiment=next_experiment.LOOK,
         warnings=(*motion.warnings, *found),
     )
+
+
+def _at_bounds(camera: Sequence[Cause]) -> list[str]:
+    """A warning for each strength of a camera's effects that is at an end of the range searched."""
+    return [
+        at_bound(cause.effect, name, one.value, one.unit)
+        for cause in camera
+        for name, one in cause.parameters.items()
+        if any(math.isnan(side) for side in one.ci90)
+    ]
 
 
 def _values(causes: Sequence[Cause]) -> str:
@@ -252,7 +281,8 @@ def _seen(episode: Episode, poses: Poses) -> _Seen:
     original = np.flatnonzero(new)[np.cumsum(new) - 1]  # the row that each row is a copy of
     # A late camera repeats its first frame, until it has seen another one: no frame was lost.
     usual = np.ones(len(new), dtype=bool)
-    usual[1 : 1 + int(new[1:].argmax())] = False
+    if len(new) > 1:
+        usual[1 : 1 + int(new[1:].argmax())] = False
     deviation = poses.covariance.diagonal(dim1=1, dim2=2).sqrt().nan_to_num(torch.inf).numpy()
     place, explained = poses.place.nan_to_num().numpy(), poses.explained.numpy()
     return _Seen(place[original], explained[original], deviation[original], usual)

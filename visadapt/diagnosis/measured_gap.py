@@ -75,8 +75,9 @@ def measure(
     rms += heldout.held_out(search.system, rows, _fitted(sets), lambda errors: errors.rms(noise), jobs)
     done(2)
     source = with_repeats or source
-    source_rms, held_out = source.rms(noise), rows.shape[0] > 1
-    errors = PredictionErrors(source_rms, reached, corrected.floor(noise), reached, noise, rows.period, held_out)
+    source_rms, held_out, several = source.rms(noise), rows.shape[0] > 1, len(rows.episode.unique()) > 1
+    floor = corrected.floor(noise)
+    errors = PredictionErrors(source_rms, reached, floor, reached, noise, rows.period, held_out, several)
     improvable = False
     if held_out and errors.gap().closed < MIN_GAP_CLOSED:  # else a black box cannot close enough of what is left
         black_box = heldout.beside_black_box(search.system, rows, best.effects, best.fits, jobs)

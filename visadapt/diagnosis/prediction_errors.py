@@ -24,6 +24,7 @@ class PredictionErrors:
     deviation: Tensor  # (m,) standard deviations of the measurement noise, in the states' units
     period: float  # s between rows
     held_out: bool  # whether the rows that are predicted were not fitted; False where they are too few to hold some out
+    several: bool  # whether whole episodes were held out; of a single episode, stretches of it are
 
     def closed_by(self, rms: Tensor) -> float:
         """Share of the gap that the set with these errors (H, m) closes."""
@@ -32,9 +33,10 @@ class PredictionErrors:
     def gap(self) -> Gap:
         """The errors at the longest horizon, over all channels."""
         before, after, floor, box = (_last(e) for e in (self.before, self.after, self.floor, self.black_box))
+        held_out = f"held-out {'episodes' if self.several else 'stretches'}"
         measure = (
             f"root mean square error of predictions {len(self.before) * self.period:.2g} s ahead on "
-            f"{'held-out episodes' if self.held_out else 'the rows that were fitted'}, in standard deviations of the "
+            f"{held_out if self.held_out else 'the rows that were fitted'}, in standard deviations of the "
             "measurement noise"
         )
         return Gap(measure, before, after, floor, box, heldout.closed(before, after, floor))

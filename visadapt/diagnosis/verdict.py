@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from visadapt.diagnosis import next_experiment
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Gap, without_slight
-from visadapt.diagnosis.search.causes import Alternative
+from visadapt.diagnosis.search.causes import Alternative, is_at_end
 from visadapt.diagnosis.search.heldout import MIN_GAP
 from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
@@ -23,8 +23,6 @@ predictions with them are not within the noise."""
 CLEAR_OF_NOISE = 3.0
 """Error of predictions over the noise above which there is a gap. Where the error with the causes is above it, the
 share of the gap that they close decides the verdict."""
-
-AT_BOUND = 1e-3  # Distance from an end of its range, as a share of it, within which a strength is at that end
 
 CLOSES_BUT = "the causes close the gap but do not explain everything"
 """What the warning of `left_unexplained` begins with."""
@@ -97,13 +95,19 @@ def at_bounds(comparison: ModelComparison) -> list[str]:
     """A warning for each strength that the best set has at an end of the range searched."""
     table = [(effect, parameter) for effect in comparison.best.effects for parameter in effect.table]
     return [
-        f"{effect.name}: {parameter.name} is at {with_unit(f'{end:g}', parameter.unit)}, the end of the range searched"
-        "; the truth may lie beyond it, and the other causes are then wrong as well"
+        at_bound(effect.name, parameter.name, end, parameter.unit)
         for (effect, parameter), value in zip(table, comparison.best.fits.theta[0].tolist(), strict=True)
         for end in (parameter.low, parameter.high)
-        if parameter.is_strength and end != parameter.neutral
-        if abs(value - end) < AT_BOUND * (parameter.high - parameter.low)
+        if is_at_end(parameter, value, end)
     ]
+
+
+def at_bound(effect: str, parameter: str, end: float, unit: str) -> str:
+    """The warning that a strength of a cause is at an end of the range searched."""
+    return (
+        f"{effect}: {parameter} is at {with_unit(f'{end:g}', unit)}, the end of the range searched; the truth may lie "
+        "beyond it, and the other causes are then wrong as well"
+    )
 
 
 def left_unexplained(comparison: ModelComparison, verdict: str, unexplained: bool) -> list[str]:

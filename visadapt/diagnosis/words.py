@@ -12,6 +12,9 @@ UNKNOWN = "unknown"
 OPPOSITE = " has the opposite sign of the source's"
 """What a diagnosis warns of, after the quantity's name, where it inverted a sign of the recording."""
 
+MISFIT = "root mean square of frames less those drawn by the renderer, in grey levels of 255"
+"""`Gap.measure` of a film whose motion shows no gap."""
+
 
 def number(value: float, digits: int = 3) -> str:
     """A number with this many significant digits; with an exponent below 1e-4 and from 1e6 on."""

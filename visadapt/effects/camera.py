@@ -6,7 +6,8 @@ al. 2020, WACV, 3674), with the extra `camera`: both are exact where nothing is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib import import_module
 from typing import Any, ClassVar
 
@@ -52,6 +53,11 @@ class CameraEffect(Effect):
     stage = Stage.CAMERA
     in_one_frame: ClassVar[bool] = True
     """whether a single frame shows it, so that a diagnosis looks for it in pixels; False: only motion does"""
+
+    @classmethod
+    def table_in(cls, height: int, width: int) -> tuple[Parameter, ...]:
+        """The table, with the ranges searched in frames of this size in px."""
+        return cls.table
 
     def memory(self, state: Tensor, period: float) -> Tensor:
         """The effect's memory (B, any, any) before the first frame of an episode that begins in `state`."""
@@ -180,6 +186,11 @@ class Occlusion(CameraEffect):
         Parameter("grey", "1", 0.0, 1.0, None),
     )
 
+    @classmethod
+    def table_in(cls, height: int, width: int) -> tuple[Parameter, ...]:
+        sides = {"left": width, "right": width, "top": height, "bottom": height}
+        return tuple(replace(p, high=float(sides[p.name])) if p.name in sides else p for p in cls.table)
+
     def apply_to(self, frame: Tensor, memory: Tensor, generator: torch.Generator | None) -> Reading:
         def covered(size: int, first: str, last: str) -> Tensor:
             """(B or 1, size) share of each pixel, which reaches half a px to either side of its whole number."""
@@ -218,6 +229,12 @@ class Gamma(CameraEffect):
     equation = "grey seen = grey^exponent"
     source = "Farid (2001), Blind inverse gamma correction, IEEE Transactions on Image Processing 10(10)"
     table = (Parameter("exponent", "1", 0.3, 3.0, 1.0),)
+    settled_by: ClassVar[Mapping[str, str]] = {
+        "brightness": (
+            "film a card with several known grey levels: brightness changes them along a straight line, gamma along a "
+            "curve"
+        )
+    }
 
     def apply_to(self, frame: Tensor, memory: Tensor, generator: torch.Generator | None) -> Reading:
         seen = frame > FAINTEST

@@ -126,7 +126,7 @@ class _Comparison:
         self.renderer = renderer
         self.frames = frames
         self.camera = camera
-        table = [parameter for kind in camera for parameter in kind.table]
+        table = [parameter for kind in camera for parameter in kind.table_in(*frames.shape[1:])]
         self.low, self.high = (
             torch.tensor([getattr(p, end) for p in table], dtype=torch.float64) for end in ("low", "high")
         )

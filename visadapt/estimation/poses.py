@@ -16,9 +16,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from visadapt.systems import System
+
 LEAN = 0.5  # rad, largest |theta| of the grid searched
 
 SPACING = 0.05  # m and rad between the poses of the grid: about 2 px for a camera that sees 3 m in 120 px
+
+LONGEST_REACH = 10.0  # m, largest |x| that is looked at, whatever a renderer says that it shows
 
 DIFFERENCE = 0.0125
 """m and rad, half-width of the central differences: half a pixel, so that the kinks of interpolated pictures, which
@@ -46,6 +50,12 @@ class Poses:
     explained: Tensor  # (T,) whether the frame shows cart and pole where they are drawn
 
 
+def reach_of(renderer: nn.Module, system: System) -> float:
+    """m, largest |x| at which a cart is looked for: that of the system's range or, where it is farther, that at which
+    the renderer says that it still shows the hinge (`farthest`)."""
+    return max(system.states[system.index("x")].largest, min(LONGEST_REACH, getattr(renderer, "farthest", 0.0)))
+
+
 class PoseFinder:
     """Finds poses by a renderer (nn.Module of x (B,) and theta (B,) to frames (B, H, W) in [0, 1]).
 
@@ -57,7 +67,7 @@ class PoseFinder:
 
     def __init__(self, renderer: nn.Module, reach: float) -> None:
         self.renderer = renderer
-        self._like = next(renderer.parameters()).detach()
+        self._like = next(renderer.parameters(), torch.zeros(())).detach()
         axes = [
             torch.linspace(-limit, limit, 2 * max(1, round(limit / SPACING)) + 1, dtype=self._like.dtype)
             for limit in (reach, LEAN)

@@ -30,7 +30,7 @@ from visadapt.estimation.camera_fit import SeenBy, within_frame
 from visadapt.estimation.kalman import Linear, backward
 from visadapt.estimation.linearise import linearise_step, load_effect
 from visadapt.estimation.noise import Noise, UnknownNoise, most_probable_noise
-from visadapt.estimation.poses import HIDDEN, PoseFinder, Poses
+from visadapt.estimation.poses import HIDDEN, PoseFinder, Poses, reach_of
 from visadapt.recordings import Episode
 from visadapt.world import World
 
@@ -58,7 +58,8 @@ class Tracker:
 
     Args:
         renderer: learnt, of x (B,) in m and theta (B,) in rad to frames (B, H, W) in [0, 1].
-        world: the source physics, without effects; the cart is looked for within the range of its system's table.
+        world: the source physics, without effects; the cart is looked for within the range of its system's table, or
+            as far as the renderer shows it.
         camera: known faults of the camera, through which the renderer's pictures are seen.
 
     Raises:
@@ -72,13 +73,12 @@ class Tracker:
         self.world = world
         self._seen = [system.index("x"), system.index("theta")]
         self._rates = [system.index("x_dot"), system.index("theta_dot")]
-        across = system.states[self._seen[0]]
         load = load_effect(type(system))
         nothing = load(**{parameter.name: 0.0 for parameter in load.table})
         self._pushed = world.with_effects((nothing,))
         self._late = [effect.name for effect in camera if not effect.in_one_frame]
         camera = [effect for effect in camera if effect.in_one_frame]
-        self.poses = PoseFinder(SeenBy(renderer, camera) if camera else renderer, across.largest)
+        self.poses = PoseFinder(SeenBy(renderer, camera) if camera else renderer, reach_of(renderer, system))
         self._known = within_frame(camera, torch.zeros(self.poses.size)).to(torch.uint8)
         """(H, W) 1 where the renderer draws what is seen, else 0"""
 

@@ -11,7 +11,6 @@ import jinja2
 from visadapt.diagnosis.explanations import explanations
 from visadapt.diagnosis.result import (
     AMBIGUOUS,
-    IDENTIFIED,
     NO_GAP,
     Box,
     Cause,
@@ -22,8 +21,11 @@ from visadapt.diagnosis.result import (
     Region,
     without_slight,
 )
-from visadapt.diagnosis.words import estimate, interval, listed, number, percent, plain, with_unit
+from visadapt.diagnosis.words import MISFIT, estimate, interval, listed, number, percent, plain, with_unit
+from visadapt.effects import EFFECTS, CameraEffect
 from visadapt.systems.base import NAMED
+
+REPEATED = "the readings that are repeated"
 
 
 def unit_of(variable: str, system: str) -> str:
@@ -62,14 +64,49 @@ def sentence(diagnosis: Diagnosis) -> str:
             f"No gap: the simulator predicts this recording as well as its noise allows "
             f"(error {number(gap.before)}, noise {number(gap.floor)})."
         )
+    return _explained(diagnosis) if diagnosis.causes else _unexplained(diagnosis)
+
+
+def _explained(diagnosis: Diagnosis) -> str:
+    """The causes and what they close. A camera's are judged by pixels, the others by the motion that was predicted."""
     carrying = without_slight(diagnosis.causes)
-    if diagnosis.verdict == IDENTIFIED:
-        return f"{_capitalised(listed([_described(cause) for cause in carrying]))} {_closes(diagnosis)}."
-    if diagnosis.verdict == AMBIGUOUS:
-        sets = explanations(carrying)
-        whole = listed([_either(group, sets) for group in _alternatives(carrying)])
-        return f"{_capitalised(whole)} {_closes(diagnosis, sets)}; this recording cannot tell which."
-    return _unexplained(diagnosis)
+    sets = explanations(carrying) if diagnosis.verdict == AMBIGUOUS else []
+    camera = [cause for cause in carrying if _in_pixels(cause)]
+    motion = [cause for cause in carrying if not _in_pixels(cause)]
+    pixels = diagnosis.where.pixels
+    if not camera or not motion or pixels is None:
+        parts = [f"{_either_of(carrying, sets)} {_closes(diagnosis, carrying, sets)}"]
+    elif diagnosis.gap.measure == MISFIT:
+        parts = [
+            f"{_either_of(camera, sets)} {_closes(diagnosis, camera)}",
+            f"{_either_of(motion, sets)} {_verb('explain', motion)} {REPEATED}",
+        ]
+    else:
+        left = f"the pixels to within {number(pixels.error, 2)} grey levels"
+        parts = [
+            f"{_either_of(camera, sets)} {_verb('explain', camera)} {left}",
+            f"{_either_of(motion, sets)} {_closes(diagnosis, motion, sets)}",
+        ]
+    undecided = ["this recording cannot tell which"] if diagnosis.verdict == AMBIGUOUS else []
+    return f"{_capitalised('; '.join([*parts, *undecided]))}."
+
+
+def _in_pixels(cause: Cause) -> bool:
+    """Whether it is an effect of the camera that a single frame shows."""
+    effect = EFFECTS.get(cause.effect)
+    return effect is not None and issubclass(effect, CameraEffect) and effect.in_one_frame
+
+
+def _either_of(causes: Sequence[Cause], sets: Sequence[Sequence[Cause]]) -> str:
+    """The causes in words; of several `sets` of them that explain the recording, those that are alternatives."""
+    if not sets:
+        return listed([_described(cause) for cause in causes])
+    return listed([_either(group, sets) for group in _alternatives(causes)])
+
+
+def _verb(verb: str, causes: Sequence[Cause]) -> str:
+    """The verb, of which alternatives are one subject."""
+    return verb if len(_alternatives(causes)) > 1 else f"{verb}s"
 
 
 def _alternatives(causes: Sequence[Cause]) -> list[list[Cause]]:
@@ -131,23 +168,22 @@ def _described(cause: Cause) -> str:
     return f"{plain(cause.effect)} ({values})" if values else plain(cause.effect)
 
 
-def _closes(diagnosis: Diagnosis, sets: Sequence[Sequence[Cause]] = ()) -> str:
-    """What the causes close; of several `sets` of them that explain the recording, from the least to the most."""
-    many = len(_alternatives(without_slight(diagnosis.causes))) > 1
+def _closes(diagnosis: Diagnosis, causes: Sequence[Cause], sets: Sequence[Sequence[Cause]] = ()) -> str:
+    """What causes close; of several `sets` of them that explain the recording, from the least to the most."""
     if math.isnan(diagnosis.gap.closed):  # beside the repeated readings the source predicts as well as the noise allows
-        return f"{'explain' if many else 'explains'} the readings that are repeated"
+        return f"{_verb('explain', causes)} {REPEATED}"
     named = [frozenset(cause.effect for cause in each) for each in sets]
     each = [one.gap_closed for one in diagnosis.ranking if frozenset(one.effects) in named]
     least, most = (end([diagnosis.gap.closed, *filter(math.isfinite, each)]) for end in (min, max))
     share = percent(most) if percent(least) == percent(most) else f"{round(100 * least)} to {percent(most)}"
-    return f"{'close' if many else 'closes'} {share} of the gap to the simulator"
+    return f"{_verb('close', causes)} {share} of the gap to the simulator"
 
 
 def alone(cause: Cause) -> str:
     """What a cause closes by itself, and what opens again without it, where that is known."""
-    said = ""
+    said, of = "", " of the pixels' misfit" if _in_pixels(cause) else ""
     if math.isfinite(cause.gap_closed):
-        said += f", closes {percent(cause.gap_closed)} alone"
+        said += f", closes {percent(cause.gap_closed)}{of} alone"
     if math.isfinite(cause.gap_reopened):
         said += f", without it {percent(cause.gap_reopened)} opens again"
     return said

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from visadapt.diagnosis.result import Cause, Estimate
-from visadapt.diagnosis.search.causes import Z_90
+from visadapt.diagnosis.search.causes import SLIGHT, Z_90, is_at_end
 from visadapt.effects import EFFECTS, Blur, Brightness, CameraEffect, CameraShift, Gamma, Occlusion
 from visadapt.effects.camera import moved
 from visadapt.estimation.camera_fit import Camera, CameraFit, fit_camera, made, through
@@ -38,8 +38,12 @@ COVERED = 10 / 255  # Mean misfit of a pixel above which something may cover it
 COVERED_PIXELS = 6
 
 PROBE, UNSEEN_SHARE = 5.0, 0.5
-"""px by which the camera is moved along the track as a test, and misfit, as a share of that of the frames, below which
-another position of the cart makes up for the move."""
+"""px by which the camera is moved along the track as a test, and misfit, as a share of that of the frames and of the
+change that the move makes, below which another position of the cart makes up for the move."""
+
+
+Fits = dict[type[CameraEffect], CameraFit]
+"""Fits of a camera with or without one effect, by that effect."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +52,9 @@ class CameraFindings:
 
     unchanged: CameraFit  # without effects
     best: CameraFit
-    alone: dict[type[CameraEffect], CameraFit]  # each effect of the best by itself
-    without: dict[type[CameraEffect], CameraFit]  # the best less one
-    alike: dict[type[CameraEffect], tuple[str, ...]]  # effects that explain the frames as well in its place
+    alone: Fits  # each effect by itself
+    without: Fits  # the best less one
+    alike: dict[type[CameraEffect], Fits]  # the best with another effect in its place that explains the frames as well
     fixed: frozenset[str]  # parameters that these frames do not show
 
     @property
@@ -64,21 +68,42 @@ class CameraFindings:
         return 0.5 * self.best.residual[0].numel() * math.log(self.unchanged.mean_square / self.best.mean_square)
 
     def causes(self) -> list[Cause]:
-        """The effects of the best camera as the result states them; shares are those of the pixels' misfit."""
+        """The effects of the best camera, each followed by those that explain the frames as well in its place, as the
+        result states them; shares are those of the pixels' misfit."""
+        if not self.best.camera:
+            return []
         whole = self.unchanged.misfit - self.best.misfit
-        deviations = iter(self.best.covariance.diagonal().sqrt().tolist())
-        out = []
-        for kind, effect in zip(self.best.camera, self.best.effects, strict=True):
-            parameters = {}
-            for p in kind.table:
-                value, reach = getattr(effect, p.name).item(), Z_90 * next(deviations)
-                low, high = max(p.low, value - reach), min(p.high, value + reach)
-                parameters[p.name] = Estimate(value, p.unit, (p.low, p.high) if p.name in self.fixed else (low, high))
-            closed = (self.unchanged.misfit - self.alone[kind].misfit) / whole
-            reopened = (self.without[kind].misfit - self.best.misfit) / whole
-            named = {other.name for other in self.best.camera}
-            alike = tuple(name for name in self.alike[kind] if name not in named)
-            out.append(Cause(kind.name, parameters, 1.0, closed, reopened, indistinguishable_from=alike))
+        closes = {kind: (self.unchanged.misfit - fit.misfit) / whole for kind, fit in self.alone.items()}
+        reopens = {kind: (fit.misfit - self.best.misfit) / whole for kind, fit in self.without.items()}
+        carrying = {kind for kind in self.best.camera if reopens[kind] >= SLIGHT}
+        if not carrying:  # they stand in for each other
+            carrying = {max(self.best.camera, key=lambda kind: closes[kind])}
+        out: dict[str, Cause] = {}
+        for kind in self.best.camera:
+            group = {kind: self.best, **self.alike[kind]}
+            for one, fit in group.items():
+                name, slight = one.name, kind not in carrying
+                alike = tuple(other.name for other in group if other is not one)
+                if known := out.get(name):  # in the place of two effects of the best camera
+                    alike = (*known.indistinguishable_from, *alike)
+                    out[name] = replace(known, slight=known.slight and slight, indistinguishable_from=alike)
+                    continue
+                found = self._estimates(one, fit)
+                out[name] = Cause(name, found, 1 / len(group), closes[one], reopens[kind], slight, alike)
+        return list(out.values())
+
+    def _estimates(self, kind: type[CameraEffect], fit: CameraFit) -> dict[str, Estimate]:
+        """The parameters of one effect of a fit."""
+        first = sum(len(other.table) for other in fit.camera[: fit.camera.index(kind)])
+        table = kind.table_in(*fit.residual.shape[1:])
+        reaches = Z_90 * fit.covariance.diagonal()[first:].sqrt()
+        out = {}
+        for p, value, reach in zip(table, fit.values[first:].tolist(), reaches.tolist(), strict=False):
+            low, high = max(p.low, value - reach), min(p.high, value + reach)
+            if kind is not Occlusion:  # what a box covers beyond the frame does not matter
+                low = math.nan if is_at_end(p, value, p.low) else low
+                high = math.nan if is_at_end(p, value, p.high) else high
+            out[p.name] = Estimate(value, p.unit, (p.low, p.high) if p.name in self.fixed else (low, high))
         return out
 
 
@@ -90,12 +115,8 @@ def find_camera(
     grown, alone, alike = search.grow()
     needed, without = search.drop_idle(grown)
     best, without = search.sharpen(needed, without)
-    alone = {kind: alone.get(kind, search.unchanged) for kind in best.camera}
-    return CameraFindings(search.unchanged, best, alone, without, alike, search.fixed)
-
-
-Fits = dict[type[CameraEffect], CameraFit]
-"""Fits of a camera with or without one effect, by that effect."""
+    alone = {kind: alone.get(kind, search.unchanged) for kind in SEARCHED}
+    return CameraFindings(search.unchanged, best, alone, without, search.exchanged(best, alike), search.fixed)
 
 
 class _CameraSearch:
@@ -122,9 +143,9 @@ class _CameraSearch:
         if _track_is_featureless(finder, self.unchanged):
             self.fixed = frozenset({"dx"})
 
-    def grow(self) -> tuple[CameraFit, Fits, dict[type[CameraEffect], tuple[str, ...]]]:
+    def grow(self) -> tuple[CameraFit, Fits, dict[type[CameraEffect], Fits]]:
         """The camera that grows by the best effect while that lowers the misfit enough; each effect alone; and, for
-        each effect of the camera, those that did as well when it was added."""
+        each effect of the camera, the fits of those that did as well when it was added."""
         best, alike = self.unchanged, {}
         alone: Fits = {}
         while len(best.camera) < MOST_EFFECTS:
@@ -135,11 +156,7 @@ class _CameraSearch:
             if tried[chosen].misfit > (1 - MIN_CLOSED) * best.misfit:
                 break
             best = tried[chosen]
-            alike[chosen] = tuple(
-                kind.name
-                for kind, fit in tried.items()
-                if kind is not chosen and fit.misfit < (1 + EQUAL_FIT) * best.misfit
-            )
+            alike[chosen] = {kind: fit for kind, fit in tried.items() if kind is not chosen and _as_good(fit, best)}
         return best, alone, alike
 
     def drop_idle(self, best: CameraFit) -> tuple[CameraFit, Fits]:
@@ -166,6 +183,22 @@ class _CameraSearch:
             best = self._fit(*_without(best, still), best.place, smooth=True)
             without = self._without_each(best)
         return best, without
+
+    def exchanged(self, best: CameraFit, alike: dict[type[CameraEffect], Fits]) -> dict[type[CameraEffect], Fits]:
+        """For each effect of the camera, the camera with another one in its place that explains the frames as well.
+        `alike` are the fits among which these are looked for, which have the other effect last."""
+        out: dict[type[CameraEffect], Fits] = {}
+        for kind in best.camera:
+            rest, values = _without(best, {kind})
+            out[kind] = {}
+            for other, fit in alike[kind].items():
+                if other in best.camera:
+                    continue
+                start = torch.cat((values, fit.values[-len(other.table) :]))
+                again = self._fit((*rest, other), start, best.place, smooth=True)
+                if _as_good(again, best):
+                    out[kind][other] = again
+        return out
 
     def _with_each(self, best: CameraFit) -> Fits:
         """The camera with one effect more."""
@@ -200,6 +233,10 @@ class _CameraSearch:
 
     def _fit(self, camera: Camera, values: Tensor, place: Tensor, smooth: bool = False) -> CameraFit:
         return fit_camera(self._renderer, self._shown, camera, values, place, self.fixed, smooth)
+
+
+def _as_good(fit: CameraFit, best: CameraFit) -> bool:
+    return fit.misfit < (1 + EQUAL_FIT) * best.misfit
 
 
 def _without(fit: CameraFit, left_out: Collection[type[CameraEffect]]) -> tuple[Camera, Tensor]:
@@ -284,6 +321,8 @@ def _covered(residual: Tensor, shown: Tensor) -> Tensor | None:
 def _track_is_featureless(finder: PoseFinder, unchanged: CameraFit) -> bool:
     """Whether a camera moved along the track shows the same as a cart at another place."""
     drawn = finder.renderer(*unchanged.place.to(unchanged.residual).T)
-    shift = CameraShift(dx=PROBE, dy=0.0)
-    again = finder((255 * through(drawn, [shift])).round().clamp(0, 255).to(torch.uint8))
-    return float(again.misfit.median()) < UNSEEN_SHARE * unchanged.misfit
+    shown = through(drawn, [CameraShift(dx=PROBE, dy=0.0)])
+    again = finder((255 * shown).round().clamp(0, 255).to(torch.uint8))
+    # Another fault of the camera may raise the frames' misfit far above what any feature of the track makes.
+    changed = float((shown - drawn).square().mean((1, 2)).sqrt().median())
+    return float(again.misfit.median()) < UNSEEN_SHARE * min(unchanged.misfit, changed)

@@ -26,6 +26,8 @@ Z_90 = 1.6449  # Half-width of a normal distribution's 90 % interval, in standar
 SLIGHT = 0.01
 """Share of the gap that must open again without a cause for the verdict to rest on it."""
 
+AT_BOUND = 1e-3  # Distance from an end of its range, as a share of it, within which a strength is at that end
+
 NEGLIGIBLE = 0.01  # Probability of a set up to which it does not widen the intervals of the others' parameters
 
 SHOWN = 8  # Episodes at most whose phases are stated
@@ -228,6 +230,12 @@ def _estimate(
         if value > last:
             return Estimate(last, parameter.unit, (last, parameter.high))
     return Estimate(value, parameter.unit, (max(low, parameter.low), min(high, parameter.high)))
+
+
+def is_at_end(parameter: Parameter, value: float, end: float) -> bool:
+    """Whether a strength lies at this end of the range searched, where it does something."""
+    near = abs(value - end) < AT_BOUND * (parameter.high - parameter.low)
+    return parameter.is_strength and end != parameter.neutral and near
 
 
 def ranking(
