@@ -85,29 +85,34 @@ def test_a_larger_mass_and_added_inertia_are_told_apart_by_a_balance(recorded):
     )
 
 
-def test_a_friction_is_found_by_the_sensor_of_another_joint():
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("hinge.viscous_friction", {"coefficient": 1e-4}), ("arm_axis.coulomb_friction", {"torque": 2e-3})],
+)
+def test_a_friction_is_found_by_the_arm_s_sensor_alone(name, values):
     rotary = furuta()()
     named = {effect.name: effect for effect in catalogue(rotary)}
-    machine = World(rotary, [named["hinge.viscous_friction"](coefficient=1e-4)], 0.02, substeps=10)
+    machine = World(rotary, [named[name](**values)], 0.02, substeps=10)
     machine.double().requires_grad_(False)
-    generator, time = np.random.default_rng(0), 0.02 * np.arange(ROWS)
+    generator, time = torch.Generator().manual_seed(0), 0.02 * np.arange(ROWS)
     episodes = []
-    for episode in range(2):
+    for episode in range(4):
         volts = 1.5 * np.sin((4 + episode) * time) + np.sin(11 * time + episode)
         at, arm = machine.start(torch.zeros(1, 4, dtype=torch.float64)), []
         for command in torch.from_numpy(volts)[:, None, None]:
-            arm.append(at.state[0, :1].numpy() + 1e-3 * generator.normal())
+            arm.append((at.state[0] + 1e-3 * torch.randn(4, generator=generator))[:1].numpy())
             at = machine.step(at, command)
         episodes.append(Episode(time, volts[:, None], np.array(arm)))
-    recording = Recording(tuple(episodes), ("arm",), 0.02, ("one", "two"))
+    recording = Recording(tuple(episodes), ("arm",), 0.02, ("one", "two", "three", "four"))
     searched = [
-        named[name]
+        named[f"{joint}.{kind}"]
         for joint in ("arm_axis", "hinge")
-        for name in (f"{joint}.viscous_friction", f"{joint}.coulomb_friction", f"{joint}.added_inertia")
+        for kind in ("viscous_friction", "coulomb_friction", "stribeck_friction")
     ]
     found = diagnose(recording, World(rotary, period=0.02), searched)
-    assert (found.verdict, [cause.effect for cause in found.causes]) == ("identified", ["hinge.viscous_friction"])
-    assert found.causes[0].parameters["coefficient"].value == pytest.approx(1e-4, rel=0.02)
+    assert (found.verdict, [cause.effect for cause in found.causes]) == ("identified", [name])
+    ((parameter, value),) = values.items()
+    assert found.causes[0].parameters[parameter].value == pytest.approx(value, rel=0.02)
 
 
 def test_a_delay_is_no_lag_and_of_one_sensor_it_is_that_of_all():
