@@ -129,7 +129,8 @@ PARTS = {
     "widening": Part(
         Search, "_improve_while_unexplained", _without_widening, lambda left, self, made: left > WIDEN_ABOVE
     ),
-    "late sensors": Part(Search, "try_late_sensors", _nothing),
+    "late sensors": Part(Search, "_fit_late", _nothing, lambda _, self, bases: bool(bases)),
+    "fair comparison": Part(Search, "_compare_fairly", _nothing),
     "phases of episodes": Part(Search, "_phases_of_episodes", _nothing),
     "jumps": Part(DIAGNOSE, "with_jumps", _nothing, lambda out, _: out is not None),
     "coloured noise": Part(
