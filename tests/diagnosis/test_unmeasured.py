@@ -81,7 +81,7 @@ def test_a_larger_mass_and_added_inertia_are_told_apart_by_a_balance(recorded):
     assert found.verdict == "ambiguous"
     assert {cause.effect for cause in found.causes} == {"mass.scale", "forward.added_inertia"}
     assert found.next_experiment.endswith(
-        "apart: no motion tells another mass from inertia that is added: measure mass by itself."
+        "apart: no motion tells another mass from added inertia of forward: measure mass by itself."
     )
 
 
@@ -251,3 +251,64 @@ def test_a_motor_whose_speed_alone_is_measured(damping, verdict, named):
     causes = {cause.effect: cause.parameters for cause in found.causes if not cause.slight}
     assert (found.verdict, set(causes)) == (verdict, named)
     assert causes["resistance.scale"]["scale"].value == pytest.approx(resistance, rel=0.02)
+
+
+@dataclass(frozen=True)
+class Heater(System):
+    """A block that is heated and loses heat to the room, whose temperature above that of the room is measured."""
+
+    capacity: float = 30.0  # J/K
+    loss: float = 0.5  # W/K
+
+    name = "heated_block"
+    states: ClassVar[tuple[Variable, ...]] = (Variable("temperature", "K", 0.0, 80.0),)
+    actions: ClassVar[tuple[Variable, ...]] = (Variable("power", "W", 0.0, 40.0),)
+    loads = (Variable("heat", "W", -10.0, 10.0),)
+    coordinates = ((None, 0),)
+
+    def derivative(self, state, command, load):
+        heat = command[:, 0] + load[:, 0] - self.loss * state[:, 0]
+        return torch.stack((heat / self.capacity,), -1)
+
+
+def heated(loss=0.5, bias=0.0, noise=0.3):
+    """The temperature under 20 W, then 5 W, by its closed form."""
+    time = 0.16 * np.arange(480)
+    power = np.where(time < 40, 20.0, 5.0)
+    rate, change = loss / Heater().capacity, float(time[time >= 40][0])
+    hot, warm = (20 + bias) / loss, (5 + bias) / loss
+    there = hot * -math.expm1(-rate * change)
+    later = warm + (there - warm) * np.exp(-rate * (time - change))
+    temperature = np.where(time < change, hot * -np.expm1(-rate * time), later)
+    read = temperature + noise * np.random.default_rng(0).normal(size=len(time))
+    episode = Episode(time, power[:, None], read[:, None])
+    return Recording((episode,), ("temperature",), 0.16, ("one",))
+
+
+def test_a_gap_that_half_a_second_does_not_show_is_said():
+    searched = [effect for effect in catalogue(Heater()) if effect.name in ("loss.scale", "heat.viscous_friction")]
+    found = diagnose(heated(loss=0.7), World(Heater(), period=0.16), searched)
+    assert found.verdict == "no_gap"
+    assert any("explains whole episodes far better" in warning for warning in found.warnings)
+    assert "What acts more slowly shows in long runs" in found.next_experiment
+    same = diagnose(heated(), World(Heater(), period=0.16), searched)
+    assert (same.verdict, same.warnings) == ("no_gap", found.warnings[:-1])
+
+
+def test_a_cause_at_the_end_of_its_range_is_said_also_of_an_equivalent_one():
+    names = ("power.actuator_bias", "heat.constant_load")
+    searched = [effect for effect in catalogue(Heater()) if effect.name in names]
+    found = diagnose(heated(bias=12.0, noise=0.02), World(Heater(), period=0.16), searched)
+    assert {cause.effect for cause in found.causes} == set(names)
+    assert any(warning.startswith("heat.constant_load: force is at 10 W, the end") for warning in found.warnings)
+
+
+def test_a_damping_is_told_from_friction_by_no_motion():
+    named = {effect.name: effect for effect in catalogue(Heater())}
+    assert named["loss.scale"].settled_by["heat.viscous_friction"].endswith("measure loss by itself")
+    assert "dry friction" in named["heat.viscous_friction"].settled_by["heat.coulomb_friction"]
+
+
+def test_a_system_in_the_place_of_a_world_is_refused():
+    with pytest.raises(TypeError, match=r"Heater is no World; World\(system, period=...\) is right"):
+        diagnose(heated(), Heater())  # type: ignore[arg-type]

@@ -90,6 +90,15 @@ def test_what_is_wrong_is_said_in_a_line(attributes, right):
     assert not any("\n" in line for line in found)
 
 
+def test_a_parameter_that_is_broadcast_over_columns():
+    def derivative(self, state, command, load):
+        torque = (command + load) / self.inertia
+        return torch.cat((state[:, 1:], torque), 1)
+
+    (line,) = complaints(altered(derivative=derivative))
+    assert line.startswith("inertia as a tensor, one value for each row (5,), gives rates (5, 6); (5, 2) are right")
+
+
 def test_a_parameter_that_cannot_be_one_for_each_row():
     def derivative(self, state, command, load):
         return torch.stack((state[:, 1], (command + load)[:, 0] / float(self.inertia)), 1)

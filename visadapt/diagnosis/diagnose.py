@@ -42,7 +42,7 @@ from visadapt.diagnosis.search.preparation import PreparedRecording, limited, pr
 from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.verdict import at_bounds, left_unexplained, next_step, verdict_of
+from visadapt.diagnosis.verdict import at_bounds, is_slow, left_unexplained, next_step, verdict_of
 from visadapt.diagnosis.words import listed, printable
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized, twins
@@ -108,6 +108,8 @@ def diagnose(
     >>> found.verdict, [cause.effect for cause in found.causes]
     ('identified', ['constant_force'])
     """
+    if not isinstance(world, World):
+        raise TypeError(f"diagnose: {type(world).__name__} is no World; World(system, period=...) is right")
     if len(world.effects):
         names = listed([effect.name for effect in world.effects if isinstance(effect, Effect)])
         raise ValueError(f"diagnose: the world has {names}; give the source without effects, World(world.system)")
@@ -251,10 +253,16 @@ def _warnings(
     if not measured.errors.held_out:
         yield f"{source}: {TOO_SHORT}"
     yield from left_unexplained(comparison, verdict, comparison.unexplained(measured.improvable))
-    yield from at_bounds(comparison)
+    yield from at_bounds(comparison, found, explored.effects)
+    bare = comparison.unchanged
+    if is_slow(comparison, verdict):
+        better = listed([effect.name for effect in comparison.best.effects])
+        yield (
+            f"half a second ahead the simulator errs by no more than the noise, but {better} explains whole "
+            f"episodes far better (the unchanged simulator has a probability of {bare:.3f}): it acts slowly"
+        )
     if found:
         yield from phases_of_episodes(comparison.best)
-        bare = sum(one.probability for one in comparison.models if not one.model.effects)
         if bare > MAX_UNCHANGED and not explored.repeats:
             yield f"the unchanged simulator has a probability of {bare:.2f}: that there is a gap at all is not certain"
     carrying = {cause.effect for cause in without_slight(found)}

@@ -37,6 +37,13 @@ ALONG = (
 """For a film of a track without features."""
 
 
+LONGER = (
+    "Half a second ahead nothing departs from the source beyond the noise. What acts more slowly shows in long runs "
+    "under commands that stay the same for longer than the machine takes to settle."
+)
+"""For a gap that half a second does not show."""
+
+
 def separate(classes: Sequence[Collection[type[Effect]]], system: System) -> str:
     """The experiments that separate the members of each class; empty where every class has one member."""
     parts = []

@@ -14,12 +14,16 @@ from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import CoarseSteps
 from visadapt.diagnosis.search.unexplained import smooth_functions
 from visadapt.diagnosis.words import with_unit
+from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel
 
 MIN_GAP_CLOSED = 0.95
 """Share of the gap that the causes must close to be named although something remains unexplained, or although
 predictions with them are not within the noise."""
 
+LEAST_UNCHANGED = 0.01
+"""Probability of the unchanged simulator below which a recording without a gap half a second ahead has one in the long
+run."""
 CLEAR_OF_NOISE = 3.0
 """Error of predictions over the noise above which there is a gap. Where the error with the causes is above it, the
 share of the gap that they close decides the verdict."""
@@ -78,6 +82,8 @@ def next_step(
     coarse: Sequence[CoarseSteps],
 ) -> str:
     """The experiment to make next, in words."""
+    if is_slow(comparison, verdict):
+        return next_experiment.LONGER
     if verdict == NO_GAP:
         return next_experiment.more(search.profile)
     if verdict == UNEXPLAINED and coarse:
@@ -91,12 +97,27 @@ def next_step(
     return next_experiment.separate([[one.effect for one in group] for group in groups], search.system)
 
 
-def at_bounds(comparison: ModelComparison) -> list[str]:
-    """A warning for each strength that the best set has at an end of the range searched."""
-    table = [(effect, parameter) for effect in comparison.best.effects for parameter in effect.table]
+def is_slow(comparison: ModelComparison, verdict: str) -> bool:
+    """Whether there is no gap half a second ahead, and one in the long run."""
+    return verdict == NO_GAP and comparison.unchanged < LEAST_UNCHANGED
+
+
+def at_bounds(comparison: ModelComparison, found: Sequence[Cause], effects: Sequence[type[Effect]]) -> list[str]:
+    """A warning for each strength that the best set, or one of the causes `found`, has at an end of the range
+    searched; `effects` are those that were searched, and their twins."""
+    best = [(effect, parameter) for effect in comparison.best.effects for parameter in effect.table]
+    values = zip(best, comparison.best.fits.theta[0].tolist(), strict=True)
+    by_name, in_best = {effect.name: effect for effect in effects}, {effect.name for effect in comparison.best.effects}
+    others = [
+        ((by_name[cause.effect], parameter), cause.parameters[parameter.name].value)
+        for cause in found
+        if cause.effect in by_name and cause.effect not in in_best
+        for parameter in by_name[cause.effect].table
+        if parameter.name in cause.parameters
+    ]
     return [
         at_bound(effect.name, parameter.name, end, parameter.unit)
-        for (effect, parameter), value in zip(table, comparison.best.fits.theta[0].tolist(), strict=True)
+        for (effect, parameter), value in (*values, *others)
         for end in (parameter.low, parameter.high)
         if is_at_end(parameter, value, end)
     ]

@@ -218,11 +218,17 @@ def _batches(system: System) -> Iterator[str]:
         except Exception as error:
             yield f"{name} as a tensor, one value for each row ({ROWS},), raises {said(error)}"
             continue
+        if together.shape != given[0].shape:
+            yield (
+                f"{name} as a tensor, one value for each row ({ROWS},), gives rates {tuple(together.shape)}; "
+                f"{tuple(given[0].shape)} are right: take columns by state[:, 0], which has one number for each row too"
+            )
+            continue
         rows = [
             replace(itself, **{name: float(one)}).derivative(*(each[k : k + 1] for each in given))
             for k, one in enumerate(values)
         ]
-        if together.shape != given[0].shape or not equal(together, torch.cat(rows)):
+        if not equal(together, torch.cat(rows)):
             yield f"{name} as a tensor, one value for each row ({ROWS},), gives other rates than row by row"
 
 

@@ -62,6 +62,11 @@ class ModelComparison:
         """The most probable model."""
         return self.models[0].model
 
+    @property
+    def unchanged(self) -> float:
+        """Probability of the simulator as it stands."""
+        return sum(one.probability for one in self.models if not one.model.effects)
+
     def unexplained(self, improvable: bool) -> bool:
         """Whether the best model leaves something unexplained; `improvable`: a black box beside it clearly predicts
         better on held-out episodes."""

@@ -54,8 +54,10 @@ def _made(system: type[System]) -> tuple[type[Effect], ...]:
     for one, other in _alike(example):
         alike[one] = (*alike.get(one, ()), other)
         alike[other] = (*alike.get(other, ()), one)
-    heavier = dict(_heavier(example))
-    return tuple(_named(system, *each, alike.get(each[0], ()), heavier.get(each[0], "")) for each in every)
+    imitating: dict[str, tuple[str, ...]] = {}
+    for one, other in _imitating(example):
+        imitating[one] = (*imitating.get(one, ()), other)
+    return tuple(_named(system, *each, alike.get(each[0], ()), imitating.get(each[0], ())) for each in every)
 
 
 def _alike(system: System) -> Iterator[tuple[str, str]]:
@@ -79,18 +81,24 @@ def _alike(system: System) -> Iterator[tuple[str, str]]:
                     yield f"{action.name}.actuator_gain", f"{field}.scale"
 
 
-def _heavier(system: System) -> Iterator[tuple[str, str]]:
-    """Pairs of effects of which the first, scaling a parameter by more than 1, does what the second, added inertia,
-    does. They are not equivalent: a parameter may be smaller too, an added inertia is not negative."""
-    given = inputs(system)
+def _imitating(system: System) -> Iterator[tuple[str, str]]:
+    """Pairs of effects of which the first, scaling a parameter by more than 1, does what the second does: added inertia
+    or viscous friction. They are not equivalent: a parameter may be smaller too, these are not negative."""
+    state, command, load = inputs(system)
+    free, by_loads = system.rates_per_load(state, command, load, range(load.shape[1]))
     for field in scalable(system):
         scaled = _scaled(system, field, 2.0)
         if scaled is None:
             continue
-        for joint, load in enumerate(system.loads):
+        rates = scaled.derivative(state, command, load)
+        for joint, (one, by_load) in enumerate(zip(system.loads, by_loads, strict=True)):
             added = inertia_of(scaled, joint) - inertia_of(system, joint)
-            if added > 0 and equal(with_inertia(system, joint, added).derivative(*given), scaled.derivative(*given)):
-                yield f"{field}.scale", f"{load.name}.added_inertia"
+            if added > 0 and equal(with_inertia(system, joint, added).derivative(state, command, load), rates):
+                yield f"{field}.scale", f"{one.name}.added_inertia"
+            damped = -by_load * state[:, system.coordinates[joint][1], None]
+            size = float((damped * (rates - free)).sum() / damped.square().sum())
+            if size > 0 and equal(free + size * damped, rates):
+                yield f"{field}.scale", f"{one.name}.viscous_friction"
 
 
 def _scaled(system: System, field: str, factor: float) -> System | None:
@@ -109,14 +117,22 @@ def _named(
     base: type[Effect],
     attributes: dict[str, Any],
     alike: tuple[str, ...],
-    heavier: str,
+    imitating: tuple[str, ...],
 ) -> type[Effect]:
     # Where effects of two systems have the same name, the later ones replace the earlier in `EFFECTS`.
     own = {"__module__": system.__module__, "__qualname__": name, "name": name, "systems": (system,)}
     settled = {other: _MOTOR_OFF for other in alike if other.endswith(".constant_load")}
     settled |= {other: _measured(other, "an actuator's gain") for other in alike if other.endswith(".scale")}
-    settled |= {heavier: _measured(name, "inertia that is added")} if heavier else {}
+    settled |= {other: _measured(name, _of_joint(other)) for other in imitating}
+    joint, _, kind = name.partition(".")
+    if (alone := EFFECTS.get(kind)) is not None:  # what settles the library's own effects of the kind settles these
+        settled |= {f"{joint}.{other}": text for other, text in alone.settled_by.items()}
     return type(name, (base,), {"indistinguishable_from": alike, "settled_by": settled, **own, **attributes})
+
+
+def _of_joint(name: str) -> str:
+    joint, _, kind = name.partition(".")
+    return f"{kind.replace('_', ' ')} of {joint}"
 
 
 def _measured(scale: str, other: str) -> str:
