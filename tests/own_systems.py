@@ -41,7 +41,7 @@ class Pendulum(System):
 
 def page_code() -> tuple[str, str]:
     """The class and the script of the page, before that of a real machine."""
-    one, other, _ = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    one, other, *_ = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     return one, other
 
 

@@ -80,7 +80,8 @@ def load_recording(
         places.setdefault(text, []).append(where)
 
     if unmeasured := [name for name, theirs in (columns or {}).items() if not theirs]:
-        note("not measured; the simulator tells it from what was", ", ".join(unmeasured))
+        told = "not measured: taken to start near 0, and told by the simulator from what was measured"
+        note(told, ", ".join(unmeasured))
     whole: list[RawEpisode] = []
     files = _files([paths] if isinstance(paths, str | os.PathLike) else paths, note)
     sizes = [path.stat().st_size for path in files]
