@@ -39,10 +39,9 @@ class Pendulum(System):
         return torch.stack((rate, (command[:, 0] + push - weight) / self.inertia), -1)
 
 
-def page_code() -> tuple[str, str]:
-    """The class and the script of the page, before that of a real machine."""
-    one, other, *_ = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    return one, other
+def page_code() -> list[str]:
+    """The page's code: the class, the script that records, that which diagnoses, and the class of a real machine."""
+    return re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
 
 
 @cache

@@ -177,7 +177,7 @@ def test_the_effect_of_ones_own_works():
 @pytest.mark.parametrize("line", [line for page in PAGES for line in COMMAND_LINES.findall(page.read_text())])
 def test_the_commands_that_pages_show_are_ones_that_the_command_line_takes(line, tmp_path, monkeypatch):
     (tmp_path / "furuta.py").write_text(page_code()[0])  # the files that must be there
-    (tmp_path / "my_rig.py").write_text(PYTHON.findall(text_of("own_system.md"))[2])
+    (tmp_path / "my_rig.py").write_text(page_code()[3])
     monkeypatch.chdir(tmp_path)
     parser = argparse.ArgumentParser(exit_on_error=False)
     commands = parser.add_subparsers(required=True)

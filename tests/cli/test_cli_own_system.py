@@ -35,6 +35,9 @@ def test_the_tutorial_as_a_user_runs_it(rig, capsys, monkeypatch):
     (rig / "record.py").write_text(page_code()[1].replace("range(4)", "range(2)").replace("range(125)", "range(80)"))
     monkeypatch.syspath_prepend(rig)
     runpy.run_path("record.py")
+    (rig / "diagnose.py").write_text(page_code()[2])
+    world = runpy.run_path("diagnose.py")["world"]
+    assert [effect.name for effect in world.effects] == ["arm_axis.coulomb_friction"]
     del sys.modules["furuta"]
     assert cli.main(["check", "furuta.py:Furuta"]) == 0
     assert "furuta is right; 46 effects act on it" in capsys.readouterr().out
