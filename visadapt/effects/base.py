@@ -8,7 +8,7 @@ adding an effect means adding one class.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
@@ -141,6 +141,11 @@ class Effect(nn.Module):
             )
         for key, value in values.items():
             self._parameters[key] = nn.Parameter(torch.as_tensor(value, dtype=torch.get_default_dtype()))
+
+    @classmethod
+    def is_simpler(cls, values: Sequence[float]) -> bool:
+        """Whether, at these values of its parameters (P,), some of them do nothing: a simpler effect does the same."""
+        return False
 
     def with_values(self, values: Tensor) -> Self:
         """The same effect with other parameters: (P,) in the order of `table`, or (B, P), a row for each batch row."""

@@ -7,6 +7,7 @@ gives the law a name, units and ranges; parameters that stand for a force have t
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -141,6 +142,11 @@ class StribeckLaw(DryFrictionLaw):
     """Dry friction of the joint that is larger near rest than at speed."""
 
     source = "Armstrong-Helouvry, Dupont and Canudas de Wit (1994), Automatica 30(7), section 2.2"
+
+    @classmethod
+    def is_simpler(cls, values: Sequence[float]) -> bool:
+        at_speed, breakaway, _ = values
+        return breakaway <= at_speed
 
     def limits(self, state: Tensor, command: Tensor, system: System) -> tuple[Tensor, Tensor]:
         at_speed, breakaway = self.value(self.table[0].name, state), self.value("breakaway", state)

@@ -50,9 +50,12 @@ def log_posterior_odds(effects: Effects, fits: FitState, catalogue: int) -> floa
 
 
 def _uninformed(effects: Effects, fits: FitState, variance: Tensor, precision: Tensor) -> bool:
-    """Whether all strengths of an effect may be zero, or all of several shapes are undetermined, for any effect."""
+    """Whether all strengths of an effect may be zero, or all of several shapes are undetermined, or a simpler effect
+    does the same, for any effect."""
     first = 0
     for effect in effects:
+        if effect.is_simpler(fits.theta[0, first : first + len(effect.table)].tolist()):
+            return True
         strengths, shapes = [], []
         for k, parameter in enumerate(effect.table, first):
             undetermined = float(variance[k] * precision[k]) > MAX_VARIANCE_RATIO
