@@ -100,8 +100,8 @@ def _film(runs: Mapping[str, Run], target: Target, due: float) -> Film:
         if state is None or state.shape[1] != len(CartPole.states):
             raise ValueError(f"panel {title!r}: a cart-pole's states (rows, 4) are needed to film {target.name}")
         pictures = None if isinstance(target, SyntheticTarget) else each.episode.frame
-        limits = (limit, math.inf if reach is None and each.episode.frame is None else reach)
-        panels.append(CartPolePanel(title, each, pictures, drawn, *limits))
+        farthest = math.inf if reach is None and each.episode.frame is None else reach
+        panels.append(CartPolePanel(title, each, pictures, drawn, limit, farthest))
     return CartPoleFilm(panels, target.period, due)
 
 

@@ -29,8 +29,6 @@ def check_attitude(raw: RawEpisode, system: System) -> None:
     if not isinstance(system, RigidBody):
         return
     attitude, rates = (_columns(raw, system, columns) for columns in (ATTITUDE, RATES))
-    if attitude is None:
-        return
     length = np.linalg.norm(attitude, axis=1)
     row = int(np.abs(length - 1).argmax())
     first = system.states[ATTITUDE][0].name
@@ -38,8 +36,6 @@ def check_attitude(raw: RawEpisode, system: System) -> None:
         raise RecordingError(
             f"{raw.cell(row, first)}: the quaternion's length is {length[row]:.3g}; a unit quaternion is right"
         )
-    if rates is None:
-        return
     fit, slope = _turning(raw, attitude, rates)
     if fit > TURNS_CORRELATION and 0.5 < slope * DEGREE < 2:
         right = "rad/s are right (these look like degrees per second)"
@@ -55,10 +51,9 @@ def check_attitude(raw: RawEpisode, system: System) -> None:
         )
 
 
-def _columns(raw: RawEpisode, system: System, columns: slice) -> NDArray[np.float64] | None:
-    """(T, n) of states; None where one of them was not measured."""
-    names = [state.name for state in system.states[columns]]
-    return np.column_stack([raw.states[name] for name in names]) if raw.states.keys() >= set(names) else None
+def _columns(raw: RawEpisode, system: System, columns: slice) -> NDArray[np.float64]:
+    """(T, n) of states, which a recording of a vehicle must have."""
+    return np.column_stack([raw.states[state.name] for state in system.states[columns]])
 
 
 def _turning(raw: RawEpisode, attitude: NDArray[np.float64], rates: NDArray[np.float64]) -> tuple[float, float]:

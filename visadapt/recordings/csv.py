@@ -267,13 +267,19 @@ def needed(system: System) -> tuple[str, ...]:
     return ("time", *(name for name in names if name not in rates), *(variable.name for variable in system.actions))
 
 
+def may_be_unmeasured(system: System) -> list[str]:
+    """States that a recording may lack where `given` says so: of a vehicle velocities alone."""
+    states = [state.name for state in system.states]
+    return [name for name in states if name not in needed(system)] if isinstance(system, RigidBody) else states
+
+
 def check_given(given: Mapping[str, str], ours: Sequence[str], system: System) -> None:
     """Raises RecordingError where `given` maps a name that is none of `ours`, or leaves out what must be measured."""
-    states = [state.name for state in system.states]
+    states, optional = [state.name for state in system.states], may_be_unmeasured(system)
     for name, theirs in given.items():
         if name not in ours:
             raise RecordingError(f"--columns {name}=...: {system.name} has no {name!r}; it has {', '.join(ours)}")
-        if not theirs and (name not in states or (isinstance(system, RigidBody) and name in needed(system))):
+        if not theirs and name not in optional:
             raise RecordingError(f"--columns {name}=: {name} is needed; --columns {name}=... names it")
     if all(given.get(name) == "" for name in states):
         raise RecordingError(f"--columns: one of {', '.join(states)} at least must be measured")
@@ -336,8 +342,7 @@ def _is(there: str, name: str, other: bool) -> bool:
 
 def if_unmeasured(system: System, name: str) -> str:
     """The end of a message that a column is missing: what to say where it is a state that was not measured."""
-    states = [] if isinstance(system, RigidBody) else [state.name for state in system.states]
-    return f"; if it was not measured: --columns {name}=" if name in states else ""
+    return f"; if it was not measured: --columns {name}=" if name in may_be_unmeasured(system) else ""
 
 
 def _number(cell: str) -> float:

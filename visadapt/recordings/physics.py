@@ -54,26 +54,24 @@ def are_degrees(episodes: Sequence[RawEpisode], system: System) -> bool:
     False where that cannot be decided: the command never changes, the episodes of a file are together too short or too
     noisy, a velocity is neither measured nor a position's rate, or the system does not have exactly one angle.
     """
-    angles = [variable.name for variable in system.states if variable.unit == "rad"]
-    if len(angles) != 1 or not _can_decide(episodes, system, angles):
+    if (angle := _only_angle(episodes, system)) is None:
         return False
-    angular = (angles[0], system.rate_of(angles[0]))
+    angular = (angle, system.rate_of(angle))
 
     def scaled(columns: Columns) -> Columns:
         return {name: values * (DEGREE if name in angular else 1) for name, values in columns.items()}
 
-    radians, radian_slope = _fits(episodes, system)[angles[0]]
-    degrees, slope = _fits(episodes, system, scaled)[angles[0]]
+    radians, radian_slope = _fits(episodes, system)[angle]
+    degrees, slope = _fits(episodes, system, scaled)[angle]
     return degrees > EXPLAINED_CORRELATION and 1 / 3 < slope < 3 and (degrees > radians + 0.2 or radian_slope > 10)
 
 
 def is_half_a_turn_off(episodes: Sequence[RawEpisode], system: System) -> bool:
     """Whether the source explains the angle's acceleration half a turn further, and neither as it is nor with the other
     sign; False where that cannot be decided, as in `are_degrees`."""
-    angles = [variable.name for variable in system.states if variable.unit == "rad"]
-    if len(angles) != 1 or not _can_decide(episodes, system, angles):
+    if (angle := _only_angle(episodes, system)) is None:
         return False
-    (angle,), rate = angles, system.rate_of(angles[0])
+    rate = system.rate_of(angle)
 
     def further(columns: Columns) -> Columns:
         return {name: values + math.pi if name == angle else values for name, values in columns.items()}
@@ -81,8 +79,11 @@ def is_half_a_turn_off(episodes: Sequence[RawEpisode], system: System) -> bool:
     def negated(columns: Columns) -> Columns:
         return {name: -values if name in (angle, rate) else values for name, values in columns.items()}
 
-    there, *here = (_error(*_fits(episodes, system, changed)[angle]) for changed in (further, _unchanged, negated))
-    return there < MOST_ERROR and min(here) > CLEARLY * there
+    def error(changed: Callable[[Columns], Columns]) -> float:
+        return _error(*_fits(episodes, system, changed)[angle])
+
+    there = error(further)
+    return there < MOST_ERROR and all(error(changed) > CLEARLY * there for changed in (_unchanged, negated))
 
 
 def is_turned_round(episodes: Sequence[RawEpisode], system: System, name: str) -> bool:
@@ -128,6 +129,13 @@ def exchanged(episodes: Sequence[RawEpisode], system: System, one: str, other: s
     explained = min(fits[one][0], fits[other][0])
     opposite = max(unchanged[0][one][0], unchanged[0][other][0]) < 0
     return explained > EXPLAINED_CORRELATION and best < 0.7 * explained and opposite
+
+
+def _only_angle(episodes: Sequence[RawEpisode], system: System) -> str | None:
+    """The system's angle, by which its unit and zero are judged; None where it has none or several, or where that
+    cannot be decided."""
+    angles = [variable.name for variable in system.states if variable.unit == "rad"]
+    return angles[0] if len(angles) == 1 and _can_decide(episodes, system, angles) else None
 
 
 def _can_decide(episodes: Sequence[RawEpisode], system: System, names: Sequence[str]) -> bool:

@@ -7,7 +7,7 @@ the joint with the load `shoulder`. Units and searched ranges follow from those 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -50,14 +50,14 @@ _GENERATED: set[type[Effect]] = set()
 def _made(system: type[System]) -> tuple[type[Effect], ...]:
     example = system()
     every = (*on_commands(system), *on_joints(system), *on_parameters(system), *on_sensors(system))
-    alike: dict[str, tuple[str, ...]] = {}
-    for one, other in _alike(example):
-        alike[one] = (*alike.get(one, ()), other)
-        alike[other] = (*alike.get(other, ()), one)
-    imitating: dict[str, tuple[str, ...]] = {}
-    for one, other in _imitating(example):
-        imitating[one] = (*imitating.get(one, ()), other)
-    return tuple(_named(system, *each, alike.get(each[0], ()), imitating.get(each[0], ())) for each in every)
+    alike, imitating = list(_alike(example)), list(_imitating(example))
+    either_way = [*alike, *((other, one) for one, other in alike)]
+    return tuple(_named(system, *each, _others(each[0], either_way), _others(each[0], imitating)) for each in every)
+
+
+def _others(name: str, pairs: Sequence[tuple[str, str]]) -> tuple[str, ...]:
+    """The second ones of the pairs of which `name` is the first."""
+    return tuple(other for one, other in pairs if one == name)
 
 
 def _alike(system: System) -> Iterator[tuple[str, str]]:
