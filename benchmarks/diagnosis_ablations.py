@@ -29,6 +29,7 @@ from benchmarks.blind.diagnosis import (
     run_one,
 )
 from benchmarks.blind.scoring import Truth, score
+from datasets.blind.kinds import Effects
 from experiments.result_tables import read_rows, write_csv
 
 WHOLE = "as shipped"
@@ -59,6 +60,8 @@ class Settings:
     """recordings of each set"""
     seed: int = 5001
     """seed of the recordings"""
+    effects: Effects = "core"
+    """what the recordings are drawn from"""
     parts: tuple[str, ...] = tuple(PARTS)
     """what is left out"""
     jobs: int = 2
@@ -75,16 +78,17 @@ def main(settings: Settings) -> None:
     """Run what is missing, then write the table."""
     rows = []
     for kind in settings.kinds:
-        folder = recordings_of(Check(kinds=(kind,), count=settings.count, seed=settings.seed), kind)
+        check = Check(kinds=(kind,), count=settings.count, seed=settings.seed, effects=settings.effects)
+        label, folder = check.label(kind), recordings_of(check, kind)
         recordings, truths = recordings_in(folder), read_key(folder)
         logs = settings.work / folder.name
         whole = run_one(WATCHED, recordings, logs / "whole.jsonl", settings.jobs)
-        rows.append(_row(kind, WHOLE, truths, whole, whole))
+        rows.append(_row(label, WHOLE, truths, whole, whole))
         print(rows[-1])
         for part in settings.parts:
             acts = [one for one in recordings if part in whole[one.name].get("answer", FAILED).get("acting", ())]
             lines = run_one(part, acts, logs / f"{part}.jsonl", settings.jobs)
-            rows.append(_row(kind, part, truths, whole, {one.name: lines[one.name] for one in acts}))
+            rows.append(_row(label, part, truths, whole, {one.name: lines[one.name] for one in acts}))
             print(rows[-1])
     run = {(row["kind"], row["without"]) for row in rows}
     others = read_rows(settings.out) if settings.out.exists() else []
@@ -92,7 +96,7 @@ def main(settings: Settings) -> None:
     write_csv(settings.out, COLUMNS, [*kept, *rows])
 
 
-def _row(kind: str, part: str, truths: Mapping[str, Truth], whole: Lines, acting: Lines) -> dict[str, object]:
+def _row(label: str, part: str, truths: Mapping[str, Truth], whole: Lines, acting: Lines) -> dict[str, object]:
     """A row of the table: the answers of `acting`, and those of the `whole` diagnosis to all other recordings."""
     scores = [score(truth, {**whole, **acting}[file].get("answer", FAILED)) for file, truth in truths.items()]
     named = [one.exact for one in scores if one.exact is not None]
@@ -103,7 +107,7 @@ def _row(kind: str, part: str, truths: Mapping[str, Truth], whole: Lines, acting
     seconds = [
         round(sum(lines[file]["seconds"] for file in acting) / max(1, len(acting)), 1) for lines in (acting, whole)
     ]
-    return dict(zip(COLUMNS, [kind, part, len(acting), *counts, *seconds], strict=True))
+    return dict(zip(COLUMNS, [label, part, len(acting), *counts, *seconds], strict=True))
 
 
 if __name__ == "__main__":

@@ -32,15 +32,18 @@ SEARCHED = [
 def recorded(tmp_path):
     """Writes and reads a recording of a rover with other values, integrated by scipy."""
 
-    def of(left=1.0, mass=1.0):
+    def of(left=1.0, mass=1.0, headings=None):
+        """With headings at the start of each episode, these are not recorded."""
         generator, rover = np.random.default_rng(0), Rover()
-        lines = ["episode,time,x,y,yaw,left,right"]
+        columns = ("x", "y", "yaw") if headings is None else ("x", "y")
+        lines = [",".join(("episode", "time", *columns, "left", "right"))]
         for episode in range(2):
             state = np.zeros(5)
+            state[2] = 0.0 if headings is None else headings[episode]
             for row in range(ROWS):
                 t = row * PERIOD
                 torques = 0.4 + 0.8 * math.sin(1.1 * t + episode), 0.4 + 0.8 * math.sin(1.7 * t + 2 * episode)
-                seen = state[:3] + 1e-3 * generator.normal(size=3)
+                seen = (state[:3] + 1e-3 * generator.normal(size=3))[: len(columns)]
                 lines.append(",".join(str(one) for one in (episode, t, *seen, *torques)))
                 forces = left * torques[0] / rover.radius, torques[1] / rover.radius
 
@@ -53,7 +56,7 @@ def recorded(tmp_path):
                 state = solve_ivp(rates, (0, PERIOD), state, rtol=1e-6, atol=1e-8, method="LSODA").y[:, -1]
         path = tmp_path / "rover.csv"
         path.write_text("\n".join(lines))
-        return load_recording(path, rover)
+        return load_recording(path, rover, None if headings is None else {"yaw": ""})
 
     return of
 
@@ -74,6 +77,16 @@ def test_what_is_there_is_found_without_measured_velocities(recorded, target, na
     if name:
         (estimate,) = found.causes[0].parameters.values()
         assert estimate.value == pytest.approx(value, rel=0.02)
+
+
+@pytest.mark.parametrize(("left", "name"), [(1.0, ""), (0.7, "left.actuator_gain")])
+def test_a_heading_without_a_sensor_may_start_anywhere(recorded, left, name):
+    found = diagnose(recorded(left=left, headings=(2.5, -1.6)), World(Rover(), period=PERIOD), SEARCHED)
+    assert found.verdict == ("identified" if name else "no_gap")
+    assert [cause.effect for cause in found.causes if not cause.slight] == ([name] if name else [])
+    if name:
+        (estimate,) = found.causes[0].parameters.values()
+        assert estimate.value == pytest.approx(left, rel=0.01)
 
 
 def test_a_larger_mass_and_added_inertia_are_told_apart_by_a_balance(recorded):

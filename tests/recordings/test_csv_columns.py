@@ -71,7 +71,7 @@ class TestColumns:
         recording = load(path, columns={"x": "", "theta_dot": ""})
         assert recording.measured == ("theta",)
         assert recording.warnings == (
-            "x, theta_dot: not measured: taken to start near 0, and told by the simulator from what was measured",
+            "x, theta_dot: not measured: estimated with the simulator from what was measured",
         )
         refuses("one of x, x_dot, theta, theta_dot at least must be measured", path, columns=dict.fromkeys(STATES, ""))
         refuses("--columns command=: command is needed; --columns command=... names it", path, columns={"command": ""})

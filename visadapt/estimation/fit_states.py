@@ -13,7 +13,7 @@ from visadapt.effects import Effect
 from visadapt.estimation.candidate import COARSE, FINE
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
-from visadapt.estimation.segments import Segments, initial_states
+from visadapt.estimation.segments import Segments, initial_states, noise_of_readings, unmeasured
 from visadapt.systems import System
 
 Effects = tuple[type[Effect], ...]
@@ -23,14 +23,21 @@ QUICK, CAREFUL, FINAL = (12, COARSE), (20, FINE), (7, FINE)
 refit to all rows, starting from a CAREFUL fit to some of them."""
 
 
+GUESSED_NOISE = 0.01  # Standard deviation of readings, in their unit, with which the source's fit starts
+
+
 def initial_fit(system: System, rows: Segments) -> FitState:
     """The start of the source's own fit (no effects): states from the measurements, guessed noise."""
     state = initial_states(rows, system)[None]
+    noise = torch.full((len(rows.channels),), GUESSED_NOISE**2, dtype=torch.float64)
+    if unmeasured(rows, system):
+        # What is unknown follows readings that are believed too much.
+        noise = torch.maximum(noise, noise_of_readings(rows))
     return FitState(
         torch.zeros(1, 0, dtype=torch.float64),
         state,
         torch.full((1, len(profile_of(system).driven)), math.log(0.2**2), dtype=torch.float64),
-        torch.full((1, len(rows.channels)), math.log(0.01**2), dtype=torch.float64),
+        noise.log()[None],
         torch.full((1,), -math.inf, dtype=torch.float64),
         torch.zeros(1, 0, 0, dtype=torch.float64),
     )

@@ -37,6 +37,7 @@ class Segments:
     resolution: tuple[float, ...]  # of each channel: the smallest difference between two different readings
     colour: Colour | None = None  # of a fit's innovations, where they are known not to be white
     jumps: bool = False  # whether process noise is a jump of each velocity; False: a load on each joint
+    estimated: Tensor | None = None  # (W, T, n) states, of which the `unmeasured` are used; None: these are 0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -89,7 +90,8 @@ class Segments:
     def select(self, windows: Tensor) -> Segments:
         """These windows, by index."""
         every = ("measured", "used", "inside", "time", "first", "episode")
-        return replace(self, **{name: getattr(self, name)[windows] for name in every})
+        estimated = None if self.estimated is None else self.estimated[windows]
+        return replace(self, estimated=estimated, **{name: getattr(self, name)[windows] for name in every})
 
     def spread(self, most: int) -> Tensor:
         """Indices of windows spread evenly over the recording, with about `most` rows in all; at least four, or all."""
@@ -134,20 +136,36 @@ def smoothly_filled(values: Tensor, used: Tensor, stamps: Tensor) -> Tensor:
     return out
 
 
+def unmeasured(rows: Segments, system: System) -> list[int]:
+    """Columns of the states that no reading gives, and that are not the velocity of a position that one gives."""
+    position_of, channels = profile_of(system).position_of, rows.channels
+    return [k for k in range(len(system.states)) if k not in channels and position_of.get(k) not in channels]
+
+
 def initial_states(rows: Segments, system: System) -> Tensor:
-    """Initial guess (W, T, n) of the states: the measurements that may be used, those in between interpolated, and
-    difference quotients for missing velocities."""
+    """Initial guess (W, T, n) of the states: the measurements that may be used, those in between interpolated,
+    difference quotients for missing velocities, and what is `estimated` of states that no reading gives."""
     out = torch.zeros(*rows.shape, len(system.states), dtype=torch.float64)
+    if rows.estimated is not None:
+        columns = unmeasured(rows, system)
+        out[..., columns] = rows.estimated[..., columns]
     for k, channel in enumerate(rows.channels):
         out[..., channel] = rows.filled[..., k]
     for channel, position_column in profile_of(system).position_of.items():
-        if channel not in rows.channels:
+        if channel not in rows.channels and position_column in rows.channels:
             position = out[..., position_column]
             change = torch.zeros_like(position)
             change[:, 1:-1] = (position[:, 2:] - position[:, :-2]) / (rows.time[:, 2:] - rows.time[:, :-2])
             change[:, 0] = (position[:, 1] - position[:, 0]) / rows.duration[:, 0]
             out[..., channel] = change
     return out * rows.inside[..., None]
+
+
+def noise_of_readings(rows: Segments) -> Tensor:
+    """(m,) variances of the readings' noise, from their third differences, in which smooth motion nearly vanishes."""
+    third, weights = rows.filled.diff(n=3, dim=1), rows.used.unfold(1, 4, 1).prod(-1)
+    # The squares of the coefficients 1, 3, 3 and 1 sum to 20.
+    return (weights * third.square()).sum((0, 1)) / (20 * weights.sum((0, 1)).clamp(min=1))
 
 
 def cut(

@@ -80,7 +80,7 @@ def load_recording(
         places.setdefault(text, []).append(where)
 
     if unmeasured := [name for name, theirs in (columns or {}).items() if not theirs]:
-        told = "not measured: taken to start near 0, and told by the simulator from what was measured"
+        told = "not measured: estimated with the simulator from what was measured"
         note(told, ", ".join(unmeasured))
     whole: list[RawEpisode] = []
     files = _files([paths] if isinstance(paths, str | os.PathLike) else paths, note)

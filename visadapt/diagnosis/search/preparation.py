@@ -19,6 +19,7 @@ from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import Convention, profile_of
 from visadapt.estimation.repeated_readings import RepeatedReadings, find_repeats
 from visadapt.estimation.segments import Segments, cut, smoothly_filled
+from visadapt.estimation.unmeasured_states import with_unmeasured
 from visadapt.recordings import Episode, Recording
 from visadapt.recordings.runs import runs
 from visadapt.recordings.thinning import spread
@@ -67,7 +68,7 @@ def limited(recording: Recording, system: System) -> Recording:
 
 def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effect]] = ()) -> PreparedRecording:
     """Prepare a recording of some or all states, and the commands; `catalogue` are the effects that may act."""
-    draft = _on_its_clock(_read(recording, system))
+    draft = _with_unmeasured(_on_its_clock(_read(recording, system)))
     if not profile_of(system).check_sensors:
         return draft.prepared()
     first = draft.source or draft.source_fit()
@@ -204,6 +205,14 @@ def _on_its_clock(draft: _Draft) -> _Draft:
     fitted, other = (replace(each, rows=each.rows.with_channels(kept)).source_fit() for each in (draft, steady))
     chosen, fit = (steady, other) if other.likelihood[0] > fitted.likelihood[0] else (draft, fitted)
     return replace(chosen, source=fit if len(kept) == len(channels) else None)
+
+
+def _with_unmeasured(draft: _Draft) -> _Draft:
+    """With estimates of the states that were not measured."""
+    rows = with_unmeasured(draft.rows, draft.readings.system)
+    if rows is draft.rows:
+        return draft
+    return draft.changed(rows, replace(draft.raw, estimated=rows.estimated))
 
 
 def _without_defective_angles(draft: _Draft, source: FitState) -> _Draft:
