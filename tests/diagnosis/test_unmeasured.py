@@ -23,7 +23,15 @@ SEARCHED = [
     BY_NAME[name]
     for name in (
         *("left.actuator_gain", "right.actuator_gain", "mass.scale", "inertia.scale", "yaw.sensor_offset"),
-        *("forward.viscous_friction", "forward.coulomb_friction", "turn.coulomb_friction", "forward.added_inertia"),
+        *(
+            "x.drift",
+            "y.drift",
+            "x.sensor_scale",
+            "forward.viscous_friction",
+            "forward.coulomb_friction",
+            "turn.coulomb_friction",
+            "forward.added_inertia",
+        ),
     )
 ]
 
@@ -32,7 +40,7 @@ SEARCHED = [
 def recorded(tmp_path):
     """Writes and reads a recording of a rover with other values, integrated by scipy."""
 
-    def of(left=1.0, mass=1.0, headings=None):
+    def of(left=1.0, mass=1.0, headings=None, drift=(0.0, 0.0)):
         """With headings at the start of each episode, these are not recorded."""
         generator, rover = np.random.default_rng(0), Rover()
         columns = ("x", "y", "yaw") if headings is None else ("x", "y")
@@ -50,7 +58,7 @@ def recorded(tmp_path):
                 def rates(_, s, forces=forces):
                     turning = rover.half_track * (forces[1] - forces[0] - rover.damping * rover.half_track * s[4])
                     forward = sum(forces) - rover.damping * s[3]
-                    speeds = s[3] * math.cos(s[2]), s[3] * math.sin(s[2]), s[4]
+                    speeds = s[3] * math.cos(s[2]) + drift[0], s[3] * math.sin(s[2]) + drift[1], s[4]
                     return [*speeds, forward / (mass * rover.mass), turning / rover.inertia]
 
                 state = solve_ivp(rates, (0, PERIOD), state, rtol=1e-6, atol=1e-8, method="LSODA").y[:, -1]
@@ -87,6 +95,13 @@ def test_a_heading_without_a_sensor_may_start_anywhere(recorded, left, name):
     if name:
         (estimate,) = found.causes[0].parameters.values()
         assert estimate.value == pytest.approx(left, rel=0.01)
+
+
+def test_a_drift_is_none_of_the_sensors(recorded):
+    found = diagnose(recorded(drift=(0.15, -0.05)), World(Rover(), period=PERIOD), SEARCHED)
+    assert found.verdict == "identified"
+    rates = {cause.effect: cause.parameters["rate"].value for cause in found.causes if not cause.slight}
+    assert rates == pytest.approx({"x.drift": 0.15, "y.drift": -0.05}, abs=1e-3)
 
 
 def test_a_larger_mass_and_added_inertia_are_told_apart_by_a_balance(recorded):

@@ -6,11 +6,11 @@ from typing import Any
 import pytest
 import torch
 
-from tests.own_systems import Pendulum, furuta
+from tests.own_systems import Pendulum, Rover, furuta
 from tests.worlds import columns
 from visadapt.effects import EFFECTS
 from visadapt.effects.catalogue import catalogue, catalogue_text, twins
-from visadapt.systems import CartPole
+from visadapt.systems import CartPole, System, Variable
 from visadapt.world import World
 
 FURUTA = furuta()()
@@ -53,6 +53,50 @@ def test_added_inertia_is_that_of_a_heavier_arm():
     )
     scaled: Any = World(FURUTA, [added, BY_NAME["half_length.scale"](scale=2.0)]).altered(STATE)
     assert scaled.half_length.item() == pytest.approx(0.129)
+
+
+def test_a_drift_carries_what_belongs_to_no_joint():
+    rover = Rover()
+    named = {effect.name: effect for effect in catalogue(rover)}
+    assert [name for name in named if name.endswith(".drift")] == ["x.drift", "y.drift"]
+    assert named["x.drift"].table[0].unit == "m/s"
+    drifts = named["x.drift"](rate=torch.tensor([0.3, 0.1])), named["y.drift"](rate=-0.1)
+    heavier, torques = named["forward.added_inertia"](inertia=2.0), columns(1.0, 0.7).repeat(2, 1)
+    paths = []
+    for effects in ([heavier], [*drifts, heavier]):
+        world = World(rover, effects, 0.05)
+        at = world.start(torch.zeros(2, 5, dtype=torch.float64))
+        for _ in range(20):
+            at = world.step(at, torques)
+        paths.append(at.state)
+    carried = torch.tensor([[0.3, -0.1, 0, 0, 0], [0.1, -0.1, 0, 0, 0]], dtype=torch.float64)
+    torch.testing.assert_close(paths[1] - paths[0], carried, rtol=1e-6, atol=1e-8)
+    (slope,) = torch.autograd.grad(paths[1][:, 0].sum(), list(drifts[0].parameters()))
+    torch.testing.assert_close(slope.double(), torch.ones(2, dtype=torch.float64), rtol=1e-6, atol=1e-6)
+
+
+def test_a_command_that_is_the_rate_of_a_state_has_the_bias_that_is_its_drift():
+    class Unicycle(System):
+        name = "unicycle"
+        states = (
+            Variable("x", "m", -5, 5),
+            Variable("y", "m", -5, 5),
+            Variable("yaw", "rad", -4, 4),
+            *Rover.states[3:4],
+        )
+        actions = (Variable("turn", "rad/s", -1, 1), Variable("pull", "m/s2", -1, 1))
+        loads = (Variable("forward", "N/kg", -1, 1),)
+        coordinates = ((None, 3),)
+
+        def derivative(self, state, command, load):
+            yaw, speed = state[:, 2], state[:, 3]
+            turn, pull = command.unbind(1)
+            return torch.stack((speed * yaw.cos(), speed * yaw.sin(), turn, pull + load[:, 0] - speed), 1)
+
+    unicycle = dataclass(frozen=True)(Unicycle)()
+    named = {effect.name: effect for effect in catalogue(unicycle)}
+    assert twins(named["turn.actuator_bias"], named.values(), unicycle) == [named["yaw.drift"]]
+    assert "switch the actuator off" in named["turn.actuator_bias"].settled_by["yaw.drift"]
 
 
 def test_a_parameter_is_scaled_by_a_factor_for_each_row():

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from visadapt.estimation.candidate import COARSE, CandidateModel
 from visadapt.estimation.fit_states import initial_fit
+from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.linearise import linearise_step
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments, unmeasured
@@ -46,9 +47,9 @@ def _starts(system: System, columns: list[int]) -> Tensor:
     """(S, U) values of U states, spread over their ranges, 0 first."""
     ends = torch.tensor([(system.states[k].low, system.states[k].high) for k in columns], dtype=torch.float64)
     share = torch.quasirandom.SobolEngine(len(columns), scramble=True, seed=0).draw(STARTS).double()
-    share = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
-    share[0] = 0.0
-    return share
+    starts = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
+    starts[0] = 0.0
+    return starts
 
 
 def _filtered(rows: Segments, system: System, columns: list[int], starts: Tensor) -> tuple[Tensor, Tensor]:
@@ -56,38 +57,47 @@ def _filtered(rows: Segments, system: System, columns: list[int], starts: Tensor
     values of the states in `columns`."""
     count, (windows, length) = len(starts), rows.shape
     model, first = CandidateModel(system, (), rows, COARSE), initial_fit(system, rows)
-    sizes = torch.tensor([variable.largest for variable in system.states], dtype=torch.float64)
-    group = [k for k, driven in enumerate(model.profile.driven) for _ in driven]
-    disturbance = (model.noise_directions * first.log_process[0, group].exp()) @ model.noise_directions.mT
-    wander, variance = torch.zeros_like(sizes), sizes.new_tensor(model.profile.initial_variance)
-    wander[columns] = (WANDER * sizes[columns]).square()
-    variance[columns] = (sizes[columns] / count ** (1 / len(columns))).square()
-    disturbance = (disturbance + torch.diag(wander)).repeat(count, 1, 1, 1)
-    noise = torch.diag(first.log_noise[0].exp())
-    none = sizes.new_zeros(0)
+    none = starts.new_zeros(0)  # parameters: the source has no effects
     world, acting = model.stepping(none, model.in_windows(model.acting(none[None]))[0])
-    acting, time, duration = (each.repeat(count, *[1] * (each.dim() - 1)) for each in (acting, rows.time, rows.duration))
-    measured, used = rows.measured.repeat(count, 1, 1), rows.used.repeat(count, 1, 1)
-    inside = rows.inside.repeat(count, 1) > 0
-    state = first.state[0, :, 0].repeat(count, 1, 1)
+    initial, disturbance = _variances(model, first, columns, count)
+    state, covariance = first.state[0, :, 0].repeat(count, 1, 1), torch.diag(initial).repeat(count * windows, 1, 1)
     state[..., columns] = starts[:, None]
-    state, covariance = state.flatten(0, 1), torch.diag(variance).repeat(count * windows, 1, 1)
+    state = state.flatten(0, 1)
+
+    def every(values: Tensor) -> Tensor:
+        """Values (W, T, ...) row by row, for each start."""
+        return values.repeat(count, *[1] * (values.dim() - 1)).transpose(0, 1)
+
+    acting, time, duration, disturbance = (every(each) for each in (acting, rows.time, rows.duration, disturbance))
+    measured, used, inside = every(rows.measured), every(rows.used), every(rows.inside) > 0
+    noise, channels = torch.diag(first.log_noise[0].exp()), list(rows.channels)
     foreseen, states = state.new_zeros(len(state)), []
     for t in range(length):
         if t:
-            step = linearise_step(world, none, time[:, t - 1], state, acting[:, t - 1], duration=duration[:, t - 1])
-            moved = step.by_state @ covariance @ step.by_state.mT + disturbance[:, t - 1]
-            state = torch.where(inside[:, t, None], step.value, state)
-            covariance = torch.where(inside[:, t, None, None], moved, covariance)
-        seen = used[:, t, :, None] * covariance[:, list(rows.channels)]
-        root, _ = torch.linalg.cholesky_ex(used[:, t, None] * seen[..., list(rows.channels)] + noise)
-        error = (used[:, t] * (measured[:, t] - state[:, list(rows.channels)]))[..., None]
-        white, cross = torch.linalg.solve_triangular(root, torch.cat((error, seen), -1), upper=False).tensor_split(
-            [1], -1
-        )
+            step = linearise_step(world, none, time[t - 1], state, acting[t - 1], duration=duration[t - 1])
+            moved = step.by_state @ covariance @ step.by_state.mT + disturbance[t - 1]
+            state = torch.where(inside[t, :, None], step.value, state)
+            covariance = torch.where(inside[t, :, None, None], moved, covariance)
+        seen = used[t, :, :, None] * covariance[:, channels]
+        root, _ = torch.linalg.cholesky_ex(used[t, :, None] * seen[..., channels] + noise)
+        error = (used[t] * (measured[t] - state[:, channels]))[..., None]
+        white = torch.linalg.solve_triangular(root, error, upper=False)
+        cross = torch.linalg.solve_triangular(root, seen, upper=False)
         foreseen = foreseen - 0.5 * white.square().sum((1, 2)) - root.diagonal(dim1=1, dim2=2).log().sum(1)
         state = state + (cross.mT @ white)[..., 0]
         covariance = covariance - cross.mT @ cross
-        covariance = 0.5 * (covariance + covariance.mT)
+        covariance = 0.5 * (covariance + covariance.mT)  # rounding errors that are not symmetric would grow
         states.append(state)
     return foreseen.unflatten(0, (count, windows)), torch.stack(states, 1).unflatten(0, (count, windows))
+
+
+def _variances(model: CandidateModel, first: FitState, columns: list[int], count: int) -> tuple[Tensor, Tensor]:
+    """Variances (n,) of the first states, and covariances (W, T - 1, n, n) of the process noise, for filters that start
+    with `count` values of the states in `columns`."""
+    sizes = torch.tensor([variable.largest for variable in model.system.states], dtype=torch.float64)
+    initial, wander = sizes.new_tensor(model.profile.initial_variance), torch.zeros_like(sizes)
+    initial[columns] = (sizes[columns] / count ** (1 / len(columns))).square()
+    wander[columns] = (WANDER * sizes[columns]).square()
+    group = [k for k, driven in enumerate(model.profile.driven) for _ in driven]
+    loads = model.noise_directions
+    return initial, (loads * first.log_process[0, group].exp()) @ loads.mT + torch.diag(wander)

@@ -15,9 +15,11 @@ from typing import Any
 import torch
 
 from visadapt.effects.base import EFFECTS, Effect
-from visadapt.effects.own.added_inertia import inertia_of, with_inertia
+from visadapt.effects.own.added_inertia import inertia_of
 from visadapt.effects.own.commands import on_commands
+from visadapt.effects.own.drift import drifting, on_states
 from visadapt.effects.own.dynamics import on_joints, on_parameters, scalable
+from visadapt.effects.own.extended import with_inertia
 from visadapt.effects.own.sensors import on_sensors
 from visadapt.systems import SYSTEMS, System
 from visadapt.systems.contract import equal, inputs
@@ -49,7 +51,8 @@ _GENERATED: set[type[Effect]] = set()
 @cache
 def _made(system: type[System]) -> tuple[type[Effect], ...]:
     example = system()
-    every = (*on_commands(system), *on_joints(system), *on_parameters(system), *on_sensors(system))
+    every = (*on_commands(system), *on_joints(system), *on_states(system))
+    every = (*every, *on_parameters(system), *on_sensors(system))
     alike, imitating = list(_alike(example)), list(_imitating(example))
     either_way = [*alike, *((other, one) for one, other in alike)]
     return tuple(_named(system, *each, _others(each[0], either_way), _others(each[0], imitating)) for each in every)
@@ -73,6 +76,10 @@ def _alike(system: System) -> Iterator[tuple[str, str]]:
                 by_load * (by_command * by_load).sum() / by_load.square().sum(), by_command
             ):
                 yield f"{action.name}.actuator_bias", f"{joint.name}.constant_load"
+        for column in drifting(type(system)):
+            moved = torch.eye(state.shape[1]).double()[column]
+            if bool(by_command.any()) and equal(by_command[0] * moved, by_command):
+                yield f"{action.name}.actuator_bias", f"{system.states[column].name}.drift"
         stronger = system.derivative(state, command * (1 + unit), rest)
         for field in scalable(system):
             for factor in (2.0, 0.5):
@@ -122,6 +129,7 @@ def _named(
     # Where effects of two systems have the same name, the later ones replace the earlier in `EFFECTS`.
     own = {"__module__": system.__module__, "__qualname__": name, "name": name, "systems": (system,)}
     settled = {other: _MOTOR_OFF for other in alike if other.endswith(".constant_load")}
+    settled |= {other: _COMMANDS_OFF for other in alike if other.endswith(".drift")}
     settled |= {other: _measured(other, "an actuator's gain") for other in alike if other.endswith(".scale")}
     settled |= {other: _measured(name, _of_joint(other)) for other in imitating}
     joint, _, kind = name.partition(".")
@@ -139,6 +147,8 @@ def _measured(scale: str, other: str) -> str:
     field = scale.removesuffix(".scale")
     return f"no motion tells another {field} from {other}: measure {field} by itself"
 
+
+_COMMANDS_OFF = "switch the actuator off: a drift is still there, an actuator's bias is gone"
 
 _MOTOR_OFF = (
     "switch the motor off and measure the load on the joint with a balance: a constant load is still there, an "
