@@ -195,10 +195,10 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable) -> None:
         )
     if correlation(change, between) < IS_RATE_CORRELATION:
         return
-    ratio = float(change.std() / between.std())
+    sizes = float(change.std()), float(between.std())
     for times in (1 / DEGREE,) if angle else (100.0, 1000.0):
-        for wrong, factor in ((variable, ratio), (rate, 1 / ratio)):
-            if 0.5 < factor / times < 2:
+        for wrong, (large, small) in ((variable, sizes), (rate, sizes[::-1])):
+            if 0.5 * times * small < large < 2 * times * small:
                 raise RecordingError(
                     f"{raw.source}: {raw.column(wrong.name)} is {times:.0f} times what the other says "
                     f"({variable.name} changes by {change.std():.3g} {rate.unit}, {rate.name} is {between.std():.3g} "
