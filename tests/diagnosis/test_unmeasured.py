@@ -1,7 +1,7 @@
 """Machines of which little is measured: poses of a robot on wheels, a motor's speed, a pendulum by its arm."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -95,6 +95,24 @@ def test_a_heading_without_a_sensor_may_start_anywhere(recorded, left, name):
     if name:
         (estimate,) = found.causes[0].parameters.values()
         assert estimate.value == pytest.approx(left, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("states", "commands", "headings", "named"),
+    [
+        ([1, 1, -1], [1, 1], None, "yaw"),
+        ([1, 1, 1], [1, -1], None, "right"),
+        ([1, 1, 1], [-1, -1], None, "every command"),
+        # Without a heading, the machine in a mirror moves alike.
+        ([1, -1], [1, 1], (2.5, -1.6), "x or y"),
+    ],
+)
+def test_what_has_the_other_sign_is_named_and_inverted(recorded, states, commands, headings, named):
+    recording = recorded(headings=headings)
+    turned = tuple(Episode(e.time, e.action * commands, e.state * states) for e in recording.episodes)
+    found = diagnose(replace(recording, episodes=turned), World(Rover(), period=PERIOD), SEARCHED)
+    assert found.verdict == "no_gap"
+    assert f"{named} has the opposite sign of the source's; it was inverted" in found.warnings
 
 
 def test_a_drift_is_none_of_the_sensors(recorded):

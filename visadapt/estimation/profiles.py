@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 
@@ -22,7 +22,7 @@ class Convention:
 
     name: str  # the quantity of opposite sign, as the warning calls it
     columns: Columns  # states that change sign
-    command: float = 1.0  # factor of the command: 1 or -1
+    commands: Columns = ()  # commands that change sign
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ _CART_POLE = SystemProfile(
     angle_sensor=(2, 3),
     sign_conventions=(
         Convention("the angle", (2, 3)),
-        Convention("the command", (), -1.0),
+        Convention("the command", (), (0,)),
         Convention("the position", (0, 1)),
     ),
 )
@@ -200,4 +200,20 @@ def _own_profile(system: type[System]) -> SystemProfile:
         smooth_function_factors={
             load.name: (None, names[velocity]) for load, velocity in zip(system.loads, velocities, strict=True)
         },
+        sign_conventions=tuple(_own_conventions(system)),
     )
+
+
+def _own_conventions(system: type[System]) -> Iterator[Convention]:
+    """Commands of the other sign, one by one and all of them, each joint, and each state that belongs to no joint."""
+    signed = [k for k, action in enumerate(system.actions) if action.low < 0]
+    for k in signed:
+        yield Convention(system.actions[k].name, (), (k,))
+    if len(signed) > 1:
+        yield Convention("every command", (), tuple(signed))
+    joints = [(position, velocity) for position, velocity in system.coordinates if position is not None]
+    in_joints = {column for pair in system.coordinates for column in pair}
+    alone = [(column,) for column in range(len(system.states)) if column not in in_joints]
+    for columns in (*joints, *alone):
+        if all(system.states[column].low < 0 for column in columns):
+            yield Convention(system.states[columns[0]].name, columns)

@@ -116,7 +116,9 @@ class _Readings:
     def whole(self, convention: Convention | None) -> Recording:
         """Episodes from their first usable row on, in the signs of the source. Repeated and missing readings are filled
         in; rows of longer runs of these are marked as not usable."""
-        sign, command_sign = sensor_checks.signs(convention, self.channels), convention.command if convention else 1.0
+        convention = convention or Convention("", ())
+        sign = sensor_checks.signs(convention.columns, self.channels)
+        command_sign = sensor_checks.signs(convention.commands, range(len(self.system.actions)))
         parts = zip(self.stamps, self.commands, self.states, self.repeats.used, strict=True)
         episodes, usable = [], []
         for rows, first in zip(parts, self.first_usable, strict=True):
@@ -265,7 +267,7 @@ def _in_signs_of_source(draft: _Draft, first: FitState, catalogue: Sequence[type
     if band is not None and profile_of(system).angle_sensor[0] in convention.columns:
         band = (-band[1], -band[0])
     told = f"{convention.name}{OPPOSITE}; it was inverted"
-    rows, raw = (sensor_checks.to_source(each, convention) for each in (draft.rows, draft.raw))
+    rows, raw = (sensor_checks.to_source(each, convention, system) for each in (draft.rows, draft.raw))
     return replace(draft, convention=convention, defect=band).changed(rows, raw, told)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -12,11 +12,13 @@ from torch import Tensor
 
 from visadapt.diagnosis.search.disturbance import disturbance
 from visadapt.diagnosis.search.search import Search
+from visadapt.diagnosis.words import listed
 from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import Convention, profile_of
 from visadapt.estimation.segments import Segments
+from visadapt.estimation.unmeasured_states import with_unmeasured
 from visadapt.systems import System
 
 SUSPICIOUS_LOG_PROCESS = math.log(0.02**2)
@@ -25,6 +27,8 @@ and sensors are checked."""
 
 MIN_GAIN_PER_READING = 0.1
 """Log likelihood per reading that another convention must gain to be taken for that of the recording."""
+
+ALIKE = 3.0  # Log likelihood of the source within which two conventions are as likely
 
 EFFECTS_WITH_SIGNS, MOST_EFFECTS_WITH_SIGNS, LEADS_WITH_SIGNS = 2, 6, 3
 """Before a sign convention is decided on, EFFECTS_WITH_SIGNS effects are added one by one to the source in both, the
@@ -36,20 +40,24 @@ each one added."""
 def opposite_signs(
     system: System, rows: Segments, catalogue: Sequence[type[Effect]], source: FitState, fitted: FitState | None
 ) -> Convention | None:
-    """The convention in which the recording is far likelier than in the source's, if there is one.
+    """The convention in which the recording is far likelier than in the source's, if there is one. Where a mirror image
+    moves alike, several are as likely: it then has the names of all, and the signs of the first.
 
     `catalogue` are the effects that may be present, `source` is a fit of the source before bad readings were excluded,
     `fitted` that to `rows`, if known.
     """
-    profile = profile_of(system)
-    if not profile.sign_conventions or float(source.log_process.max()) < SUSPICIOUS_LOG_PROCESS:
+    every = [
+        each for each in profile_of(system).sign_conventions if each.commands or {*each.columns} & {*rows.channels}
+    ]
+    if not every or float(source.log_process.max()) < SUSPICIOUS_LOG_PROCESS:
         return None
     required = MIN_GAIN_PER_READING * float(rows.used.sum())
     as_given = Search(system, rows, catalogue, fitted)
-    conventions = [to_source(rows, convention) for convention in profile.sign_conventions]
+    conventions = [to_source(rows, convention, system) for convention in every]
     others = [Search(system, each, catalogue, rival=_likelihood(as_given)) for each in conventions]
-    best = max(range(len(others)), key=lambda k: _likelihood(others[k]))
-    other = others[best]
+    most = max(_likelihood(each) for each in others)
+    alike = [k for k, each in enumerate(others) if _likelihood(each) > most - ALIKE]
+    other = others[alike[0]]
     if _ahead(other, as_given) <= required:
         return None
     # A sensor that is late by a period can look like a wrong sign, and the screening does not see it.
@@ -60,7 +68,9 @@ def opposite_signs(
             break
         for search in (as_given, other):
             search.extend([search.best], LEADS_WITH_SIGNS)
-    return profile.sign_conventions[best] if _ahead(other, as_given) > required else None
+    if _ahead(other, as_given) <= required:
+        return None
+    return replace(every[alike[0]], name=listed([every[k].name for k in alike], "or"))
 
 
 def _ahead(one: Search, other: Search) -> float:
@@ -71,16 +81,16 @@ def _likelihood(search: Search) -> float:
     return float(search.best.fits.likelihood[0])
 
 
-def signs(convention: Convention | None, channels: Sequence[int]) -> Tensor:
-    """(m,) factors, 1 or -1, of these columns of the state from another convention, if any, to that of the source."""
-    turned = convention.columns if convention else ()
-    return torch.tensor([-1.0 if channel in turned else 1.0 for channel in channels], dtype=torch.float64)
+def signs(turned: Sequence[int], columns: Iterable[int]) -> Tensor:
+    """(m,) factors of these columns: -1 of those that are `turned`, else 1."""
+    return torch.tensor([-1.0 if column in turned else 1.0 for column in columns], dtype=torch.float64)
 
 
-def to_source(rows: Segments, convention: Convention) -> Segments:
+def to_source(rows: Segments, convention: Convention, system: System) -> Segments:
     """Rows of another convention in that of the source."""
-    measured = rows.measured * signs(convention, rows.channels)
-    return replace(rows, measured=measured, command=rows.command * convention.command)
+    measured = rows.measured * signs(convention.columns, rows.channels)
+    command = rows.command * signs(convention.commands, range(rows.command.shape[-1]))
+    return with_unmeasured(replace(rows, measured=measured, command=command), system)
 
 
 MAX_LAG = 0.2
