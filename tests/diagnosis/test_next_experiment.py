@@ -1,12 +1,19 @@
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
 from visadapt.diagnosis.next_experiment import explain, separate
+from visadapt.diagnosis.result import AMBIGUOUS, Cause
+from visadapt.diagnosis.search.causes import Alternative
 from visadapt.diagnosis.search.unexplained import SmoothFunction
+from visadapt.diagnosis.verdict import next_step
 from visadapt.effects import (
     ActuatorBias,
     Brightness,
     ConstantForce,
     CoulombFriction,
+    Effect,
     Gamma,
     PeriodicForce,
     QuadraticDrag,
@@ -29,6 +36,17 @@ def test_one_that_no_experiment_settles_gets_a_general_one():
     advice = separate([[ViscousFriction, ActuatorBias, ConstantForce]], CartPole())
     assert "spring balance" in advice
     assert "free motions with the motor off" in advice
+
+
+def test_slight_causes_need_no_experiment():
+    search: Any = SimpleNamespace(system=CartPole())
+    nothing: Any = None
+    pairs: list[list[type[Effect]]] = [[ActuatorBias, ConstantForce], [CoulombFriction, QuadraticDrag]]
+    groups = [[Alternative(effect, nothing, effect) for effect in pair] for pair in pairs]
+    found = [Cause(effect.name, {}, 0.5, 0.5, slight=pair is pairs[1]) for pair in pairs for effect in pair]
+    advice = next_step(search, nothing, AMBIGUOUS, groups, found, nothing, ())
+    assert advice.startswith("To tell actuator_bias and constant_force apart: ")
+    assert "friction" not in advice
 
 
 def test_every_member_of_a_class_is_told_apart():

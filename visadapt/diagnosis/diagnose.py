@@ -166,7 +166,7 @@ def diagnose(
         causes=found,
         ranking=ranking(comparison, explored.effects, system, measured.closed, repeats),
         gap=measured.gap,
-        next_experiment=next_step(search, comparison, verdict, groups, measured.gap, prepared.coarse),
+        next_experiment=next_step(search, comparison, verdict, groups, found, measured.gap, prepared.coarse),
         warnings=(
             *used.warnings,
             *(f"{effect.name}: {NOT_SEARCHED}" for effect in effects if remembers(effect, system)),

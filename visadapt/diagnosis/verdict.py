@@ -78,10 +78,11 @@ def next_step(
     comparison: ModelComparison,
     verdict: str,
     groups: Sequence[Sequence[Alternative]],
+    found: Sequence[Cause],
     gap: Gap,
     coarse: Sequence[CoarseSteps],
 ) -> str:
-    """The experiment to make next, in words."""
+    """The experiment to make next, in words; slight causes among those `found` need none."""
     if is_slow(comparison, verdict):
         return next_experiment.LONGER
     if verdict == NO_GAP:
@@ -94,7 +95,9 @@ def next_step(
             source = CandidateModel(search.system, (), search.rows)
             first = smooth_functions(source, search.source.fits)[0]
         return next_experiment.explain(first)
-    return next_experiment.separate([[one.effect for one in group] for group in groups], search.system)
+    carrying = {cause.effect for cause in without_slight(found)}
+    classes = [[one.effect for one in group] for group in groups]
+    return next_experiment.separate([c for c in classes if carrying & {one.name for one in c}], search.system)
 
 
 def is_slow(comparison: ModelComparison, verdict: str) -> bool:
