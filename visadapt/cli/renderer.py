@@ -137,8 +137,7 @@ def _check_angles(path: str, episodes: Sequence[Episode], poses: Sequence[NDArra
     for number, (episode, pose) in enumerate(zip(episodes, poses, strict=True)):
         if len(pose) >= LEAST_ROWS and episode.action.shape[1] == 1:
             time, action, state = (each.astype(float) for each in (episode.time, episode.action, pose))
-            place = lambda row: f"row {row + 1}"  # noqa: E731
-            judged.append(RawEpisode(Path(path), time, action, state, ("x", "theta"), place, number=number))
+            judged.append(RawEpisode(Path(path), time, action, state, ("x", "theta"), number=number))
     if not judged:
         return
     theta = np.concatenate([pose[:, 1] for pose in poses])

@@ -35,8 +35,6 @@ UNITS_S = {"nanoseconds": 1e-9, "microseconds": 1e-6, "milliseconds": 1e-3, "min
 """Units that stamps come in by mistake."""
 PERIOD_RATIO = 1.5
 """Largest ratio between the periods of two episodes of one recording."""
-
-
 ROUNDING_ERROR = 0.55
 """Largest deviation of rounded stamps from a steady clock, over the unit that they are rounded to: half of it, and what
 the fit of the clock adds."""
@@ -55,7 +53,7 @@ class RawEpisode:
     """(T, n_measured)"""
     measured: tuple[str, ...]
     """names of the columns of state, in the system's order"""
-    place: Callable[[int], str]
+    place: Callable[[int], str] = lambda row: f"row {row + 1}"
     """names a row, counted from 0, in messages"""
     names: Mapping[str, str] = field(default_factory=dict)
     """the file's names of the variables"""
@@ -144,12 +142,10 @@ def uninterrupted(raw: RawEpisode, note: Note) -> list[RawEpisode]:
     gaps = steps > GAP_PERIODS * period * (1 + 1e-6)
     irregular = gaps.mean() > MOST_GAPS and gaps.sum() > 1
     longest = max(HARMLESS_GAP_S, (LONGEST_STEP_PERIODS if irregular else GAP_PERIODS) * period)
-    cuts = np.flatnonzero(steps > longest * (1 + 1e-6))
+    cuts = (np.flatnonzero(steps > longest * (1 + 1e-6)) + 1).tolist()
     for cut in cuts:
-        note("rows are missing here; the episode was split", f"{raw.source}, {raw.place(int(cut) + 1)}")
-    edges = [0, *(int(cut) + 1 for cut in cuts), len(raw.time)]
-    parts = [raw.part(start, end) for start, end in pairwise(edges)]
-    return [_clocked(part, note) for part in parts]
+        note("rows are missing here; the episode was split", f"{raw.source}, {raw.place(cut)}")
+    return [_clocked(raw.part(start, end), note) for start, end in pairwise([0, *cuts, len(raw.time)])]
 
 
 def _clocked(part: RawEpisode, note: Note) -> RawEpisode:

@@ -1,7 +1,7 @@
 """Recordings of states as CSV: columns `episode,time,<states>,<actions>`, SI units, one row per instant.
 
-Without a column `episode` the file is one episode. Rates of change may be missing. Other common names, separators
-(commas or semicolons, as spreadsheets write them) and clocks (`clock.py`) are understood too.
+Without a column `episode` the file is one episode. Rates of change may be missing. Other common names (`columns.py`),
+separators (commas or semicolons, as spreadsheets write them) and clocks (`clock.py`) are understood too.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import string
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import chain, count, islice, pairwise
+from itertools import chain, count, islice
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +23,11 @@ from numpy.typing import NDArray
 
 from visadapt.progress import Progress
 from visadapt.recordings.clock import Note, RawEpisode
+from visadapt.recordings.columns import match
 from visadapt.recordings.episode import RecordingError
+from visadapt.recordings.runs import runs
 from visadapt.recordings.thinning import STRETCH, thinned
-from visadapt.systems import RigidBody, System
+from visadapt.systems import System
 
 SEPARATORS = "\t;,"
 """The first that is as often in the line of names as in the next line separates: names and numbers may have commas."""
@@ -33,17 +35,6 @@ SEPARATORS = "\t;,"
 UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 
 PLAIN = frozenset(string.printable) - frozenset('"#_')  # Characters of lines without quoted cells and comments
-
-OTHER_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
-    "cartpole": {
-        "x": ("position", "cart_position", "pos", "s"),
-        "x_dot": ("positionD", "velocity", "cart_velocity"),
-        "theta": ("angle", "pole_angle"),
-        "theta_dot": ("angleD", "angular_velocity"),
-        "command": ("action", "u", "Q", "control", "input", "force"),
-    }
-}
-"""Other common names of a system's variables; upper and lower case are the same."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +195,9 @@ def _lines(path: Path, progress: Progress | None = None) -> Generator[tuple[int,
                 for number, line in enumerate(file, 1):
                     if progress is not None and number % STRETCH == 0:
                         progress(raw.tell() // 10**6, size // 10**6 + 1, math.nan)
-                    if (text := line.strip()) and not text.startswith("#") and not _says_separator(number, text):
+                    text = line.strip()
+                    names_separator = number == 1 and re.fullmatch("sep=.", text)  # as Excel writes it
+                    if text and not text.startswith("#") and not names_separator:
                         yield number, line.removesuffix("\n")
             except UnicodeDecodeError as error:
                 byte = raw.tell() - len(error.object) + error.start
@@ -212,11 +205,6 @@ def _lines(path: Path, progress: Progress | None = None) -> Generator[tuple[int,
                 raise RecordingError(f"{path}: not text in UTF-8{coded}; CSV in UTF-8 is right") from error
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-
-
-def _says_separator(number: int, text: str) -> bool:
-    """Whether this is Excel's first line, which names the separator."""
-    return number == 1 and re.fullmatch("sep=.", text) is not None
 
 
 def read_rows(
@@ -250,99 +238,13 @@ def read_rows(
     label = values["episode"]
     if np.isnan(label).any():
         raise RecordingError(f"{path}: {rows.place(int(np.isnan(label).argmax()))}, column 'episode' is not a number")
-    edges = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), len(label)]
-    if len(edges) > max(len(label) / 2, 2 * len(np.unique(label)) + 1):
+    parts = list(runs(label))
+    if len(parts) > max(len(label) / 2 - 1, 2 * len(np.unique(label))):
         raise RecordingError(
-            f"{path}: the rows of episodes are mixed, {label[0]:g} and {label[edges[1]]:g} in turn; all rows of an "
+            f"{path}: the rows of episodes are mixed, {label[0]:g} and {label[parts[0][1]]:g} in turn; all rows of an "
             "episode one below the other are right"
         )
-    return [replace(whole.part(start, end), number=float(label[start])) for start, end in pairwise(edges)]
-
-
-def needed(system: System) -> tuple[str, ...]:
-    """Columns that a recording must have, unless `given` says that one was not measured: time, all states but
-    velocities, and actions."""
-    names = [variable.name for variable in system.states]
-    rates = {system.rate_of(name) for name in names} | {names[velocity] for _, velocity in system.coordinates}
-    return ("time", *(name for name in names if name not in rates), *(variable.name for variable in system.actions))
-
-
-def may_be_unmeasured(system: System) -> list[str]:
-    """States that a recording may lack where `given` says so: of a vehicle velocities alone."""
-    states = [state.name for state in system.states]
-    return [name for name in states if name not in needed(system)] if isinstance(system, RigidBody) else states
-
-
-def check_given(given: Mapping[str, str], ours: Sequence[str], system: System) -> None:
-    """Raises RecordingError where `given` maps a name that is none of `ours`, or leaves out what must be measured."""
-    states, optional = [state.name for state in system.states], may_be_unmeasured(system)
-    for name, theirs in given.items():
-        if name not in ours:
-            raise RecordingError(f"--columns {name}=...: {system.name} has no {name!r}; it has {', '.join(ours)}")
-        if not theirs and name not in optional:
-            raise RecordingError(f"--columns {name}=: {name} is needed; --columns {name}=... names it")
-    if all(given.get(name) == "" for name in states):
-        raise RecordingError(f"--columns: one of {', '.join(states)} at least must be measured")
-
-
-def match(
-    path: Path, header: tuple[str, ...], system: System, given: Mapping[str, str], states: bool = True
-) -> dict[str, int]:
-    """The index of each of our variables in a file's header; `given` maps our names to the file's, or to "" where a
-    state was not measured.
-
-    Without `states` it has no states, as where frames are read in their place.
-
-    Raises:
-        RecordingError: a needed column is missing, several columns could be one variable, or `given` names a variable
-            or a column that does not exist.
-    """
-    others = {"time": ("t", "timestamp"), **OTHER_NAMES.get(system.name, {})}
-    wanted_states = [state.name for state in system.states] if states else []
-    ours = ["episode", "time", *wanted_states, *(action.name for action in system.actions)]
-    if unread := [state.name for state in system.states if not states and state.name in given]:
-        raise RecordingError(f"--columns {unread[0]}=...: no states are read where frames are")
-    check_given(given, ours, system)
-    found: dict[str, int] = {}
-    for name in ours:
-        if given.get(name) == "":
-            continue
-        candidates: list[int] = []
-        named = [(given[name],)] if name in given else [(name,), others.get(name, ())]
-        for k, names in enumerate(named):
-            alike = [index for index, there in enumerate(header) if any(_is(there, one, k > 0) for one in names)]
-            exact = [index for index in alike if name in given and header[index] == given[name]]
-            candidates = candidates or exact or alike
-        if len(candidates) > 1:
-            which = ", ".join(repr(header[index]) for index in candidates)
-            ask = f"say which: --columns {name}=..."
-            if len({header[index] for index in candidates}) < len(candidates):
-                ask = "give them different names"
-            raise RecordingError(f"{path}: the columns {which} could each be {name}; {ask}")
-        if candidates:
-            taken = next((other for other, index in found.items() if index == candidates[0]), None)
-            if taken is not None:
-                raise RecordingError(f"{path}: column {header[candidates[0]]!r} is taken for both {taken} and {name}")
-            found[name] = candidates[0]
-        elif name in given:
-            raise RecordingError(f"{path}: has no column {given[name]!r} for {name}; it has {', '.join(header)}")
-        elif name in needed(system):
-            raise RecordingError(
-                f"{path}: column {name!r} is missing; it has {', '.join(header)}; "
-                f"if one of them is {name}: --columns {name}=...{if_unmeasured(system, name)}"
-            )
-    return found
-
-
-def _is(there: str, name: str, other: bool) -> bool:
-    """Whether a column has a name, whatever the case; but of another common name (`OTHER_NAMES`) that is a single
-    letter, the case counts: t is the time, T a temperature."""
-    return there == name if other and len(name) == 1 else there.lower() == name.lower()
-
-
-def if_unmeasured(system: System, name: str) -> str:
-    """The end of a message that a column is missing: what to say where it is a state that was not measured."""
-    return f"; if it was not measured: --columns {name}=" if name in may_be_unmeasured(system) else ""
+    return [replace(whole.part(start, end), number=float(label[start])) for start, end in parts]
 
 
 def _number(cell: str) -> float:

@@ -11,12 +11,12 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from visadapt.progress import Report, staged
 from visadapt.recordings.checks import check_commands, check_finite, check_units
 from visadapt.recordings.clock import Note, RawEpisode, alike, check_forward, check_steps, uninterrupted
-from visadapt.recordings.csv import match, read_rows
+from visadapt.recordings.columns import match
+from visadapt.recordings.csv import read_rows
 from visadapt.recordings.episode import Episode, Recording, RecordingError
 from visadapt.recordings.hdf5 import read_names, read_stretches
 from visadapt.recordings.logs import read_log
@@ -48,12 +48,12 @@ def load_recording(
 ) -> Recording:
     """Read states and actions from CSV and HDF5 files and logs, or frames and actions from HDF5 files.
 
-    Names are matched by `csv.py`; those of logs, bags of ROS and ULog, are TOPIC.FIELD (`logs.py`). Clocks are checked
-    by `clock.py`; rows of an unsteady one keep their stamps. An angle is unwrapped within an episode if the physics are
-    the same after a whole turn. Upright is then 0; if the pole turns over, in the turn in which it is upright most
-    often. A command in N (a column `force` that exceeds 1) is divided by the system's `max_force`. Where files are too
-    long for memory, stretches of rows are left out (`thinning.py`). The recording's warnings say what was changed or
-    left out.
+    Names are matched by `columns.py`; those of logs, bags of ROS and ULog, are TOPIC.FIELD (`logs.py`). Clocks are
+    checked by `clock.py`; rows of an unsteady one keep their stamps. An angle is unwrapped within an episode if the
+    physics are the same after a whole turn. Upright is then 0; if the pole turns over, in the turn in which it is
+    upright most often. A command in N (a column `force` that exceeds 1) is divided by the system's `max_force`. Where
+    files are too long for memory, stretches of rows are left out (`thinning.py`). The recording's warnings say what was
+    changed or left out.
 
     Args:
         paths: one or several: files, bags of ROS 2, or folders whose recordings are taken in the order of their names.
@@ -79,15 +79,15 @@ def load_recording(
     def note(text: str, where: str) -> None:
         places.setdefault(text, []).append(where)
 
-    if unmeasured := [name for name, theirs in (columns or {}).items() if not theirs]:
-        told = "not measured: estimated with the simulator from what was measured"
-        note(told, ", ".join(unmeasured))
+    columns = columns or {}
+    if unmeasured := [name for name, theirs in columns.items() if not theirs]:
+        note("not measured: estimated with the simulator from what was measured", ", ".join(unmeasured))
     whole: list[RawEpisode] = []
     files = _files([paths] if isinstance(paths, str | os.PathLike) else paths, note)
     sizes = [path.stat().st_size for path in files]
     for path, size in zip(files, sizes, strict=True):
         most = MOST_BYTES * size / max(1, sum(sizes))
-        episodes = _read(path, system, columns or {}, frames, note, most, progress)
+        episodes = _read(path, system, columns, frames, note, most, progress)
         for raw in episodes:
             check_finite(raw, system.actions)
             check_forward(raw)
@@ -102,21 +102,18 @@ def load_recording(
     turning = [state.name for state in system.states if state.unit == "rad" and turns(system, state.name)]
     parts = [part for raw in whole for part in uninterrupted(_unwrapped(raw, turning), note)]
     parts, period = alike(_long_enough(parts, note), note)
+    outliers = any(part.usable is not None for part in parts)
     return Recording(
         episodes=tuple(Episode(part.time, part.action, None if frames else part.state, part.frame) for part in parts),
         measured=whole[0].measured,
         period=period,
         sources=tuple(part.source for part in parts),
-        usable=() if all(part.usable is None for part in parts) else tuple(map(_usable, parts)),
+        usable=tuple(np.ones(len(p.time), bool) if p.usable is None else p.usable for p in parts) if outliers else (),
         warnings=tuple(
             f"{where[0]}{f' and {len(where) - 1} more' if len(where) > 1 else ''}: {text}"
             for text, where in places.items()
         ),
     )
-
-
-def _usable(part: RawEpisode) -> NDArray[np.bool_]:
-    return np.ones(len(part.time), bool) if part.usable is None else part.usable
 
 
 def _files(paths: Sequence[str | os.PathLike[str]], note: Note) -> list[Path]:
@@ -199,7 +196,7 @@ def _read_hdf5(
     found = match(path, header, system, given, states=not frames)
     measured = tuple(variable.name for variable in system.states if variable.name in found)
     names = {name: header[index] for name, index in found.items()}
-    rows = []
+    raw = []
     episodes, total = read_stretches(path, frames, most)
     if (used := sum(len(episode.time) for episode in episodes.values())) < total:
         note(thinned(used, total), str(path))
@@ -215,13 +212,12 @@ def _read_hdf5(
                 f"{', '.join(state_names)} and {', '.join(action_names)} are right"
             )
         table = np.column_stack([episode.time, states, episode.action]).astype(float)
-        state, action = (
-            table[:, [found[name] for name in each]] for each in (measured, [a.name for a in system.actions])
-        )
-        place = lambda row: f"row {row + 1}"  # noqa: E731
+        action = table[:, [found[variable.name] for variable in system.actions]]
+        state = table[:, [found[name] for name in measured]]
         seen = episode.frame if frames else None
-        rows.append(RawEpisode(path, table[:, found["time"]], action, state, measured, place, names, number, seen))
-    return rows
+        time = table[:, found["time"]]
+        raw.append(RawEpisode(path, time, action, state, measured, names=names, number=number, frame=seen))
+    return raw
 
 
 def _shared(episodes: Sequence[RawEpisode], system: System, note: Note) -> list[RawEpisode]:
@@ -245,10 +241,10 @@ def _commands(episodes: list[RawEpisode], system: System, note: Note) -> list[Ra
         any(raw.names.get(one.name, "").lower().split(".")[-1] == "force" for one in system.actions if one.unit == "1")
         for raw in episodes
     ]
-    largest = max((np.abs(raw.action).max() for raw, force in zip(episodes, forces, strict=True) if force), default=0)
     limit = getattr(system, "max_force", None)
     if limit is None or not any(forces):
         return episodes
+    largest = max(np.abs(raw.action).max() for raw, force in zip(episodes, forces, strict=True) if force)
     if largest <= 1 and not is_in_newtons(episodes, system, limit):
         within = "the column 'force' stays within [-1, 1] and is taken to be a share of max_force"
         note(f"{within}; a force in N is to be divided by it, {limit:g} N", "the recording")

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from visadapt.recordings.clock import Note, RawEpisode
-from visadapt.recordings.csv import check_given, if_unmeasured, needed
+from visadapt.recordings.columns import check_given, if_unmeasured, needed
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.topics import Read, Topic
 from visadapt.systems import RigidBody, System
@@ -43,17 +43,14 @@ def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], n
     wanted: dict[str, set[str]] = {}
     for topic, field in places.values():
         wanted.setdefault(topic, set()).add(field)
-    return _rows(path, system, places, _topics(path, read, wanted), note)
-
-
-def _topics(path: Path, read: Read, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
     try:
-        return read(path, wanted)
+        topics = read(path, wanted)
     except RecordingError:
         raise
     except Exception as error:  # parsers raise anything on a damaged file, MemoryError on a wrong size
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-    raise RecordingError(f"{path}: cannot be read as a log, is it cut short or damaged? {reason}")
+        raise RecordingError(f"{path}: cannot be read as a log, is it cut short or damaged? {reason}") from None
+    return _rows(path, system, places, topics, note)
 
 
 def _rows(
@@ -70,29 +67,25 @@ def _rows(
             raise RecordingError(f"{path}: the clock of {name} runs backwards after its message {back[0] + 1}")
     read = list(dict.fromkeys(places[name][0] for name in measured))
     commanded = list(dict.fromkeys(places[action.name][0] for action in system.actions))
-    slowest = max(read, key=lambda name: _interval(topics[name].time))
-    first = max(topics[name].time[0] for name in (*read, *commanded))
-    ends = {
-        name: topics[name].time[-1] if name in read else _held_until(topics[name].time) for name in (*read, *commanded)
-    }
-    last = min(ends.values())
+    every = (*read, *commanded)
+    slowest = max(read, key=lambda name: np.median(np.diff(topics[name].time)))
+    begins = {name: topics[name].time[0] for name in every}
+    ends = {name: topics[name].time[-1] if name in read else _held_until(topics[name].time) for name in every}
+    last_to_begin, first_to_end = max(begins, key=begins.__getitem__), min(ends, key=ends.__getitem__)
     time = topics[slowest].time
-    used = (time >= first) & (time <= last)
+    early, late = time < begins[last_to_begin], time > ends[first_to_end]
+    used = ~early & ~late
     for name in read:
         if name != slowest:
             used &= _between_readings(time, topics[name].time)
     rows = np.flatnonzero(used)
     if len(rows) < 2:
-        raise RecordingError(f"{path}: {', '.join((*read, *commanded))} have no time in common")
+        raise RecordingError(f"{path}: {', '.join(every)} have no time in common")
     time = time[rows]
-
-    every = (*read, *commanded)
-    for when, edge, outside in (
-        ("before the first", [topics[name].time[0] for name in every], topics[slowest].time < first),
-        ("after the last", [-ends[name] for name in every], topics[slowest].time > last),
-    ):
-        if dropped := int(outside.sum()):
-            note(f"{dropped} rows {when} message of {every[int(np.argmax(edge))]} are left out", str(path))
+    if early.any():
+        note(f"{early.sum()} rows before the first message of {last_to_begin} are left out", str(path))
+    if late.any():
+        note(f"{late.sum()} rows after the last message of {first_to_end} are left out", str(path))
     quaternion = [state.name for state in system.states[ATTITUDE]] if isinstance(system, RigidBody) else []
 
     def state(name: str) -> NDArray[np.float64]:
@@ -129,11 +122,6 @@ def _rows(
         lambda row: f"message {rows[row] + 1} of {slowest}",
         {name: ".".join(place) for name, place in places.items()},
     )
-
-
-def _interval(stamps: NDArray[np.float64]) -> float:
-    """The median interval in s between a topic's messages."""
-    return float(np.median(np.diff(stamps)))
 
 
 def _held_until(stamps: NDArray[np.float64]) -> float:

@@ -1,0 +1,109 @@
+"""Which column of a recording is which variable: the names that are recognised, and the states that may be missing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from visadapt.recordings.episode import RecordingError
+from visadapt.systems import RigidBody, System
+
+OTHER_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
+    "cartpole": {
+        "x": ("position", "cart_position", "pos", "s"),
+        "x_dot": ("positionD", "velocity", "cart_velocity"),
+        "theta": ("angle", "pole_angle"),
+        "theta_dot": ("angleD", "angular_velocity"),
+        "command": ("action", "u", "Q", "control", "input", "force"),
+    }
+}
+"""Other common names of a system's variables; upper and lower case are the same."""
+
+
+def needed(system: System) -> tuple[str, ...]:
+    """Columns that a recording must have, unless `given` says that one was not measured: time, all states but
+    velocities, and actions."""
+    names = [variable.name for variable in system.states]
+    rates = {system.rate_of(name) for name in names} | {names[velocity] for _, velocity in system.coordinates}
+    return ("time", *(name for name in names if name not in rates), *(variable.name for variable in system.actions))
+
+
+def may_be_unmeasured(system: System) -> list[str]:
+    """States that a recording may lack where `given` says so: of a vehicle velocities alone."""
+    states = [state.name for state in system.states]
+    return [name for name in states if name not in needed(system)] if isinstance(system, RigidBody) else states
+
+
+def check_given(given: Mapping[str, str], ours: Sequence[str], system: System) -> None:
+    """Raises RecordingError where `given` maps a name that is none of `ours`, or leaves out what must be measured."""
+    states, optional = [state.name for state in system.states], may_be_unmeasured(system)
+    for name, theirs in given.items():
+        if name not in ours:
+            raise RecordingError(f"--columns {name}=...: {system.name} has no {name!r}; it has {', '.join(ours)}")
+        if not theirs and name not in optional:
+            raise RecordingError(f"--columns {name}=: {name} is needed; --columns {name}=... names it")
+    if all(given.get(name) == "" for name in states):
+        raise RecordingError(f"--columns: one of {', '.join(states)} at least must be measured")
+
+
+def match(
+    path: Path, header: tuple[str, ...], system: System, given: Mapping[str, str], states: bool = True
+) -> dict[str, int]:
+    """The index of each of our variables in a file's header; `given` maps our names to the file's, or to "" where a
+    state was not measured.
+
+    Without `states` it has no states, as where frames are read in their place.
+
+    Raises:
+        RecordingError: a needed column is missing, several columns could be one variable, or `given` names a variable
+            or a column that does not exist.
+    """
+    others = {"time": ("t", "timestamp"), **OTHER_NAMES.get(system.name, {})}
+    wanted_states = [state.name for state in system.states] if states else []
+    ours = ["episode", "time", *wanted_states, *(action.name for action in system.actions)]
+    if unread := [state.name for state in system.states if not states and state.name in given]:
+        raise RecordingError(f"--columns {unread[0]}=...: no states are read where frames are")
+    check_given(given, ours, system)
+    found: dict[str, int] = {}
+    for name in ours:
+        if given.get(name) == "":
+            continue
+        candidates = _candidates(header, name, given.get(name), others.get(name, ()))
+        if len(candidates) > 1:
+            which = ", ".join(repr(header[index]) for index in candidates)
+            ask = f"say which: --columns {name}=..."
+            if len({header[index] for index in candidates}) < len(candidates):
+                ask = "give them different names"
+            raise RecordingError(f"{path}: the columns {which} could each be {name}; {ask}")
+        if candidates:
+            taken = next((other for other, index in found.items() if index == candidates[0]), None)
+            if taken is not None:
+                raise RecordingError(f"{path}: column {header[candidates[0]]!r} is taken for both {taken} and {name}")
+            found[name] = candidates[0]
+        elif name in given:
+            raise RecordingError(f"{path}: has no column {given[name]!r} for {name}; it has {', '.join(header)}")
+        elif name in needed(system):
+            raise RecordingError(
+                f"{path}: column {name!r} is missing; it has {', '.join(header)}; "
+                f"if one of them is {name}: --columns {name}=...{if_unmeasured(system, name)}"
+            )
+    return found
+
+
+def _candidates(header: Sequence[str], name: str, given: str | None, others: Sequence[str]) -> list[int]:
+    """The indices of the columns that may be our variable `name`: those called as `given`, or else by our name, or else
+    by another common name. Upper and lower case are the same except in other names of one letter: t is the time, T a
+    temperature."""
+
+    def called(name: str) -> list[int]:
+        return [index for index, there in enumerate(header) if there.lower() == name.lower()]
+
+    if given is not None:
+        return [index for index in called(given) if header[index] == given] or called(given)
+    alias = [index for other in others for index in called(other) if len(other) > 1 or header[index] == other]
+    return called(name) or sorted(alias)
+
+
+def if_unmeasured(system: System, name: str) -> str:
+    """The end of a message that a column is missing: what to say where it is a state that was not measured."""
+    return f"; if it was not measured: --columns {name}=" if name in may_be_unmeasured(system) else ""
