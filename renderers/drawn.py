@@ -59,14 +59,18 @@ class DrawnCartPole:
         base = self.cart_height + 0.04
         self._fill(canvas, _box(-10.0, 10.0, -base - 0.03, -base), TRACK_GREY)
         self._fill(canvas, _box(x - self.cart_width / 2, x + self.cart_width / 2, -base, -0.04), CART_GREY)
+        self._fill(canvas, self.pole(x, theta), POLE_GREY)
+        around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+        self._fill(canvas, np.array([x, 0.0]) + 0.05 * np.stack([np.cos(around), np.sin(around)], -1), AXLE_GREY)
+        return np.asarray(cv2.resize(canvas, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
+
+    def pole(self, x: float, theta: float) -> NDArray[np.floating]:
+        """Corners (4, 2) in m of the pole, x to the right and z up from the hinge at x = 0; theta in rad."""
         along = np.array([np.sin(theta), np.cos(theta)])
         across = np.array([along[1], -along[0]]) * self.pole_width / 2
         hinge = np.array([x, 0.0])
         tip = hinge + along * self.pole_length
-        self._fill(canvas, np.array([hinge - across, hinge + across, tip + across, tip - across]), POLE_GREY)
-        around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-        self._fill(canvas, hinge + 0.05 * np.stack([np.cos(around), np.sin(around)], -1), AXLE_GREY)
-        return np.asarray(cv2.resize(canvas, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
+        return np.array([hinge - across, hinge + across, tip + across, tip - across])
 
     def _fill(self, canvas: NDArray[np.uint8], corners: NDArray[np.floating], grey: int) -> None:
         """Fill a polygon of corners (n, 2) in m, x to the right and z up from the hinge."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
@@ -11,29 +11,22 @@ from safetensors.torch import save
 from torch import Tensor, uint8
 
 
-def sealed(text: str, tensors: Mapping[str, Tensor]) -> str:
-    """The JSON that says what tensors are, after a checksum of both.
-
-    One entry of a header, since safetensors writes several in an order that changes from run to run.
-    """
-    return f"{_checksum(text, tensors)} {text}"
-
-
 def unsealed(entry: str, tensors: Mapping[str, Tensor]) -> str | None:
-    """The JSON of what `sealed` gave; None where the checksum does not fit. Older files have none."""
+    """The JSON in the entry of a header; None where the checksum before it does not fit. Older files have none."""
     if entry.startswith("{"):
         return entry
-    checksum, _, text = entry.partition(" ")
-    return text if checksum == _checksum(text, tensors) else None
+    written, _, text = entry.partition(" ")
+    return text if written == checksum(text, sorted(tensors.items())) else None
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], key: str, text: str) -> None:
-    """Write tensors, with the JSON that says what they are under a key of the header.
+    """Write tensors, with the JSON that says what they are, after a checksum of both, under a key of the header.
 
-    Not by `safetensors.torch.save_file`, which writes a file of another name first: a process that is killed meanwhile
-    leaves it.
+    Not under several keys, which safetensors writes in an order that changes from run to run. Nor by
+    `safetensors.torch.save_file`, which writes a file of another name first: a process that is killed meanwhile leaves
+    it.
     """
-    path.write_bytes(save(dict(tensors), {key: sealed(text, tensors)}))
+    path.write_bytes(save(dict(tensors), {key: f"{checksum(text, sorted(tensors.items()))} {text}"}))
 
 
 def read_tensors(path: Path, kind: str, error: type[ValueError]) -> tuple[dict[str, str], dict[str, Tensor]]:
@@ -53,9 +46,10 @@ def read_tensors(path: Path, kind: str, error: type[ValueError]) -> tuple[dict[s
         raise error(f"{path}: not a complete safetensors file ({caught})") from caught
 
 
-def _checksum(text: str, tensors: Mapping[str, Tensor]) -> str:
+def checksum(text: str, tensors: Iterable[tuple[str, Tensor]]) -> str:
+    """The SHA-256 of a text and, in this order, of tensors with their names."""
     found = hashlib.sha256(text.encode())
-    for name, values in sorted(tensors.items()):
+    for name, values in tensors:
         found.update(f"{name} {values.dtype} {tuple(values.shape)}".encode())
         found.update(values.detach().cpu().contiguous().reshape(-1).view(uint8).numpy().tobytes())
     return found.hexdigest()

@@ -186,7 +186,7 @@ class CartPoleFilm(Film):
         cone = Wedge((0, 0), 1.08 * sizes.pole_length, 80, 100, alpha=0.3, visible=panel.swings_up)
         earlier = PolyCollection([], facecolors=to_rgba_array([BLUE] * 16, np.linspace(0.28, 0.02, 16)))
         cart = Rectangle((0, -base), sizes.cart_width, base, facecolor=INK)
-        pole = Polygon(_pole(sizes, 0.0, 0.0))
+        pole = Polygon(sizes.pole(0.0, 0.0))
         hinge = Circle((0, 0), 0.05, facecolor=TROUGH)
         arrow = FancyArrowPatch((0, 0), (1, 0), color=ORANGE, shrinkA=0, shrinkB=0)
         arrow.set_arrowstyle("simple,head_length=18,head_width=22,tail_width=8")
@@ -199,11 +199,11 @@ class CartPoleFilm(Film):
             up = panel.swings_up and abs(theta) < UPRIGHT_RAD
             cone.set(center=(x, 0), facecolor=TEAL if up else MUTED)
             cart.set_x(x - sizes.cart_width / 2)
-            pole.set(xy=_pole(sizes, x, theta), facecolor=TEAL if up else BLUE)
+            pole.set(xy=sizes.pole(x, float(theta)), facecolor=TEAL if up else BLUE)
             hinge.set_center((x, 0))
             if panel.swings_up:
                 rows = range(row - 2, max(row - 34, -1), -2)
-                earlier.set_verts([_pole(sizes, *panel.state[each, [0, 2]]) for each in rows])
+                earlier.set_verts([sizes.pole(*panel.state[each, [0, 2]].tolist()) for each in rows])
             force = 0.0 if panel.run.force is None else float(panel.run.force[row]) / self.full_force
             tip = x - math.copysign(sizes.cart_width / 2 + 0.03, force)
             arrow.set_positions((tip - 0.19 * wide * force, -base / 2), (tip, -base / 2))
@@ -226,9 +226,8 @@ class CartPoleFilm(Film):
 
         def show(row: int, ended: bool) -> None:
             x, x_dot, theta = panel.state[row, :3]
-            for text, value in zip(
-                readings, (f"{x:+.2f}", f"{x_dot:+.2f}", f"{math.degrees(theta):+.1f}"), strict=True
-            ):
+            values = (f"{x:+.2f}", f"{x_dot:+.2f}", f"{math.degrees(theta):+.1f}")
+            for text, value in zip(readings, values, strict=True):
                 text.set(text=value.replace("-", MINUS), color=MUTED if ended else INK)
             set_command(None if row == len(episode.time) - 1 else float(episode.action[row, 0]))
             set_force(None if ended or panel.run.force is None else float(panel.run.force[row]))
@@ -242,11 +241,3 @@ def _picture(axes: Axes, pictures: NDArray[np.uint8]) -> Callable[[int, bool], N
     """Fill axes with one of several pictures (T, H, W) or (T, H, W, 3); the function returned chooses it by row."""
     image = axes.imshow(pictures[0], "gray", vmin=0, vmax=255, animated=True)
     return lambda row, ended: image.set_data(pictures[row])
-
-
-def _pole(sizes: DrawnCartPole, x: float, theta: float) -> Floats:
-    """Corners (4, 2) in m"""
-    along = np.array([math.sin(theta), math.cos(theta)])
-    across = sizes.pole_width / 2 * np.array([along[1], -along[0]])
-    hinge, tip = np.array([x, 0.0]), np.array([x, 0.0]) + sizes.pole_length * along
-    return np.stack([hinge - across, hinge + across, tip + across, tip - across])

@@ -76,12 +76,8 @@ def _run(policy: Policy, target: Target, seconds: float, seed: int, see: See | N
     steps = round(seconds / target.period)
     if isinstance(target, FlightTarget):
         steps = min(steps, target.task.steps)
-    if (
-        see is None
-        and policy.shown == "state"
-        and isinstance(target, SyntheticTarget)
-        and math.isinf(target.angle_limit)
-    ):
+    swings_up = isinstance(target, SyntheticTarget) and math.isinf(target.angle_limit)
+    if see is None and policy.shown == "state" and swings_up:
         see = see_within_a_turn
     generator = torch.Generator().manual_seed(seed)
     return run(target, policy.eval(), 1, steps, generator, strict=False, see=see)[0]

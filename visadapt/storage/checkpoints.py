@@ -6,17 +6,15 @@ file's header.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
-from renderers.tensor_file import read_tensors, unsealed, write_tensors
+from renderers.tensor_file import checksum, read_tensors, unsealed, write_tensors
 from renderers.weights import HEADER_KEY
 from visadapt.storage.atomic_files import replacing
 
@@ -94,11 +92,7 @@ def check_sizes(needed: Mapping[str, Tensor], found: Mapping[str, Tensor], origi
 
 def weights_digest(network: nn.Module) -> str:
     """The SHA-256 of all weights and buffers of a network."""
-    digest = hashlib.sha256()
-    for name, value in network.state_dict().items():
-        digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-        digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()
+    return checksum("", network.state_dict().items())
 
 
 def save_network(path: Path, network: nn.Module, settings: Mapping[str, Any]) -> None:
