@@ -46,13 +46,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     plan_help = "where several effects fit equally well, write here what to add to the commands to tell them apart"
     add("--plan", metavar="F.csv", help=plan_help)
     _add_seed(parser)
-    add(
-        "--jobs",
-        metavar="N",
-        type=_positive,
-        default=1,
-        help="processes that share the work (default: 1)",
-    )
+    add("--jobs", metavar="N", type=_positive, default=1, help="processes that share the work (default: 1)")
 
 
 def effects(parser: argparse.ArgumentParser) -> None:

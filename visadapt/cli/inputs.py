@@ -12,7 +12,7 @@ import shutil
 import sys
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -37,10 +37,10 @@ OWN_FILES: set[str] = set()
 """Files of the user's whose code is run."""
 OWN_FOLDERS: set[Path] = set()
 """Folders where these may have imported other files of the user's from."""
-LIBRARIES = (
+LIBRARIES = {
     *(Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib")),
     *(Path(__file__).parents[2] / package for package in ("visadapt", "renderers")),
-)
+}
 """Folders in whose code an error is not the user's, wherever they lie."""
 
 
@@ -170,11 +170,11 @@ def _effect(text: str, system: System) -> Effect:
     except ValueError as error:
         raise InputError(f"--effect {text}: {error}") from error
     for parameter in sized(EFFECTS[name], system).table:
-        low, high, value = (f"{one:g}" for one in (parameter.low, parameter.high, values[parameter.name]))
-        if not parameter.low <= values[parameter.name] <= parameter.high:
-            range_searched = f"{low} to {with_unit(high, parameter.unit)}"
-            given = f"visadapt: --effect {text}: {parameter.name} is {with_unit(value, parameter.unit)}"
-            print(f"{given}; a diagnosis looks for it from {range_searched}", file=sys.stderr)
+        value = values[parameter.name]
+        if not parameter.low <= value <= parameter.high:
+            given, high = (with_unit(f"{one:g}", parameter.unit) for one in (value, parameter.high))
+            searched = f"a diagnosis looks for it from {parameter.low:g} to {high}"
+            print(f"visadapt: --effect {text}: {parameter.name} is {given}; {searched}", file=sys.stderr)
     return effect
 
 
@@ -271,10 +271,8 @@ def own_line(error: BaseException) -> str | None:
 
 
 def _is_own(file: str) -> bool:
-    def lies_in(folders: Iterable[Path]) -> bool:
-        return any(folder in Path(file).parents for folder in folders)
-
-    return file in OWN_FILES or (lies_in(OWN_FOLDERS) and not lies_in(LIBRARIES))
+    folders = Path(file).parents
+    return file in OWN_FILES or (not OWN_FOLDERS.isdisjoint(folders) and LIBRARIES.isdisjoint(folders))
 
 
 def describe(error: BaseException, path: str | None = None) -> str:

@@ -107,6 +107,5 @@ def printable(message: object) -> str:
     """A message in one line without control characters, which a name or a cell may hold; a very long one is cut in
     the middle."""
     text = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in str(message))
-    return (
-        text if len(text) <= LONGEST_MESSAGE else f"{text[: LONGEST_MESSAGE // 2]} ... {text[-LONGEST_MESSAGE // 2 :]}"
-    )
+    half = LONGEST_MESSAGE // 2
+    return text if len(text) <= LONGEST_MESSAGE else f"{text[:half]} ... {text[-half:]}"

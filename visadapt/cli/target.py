@@ -58,8 +58,7 @@ def load_target(options: argparse.Namespace, source: World, frames: bool) -> Tar
         env = lambda: ready.pop() if ready else factory()  # noqa: E731  # the one that is made already, then new ones
     if mapping is None:
         raise InputError(f"{name}: a gymnasium id needs --map MAP.toml; a target of your own is package.module:factory")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of an inherited period: said below
+    with warnings.catch_warnings(action="ignore"):  # of an inherited period: said below
         target = GymnasiumTarget(env, mapping, type(source.system), frames=frames, name=name)
     if target.period_origin != "as given":
         print(f"visadapt: {name}: {target.period:g} s between actions, from {target.period_origin}", file=sys.stderr)
@@ -93,15 +92,11 @@ def _check(path: str, policy: Policy, source: World, target: Target) -> None:
     # Only what is observed says how large it is. A reset is no step: it is not counted.
     observed = checked(target, target.reset(1, torch.Generator().manual_seed(0)), 1)
     shown = SHOWN[policy.shown](observed).shape[1:]
-    if policy.shown != "frame" and shown != policy.observation_shape:
-        (here,), (needed,) = shown, policy.observation_shape
-        raise InputError(f"{target.name} shows {here} numbers of {policy.shown}; {path} was trained on {needed}")
-    if policy.shown == "frame":
-        height, width = policy.observation_shape
-        if shown != (height, width):
-            raise InputError(
-                f"{target.name} shows frames of {shown[1]} x {shown[0]} px; {path} was trained on {width} x {height}"
-            )
+    if shown != (needed := policy.observation_shape):
+        differ = f"{shown[0]} numbers of {policy.shown}; {path} was trained on {needed[0]}"
+        if policy.shown == "frame":
+            differ = f"frames of {shown[1]} x {shown[0]} px; {path} was trained on {needed[1]} x {needed[0]}"
+        raise InputError(f"{target.name} shows {differ}")
     if abs(target.period - source.period) > 1e-6:
         raise InputError(
             f"{target.name} has {target.period:g} s between actions, {path} was trained for {source.period:g} s: "

@@ -22,10 +22,7 @@ from visadapt.targets import mujoco_frames
 from visadapt.targets.base import Observation, Target, TargetError
 from visadapt.targets.env_map import EnvMap
 
-RETURNED = {
-    "reset": ("observation", "info"),
-    "step": ("observation", "reward", "terminated", "truncated", "info"),
-}
+RETURNED = {"reset": ("observation", "info"), "step": ("observation", "reward", "terminated", "truncated", "info")}
 """What these methods of an environment return."""
 
 
