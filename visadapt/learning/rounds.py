@@ -152,7 +152,11 @@ class JointLearning:
         self._collect(folder, samples)
         if self.explain is not None:
             self.found = self.explain(self.recorded, folder.diagnosis)
-            self._estimate_beside_what_is_known()
+            network = self.residual.network
+            if isinstance(network, FlightResidualNetwork) and network.predict is not None:
+                # A vehicle's disturbance estimate then holds only what source and named effects leave unexplained. A
+                # policy that is loaded from its file estimates in the same way.
+                network.predict = self.known.steps_along
         if self.found.complete:
             losses: list[GroundLoss] = []
             self.residual.network.load_state_dict(self.untrained)
@@ -161,13 +165,6 @@ class JointLearning:
             losses, transitions = self._ground(folder)
             tuning = self._tune_with_residual(folder, transitions)
         return Round(self.ledger.used, losses, tuning, self.found)
-
-    def _estimate_beside_what_is_known(self) -> None:
-        """Let a vehicle's disturbance estimate predict with the source and the named effects, so that it holds only
-        what these leave unexplained. A policy that is loaded from its file estimates in the same way."""
-        network = self.residual.network
-        if isinstance(network, FlightResidualNetwork) and network.predict is not None:
-            network.predict = self.known.steps_along
 
     def _collect(self, folder: RoundFolder, samples: int) -> None:
         """Collect `samples` steps of the target, but no more than the ledger has left, and enter them in the ledger.

@@ -32,6 +32,7 @@ from visadapt.estimation.linearise import linearise_step, load_effect
 from visadapt.estimation.noise import Noise, UnknownNoise, most_probable_noise
 from visadapt.estimation.poses import HIDDEN, PoseFinder, Poses, reach_of
 from visadapt.recordings import Episode
+from visadapt.recordings.runs import runs
 from visadapt.world import World
 
 SHOCK = 0.03
@@ -142,7 +143,8 @@ class Tracker:
                 f"{first} the first (where it draws cart and pole, they differ by {differs:.0f} % of the contrast, "
                 f"at most {100 * HIDDEN:.0f} % is right)"
             )
-            if 2 * len(missed) > len(poses.contrast) or _longest(~poses.explained) > BRIDGED:
+            longest = max(end - start for start, end in runs(poses.explained.numpy()) if not poses.explained[start])
+            if 2 * len(missed) > len(poses.contrast) or longest > BRIDGED:
                 raise TrackingError(line)
             warnings.warn(f"{line}; they were left out", TrackingWarning, stacklevel=3)
         return poses
@@ -209,9 +211,3 @@ class Tracker:
         both[self._rates], both[self._seen], late[self._seen] = pushed * h, pushed * h**2 / 2, pushed * h**2 / 12**0.5
         drift[-1] = both.outer(both) + late.outer(late)
         return unit, drift
-
-
-def _longest(missed: Tensor) -> int:
-    """Most consecutive rows that are `missed` (T,)."""
-    used = torch.cat((torch.tensor([-1]), (~missed).nonzero()[:, 0], torch.tensor([len(missed)])))
-    return int(used.diff().max()) - 1

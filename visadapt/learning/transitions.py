@@ -52,7 +52,11 @@ class Transitions:
             if episode.state is None:
                 raise ValueError(f"episode {number} has no states to learn from: estimate them first")
             state = torch.as_tensor(episode.state, dtype=dtype)
-            seen = _frames(episode, number) if frames else state
+            seen = state
+            if frames:
+                if episode.frame is None:
+                    raise ValueError(f"episode {number} has no camera frames")
+                seen = torch.from_numpy(np.ascontiguousarray(episode.frame))
             action = pad(torch.as_tensor(episode.action[:-1], dtype=dtype), (0, 0, 0, 1))
             time = torch.as_tensor(episode.time - episode.time[0], dtype=dtype)
             task_state = state[:, :0] if episode.task_state is None else torch.as_tensor(episode.task_state)
@@ -115,9 +119,3 @@ class Transitions:
             seen = seen.to(self.states) / 255
         # Before the first row of an episode comes the last one of another, in which the action is zero.
         return History(seen, self.actions[rows - 1])
-
-
-def _frames(episode: Episode, number: int) -> Tensor:
-    if episode.frame is None:
-        raise ValueError(f"episode {number} has no camera frames")
-    return torch.from_numpy(np.ascontiguousarray(episode.frame))

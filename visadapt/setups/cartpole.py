@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from renderers import LayeredRenderer, RendererError, load_renderer
+from renderers import Camera, LayeredRenderer, RendererError, load_renderer
 from visadapt.effects import CameraEffect
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.perception import PerceptionSettings, learn_to_see
@@ -160,16 +160,9 @@ def cartpole_frames(
         assert isinstance(policy, ImagePolicy)
         perception = settings.perception or PerceptionSettings()
         eyes = policy.perception.requires_grad_(True)
-        args = (
-            eyes,
-            render,
-            source.period,
-            perception,
-            torch.Generator().manual_seed(seed),
-            staged(report, "perception"),
-        )
-        about = {"seed": seed, **asdict(perception)}
-        train_or_load(path, eyes, about, lambda partial: learn_to_see(*args, partial))
+        generator, progress = torch.Generator().manual_seed(seed), staged(report, "perception")
+        train = partial(learn_to_see, eyes, render, source.period, perception, generator, progress)
+        train_or_load(path, eyes, {"seed": seed, **asdict(perception)}, train)
         policy.encoder.load_state_dict(eyes.requires_grad_(False).state_dict())
 
     return Setup(
@@ -186,8 +179,8 @@ def cartpole_frames(
 
 def _narrowed(settings: SetupSettings, renderer: LayeredRenderer) -> SetupSettings:
     """The settings with all positions of the cart scaled down, where the camera sees less than `REACH`."""
-    column, scale, width = float(renderer.origin[0]), float(renderer.gain[0]), renderer.size[1]
-    share = min(column + 0.5, width - 0.5 - column) / scale / REACH
+    camera = Camera(width=renderer.size[1], scale=float(renderer.gain[0]), column=float(renderer.origin[0]))
+    share = camera.reach / REACH
     if share >= 1:
         return settings
 

@@ -33,10 +33,9 @@ class Cost:
     def __call__(self, states: Tensor, actions: Tensor, now: Tensor) -> Tensor:
         """Cost (B,) of planned states (B, K, n_state) and actions (B, K, n_action) from the state now (B, n_state)."""
         horizon = states.shape[1]
-        left = 1 - torch.arange(1, horizon + 1, device=now.device, dtype=now.dtype) / horizon
+        left = 1 - torch.arange(1, horizon + 1).to(now) / horizon
         reference = left[:, None] * now[:, None]
-        weights = torch.tensor(self.state, device=now.device, dtype=now.dtype)
-        tracking = (weights * (states - reference).square()).sum((1, 2))
+        tracking = (now.new_tensor(self.state) * (states - reference).square()).sum((1, 2))
         return tracking + self.action * actions.square().sum((1, 2))
 
 
@@ -52,8 +51,7 @@ class SettlingCost(Cost):
     end: float = 0.0
 
     def __call__(self, states: Tensor, actions: Tensor, now: Tensor) -> Tensor:
-        weights = torch.tensor(self.state, device=now.device, dtype=now.dtype)
-        settled = (weights * states[:, -1].square()).sum(1)
+        settled = (now.new_tensor(self.state) * states[:, -1].square()).sum(1)
         return super().__call__(states, actions, now) + self.end * settled
 
 
@@ -69,8 +67,7 @@ class RegulatorCost(Cost):
     """V, (n_state, n_state)"""
 
     def __call__(self, states: Tensor, actions: Tensor, now: Tensor) -> Tensor:
-        weights, to_go = (torch.tensor(each, device=now.device, dtype=now.dtype) for each in (self.state, self.to_go))
-        last = states[:, -1]
+        last, weights, to_go = states[:, -1], now.new_tensor(self.state), now.new_tensor(self.to_go)
         tracking = (weights * states.square()).sum((1, 2)) + ((last @ to_go) * last).sum(1)
         return tracking + self.action * actions.square().sum((1, 2))
 
