@@ -49,10 +49,9 @@ def fit(
         raise ValueError(f"steps is {steps}, must be at least 3")
     renderer.start_from(frames)
     if isinstance(renderer, LayeredRenderer):
-        camera = [renderer.origin, renderer.gain, renderer.tilt]
-        known = {id(parameter) for parameter in camera}
-        pictures = [parameter for parameter in renderer.parameters() if id(parameter) not in known]
-        groups = [{"params": pictures}, {"params": camera[:2]}, {"params": camera[2:]}]
+        camera = ("origin", "gain", "tilt")
+        pictures = [parameter for name, parameter in renderer.named_parameters() if name not in camera]
+        groups = [{"params": pictures}, {"params": [renderer.origin, renderer.gain]}, {"params": [renderer.tilt]}]
         rates = [0.1, 0.05, 0.003]
     else:
         groups, rates = [{"params": list(renderer.parameters())}], [4e-3]

@@ -6,8 +6,6 @@ import argparse
 import json
 from pathlib import Path
 
-from torch import nn
-
 from renderers import load_renderer
 from visadapt import diagnosis
 from visadapt.cli.inputs import InputError, import_effects, progress, the_system
@@ -36,7 +34,9 @@ def run(options: argparse.Namespace) -> None:
     system = the_system(options)
     import_effects(options)
     policy = _state_policy(Path(options.policy), system) if options.policy else None
-    renderer = _renderer(Path(options.renderer), system) if options.renderer else None
+    if options.renderer and not isinstance(system, CartPole):
+        raise InputError(f"--renderer: renderers draw a cart-pole, not a {system.name}")
+    renderer = load_renderer(Path(options.renderer)) if options.renderer else None
     if options.plan and renderer is not None:
         raise InputError("--plan: a plan needs a recording of states, not of frames")
     with progress() as report:
@@ -98,12 +98,6 @@ def _settings(options: argparse.Namespace, system: System) -> dict[str, str]:
         "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
     }
     return {name: printable(value) for name, value in settings.items() if value}
-
-
-def _renderer(path: Path, system: System) -> nn.Module:
-    if not isinstance(system, CartPole):
-        raise InputError(f"--renderer: renderers draw a cart-pole, not a {system.name}")
-    return load_renderer(path)
 
 
 def _check_period(path: Path, policy: StatePolicy, period: float) -> None:

@@ -37,7 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # as stderr: a file's name may not fit the encoding
     with suppress(ValueError):  # outside the main thread
-        signal.signal(signal.SIGTERM, _terminated)
+        # As after an interrupt, so that nothing half-written is left.
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         options = _parser().parse_args(arguments)
         command = options.command
@@ -63,11 +64,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"visadapt: {printable(message)}", file=sys.stderr)
         return 2  # argparse's own
     return 0
-
-
-def _terminated(number: int, _frame: object) -> NoReturn:
-    """End as after an interrupt, so that nothing half-written is left."""
-    raise SystemExit(128 + number)
 
 
 class _Parser(argparse.ArgumentParser):

@@ -26,6 +26,8 @@ from visadapt.recordings.physics import (
 from visadapt.recordings.sensors import TURN, differences
 from visadapt.systems import CartPole, RigidBody, System, Variable
 
+LEAST_ROWS = 8
+"""Rows of an episode below which its units are not judged."""
 MOST_RATE_RANGES = 3.0
 """Rates above this multiple of the system's stated range are taken to be in another unit."""
 IS_RATE_CORRELATION, NOT_RATE_CORRELATION = 0.8, 0.3
@@ -77,10 +79,6 @@ def check_commands(episodes: Sequence[RawEpisode], system: System, note: Note) -
         note(f"{share:.1%} of {variable.name} lie outside, up to {largest:g}; {right}", "the recording")
 
 
-LEAST_ROWS = 8
-"""Rows of an episode below which its units are not judged."""
-
-
 def check_units(episodes: Sequence[RawEpisode], system: System) -> None:
     """Check the columns of a file's episodes, all of which have the same.
 
@@ -118,9 +116,10 @@ def check_units(episodes: Sequence[RawEpisode], system: System) -> None:
             f"{whole.source}: {whole.column('z')} accelerates against the thrust, as if it pointed down; up is right"
         )
     if is_half_a_turn_off(judged, system):
+        zero = "0 upright" if isinstance(system, CartPole) else "the source's zero"
         raise RecordingError(
             f"{whole.source}: {whole.column(angles[0])} answers the command as it should half a turn further; "
-            f"{_zero(system)} is right"
+            f"{zero} is right"
         )
     if are_degrees(judged, system):
         name, values = angles[0], np.concatenate([raw.states[angles[0]] for raw in judged])
@@ -135,11 +134,6 @@ def check_units(episodes: Sequence[RawEpisode], system: System) -> None:
                 f"{whole.column(other)} as {name}: they are exchanged "
                 f"(or the command's sign is wrong: positive pushes towards +x)"
             )
-
-
-def _zero(system: System) -> str:
-    """Where the system's angle is 0, in words."""
-    return "0 upright" if isinstance(system, CartPole) else "the source's zero"
 
 
 def _rates(time: NDArray[np.float64], values: NDArray[np.float64], angle: bool) -> NDArray[np.float64]:

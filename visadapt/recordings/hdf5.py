@@ -17,7 +17,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -84,10 +84,8 @@ def write_recording(
                 if len(names) != width:
                     raise RecordingError(f"{path}: {len(names)} names for {width} columns of {kind}")
                 if len({*names}) < width or not all(isinstance(name, str) for name in names):
-                    found = ", ".join(map(str, names))
-                    raise RecordingError(
-                        f"{path}: the columns of {kind} are called {found}; names that differ are right"
-                    )
+                    called = f"the columns of {kind} are called {', '.join(map(str, names))}"
+                    raise RecordingError(f"{path}: {called}; names that differ are right")
                 if width:
                     file.attrs[f"{kind}_names"] = list(names)
         for number, episode in enumerate(episodes):
@@ -158,11 +156,15 @@ def read_stretches(
             size = sum(dataset.nbytes for each in every for dataset in each.values())
             allow(size)
             used = [kept(start, end, max(1, math.ceil(size / most_bytes))) for start, end in pairwise(starts)]
-            episodes = {
-                number: _read_episode(path, number, datasets, rows)
-                for number, (datasets, rows) in enumerate(zip(every, used, strict=True))
-                if rows.any() or not rows.size
-            }
+            episodes = {}
+            for number, (datasets, rows) in enumerate(zip(every, used, strict=True)):
+                if rows.any() or not rows.size:
+                    where = f"{path}: {_group_name(number)}"
+                    arrays = {name: _read_dataset(dataset, name, where, rows) for name, dataset in datasets.items()}
+                    try:
+                        episodes[number] = Episode(**arrays)
+                    except ValueError as error:
+                        raise RecordingError(f"{where}: {error}") from error
         _check_alike(path, [*episodes.values()])
         return episodes, starts[-1]
 
@@ -302,15 +304,6 @@ def _datasets(path: Path, file: h5py.File, number: int, frames: bool) -> dict[st
                 if dataset.nbytes > COMPRESSION * dataset.id.get_storage_size() or dataset.dtype.hasobject:
                     raise TypeError
     return found
-
-
-def _read_episode(path: Path, number: int, datasets: Mapping[str, h5py.Dataset], rows: NDArray[np.bool_]) -> Episode:
-    where = f"{path}: {_group_name(number)}"
-    arrays = {name: _read_dataset(dataset, name, where, rows) for name, dataset in datasets.items()}
-    try:
-        return Episode(**arrays)
-    except ValueError as error:
-        raise RecordingError(f"{where}: {error}") from error
 
 
 def _read_dataset(dataset: h5py.Dataset, name: str, where: str, rows: NDArray[np.bool_]) -> NDArray[Any]:

@@ -101,19 +101,15 @@ def _read_bag(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
                     "Iron or later, which stores definitions, or a standard type is right"
                 ) from None
             numbers = [_number(path, message, name, field) for field in fields[name]]
-            rows[name].append([1e-9 * stamp, _header(message), *numbers])
+            header = getattr(getattr(message, "header", None), "stamp", None)
+            written = 0.0 if header is None else header.sec + 1e-9 * header.nanosec
+            rows[name].append([1e-9 * stamp, written, *numbers])
     tables = {name: np.array(each).reshape(-1, 2 + len(fields[name])) for name, each in rows.items()}
     clock = int(all((table[:, 1] > 0).all() for table in tables.values()))
     return {
         name: Topic(table[:, clock], dict(zip(fields[name], table[:, 2:].T, strict=True)))
         for name, table in tables.items()
     }
-
-
-def _header(message: Any) -> float:
-    """Stamp of a message's header in s; 0 where it has none."""
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    return 0.0 if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
 
 
 def _number(path: Path, message: Any, topic: str, field: str) -> float:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import nn
@@ -20,7 +20,7 @@ from visadapt.learning.rounds import JointLearning, Label
 from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.training_state import train_or_load
 from visadapt.learning.transitions import Observe
-from visadapt.learning.tuning import tune
+from visadapt.learning.tuning import TuneSettings, tune
 from visadapt.policies import ImagePolicy, Policy
 from visadapt.progress import Report, staged
 from visadapt.setups.explained import explained
@@ -107,18 +107,21 @@ class Setup:
         about = {**given, **numbers["source"], "perception": numbers["perception"]}
         whole = {**about, "refinement": numbers["refinement"]}
         rough, fine = path.with_suffix(".rough.safetensors"), self.settings.refinement
-        stages = [(path, self.settings.source, whole)]
-        if fine is not None:
-            stages = [(rough, self.settings.source, about), (path, fine, whole)]
         # `prepare` draws from a generator of `seed` itself, so training uses the seeds after it.
         first = seed if self.prepare is None else seed + 1
-        for draws, (made, settings, described) in enumerate(stages, first):
-            if made == path or not path.exists():
-                generator = torch.Generator().manual_seed(draws)
-                stage = "source policy" if draws == first else "source policy, refined"
-                progress = staged(report, f"{self.source.system.name}: {stage}")
-                args = (policy, self.source, self.observe, settings, generator, None, progress)
-                train_or_load(made, policy, described, partial(tune, *args), NEWER)
+
+        def stage(made: Path, settings: TuneSettings, described: dict[str, Any], draws: int, name: str) -> None:
+            generator = torch.Generator().manual_seed(draws)
+            progress = staged(report, f"{self.source.system.name}: {name}")
+            args = (policy, self.source, self.observe, settings, generator, None, progress)
+            train_or_load(made, policy, described, partial(tune, *args), NEWER)
+
+        if fine is None:
+            stage(path, self.settings.source, whole, first, "source policy")
+        else:
+            if not path.exists():
+                stage(rough, self.settings.source, about, first, "source policy")
+            stage(path, fine, whole, first + 1, "source policy, refined")
         for finished in (prepared, rough):
             finished.unlink(missing_ok=True)
         policy.trained_in = describe(self.source)
