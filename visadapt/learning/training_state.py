@@ -66,8 +66,7 @@ class TrainingState:
             self.schedule.load_state_dict(tree["schedule"])
             self.generator.set_state(tree["generator"])
             self.losses = [float(loss) for loss in tree["losses"]]
-            more: dict[str, Any] = tree["more"]
-            return more
+            return tree["more"]
 
     def descend(self, loss: Tensor) -> None:
         """One step of optimiser and schedule, with the gradient clipped to a norm of 1."""

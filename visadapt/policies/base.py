@@ -77,8 +77,7 @@ class Policy(nn.Module):
 
     def act(self, history: History) -> Tensor:
         """The action (B, n_action) to execute now."""
-        plan: Tensor = self(history)
-        return plan[:, 0]
+        return self(history)[:, 0]
 
     def correction(self, history: History) -> Tensor:
         """The residual's correction (B, n_state) of a zero action, in units of its scale; 0 without a residual."""
@@ -86,8 +85,7 @@ class Policy(nn.Module):
         if self.residual is None:
             return observations.new_zeros(len(observations), self.n_state)
         with torch.no_grad():
-            out: Tensor = self.residual.network(history.acting(torch.zeros_like(history.actions[:, 0])))
-        return out
+            return self.residual.network(history.acting(torch.zeros_like(history.actions[:, 0])))
 
 
 class AutoregressivePolicy(Policy):

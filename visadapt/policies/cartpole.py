@@ -31,12 +31,10 @@ class ImagePolicy(Policy):
         self.out = nn.Linear(64, HORIZON * n_action)
 
     def embed(self, history: History) -> Tensor:
-        features: Tensor = self.encoder(history)
-        return features
+        return self.encoder(history)
 
     def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:
-        out: Tensor = self.out(self.hidden(inputs).relu())
-        return out
+        return self.out(self.hidden(inputs).relu())
 
 
 class StatePolicy(Policy):
@@ -58,5 +56,4 @@ class StatePolicy(Policy):
         return torch.cat((states.flatten(1), actions.flatten(1)), 1) if self.with_history else states[:, -1]
 
     def plan(self, inputs: Tensor, correction: Tensor) -> Tensor:
-        out: Tensor = self.rest(self.first(torch.cat((inputs, correction), 1)).tanh())
-        return out
+        return self.rest(self.first(torch.cat((inputs, correction), 1)).tanh())

@@ -68,8 +68,7 @@ class FlightPolicy(Policy):
         own, disturbance = inputs[:, :-N_DISTURBANCE], inputs[:, -N_DISTURBANCE:]
         first = self.first(torch.cat((own, correction), 1)) + self.disturbance_in(disturbance)
         hidden = self.rest(first.tanh()).tanh()
-        out: Tensor = self.out(hidden) + self.skip(own) + self.disturbance_out(disturbance)
-        return out
+        return self.out(hidden) + self.skip(own) + self.disturbance_out(disturbance)
 
     def disturbance(self, history: History) -> Tensor:
         """The residual's disturbance estimate and its rate, (B, N_DISTURBANCE), to anticipate a changing force."""

@@ -72,8 +72,7 @@ class FrameEncoder(nn.Module):
 
     def kinematics(self, history: History) -> Tensor:
         """Positions and angles in the frames, (B, N_KINEMATICS), in units of `learning.perception.Paths.scale`."""
-        out: Tensor = self.readout(self(history))
-        return out
+        return self.readout(self(history))
 
     def _first(self, frames: Tensor) -> Tensor:
         """The first convolution: of the latest frame minus background, and twice the differences of successive frames.
@@ -126,8 +125,7 @@ class ResidualNetwork(nn.Module):
 
     def forward(self, history: History) -> Tensor:
         """Corrections (B, n_state) in units of the residual's scale."""
-        out: Tensor = self.head(self.embed(history))
-        return out
+        return self.head(self.embed(history))
 
 
 class ImageResidualNetwork(ResidualNetwork):

@@ -137,8 +137,7 @@ def _between_readings(time: NDArray[np.float64], stamps: NDArray[np.float64]) ->
     """Whether each time (T,) lies between two readings that are not far apart."""
     after = np.searchsorted(stamps, time).clip(1, len(stamps) - 1)
     intervals = np.diff(stamps)
-    near: NDArray[np.bool_] = intervals[after - 1] <= GAP * np.median(intervals)
-    return near
+    return intervals[after - 1] <= GAP * np.median(intervals)
 
 
 def _held(time: NDArray[np.float64], stamps: NDArray[np.float64], commands: NDArray[np.float64]) -> NDArray[np.float64]:

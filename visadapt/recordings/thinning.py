@@ -43,27 +43,21 @@ def spread(recording: Recording, most: int, length: int, before: int) -> Recordi
         stretches += [(number, slice(*pair)) for pair in pairwise(edges)]
     count = max(1, most * len(stretches) // sum(rows))
     chosen = [stretches[k] for k in np.linspace(0, len(stretches) - 1, count).round().astype(int)]
-    episodes = [recording.episodes[number] for number, _ in chosen]
-    led = [slice(max(0, own.start - before), own.stop) for _, own in chosen]
-    parts = tuple(
-        replace(episode, time=episode.time[own], action=episode.action[own], state=episode.state[own], task_state=None)
-        for episode, own in zip(episodes, led, strict=True)
-        if episode.state is not None
-    )
     every = recording.usable or [np.ones(count, bool) for count in rows]
-    usable = tuple(
-        every[number][whole] & (np.arange(whole.start, whole.stop) >= own.start)
-        for (number, own), whole in zip(chosen, led, strict=True)
-    )
+    episodes, sources, usable = [], [], []
+    for number, own in chosen:
+        episode, led = recording.episodes[number], slice(max(0, own.start - before), own.stop)
+        assert episode.state is not None
+        time, action, state = episode.time[led], episode.action[led], episode.state[led]
+        episodes.append(replace(episode, time=time, action=action, state=state, task_state=None))
+        sources.append(f"{recording.sources[number]}, from {episode.time[own.start]:.1f} s")
+        usable.append(every[number][led] & (np.arange(led.start, led.stop) >= own.start))
     used = sum(own.stop - own.start for _, own in chosen)
     return replace(
         recording,
-        episodes=parts,
-        sources=tuple(
-            f"{recording.sources[number]}, from {recording.episodes[number].time[own.start]:.1f} s"
-            for number, own in chosen
-        ),
-        usable=usable,
+        episodes=tuple(episodes),
+        sources=tuple(sources),
+        usable=tuple(usable),
         warnings=(
             *recording.warnings,
             f"{sum(rows):,} rows are more than a diagnosis looks at: {used:,} of them were used, in {count} stretches "

@@ -149,8 +149,7 @@ def cartpole_frames(
     def render(x: Tensor, theta: Tensor) -> Tensor:
         own = seen.background
         here = (x.device, x.dtype) == (own.device, own.dtype)
-        frame: Tensor = (seen if here else copied(x.device, x.dtype))(x, theta)
-        return frame
+        return (seen if here else copied(x.device, x.dtype))(x, theta)
 
     def observe(state: Tensor) -> Tensor:
         return render(state[:, 0], state[:, 2])

@@ -39,8 +39,7 @@ class _Deployed(nn.Module):
         """Plan (HORIZON, n_action) of observations (LENGTH, ...) and actions (LENGTH, n_action)."""
         if self.policy.shown == "frame":
             observations = observations.to(actions.dtype) / 255
-        plan: Tensor = self.policy(History(observations[None], actions[None]))
-        return plan[0]
+        return self.policy(History(observations[None], actions[None]))[0]
 
 
 def export_policy(path: str | Path, policy: Policy, source: World | None = None) -> None:
