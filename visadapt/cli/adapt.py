@@ -33,21 +33,18 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(f"{options.policy}: is shown states, for which --renderer has no use: leave it out")
     references = read_reference(options.references, source.period) if options.references else None
     with checked():  # before the machine is run
-        about = policy, source, target, options.renderer, references, options.with_history
-        setup_to_adapt(*about).check_adaptation(policy, target)
+        setup = setup_to_adapt(policy, source, target, options.renderer, references, options.with_history)
+        setup.check_adaptation(policy, target)
     if options.round and options.round > options.samples:
         raise InputError(f"--round {options.round} is more than --samples {options.samples}: lower it, or raise those")
     folder = Path(options.out)
     open_run(folder, asked_for(options, "policy", "renderer", "references", "diagnosis", "map", "effects"))
     with progress() as report:
-        asked = {
-            name: getattr(options, name) for name in ("seed", "iterations", "renderer", "with_history", "diagnose")
-        }
-        own: dict[str, Any] = {"references": references, "report": report, **asked}
-        adapted = adapt(policy, source, target, options.samples, folder, round_samples=options.round, **own)
-    rounds = [
-        {"samples": each.samples, "policy_loss": each.policy[-1] if each.policy else None} for each in adapted.rounds
-    ]
+        names = ("seed", "iterations", "renderer", "with_history", "diagnose")
+        given: dict[str, Any] = {name: getattr(options, name) for name in names}
+        given |= {"round_samples": options.round, "references": references, "report": report}
+        adapted = adapt(policy, source, target, options.samples, folder, **given)
+    rounds = [{"samples": one.samples, "policy_loss": one.policy[-1] if one.policy else None} for one in adapted.rounds]
     write_json(folder / "ledger.json", {**asdict(adapted.ledger), "used": adapted.ledger.used, "rounds": rounds})
     if options.diagnose:
         print(_in_words(adapted.rounds[-1].explanation))

@@ -23,7 +23,7 @@ from visadapt.learning.ledger import Ledger
 from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.stability import stable
 from visadapt.learning.transitions import Observe, Transitions
-from visadapt.learning.tuning import tune
+from visadapt.learning.tuning import TuneSettings, tune
 from visadapt.policies import Policy
 from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.progress import Progress, Report, staged
@@ -213,13 +213,14 @@ class JointLearning:
     def _fit(self, folder: RoundFolder, transitions: Transitions) -> list[GroundLoss]:
         """Fit the residual, again with the next larger ridge where the policy is unstable in the world with it."""
         self._begin_tuning()
-        world, tuning = self._learnt, self.settings.tuning
+        world = self._learnt
 
         def accept() -> bool:
-            return stable(self.policy, world, self.observe, tuning, folder.generator(ACCEPTING), transitions)
+            generator = folder.generator(ACCEPTING)
+            return stable(self.policy, world, self.observe, self.settings.tuning, generator, transitions)
 
-        about = self.settings.ground, folder.generator(GROUNDING), self._progress(folder, "ground")
-        return ground(self.residual, self.known, transitions, *about, accept)
+        generator, progress = folder.generator(GROUNDING), self._progress(folder, "ground")
+        return ground(self.residual, self.known, transitions, self.settings.ground, generator, progress, accept)
 
     def _begin_tuning(self) -> None:
         """Give the policy the weights that tuning with the residual begins with."""
@@ -233,40 +234,30 @@ class JointLearning:
         """Tune the policy in the source with the named effects and the residual; the loss of every iteration."""
         self._begin_tuning()
         self.grounded = True
-        world = self._learnt
-
-        def tuned(partial: Path) -> list[float]:
-            about = self.settings.tuning, folder.generator(TUNING), transitions, self._progress(folder, "tune"), partial
-            return tune(self.policy, world, self.observe, *about)
-
-        return self._kept(folder.policy, tuned)
+        return self._tune(folder, self._learnt, self.settings.tuning, transitions)
 
     def _tune_with_names(self, folder: RoundFolder) -> list[float]:
         """Tune the policy in the source with the named effects alone; where there is no gap, it gets its weights from
         before the first round."""
-        world = self.known
+        world, settings = self.known, self.settings.with_names
         no_gap = not len(world.effects)
         if no_gap or not self.settings.tunes_on:
             self._start_anew()
-
-        def tuned(partial: Path) -> list[float]:
-            if no_gap:
-                return []
-            how, progress = self.settings.with_names, self._progress(folder, "tune")
-            return tune(self.policy, world, self.observe, how, folder.generator(TUNING), None, progress, partial)
-
-        return self._kept(folder.policy, tuned)
+        return self._tune(folder, world, replace(settings, iterations=0) if no_gap else settings)
 
     def _start_anew(self) -> None:
         """Give the policy its weights from before the first round."""
         self.policy.load_state_dict(self.first, strict=False)
 
-    def _kept(self, path: Path, tuned: Callable[[Path], list[float]]) -> list[float]:
-        """The losses of `tuned`, which tunes the policy and keeps its unfinished state in the file that it is given; or
-        those in `path`, whose weights the policy then gets."""
+    def _tune(
+        self, folder: RoundFolder, world: World, settings: TuneSettings, transitions: Transitions | None = None
+    ) -> list[float]:
+        """Tune the policy in `world`, or give it the weights of a round that was tuned before; the losses."""
+        path = folder.policy
         if not path.exists():
             partial = path.with_suffix(".partial.safetensors")
-            losses = tuned(partial)
+            generator, progress = folder.generator(TUNING), self._progress(folder, "tune")
+            losses = tune(self.policy, world, self.observe, settings, generator, transitions, progress, partial)
             save_tree(path, {"weights": self.policy.state_dict(), "losses": losses})
             partial.unlink(missing_ok=True)
         tree = load_tree(path)

@@ -113,8 +113,8 @@ class Setup:
         def stage(made: Path, settings: TuneSettings, described: dict[str, Any], draws: int, name: str) -> None:
             generator = torch.Generator().manual_seed(draws)
             progress = staged(report, f"{self.source.system.name}: {name}")
-            args = (policy, self.source, self.observe, settings, generator, None, progress)
-            train_or_load(made, policy, described, partial(tune, *args), NEWER)
+            train = partial(tune, policy, self.source, self.observe, settings, generator, None, progress)
+            train_or_load(made, policy, described, train, NEWER)
 
         if fine is None:
             stage(path, self.settings.source, whole, first, "source policy")
@@ -146,9 +146,8 @@ class Setup:
         self.check_policy(policy)
         policy.residual, policy.grounded_in = None, None
         policy.trained_in = describe(self.source)
-        generator = torch.Generator().manual_seed(seed)
-        args = (policy, self.source, self.observe, self.settings.with_names, generator)
-        return tune(*args, progress=staged(report, "tune"))
+        generator, progress = torch.Generator().manual_seed(seed), staged(report, "tune")
+        return tune(policy, self.source, self.observe, self.settings.with_names, generator, None, progress)
 
     def adapt(
         self,
