@@ -44,15 +44,9 @@ def run(options: argparse.Namespace) -> None:
         if policy is not None:
             _check_period(Path(options.policy), policy, recording.period)
         source = World(system, period=recording.period)
+        seed, jobs = options.seed, options.jobs
         result = diagnosis.diagnose(
-            recording,
-            source,
-            seed=options.seed,
-            jobs=options.jobs,
-            progress=report,
-            policy=policy,
-            announce=print,
-            renderer=renderer,
+            recording, source, seed=seed, jobs=jobs, progress=report, policy=policy, announce=print, renderer=renderer
         )
     said = [as_text(result)]
     try:

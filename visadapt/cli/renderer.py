@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -64,17 +65,10 @@ def run(options: argparse.Namespace) -> None:
     out = Path(options.out)
     with unfinished(out, settings) as folder, progress() as report:
         state = folder / "training.safetensors"
-        fit(
-            renderer,
-            x[~held],
-            theta[~held],
-            frames[~held],
-            options.iterations,
-            torch.Generator().manual_seed(options.seed),
-            progress=staged(report, "renderer"),
-            keep=lambda tree: save_tree(state, tree),
-            kept=load_tree(state) if state.exists() else None,
-        )
+        kept, keep = load_tree(state) if state.exists() else None, partial(save_tree, state)
+        generator, bar = torch.Generator().manual_seed(options.seed), staged(report, "renderer")
+        shown = x[~held], theta[~held], frames[~held]
+        fit(renderer, *shown, options.iterations, generator, progress=bar, keep=keep, kept=kept)
         with torch.no_grad():
             drawn = torch.cat([renderer(*each) for each in zip(x[held].split(64), theta[held].split(64), strict=True)])
         residual = frames[held] / 255 - drawn

@@ -168,10 +168,8 @@ class FlightFilm(Film):
         both = np.concatenate([course, self._dropped(course)]) @ across
         low, high = both.min(0), both.max(0)
         half = ((high - low) / (size - 36)).max() * size / 2
-        view.set(
-            xlim=(low + high)[0] / 2 + half[0] * np.array([-1, 1]),
-            ylim=(low + high)[1] / 2 + half[1] * np.array([-1, 1]),
-        )
+        (left, bottom), (right, top) = (low + high) / 2 - half, (low + high) / 2 + half
+        view.set(xlim=(left, right), ylim=(bottom, top))
         step = max(widgets.ceiling(float(np.ptp(course, axis=0).max()) / 8), 0.5)
         grid, colours = ground_grid(step)
         view.add_collection(

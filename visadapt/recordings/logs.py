@@ -113,15 +113,12 @@ def _rows(
     time, rows = time[kept], rows[kept]
     others = "".join(f"; {name} is interpolated to them" for name in read if name != slowest)
     note(f"rows are the readings of {slowest}{others}; a command is the mean until the next row", str(path))
-    return RawEpisode(
-        path,
-        time - time[0],
-        action[kept],
-        states[kept],
-        measured,
-        lambda row: f"message {rows[row] + 1} of {slowest}",
-        {name: ".".join(place) for name, place in places.items()},
-    )
+    names = {name: ".".join(place) for name, place in places.items()}
+
+    def message(row: int) -> str:
+        return f"message {rows[row] + 1} of {slowest}"
+
+    return RawEpisode(path, time - time[0], action[kept], states[kept], measured, message, names)
 
 
 def _held_until(stamps: NDArray[np.float64]) -> float:

@@ -12,7 +12,6 @@ from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.setups.base import Setup
 from visadapt.setups.policy_file import residual_for
 from visadapt.systems import FixedWing, Quadrotor
-from visadapt.tasks.base import FlightTask
 from visadapt.tasks.follow import Follow, RecoverCost
 from visadapt.tasks.reach import Reach
 from visadapt.tasks.references import Reference
@@ -24,6 +23,7 @@ RECORDED = 0.8
 other starts it shows no changing force, or only the residual's own."""
 
 _learn = partial(TuneSettings, longest=100, observation_noise=0.0)
+_settings = partial(SetupSettings, ground=GROUND, feedforward=False, tunes_on=True)
 
 
 def quadrotor(
@@ -59,7 +59,10 @@ def quadrotor(
         residual=partial(residual_for, with_history=with_history),
         # First to keep to the reference, then to come back from far off.
         settings=_settings(
-            _learn(task, 4000, 256, 4e-3), tuning, refinement=_learn(far_off(), 2000, 256, 1e-3, curriculum=False)
+            source=_learn(task, 4000, 256, 4e-3),
+            refinement=_learn(far_off(), 2000, 256, 1e-3, curriculum=False),
+            tuning=tuning,
+            longest_episode=task.steps,
         ),
         test=task if test is None else follow(test),
     )
@@ -82,19 +85,6 @@ def fixed_wing(source: World | None = None, with_history: bool = False, task: Re
         source=source,
         policy=ReachPolicy,
         residual=partial(residual_for, with_history=with_history),
-        settings=_settings(_learn(task, 3000, 128, 3e-3), tuning),
+        settings=_settings(_learn(task, 3000, 128, 3e-3), tuning, longest_episode=task.steps),
         test=task,
-    )
-
-
-def _settings(source: TuneSettings, tuning: TuneSettings, refinement: TuneSettings | None = None) -> SetupSettings:
-    assert isinstance(tuning.task, FlightTask)
-    return SetupSettings(
-        source,
-        tuning,
-        ground=GROUND,
-        longest_episode=tuning.task.steps,
-        feedforward=False,
-        tunes_on=True,
-        refinement=refinement,
     )
