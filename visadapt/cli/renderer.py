@@ -111,7 +111,7 @@ def _read(paths: list[str]) -> tuple[Tensor, Tensor, Tensor]:
             if episode.state is None or episode.frame is None:
                 alone = "frames" if episode.state is None else "states"
                 raise InputError(f"{where}: holds {alone} alone; frames and states are needed")
-            size, wanted = (each.shape[1:] for each in (episode.frame, frames[0] if frames else episode.frame))
+            size, wanted = episode.frame.shape[1:], (frames[0] if frames else episode.frame).shape[1:]
             if size != wanted:
                 raise InputError(f"{where}: frames of {size} rows and columns; those before have {wanted}")
             states.append(episode.state[:, pose])

@@ -79,9 +79,8 @@ def fit_named(source: World, transitions: Transitions) -> Transitions:
     named = [effect for effect in source.effects if isinstance(effect, Effect) and not isinstance(effect, CameraEffect)]
     if not named:
         return transitions
-    measured, commands = (
-        list(values.split(transitions.lengths)) for values in (transitions.states, transitions.actions)
-    )
+    measured = list(transitions.states.split(transitions.lengths))
+    commands = list(transitions.actions.split(transitions.lengths))
     fit = fit_effects(source.system, named, measured, commands, source.period)
     for effect in named:
         kind = sized(type(effect), source.system)

@@ -105,8 +105,8 @@ class Streams:
     def _fresh(self, ended: Tensor, progress: float, generator: torch.Generator) -> StreamState:
         """New starts for the streams `ended`: drawn for all streams, but only these are rendered."""
         count, transitions = self.count, self.transitions
-        start = self.task.training_start(count, progress, generator)
-        state, task_state = (placed(each, self.like)[ended] for each in start)
+        state, task_state = self.task.training_start(count, progress, generator)
+        state, task_state = placed(state, self.like)[ended], placed(task_state, self.like)[ended]
         at = self.world.start(state)
         if self._times is not None:
             # Streams are shorter than episodes: if all began at time 0, none would meet a late gust, or all phases of a

@@ -102,9 +102,8 @@ class Transitions:
 
         The sensors have not read these rows yet.
         """
-        commands, states = (
-            pad_sequence(values.split(self.lengths), batch_first=True) for values in (self.actions, self.states)
-        )
+        commands = pad_sequence(self.actions.split(self.lengths), batch_first=True)
+        states = pad_sequence(self.states.split(self.lengths), batch_first=True)
         memory = [
             torch.cat([own[:length] for own, length in zip(each, self.lengths, strict=True)])[self.rows[:, -1]]
             for each in world.memories(states[:, 0], commands, states)

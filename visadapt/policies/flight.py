@@ -100,7 +100,7 @@ class FollowPolicy(FlightPolicy):
 
     def disturbance_inputs(self, disturbance: Tensor, axes: Tensor) -> Tensor:
         linear, angular, linear_rate, angular_rate = disturbance.unflatten(1, (4, 3)).unbind(1)
-        linear, linear_rate = (matvec(axes.mT, each) for each in (linear, linear_rate))
+        linear, linear_rate = matvec(axes.mT, linear), matvec(axes.mT, linear_rate)
         return torch.cat((linear, angular, linear_rate, angular_rate), 1)
 
     def aim(self, state: Tensor, goal: Tensor) -> Tensor:

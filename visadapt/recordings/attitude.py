@@ -28,7 +28,7 @@ def check_attitude(raw: RawEpisode, system: System) -> None:
     """
     if not isinstance(system, RigidBody):
         return
-    attitude, rates = (_columns(raw, system, columns) for columns in (ATTITUDE, RATES))
+    attitude, rates = _columns(raw, system, ATTITUDE), _columns(raw, system, RATES)
     length = np.linalg.norm(attitude, axis=1)
     row = int(np.abs(length - 1).argmax())
     first = system.states[ATTITUDE][0].name

@@ -38,13 +38,14 @@ Columns = Mapping[str, NDArray[np.float64]]
 def turns(system: System, name: str) -> bool:
     """Whether the source's physics are the same a whole turn further in an angle: not so for a drum on a spring."""
     generator = torch.Generator().manual_seed(0)
-    low, high = (torch.tensor([getattr(state, end) for state in system.states]).double() for end in ("low", "high"))
+    low = torch.tensor([state.low for state in system.states]).double()
+    high = torch.tensor([state.high for state in system.states]).double()
     state = low + (high - low) * torch.rand(8, len(low), generator=generator, dtype=torch.float64)
     action = state.new_zeros(len(state), len(system.actions))
     load = state.new_zeros(len(state), len(system.loads))
     further = state.clone()
     further[:, system.index(name)] += 2 * math.pi
-    here, there = (system.derivative(each, action, load) for each in (state, further))
+    here, there = system.derivative(state, action, load), system.derivative(further, action, load)
     return torch.allclose(here, there, rtol=1e-6, atol=1e-9)
 
 

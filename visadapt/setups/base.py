@@ -182,18 +182,10 @@ class Setup:
         asked |= {"policy": weights_digest(policy), "explorer": None if explorer is None else weights_digest(explorer)}
         open_run(folder, {**asked, "known": describe(self.source), **self.settings.numbers()}, "adaptation.json")
         residual = _seeded(seed, partial(self.residual, policy, self.source)).to(next(policy.parameters()))
+        explain = explained(self.source, self.renderer, seed, report) if diagnose else None
+        source, settings, observe, label = self.source, self.settings, self.observe, self.label
         learning = JointLearning(
-            policy,
-            residual,
-            self.source,
-            target,
-            self.settings,
-            Ledger(budget),
-            self.observe,
-            self.label,
-            report,
-            explorer,
-            explained(self.source, self.renderer, seed, report) if diagnose else None,
+            policy, residual, source, target, settings, Ledger(budget), observe, label, report, explorer, explain
         )
         adapted = adapt(learning, folder, round_samples, seed)
         policy.grounded_in = describe(adapted.source)
@@ -220,7 +212,7 @@ class Setup:
                 f"a {self.source.system.name} needs a {type(wanted).__name__} of {wanted.n_state} and {wanted.n_action}"
             )
         if isinstance(policy, ImagePolicy) and isinstance(wanted, ImagePolicy):
-            own, seen = (each.perception.background.double().cpu() for each in (policy, wanted))
+            own, seen = policy.perception.background.double().cpu(), wanted.perception.background.double().cpu()
             if own.shape != seen.shape or not torch.allclose(own, seen):
                 raise ValueError(
                     "the policy was not trained with this renderer: give the one that it was trained with (--renderer)"
