@@ -63,26 +63,24 @@ def _tried(effect: type[Effect], system: System) -> Iterator[str]:
     shares = torch.linspace(0.3, 0.7, ROWS, dtype=torch.float64)
     values = torch.stack([each.low + (each.high - each.low) * shares for each in effect.table], 1)
     one = effect(**{each.name: 0.5 * (each.low + each.high) for each in effect.table}).with_values(values)
-    given: dict[str, tuple[object, tuple[int, ...]]] = {}
+    name, shape, found = "apply_to", tuple(state.shape), object()
     if isinstance(one, DynamicsEffect):
-        given["load"] = (one.load(shares, state, one.alter(system)), (ROWS, len(system.loads)))
+        name, shape, found = "load", (ROWS, len(system.loads)), one.load(shares, state, one.alter(system))
     elif isinstance(one, ActuationEffect):
         commands = command[:, None].expand(-1, 3, -1)
         bound = one.acting_on(system)
-        given["apply_to"] = (bound.apply_to(commands, bound.memory(commands[:, :1], 0.05), 0.05)[0], commands.shape)
+        shape, found = tuple(commands.shape), bound.apply_to(commands, bound.memory(commands[:, :1], 0.05), 0.05)[0]
     elif isinstance(one, SensingEffect):
-        generator = torch.Generator().manual_seed(0)
-        given["apply_to"] = (one.apply_to(state, one.memory(state, 0.05), 0.05, generator)[0], state.shape)
-    for name, (found, shape) in given.items():
-        if not isinstance(found, Tensor) or found.shape != shape:
-            kind = f"the shape {tuple(found.shape)}" if isinstance(found, Tensor) else f"a {type(found).__name__}"
-            yield f"{name} returns {kind}; a tensor {tuple(shape)} is right"
-        elif found.dtype != state.dtype:
-            yield f"{name} turns {state.dtype} into {found.dtype}: make new tensors with state.new_tensor"
-        elif not bool(found.isfinite().all()):
-            yield f"{name} gives a number that is not finite in states within the ranges"
-        else:
-            world = World(system, [one])
-            after = world.measure(world.step(world.start(state), command), torch.Generator().manual_seed(0))[0]
-            if not bool(after.isfinite().all()):
-                yield "a step with it gives a state that is not finite, from states within the ranges"
+        found = one.apply_to(state, one.memory(state, 0.05), 0.05, torch.Generator().manual_seed(0))[0]
+    if not isinstance(found, Tensor) or found.shape != shape:
+        kind = f"the shape {tuple(found.shape)}" if isinstance(found, Tensor) else f"a {type(found).__name__}"
+        yield f"{name} returns {kind}; a tensor {shape} is right"
+    elif found.dtype != state.dtype:
+        yield f"{name} turns {state.dtype} into {found.dtype}: make new tensors with state.new_tensor"
+    elif not bool(found.isfinite().all()):
+        yield f"{name} gives a number that is not finite in states within the ranges"
+    else:
+        world = World(system, [one])
+        after = world.measure(world.step(world.start(state), command), torch.Generator().manual_seed(0))[0]
+        if not bool(after.isfinite().all()):
+            yield "a step with it gives a state that is not finite, from states within the ranges"

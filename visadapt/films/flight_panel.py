@@ -70,8 +70,8 @@ class FlightPanel:
         self.follows = isinstance(task, Follow)
         states = np.array(state, float)
         states[:, : VELOCITY.stop] = states[:, : VELOCITY.stop].clip(-LARGEST_DRAWN, LARGEST_DRAWN)
-        misses = _misses(task, states, task_state) if isinstance(task, Reach) else np.empty(0)
         if isinstance(task, Reach):
+            misses = _misses(task, states, task_state)
             first = int(misses.argmin()) + 1 if len(misses) else 0
             states = states[: first + 1 + round(0.5 / task.period)]
         self.states = states
@@ -155,10 +155,10 @@ def _misses(task: Reach, states: Floats, point: Tensor) -> Floats:
 
 def length(metres: float, digits: int | None = 1) -> str:
     """A length with its unit; without `digits`, as short as it goes, from mm on."""
+    if digits is None and 0 < metres < 0.01:
+        return f"{1000 * metres:g} mm"
     if digits is None:
-        return (
-            f"{1000 * metres:g} mm" if 0 < metres < 0.01 else f"{100 * metres:g} cm" if metres < 1 else f"{metres:g} m"
-        )
+        return f"{100 * metres:g} cm" if metres < 1 else f"{metres:g} m"
     if metres < 0.995:
         return f"{100 * metres:.{digits}f} cm"
     return f"{metres:.2f} m" if metres < 99.5 else f"{metres:.0f} m"

@@ -79,9 +79,8 @@ def load_weights(module: nn.Module, weights: Mapping[str, Tensor], origin: Path)
 
 def check_sizes(needed: Mapping[str, Tensor], found: Mapping[str, Tensor], origin: Path) -> None:
     """Raise CheckpointError, which names the key, where one is missing or extra, or differs in shape or dtype."""
-    there, right = (
-        {key: f"{tuple(value.shape)} {value.dtype}" for key, value in each.items()} for each in (found, needed)
-    )
+    there = {key: f"{tuple(value.shape)} {value.dtype}" for key, value in found.items()}
+    right = {key: f"{tuple(value.shape)} {value.dtype}" for key, value in needed.items()}
     for key in (*right, *sorted(there)):
         if there.get(key) != right.get(key):
             raise CheckpointError(
