@@ -11,8 +11,16 @@ from safetensors.torch import save
 from torch import Tensor, uint8
 
 
+def sealed(text: str, tensors: Mapping[str, Tensor]) -> str:
+    """The JSON that says what tensors are, after a checksum of both.
+
+    One entry of a header, since safetensors writes several in an order that changes from run to run.
+    """
+    return f"{checksum(text, sorted(tensors.items()))} {text}"
+
+
 def unsealed(entry: str, tensors: Mapping[str, Tensor]) -> str | None:
-    """The JSON in the entry of a header; None where the checksum before it does not fit. Older files have none."""
+    """The JSON of what `sealed` gave; None where the checksum does not fit. Older files have none."""
     if entry.startswith("{"):
         return entry
     written, _, text = entry.partition(" ")
@@ -20,13 +28,12 @@ def unsealed(entry: str, tensors: Mapping[str, Tensor]) -> str | None:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], key: str, text: str) -> None:
-    """Write tensors, with the JSON that says what they are, after a checksum of both, under a key of the header.
+    """Write tensors, with the JSON that says what they are under a key of the header.
 
-    Not under several keys, which safetensors writes in an order that changes from run to run. Nor by
-    `safetensors.torch.save_file`, which writes a file of another name first: a process that is killed meanwhile leaves
-    it.
+    Not by `safetensors.torch.save_file`, which writes a file of another name first: a process that is killed meanwhile
+    leaves it.
     """
-    path.write_bytes(save(dict(tensors), {key: f"{checksum(text, sorted(tensors.items()))} {text}"}))
+    path.write_bytes(save(dict(tensors), {key: sealed(text, tensors)}))
 
 
 def read_tensors(path: Path, kind: str, error: type[ValueError]) -> tuple[dict[str, str], dict[str, Tensor]]:

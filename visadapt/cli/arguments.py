@@ -129,12 +129,8 @@ def adapt(parser: argparse.ArgumentParser) -> None:
     _add_policy_and_target(parser)
     add("--out", required=True, metavar="FOLDER", help="folder of the run; it gets the policy, policy.safetensors")
     add("--samples", metavar="N", type=_positive, default=1000, help="steps of the target in all (default: 1000)")
-    add(
-        "--round",
-        metavar="B",
-        type=_positive,
-        help="steps of the target in a round (default: a fifth of --samples, at least 20)",
-    )
+    round_help = "steps of the target in a round (default: a fifth of --samples, at least 20)"
+    add("--round", metavar="B", type=_positive, help=round_help)
     renderer_help = "the one that the policy was trained with (default: that of the drawn cart-pole)"
     add("--renderer", metavar="R.safetensors", help=renderer_help)
     add("--references", metavar="F.csv", help="what a quadrotor is to follow, if the target has none")

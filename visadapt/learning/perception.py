@@ -75,8 +75,8 @@ def learn_to_see(
     period: float,
     settings: PerceptionSettings,
     generator: torch.Generator,
-    progress: Progress | None = None,
-    checkpoint: Path | None = None,
+    progress: Progress | None,
+    checkpoint: Path | None,
 ) -> list[float]:
     """Train `encoder`, in place, to read positions and changes from 5 rendered frames; returns the losses.
 

@@ -43,14 +43,17 @@ def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], n
     wanted: dict[str, set[str]] = {}
     for topic, field in places.values():
         wanted.setdefault(topic, set()).add(field)
+    return _rows(path, system, places, _topics(path, read, wanted), note)
+
+
+def _topics(path: Path, read: Read, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
     try:
-        topics = read(path, wanted)
+        return read(path, wanted)
     except RecordingError:
         raise
     except Exception as error:  # parsers raise anything on a damaged file, MemoryError on a wrong size
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise RecordingError(f"{path}: cannot be read as a log, is it cut short or damaged? {reason}") from None
-    return _rows(path, system, places, topics, note)
+    raise RecordingError(f"{path}: cannot be read as a log, is it cut short or damaged? {reason}")
 
 
 def _rows(

@@ -218,10 +218,10 @@ def adapt(
 
 def setup_to_train(
     world: World,
-    iterations: int | None = None,
-    renderer: Renderer | None = None,
-    references: Reference | None = None,
-    with_history: bool = False,
+    iterations: int | None,
+    renderer: Renderer | None,
+    references: Reference | None,
+    with_history: bool,
 ) -> Setup:
     """As `setup_for`, for a new policy, with `iterations` of its training instead of the setup's own.
 
