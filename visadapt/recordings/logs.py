@@ -53,6 +53,7 @@ def _topics(path: Path, read: Read, wanted: Mapping[str, set[str]]) -> dict[str,
         raise
     except Exception as error:  # parsers raise anything on a damaged file, MemoryError on a wrong size
         reason = " ".join(str(error).split())[:200] or type(error).__name__
+    # Raised here and not above, so that it does not hold on to the parser's error and what that has read.
     raise RecordingError(f"{path}: cannot be read as a log, is it cut short or damaged? {reason}")
 
 
