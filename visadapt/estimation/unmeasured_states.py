@@ -2,7 +2,8 @@
 
 A fit improves states that are nearly right; of a state without a reading nothing says where it is. So the source is
 filtered through each window from several values of these states (extended Kalman filters in a batch), and the filter
-that foresees the readings best gives the estimate from which fits start.
+that foresees the readings best gives the estimate from which fits start. Filters that believe the source much tell
+forwards from backwards; those that believe it little follow a machine that differs from it. So several are tried.
 """
 
 from __future__ import annotations
@@ -14,18 +15,19 @@ import torch
 from torch import Tensor
 
 from visadapt.estimation.candidate import COARSE, CandidateModel
-from visadapt.estimation.fit_states import initial_fit
-from visadapt.estimation.likelihood import FitState
+from visadapt.estimation.fitting import LEAST_NOISE
 from visadapt.estimation.linearise import linearise_step
 from visadapt.estimation.profiles import profile_of
-from visadapt.estimation.segments import Segments, unmeasured
+from visadapt.estimation.segments import Segments, initial_states, noise_of_readings, unmeasured
 from visadapt.systems import System
 
 STARTS = 32  # Values of the states without a reading from which a window is filtered: 0, and others within their ranges
 
-WANDER = 0.01
-"""Standard deviation, as a share of a state's largest size, by which a state without a reading may change from row to
-row beside what the source says: a filter that starts with a wrong value finds the right one sooner."""
+DOUBTS = ((3e-4, 3e-4), (3e-3, 1e-3), (3e-2, 1e-2))
+"""How little the source is believed: standard deviations, in each row, of the process noise of the velocities, and of a
+state without a reading beside what the source says, as shares of the largest sizes in their ranges."""
+
+READING_NOISE = 2.0  # Variance of the readings' noise in these filters, over that which `noise_of_readings` estimates
 
 
 def with_unmeasured(rows: Segments, system: System) -> Segments:
@@ -34,33 +36,41 @@ def with_unmeasured(rows: Segments, system: System) -> Segments:
     if not columns:
         return rows
     starts = _starts(system, columns)
-    foreseen, states = _filtered(rows, system, columns, starts)
-    variance = torch.tensor(profile_of(system).initial_variance, dtype=torch.float64)[columns]
-    # The smallest values that agree with the readings: a turn more of a heading does as well.
-    score = foreseen - 0.5 * (starts.square() / variance).sum(1, keepdim=True)
+    model, variance = CandidateModel(system, (), rows, COARSE), _initial_variance(system, columns)
+    tried = [_filtered(model, columns, starts, *doubt) for doubt in DOUBTS]
+    # Near the centre, where several values agree with the readings: a turn more of a heading does as well.
+    far = 0.5 * ((starts - starts[0]).square() / variance).sum(1, keepdim=True)
+    score = torch.cat([foreseen - far for foreseen, _ in tried])
     best = score.nan_to_num(nan=-math.inf).argmax(0)
-    estimated = states[best, torch.arange(len(best))]
+    estimated = torch.cat([states for _, states in tried])[best, torch.arange(len(best))]
     return replace(rows, estimated=estimated) if bool(estimated.isfinite().all()) else rows
 
 
 def _starts(system: System, columns: list[int]) -> Tensor:
-    """(S, U) values of U states, spread over their ranges, 0 first."""
-    ends = torch.tensor([(system.states[k].low, system.states[k].high) for k in columns], dtype=torch.float64)
+    """(S, U) values of U states, spread over their ranges. The first are 0, or in the middle of a range without 0."""
+    low, high = torch.tensor([(system.states[k].low, system.states[k].high) for k in columns], dtype=torch.float64).T
     share = torch.quasirandom.SobolEngine(len(columns), scramble=True, seed=0).draw(STARTS).double()
-    starts = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
-    starts[0] = 0.0
+    starts = low + share * (high - low)
+    starts[0] = torch.where((low <= 0) & (high >= 0), 0.0, 0.5 * (low + high))
     return starts
 
 
-def _filtered(rows: Segments, system: System, columns: list[int], starts: Tensor) -> tuple[Tensor, Tensor]:
+def _initial_variance(system: System, columns: list[int]) -> Tensor:
+    """(U,) prior variances of the first states of a window."""
+    return torch.tensor(profile_of(system).initial_variance, dtype=torch.float64)[columns]
+
+
+def _filtered(
+    model: CandidateModel, columns: list[int], starts: Tensor, doubt: float, wander: float
+) -> tuple[Tensor, Tensor]:
     """Log likelihoods (S, W), up to a constant, and filtered states (S, W, T, n) of the source in every window, from S
     values of the states in `columns`."""
-    count, (windows, length) = len(starts), rows.shape
-    model, first = CandidateModel(system, (), rows, COARSE), initial_fit(system, rows)
+    rows, count, (windows, length) = model.rows, len(starts), model.rows.shape
     none = starts.new_zeros(0)  # parameters: the source has no effects
     world, acting = model.stepping(none, model.in_windows(model.acting(none[None]))[0])
-    initial, disturbance = _variances(model, first, columns, count)
-    state, covariance = first.state[0, :, 0].repeat(count, 1, 1), torch.diag(initial).repeat(count * windows, 1, 1)
+    initial, disturbance = _variances(model, columns, count, doubt, wander)
+    state = initial_states(rows, model.system)[:, 0].repeat(count, 1, 1)
+    covariance = torch.diag(initial).repeat(count * windows, 1, 1)
     state[..., columns] = starts[:, None]
     state = state.flatten(0, 1)
 
@@ -70,7 +80,9 @@ def _filtered(rows: Segments, system: System, columns: list[int], starts: Tensor
 
     acting, time, duration, disturbance = (every(each) for each in (acting, rows.time, rows.duration, disturbance))
     measured, used, inside = every(rows.measured), every(rows.used), every(rows.inside) > 0
-    noise, channels = torch.diag(first.log_noise[0].exp()), list(rows.channels)
+    least = torch.tensor([LEAST_NOISE * model.system.states[k].largest for k in rows.channels], dtype=torch.float64)
+    noise = torch.diag(torch.maximum(READING_NOISE * noise_of_readings(rows), least.square()))
+    channels = list(rows.channels)
     foreseen, states = state.new_zeros(len(state)), []
     for t in range(length):
         if t:
@@ -91,13 +103,14 @@ def _filtered(rows: Segments, system: System, columns: list[int], starts: Tensor
     return foreseen.unflatten(0, (count, windows)), torch.stack(states, 1).unflatten(0, (count, windows))
 
 
-def _variances(model: CandidateModel, first: FitState, columns: list[int], count: int) -> tuple[Tensor, Tensor]:
+def _variances(
+    model: CandidateModel, columns: list[int], count: int, doubt: float, wander: float
+) -> tuple[Tensor, Tensor]:
     """Variances (n,) of the first states, and covariances (W, T - 1, n, n) of the process noise, for filters that start
     with `count` values of the states in `columns`."""
     sizes = torch.tensor([variable.largest for variable in model.system.states], dtype=torch.float64)
-    initial, wander = sizes.new_tensor(model.profile.initial_variance), torch.zeros_like(sizes)
+    initial, wandering = sizes.new_tensor(model.profile.initial_variance), torch.zeros_like(sizes)
     initial[columns] = (sizes[columns] / count ** (1 / len(columns))).square()
-    wander[columns] = (WANDER * sizes[columns]).square()
-    group = [k for k, driven in enumerate(model.profile.driven) for _ in driven]
-    loads = model.noise_directions
-    return initial, (loads * first.log_process[0, group].exp()) @ loads.mT + torch.diag(wander)
+    wandering[columns] = (wander * sizes[columns]).square()
+    loads = model.noise_directions * doubt * sizes[model.profile.driven_columns]
+    return initial, loads @ loads.mT + torch.diag(wandering)

@@ -50,6 +50,9 @@ def on_commands(system: type[System]) -> Iterator[Made]:
             actuation.ActuatorLag,
         ):
             table = tuple(_in_units_of(parameter, action) for parameter in base.table)
+            if base is actuation.ActuatorBias:
+                # As wide as that of a constant load, which may do the same: only one of the two is searched.
+                table = tuple(replace(one, low=-action.largest, high=action.largest) for one in table)
             says = _SAYS.get(base, (base.__doc__ or "").partition("\n\n")[0])
             name, attributes = f"{action.name}.{base.name}", {"table": table, "action": index, "__doc__": says}
             if name == delay_of_all(system):
