@@ -104,7 +104,7 @@ def test_a_heading_without_a_sensor_may_start_anywhere(recorded, left, name):
         ([1, 1, 1], [1, -1], None, "right"),
         ([1, 1, 1], [-1, -1], None, "every command"),
         # Without a heading, the machine in a mirror moves alike.
-        ([1, -1], [1, 1], (2.5, -1.6), "x or y"),
+        ([1, -1], [1, 1], (2.5, -1.6), "every command, x or y"),
     ],
 )
 def test_what_has_the_other_sign_is_named_and_inverted(recorded, states, commands, headings, named):

@@ -28,7 +28,7 @@ and sensors are checked."""
 MIN_GAIN_PER_READING = 0.1
 """Log likelihood per reading that another convention must gain to be taken for that of the recording."""
 
-ALIKE = 3.0  # Log likelihood of the source within which two conventions are as likely
+ALIKE = 10.0  # Log likelihood of the source within which two conventions are as likely
 
 EFFECTS_WITH_SIGNS, MOST_EFFECTS_WITH_SIGNS, LEADS_WITH_SIGNS = 2, 6, 3
 """Before a sign convention is decided on, EFFECTS_WITH_SIGNS effects are added one by one to the source in both, the
