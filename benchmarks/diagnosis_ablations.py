@@ -17,7 +17,7 @@ from typing import Any
 
 import tyro
 
-from benchmarks.blind.ablations import PARTS
+from benchmarks.blind.ablations import ALL_OF_THEM, PARTS, parts_of
 from benchmarks.blind.diagnosis import (
     FAILED,
     WATCHED,
@@ -62,7 +62,7 @@ class Settings:
     """seed of the recordings"""
     effects: Effects = "core"
     """what the recordings are drawn from"""
-    parts: tuple[str, ...] = tuple(PARTS)
+    parts: tuple[str, ...] = (*PARTS, ALL_OF_THEM)
     """what is left out"""
     jobs: int = 2
     """recordings diagnosed at once, one core each"""
@@ -86,7 +86,8 @@ def main(settings: Settings) -> None:
         rows.append(_row(label, WHOLE, truths, whole, whole))
         print(rows[-1])
         for part in settings.parts:
-            acts = [one for one in recordings if part in whole[one.name].get("answer", FAILED).get("acting", ())]
+            acting = {one: whole[one.name].get("answer", FAILED).get("acting", ()) for one in recordings}
+            acts = [one for one in recordings if {*parts_of(part)} & {*acting[one]}]
             lines = run_one(part, acts, logs / f"{part}.jsonl", settings.jobs)
             rows.append(_row(label, part, truths, whole, {one.name: lines[one.name] for one in acts}))
             print(rows[-1])

@@ -43,10 +43,16 @@ class Part:
 
 @contextmanager
 def without(part: str) -> Iterator[None]:
-    """A context in which the diagnosis lacks a part."""
-    one = PARTS[part]
-    with patch.object(one.owner, one.name, one.without):
+    """A context in which the diagnosis lacks a part, or all of TOGETHER."""
+    with ExitStack() as stack:
+        for one in parts_of(part):
+            stack.enter_context(patch.object(PARTS[one].owner, PARTS[one].name, PARTS[one].without))
         yield
+
+
+def parts_of(row: str) -> tuple[str, ...]:
+    """The parts that are left out in a row of the table."""
+    return TOGETHER if row == ALL_OF_THEM else (row,)
 
 
 @contextmanager
@@ -148,3 +154,11 @@ PARTS = {
     ),
 }
 """What may be left out, by the name of the row in the table."""
+
+TOGETHER = (
+    *("every effect alone", "exchanges", "starts without process noise", "better fits without process noise"),
+    *("widening", "phases of episodes", "fair comparison"),
+)
+ALL_OF_THEM = "all but growth, removal and careful fits"
+"""The row of a search without any of TOGETHER: effects are added to the best sets and removed, and the best sets fitted
+carefully."""

@@ -30,7 +30,7 @@ from typing import Any, Literal
 
 import tyro
 
-from benchmarks.blind.ablations import PARTS, watched, without
+from benchmarks.blind.ablations import ALL_OF_THEM, PARTS, watched, without
 from benchmarks.blind.baselines import BASELINES, FLYING
 from benchmarks.blind.flight_onestep import system_of
 from benchmarks.blind.scoring import Answer, Score, Truth, score
@@ -141,7 +141,7 @@ DIAGNOSERS: dict[str, Callable[[Path], Answer]] = {
     "ours": ours,
     **BASELINES,
     WATCHED: watched_ours,
-    **{part: partial(ours_without, part) for part in PARTS},
+    **{part: partial(ours_without, part) for part in (*PARTS, ALL_OF_THEM)},
 }
 """path of a CSV -> answer, by name"""
 

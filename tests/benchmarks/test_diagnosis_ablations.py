@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.blind.ablations import PARTS, watched, without
+from benchmarks.blind.ablations import ALL_OF_THEM, PARTS, parts_of, watched, without
 from benchmarks.blind.scoring import Truth
 from benchmarks.diagnosis_ablations import WHOLE, _row
 from tests.diagnosed import record
@@ -22,13 +22,13 @@ def test_parts_that_act_are_noted_and_nothing_else_changes():
     assert not acting & {"jumps", "coloured noise", "phases of episodes"}
 
 
-@pytest.mark.parametrize("part", PARTS)
-def test_a_part_is_left_out_and_comes_back(part):
-    own = PARTS[part]
-    whole = getattr(own.owner, own.name)
-    with without(part):
-        assert getattr(own.owner, own.name) is own.without
-    assert getattr(own.owner, own.name) is whole
+@pytest.mark.parametrize("row", [*PARTS, ALL_OF_THEM])
+def test_a_part_is_left_out_and_comes_back(row):
+    parts = [PARTS[part] for part in parts_of(row)]
+    whole = [getattr(part.owner, part.name) for part in parts]
+    with without(row):
+        assert all(getattr(part.owner, part.name) is part.without for part in parts)
+    assert [getattr(part.owner, part.name) for part in parts] == whole
 
 
 def test_where_a_part_does_not_act_the_answer_of_the_whole_counts():
