@@ -76,8 +76,8 @@ def test_a_drift_carries_what_belongs_to_no_joint():
 
 
 def test_a_command_that_is_the_rate_of_a_state_has_the_bias_that_is_its_drift():
-    class Unicycle(System):
-        name = "unicycle"
+    class TurnedRobot(System):
+        name = "turned_robot"
         states = (
             Variable("x", "m", -5, 5),
             Variable("y", "m", -5, 5),
@@ -93,9 +93,9 @@ def test_a_command_that_is_the_rate_of_a_state_has_the_bias_that_is_its_drift():
             turn, pull = command.unbind(1)
             return torch.stack((speed * yaw.cos(), speed * yaw.sin(), turn, pull + load[:, 0] - speed), 1)
 
-    unicycle = dataclass(frozen=True)(Unicycle)()
-    named = {effect.name: effect for effect in catalogue(unicycle)}
-    assert twins(named["turn.actuator_bias"], named.values(), unicycle) == [named["yaw.drift"]]
+    robot = dataclass(frozen=True)(TurnedRobot)()
+    named = {effect.name: effect for effect in catalogue(robot)}
+    assert twins(named["turn.actuator_bias"], named.values(), robot) == [named["yaw.drift"]]
     assert "switch the actuator off" in named["turn.actuator_bias"].settled_by["yaw.drift"]
 
 

@@ -56,7 +56,7 @@ def opposite_signs(
     conventions = [to_source(rows, convention, system) for convention in every]
     others = [Search(system, each, catalogue, rival=_likelihood(as_given)) for each in conventions]
     most = max(_likelihood(each) for each in others)
-    alike = [k for k, each in enumerate(others) if _likelihood(each) > most - ALIKE]
+    alike = [k for k, each in enumerate(others) if _likelihood(each) >= most - ALIKE]
     other = others[alike[0]]
     if _ahead(other, as_given) <= required:
         return None
