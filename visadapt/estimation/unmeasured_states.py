@@ -17,7 +17,6 @@ from torch import Tensor
 from visadapt.estimation.candidate import COARSE, CandidateModel
 from visadapt.estimation.fitting import LEAST_NOISE
 from visadapt.estimation.linearise import linearise_step
-from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments, initial_states, noise_of_readings, unmeasured
 from visadapt.systems import System
 
@@ -27,6 +26,8 @@ DOUBTS = ((3e-4, 3e-4), (3e-3, 1e-3), (3e-2, 1e-2))
 """How little the source is believed: standard deviations, in each row, of the process noise of the velocities, and of a
 state without a reading beside what the source says, as shares of the largest sizes in their ranges."""
 
+WINDOWS_AT_ONCE = 64  # Windows that are filtered together, so that memory is bounded
+
 READING_NOISE = 2.0  # Variance of the readings' noise in these filters, over that which `noise_of_readings` estimates
 
 
@@ -35,15 +36,21 @@ def with_unmeasured(rows: Segments, system: System) -> Segments:
     columns = unmeasured(rows, system)
     if not columns:
         return rows
-    starts = _starts(system, columns)
-    model, variance = CandidateModel(system, (), rows, COARSE), _initial_variance(system, columns)
+    parts = [rows.select(windows) for windows in torch.arange(rows.shape[0]).split(WINDOWS_AT_ONCE)]
+    estimated = torch.cat([_estimated(part, system, columns) for part in parts])
+    return replace(rows, estimated=estimated) if bool(estimated.isfinite().all()) else rows
+
+
+def _estimated(rows: Segments, system: System, columns: list[int]) -> Tensor:
+    """(W, T, n) the states along the filter of each window that foresees its readings best."""
+    starts, model = _starts(system, columns), CandidateModel(system, (), rows, COARSE)
     tried = [_filtered(model, columns, starts, *doubt) for doubt in DOUBTS]
-    # Near the centre, where several values agree with the readings: a turn more of a heading does as well.
+    # Of several values that agree with the readings, as a heading and a turn more, that near the first.
+    variance = starts.new_tensor(model.profile.initial_variance)[columns]
     far = 0.5 * ((starts - starts[0]).square() / variance).sum(1, keepdim=True)
     score = torch.cat([foreseen - far for foreseen, _ in tried])
     best = score.nan_to_num(nan=-math.inf).argmax(0)
-    estimated = torch.cat([states for _, states in tried])[best, torch.arange(len(best))]
-    return replace(rows, estimated=estimated) if bool(estimated.isfinite().all()) else rows
+    return torch.cat([states for _, states in tried])[best, torch.arange(len(best))]
 
 
 def _starts(system: System, columns: list[int]) -> Tensor:
@@ -53,11 +60,6 @@ def _starts(system: System, columns: list[int]) -> Tensor:
     starts = low + share * (high - low)
     starts[0] = torch.where((low <= 0) & (high >= 0), 0.0, 0.5 * (low + high))
     return starts
-
-
-def _initial_variance(system: System, columns: list[int]) -> Tensor:
-    """(U,) prior variances of the first states of a window."""
-    return torch.tensor(profile_of(system).initial_variance, dtype=torch.float64)[columns]
 
 
 def _filtered(
