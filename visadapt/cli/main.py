@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             message = inputs.own_line(error) if inputs else None
             if message is None:
                 raise
-        print(f"visadapt: {printable(message)}", file=sys.stderr)
+        print(f"visadapt: {in_one_line(message)}", file=sys.stderr)
         return 2  # argparse's own
     return 0
 
@@ -74,7 +74,7 @@ class _Parser(argparse.ArgumentParser):
         self.register("action", None, _Once)
 
     def error(self, message: str) -> NoReturn:
-        super().error(printable(message))
+        super().error(in_one_line(message))
 
 
 class _Once(argparse.Action):
@@ -99,7 +99,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def printable(message: object) -> str:
+def in_one_line(message: object) -> str:
     """A message in one line without control characters, which a name or a cell may hold; a very long one is cut in
     the middle."""
     text = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in str(message))
