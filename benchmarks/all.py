@@ -250,6 +250,16 @@ COMMANDS = (
         40,
         work="--work",
     ),
+    *(
+        Command(
+            f"ablations_diagnosis_{kind}",
+            "ablations_diagnosis.csv",
+            ("benchmarks.diagnosis_ablations", "--kinds", kind, "--count", "32", "--effects", "all"),
+            40,
+            work="--work",
+        )
+        for kind in ("rig", "table")
+    ),
     _blind("blind_hard", "--seed 2028 --kinds hard --count 100 --jobs 2", 20),
     _blind("blind_easy", "--seed 2028 --kinds easy --count 24 --jobs 2", 20),
     _blind(

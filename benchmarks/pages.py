@@ -57,7 +57,9 @@ TABLES = {
     "grounding": Table(adaptation.grounding, ("cartpole_pixels",)),
     "ablations": Table(adaptation.ablations, ("ablations",)),
     "ablations, states": Table(adaptation.ablations, ("ablations_states",)),
-    "ablations, diagnosis": Table(diagnosis.parts, ("ablations_diagnosis", "ablations_diagnosis_large")),
+    "ablations, diagnosis": Table(
+        diagnosis.parts, tuple(f"ablations_diagnosis{of}" for of in ("", "_large", "_rig", "_table"))
+    ),
     "ablations, flights": Table(adaptation.flight_ablations, ("ablations_flight",)),
     "other targets": Table(adaptation.other_targets, ("other_targets",)),
     "other targets, states": Table(adaptation.other_targets, ("other_targets_states",)),
