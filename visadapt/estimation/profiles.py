@@ -211,9 +211,7 @@ def _own_conventions(system: type[System]) -> Iterator[Convention]:
         yield Convention(system.actions[k].name, (), (k,))
     if len(signed) > 1:
         yield Convention("every command", (), tuple(signed))
-    joints = [(position, velocity) for position, velocity in system.coordinates if position is not None]
-    in_joints = {column for pair in system.coordinates for column in pair}
-    alone = [(column,) for column in range(len(system.states)) if column not in in_joints]
-    for columns in (*joints, *alone):
+    alone = [(column,) for column in system.outside_joints()]
+    for columns in (*system.velocity_of().items(), *alone):
         if all(system.states[column].low < 0 for column in columns):
             yield Convention(system.states[columns[0]].name, columns)

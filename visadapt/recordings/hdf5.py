@@ -179,28 +179,24 @@ def _tried(path: str | os.PathLike[str], read: Callable[[Callable[[int], None]],
     Raises:
         RecordingError: that process was ended by either; or whatever `read` raises.
     """
-    if hasattr(os, "fork") and Path(path).is_file():
-        import resource  # not on every system, as fork
-
-        def allow_time(size: int) -> None:
-            hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
-            resource.setrlimit(resource.RLIMIT_CPU, (READING_S + int(size / READING_BYTES_PER_S), hard))
-
-        if (child := os.fork()) == 0:
-            try:
-                allow_time(0)
-                with suppress(Exception), _limited_memory() as allow_memory:
-
-                    def allow(size: int) -> None:
-                        allow_time(size)
-                        allow_memory(size)
-
-                    read(allow)
-            finally:
-                os._exit(0)
-        if os.waitpid(child, 0)[1]:
-            raise RecordingError(f"{path}: is damaged: to read it ends the process, or takes far too long")
     with _limited_memory() as allow_memory:
+        if hasattr(os, "fork") and Path(path).is_file():
+            import resource  # not on every system, as fork
+
+            def allow(size: int) -> None:
+                hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+                resource.setrlimit(resource.RLIMIT_CPU, (READING_S + int(size / READING_BYTES_PER_S), hard))
+                allow_memory(size)
+
+            if (child := os.fork()) == 0:
+                try:
+                    allow(0)
+                    with suppress(Exception):
+                        read(allow)
+                finally:
+                    os._exit(0)
+            if os.waitpid(child, 0)[1]:
+                raise RecordingError(f"{path}: is damaged: to read it ends the process, or takes far too long")
         return read(allow_memory)
 
 

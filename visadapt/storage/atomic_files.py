@@ -107,8 +107,10 @@ def _is_running(process: int) -> bool:
     """Whether there is a process of that number on this machine."""
     try:
         os.kill(process, 0)
-    except OSError as error:
-        return not isinstance(error, ProcessLookupError)  # another error: it is another user's
+    except ProcessLookupError:
+        return False
+    except OSError:  # it is another user's
+        return True
     return True
 
 

@@ -165,6 +165,11 @@ class System(ABC):
         return {position: velocity for position, velocity in cls.coordinates if position is not None}
 
     @classmethod
+    def outside_joints(cls) -> list[int]:
+        """The columns of the states that belong to no joint, such as the position of a vehicle that shows its speed."""
+        return [k for k in range(len(cls.states)) if all(k not in pair for pair in cls.coordinates)]
+
+    @classmethod
     def index(cls, name: str) -> int:
         """Column of the state `name`; raises KeyError, which lists the states, if there is none."""
         names = [variable.name for variable in cls.states]

@@ -68,7 +68,7 @@ def limited(recording: Recording, system: System) -> Recording:
 
 def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effect]] = ()) -> PreparedRecording:
     """Prepare a recording of some or all states, and the commands; `catalogue` are the effects that may act."""
-    draft = _with_unmeasured(_on_its_clock(_read(recording, system)))
+    draft = _on_its_clock(_read(recording, system))
     if not profile_of(system).check_sensors:
         return draft.prepared()
     first = draft.source or draft.source_fit()
@@ -106,7 +106,7 @@ class _Readings:
         )
         if resolution := self.recording.resolution:
             rows, raw = (replace(each, resolution=resolution) for each in (rows, raw))
-        return _Draft(self, rows, raw)
+        return _Draft(self, *_with_unmeasured(rows, raw, self.system))
 
     @property
     def first_usable(self) -> list[int]:
@@ -127,6 +127,12 @@ class _Readings:
             episodes.append(Episode(time.numpy(), action, filled))
             usable.append(_without_long_runs((used > 0).all(1).numpy()))
         return replace(self.recording, episodes=tuple(episodes), usable=tuple(usable))
+
+
+def _with_unmeasured(rows: Segments, raw: Segments, system: System) -> tuple[Segments, Segments]:
+    """Both with the same estimates of the states that were not measured."""
+    rows = with_unmeasured(rows, system)
+    return rows, replace(raw, estimated=rows.estimated)
 
 
 def _without_long_runs(measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -209,14 +215,6 @@ def _on_its_clock(draft: _Draft) -> _Draft:
     return replace(chosen, source=fit if len(kept) == len(channels) else None)
 
 
-def _with_unmeasured(draft: _Draft) -> _Draft:
-    """With estimates of the states that were not measured."""
-    rows = with_unmeasured(draft.rows, draft.readings.system)
-    if rows is draft.rows:
-        return draft
-    return draft.changed(rows, replace(draft.raw, estimated=rows.estimated))
-
-
 def _without_defective_angles(draft: _Draft, source: FitState) -> _Draft:
     """Without readings of the angle where its sensor is defective; `source` is the source's fit to the draft's rows."""
     readings = draft.readings
@@ -267,7 +265,8 @@ def _in_signs_of_source(draft: _Draft, first: FitState, catalogue: Sequence[type
     if band is not None and profile_of(system).angle_sensor[0] in convention.columns:
         band = (-band[1], -band[0])
     told = f"{convention.name}{OPPOSITE}; it was inverted"
-    rows, raw = (sensor_checks.to_source(each, convention, system) for each in (draft.rows, draft.raw))
+    rows, raw = (sensor_checks.to_source(each, convention) for each in (draft.rows, draft.raw))
+    rows, raw = _with_unmeasured(rows, raw, system)
     return replace(draft, convention=convention, defect=band).changed(rows, raw, told)
 
 

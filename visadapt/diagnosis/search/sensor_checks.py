@@ -53,7 +53,7 @@ def opposite_signs(
         return None
     required = MIN_GAIN_PER_READING * float(rows.used.sum())
     as_given = Search(system, rows, catalogue, fitted)
-    conventions = [to_source(rows, convention, system) for convention in every]
+    conventions = [with_unmeasured(to_source(rows, convention), system) for convention in every]
     others = [Search(system, each, catalogue, rival=_likelihood(as_given)) for each in conventions]
     most = max(_likelihood(each) for each in others)
     alike = [k for k, each in enumerate(others) if _likelihood(each) >= most - ALIKE]
@@ -86,11 +86,11 @@ def signs(turned: Sequence[int], columns: Iterable[int]) -> Tensor:
     return torch.tensor([-1.0 if column in turned else 1.0 for column in columns], dtype=torch.float64)
 
 
-def to_source(rows: Segments, convention: Convention, system: System) -> Segments:
+def to_source(rows: Segments, convention: Convention) -> Segments:
     """Rows of another convention in that of the source."""
     measured = rows.measured * signs(convention.columns, rows.channels)
     command = rows.command * signs(convention.commands, range(rows.command.shape[-1]))
-    return with_unmeasured(replace(rows, measured=measured, command=command), system)
+    return replace(rows, measured=measured, command=command)
 
 
 MAX_LAG = 0.2

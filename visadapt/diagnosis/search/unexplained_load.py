@@ -86,12 +86,11 @@ def load_tracks(recording: Recording, world: World) -> list[LoadTrack]:
     """The unexplained loads in each episode that is long enough; none where a joint's position was not measured."""
     system = world.system
     measured = [system.index(name) for name in recording.measured]
-    in_pairs = {column for pair in system.coordinates for column in pair}
     if not system.coordinates or len(system.coordinates) < len(system.loads):
         return []
     if any(position not in measured for position, _ in system.coordinates):
         return []
-    if any(column not in measured for column in range(len(system.states)) if column not in in_pairs):
+    if any(column not in measured for column in system.outside_joints()):
         return []
     found = [
         part

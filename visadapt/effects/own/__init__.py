@@ -17,7 +17,7 @@ import torch
 from visadapt.effects.base import EFFECTS, Effect
 from visadapt.effects.own.added_inertia import inertia_of
 from visadapt.effects.own.commands import on_commands
-from visadapt.effects.own.drift import drifting, on_states
+from visadapt.effects.own.drift import on_states
 from visadapt.effects.own.dynamics import on_joints, on_parameters, scalable
 from visadapt.effects.own.extended import with_inertia
 from visadapt.effects.own.sensors import on_sensors
@@ -51,8 +51,8 @@ _GENERATED: set[type[Effect]] = set()
 @cache
 def _made(system: type[System]) -> tuple[type[Effect], ...]:
     example = system()
-    every = (*on_commands(system), *on_joints(system), *on_states(system))
-    every = (*every, *on_parameters(system), *on_sensors(system))
+    makers = on_commands, on_joints, on_states, on_parameters, on_sensors
+    every = [one for maker in makers for one in maker(system)]
     alike, imitating = list(_alike(example)), list(_imitating(example))
     either_way = [*alike, *((other, one) for one, other in alike)]
     return tuple(_named(system, *each, _others(each[0], either_way), _others(each[0], imitating)) for each in every)
@@ -76,7 +76,7 @@ def _alike(system: System) -> Iterator[tuple[str, str]]:
                 by_load * (by_command * by_load).sum() / by_load.square().sum(), by_command
             ):
                 yield f"{action.name}.actuator_bias", f"{joint.name}.constant_load"
-        for column in drifting(type(system)):
+        for column in system.outside_joints():
             moved = torch.eye(state.shape[1]).double()[column]
             if bool(by_command.any()) and equal(by_command[0] * moved, by_command):
                 yield f"{action.name}.actuator_bias", f"{system.states[column].name}.drift"

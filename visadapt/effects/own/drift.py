@@ -22,16 +22,12 @@ class Drift(DynamicsEffect):
         return with_drift(system, self.of_state, getattr(self, self.table[0].name))
 
 
-def drifting(system: type[System]) -> list[int]:
-    """The columns of the states that belong to no joint."""
-    return [k for k in range(len(system.states)) if all(k not in pair for pair in system.coordinates)]
-
-
 def on_states(system: type[System]) -> Iterator[Made]:
     """A drift of each state that belongs to no joint."""
     fastest = system().derivative(*inputs(system())).abs().amax(0)
-    for column in drifting(system):
+    for column in system.outside_joints():
         state, most = system.states[column], float(fastest[column])
+        unit = f"{state.unit}2" if state.unit.endswith("/s") else f"{state.unit}/s"
         if most > 0:
             yield (
                 f"{state.name}.drift",
@@ -39,11 +35,6 @@ def on_states(system: type[System]) -> Iterator[Made]:
                 {
                     "of_state": column,
                     "equation": f"d({state.name})/dt = that of the source + rate",
-                    "table": (Parameter("rate", per_second(state.unit), -most, most, 0.0),),
+                    "table": (Parameter("rate", unit, -most, most, 0.0),),
                 },
             )
-
-
-def per_second(unit: str) -> str:
-    """The unit of the rate of a quantity."""
-    return f"{unit}2" if unit.endswith("/s") else f"{unit}/s"
