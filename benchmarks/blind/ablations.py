@@ -136,7 +136,6 @@ PARTS = {
         Search, "_improve_while_unexplained", _without_widening, lambda left, self, made: left > WIDEN_ABOVE
     ),
     "late sensors": Part(Search, "_fit_late", _nothing, lambda _, self, bases: bool(bases)),
-    "fair comparison": Part(Search, "_compare_fairly", _nothing),
     "phases of episodes": Part(Search, "_phases_of_episodes", _nothing),
     "jumps": Part(DIAGNOSE, "with_jumps", _nothing, lambda out, _: out is not None),
     "coloured noise": Part(
@@ -157,7 +156,7 @@ PARTS = {
 
 TOGETHER = (
     *("every effect alone", "exchanges", "starts without process noise", "better fits without process noise"),
-    *("widening", "phases of episodes", "fair comparison"),
+    *("widening", "phases of episodes"),
 )
 ALL_OF_THEM = "all but growth, removal and careful fits"
 """The row of a search without any of TOGETHER: effects are added to the best sets and removed, and the best sets fitted

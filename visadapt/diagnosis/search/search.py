@@ -54,9 +54,6 @@ POLISH_MODELS = 8
 """Log posterior odds behind the best set up to which sets are fitted carefully, POLISH_MODELS at most. Sets with fewer
 parameters than the best may be farther behind, since a quick fit of the right set may keep too much process noise."""
 
-MORE_NOISE = 1.0  # Log variance of process noise by which a set close to the best has clearly more of it
-
-
 Exchanges = set[frozenset[str]]
 """Sets, by the names of their effects, that were kept so far when others were exchanged."""
 
@@ -85,7 +82,6 @@ class Search(FittedModels):
             self.try_late_sensors()
             self._settle(exchanged)
             self._phases_of_episodes()
-        self._compare_fairly()
         self._report(progress, MAX_EFFECTS)
 
     def fit_singles(self) -> list[ScoredModel]:
@@ -292,13 +288,6 @@ class Search(FittedModels):
         rough = [f for f in self.near_best() if self._careful.get(key_of(f.effects)) is not f]
         careful = self.fit([(f.effects, f.fits) for f in rough], CAREFUL)
         self._careful |= {key_of(f.effects): f for f in careful}
-
-    def _compare_fairly(self) -> None:
-        """Fit the sets close to the best from fits without process noise, where they have more of it than the best: a
-        fit may end where noise stands for what their effects would do."""
-        least = float(self.best.fits.log_process.max()) + MORE_NOISE
-        noisy = [f for f in self.near_best() if float(f.fits.log_process.max()) > least]
-        self._fit_from_quiet([(f.effects, f.fits) for f in noisy], CAREFUL)
 
     def near_best(self) -> list[ScoredModel]:
         """The sets close to the best, and the best set less each effect, where these were fitted."""
