@@ -127,6 +127,14 @@ def test_a_hinge_far_outside_the_frames_is_refused(here, capsys):
     assert "--hinge 6000,28.5: more than a frame's size outside the frames, which are 48 px wide and 40 px high" in line
 
 
+def test_lengths_in_mm_are_refused(here, capsys):
+    path = write_frames(here / "a.h5", 30)
+    for factor in (100, 1000):
+        episodes = [replace(each, state=each.state * [factor, 1, 1, 1]) for each in va.read_recording(path)]
+        write_recording(here / "other.h5", episodes)
+        assert "frames 48 px wide; x in m is right" in refused(capsys, "renderer", "other.h5", *GUESS, *OUT)
+
+
 def test_a_pole_that_is_not_drawn_yet_shows_in_the_error(here, capsys):
     write_frames(here / "a.h5", 30)
     assert run("renderer", "a.h5", *GUESS, "--iterations", 3, *OUT) == 0

@@ -31,7 +31,7 @@ from visadapt.targets import Start
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.world import World
 
-SHOWN, WITHIN = 4000, (1.0, 0.35)
+CALIBRATION_STATES, WITHIN = 4000, (1.0, 0.35)
 """States that an environment is put into, and the largest |x| in m and |theta| in rad of these."""
 
 FAINT = 20 / 255
@@ -57,6 +57,12 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(
             f"--hinge {column:g},{row:g}: more than a frame's size outside the frames, which are {width} px wide and "
             f"{height} px high; the column and row at which the hinge is seen at x = 0 are right"
+        )
+    away = options.scale * float(x.abs().median())
+    if away > 2 * width:
+        raise InputError(
+            f"x goes from {float(x.min()):.3g} to {float(x.max()):.3g}: at --scale {options.scale:g} px a metre the "
+            f"cart is mostly {away:.0f} px or more from x = 0, in frames {width} px wide; x in m is right"
         )
     torch.manual_seed(options.seed)
     renderer = LayeredRenderer(height, width, column, row, options.scale, options.pole)
@@ -91,7 +97,7 @@ def _show(options: argparse.Namespace) -> tuple[Tensor, Tensor, Tensor]:
     if not isinstance(target, GymnasiumTarget):
         raise InputError(f"{options.target}: cannot be put into chosen states; give recordings of frames and states")
     x, theta = options.within or WITHIN
-    states = Start(x, 0.0, theta, 0.0).draw(options.show or SHOWN, torch.Generator().manual_seed(options.seed))
+    states = Start(x, 0.0, theta, 0.0).draw(options.show or CALIBRATION_STATES, torch.Generator().manual_seed(options.seed))
     return states[:, 0], states[:, 2], torch.from_numpy(target.show(states.double().numpy()))
 
 

@@ -30,7 +30,7 @@ AT_BOUND = 1e-3  # Distance from an end of its range, as a share of it, within w
 
 NEGLIGIBLE = 0.01  # Probability of a set up to which it does not widen the intervals of the others' parameters
 
-SHOWN = 8  # Episodes at most whose phases are stated
+STATED_PHASES = 8  # Episodes at most whose phases are stated
 
 GapClosed = Mapping[frozenset[str], float]
 """Share of the gap that a set closes on held-out episodes, by the names of its effects."""
@@ -209,7 +209,7 @@ def phases_of_episodes(best: ScoredModel) -> list[str]:
         if has_episode_phases(effect):
             pairs = zip(effect.table, values.tolist(), strict=True)
             phases = [math.remainder(value, 2 * math.pi) for p, value in pairs if p.is_phase]
-            shown = ", ".join(f"{phase:.2f}" for phase in phases[:SHOWN]) + ", ..." * (len(phases) > SHOWN)
+            shown = ", ".join(f"{phase:.2f}" for phase in phases[:STATED_PHASES]) + ", ..." * (len(phases) > STATED_PHASES)
             out.append(
                 f"{effect.name}: its phase differs from episode to episode ({shown} rad); the one given is the first's"
             )
