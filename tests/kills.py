@@ -47,6 +47,7 @@ def main() -> int:
             whole = result(folder / name, command)
             duration = time.monotonic() - began
             print(f"{name}: {duration:.1f} s, {len(whole)} files", flush=True)
+            assert whole, f"visadapt {' '.join(command)} wrote nothing"
             for k in range(options.times):
                 moment = moments.uniform(0, duration)
                 kill(folder / f"{name}-{k}", command, moment)
@@ -68,7 +69,7 @@ def commands(inputs: Path) -> dict[str, Sequence[str]]:
     return {
         "train": (*TRAIN, f"{ITERATIONS}", "--out", "policy.safetensors"),
         "adapt": ("adapt", "--policy", policy, *target, "--out", "run"),
-        "diagnose": ("diagnose", recording, "--json", "found.json", "--report", "report.html"),
+        "diagnose": ("diagnose", "--system", "cartpole", recording, "--json", "found.json", "--report", "report.html"),
     }
 
 

@@ -28,7 +28,7 @@ from visadapt.estimation.sensitivity import Sensitivity
 BIN = 0.02
 """Share of the period of the highest frequency that a bin of time lasts."""
 PADDING = 8
-"""Points of the transform in 1 / T."""
+"""Points of the transform in 1 / T, at least."""
 PEAKS = 4
 """Number of frequencies that are returned at most."""
 
@@ -61,8 +61,9 @@ def likeliest(whole: Sensitivity, some: Sensitivity, effect: type[Effect]) -> Te
     width = max(last - first, 1e-9) / count
     bins = ((time[inside] - first) / width).long().clamp(max=count - 1)
     binned = torch.zeros(count, dtype=torch.float64).index_add(0, bins, pull[inside])
-    frequency = torch.fft.rfftfreq(PADDING * count, width, dtype=torch.float64)
-    power = torch.fft.rfft(binned, PADDING * count).abs().square()
+    points = 2 ** math.ceil(math.log2(PADDING * count))  # the length of which a transform is fastest
+    frequency = torch.fft.rfftfreq(points, width, dtype=torch.float64)
+    power = torch.fft.rfft(binned, points).abs().square()
     within = (frequency >= max(low, 1 / (last - first))) & (frequency <= high)
     too_low = coarse[coarse < 2 / (last - first)]
     if int(within.sum()) < 3:

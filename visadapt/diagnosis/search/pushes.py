@@ -142,6 +142,8 @@ class _Fit:
         self.spread = [torch.ones_like(track.load) for track in tracks]
         self.autoregression = torch.zeros(joints, LAGS, dtype=torch.float64)
         self.innovation = torch.ones(joints, dtype=torch.float64)
+        # Cholesky factors of the covariances of a part's first LAGS errors, which follow none.
+        self.first = torch.eye(LAGS, dtype=torch.float64).repeat(joints, 1, 1)
 
     def pushes(self) -> list[_Bump]:
         """The bumps that stand out clearly."""
@@ -179,7 +181,10 @@ class _Fit:
         out = values.clone()
         for lag, factor in enumerate(self.autoregression.unbind(1), 1):
             out[..., lag:, :] -= factor * values[..., :-lag, :]
-        return (out / self.innovation).flatten(-2)
+        out = out / self.innovation
+        first = values[..., :LAGS, :].movedim(-1, -2)[..., None]  # (..., J, LAGS, 1)
+        out[..., :LAGS, :] = torch.linalg.solve_triangular(self.first, first, upper=False)[..., 0].movedim(-2, -1)
+        return out.flatten(-2)
 
     def _fit(self, rounds: int) -> None:
         for k in range(rounds):
@@ -248,7 +253,7 @@ class _Fit:
             )
             deviation = (0.5 * _log_power(basis, power)).exp()
             at_rest = torch.cat([track.at_rest[:, j] for track in self.tracks])
-            friction = torch.cat([self._dry_friction(part, j).expand(n) for part, n in enumerate(lengths)])
+            friction = torch.cat([self._dry_friction(part, j) for part in range(len(lengths))])
             # At rest, dry friction is what holds the joint.
             deviations = torch.hypot(deviation, friction * at_rest).split(lengths)
             moments = torch.zeros(LAGS + 1, dtype=torch.float64)
@@ -262,14 +267,17 @@ class _Fit:
             moments = moments / sum(lengths)
             moments[0] *= 1 + WHITE_SHARE
             lags = torch.arange(LAGS)
-            self.autoregression[j] = torch.linalg.solve(moments[(lags[:, None] - lags).abs()], moments[1:])
+            covariance = moments[(lags[:, None] - lags).abs()]
+            self.first[j] = torch.linalg.cholesky(covariance)
+            self.autoregression[j] = torch.linalg.solve(covariance, moments[1:])
             self.innovation[j] = (moments[0] - self.autoregression[j] @ moments[1:]).clamp(min=1e-9).sqrt()
 
     def _dry_friction(self, part: int, joint: int) -> Tensor:
-        """() the size of a joint's dry friction."""
+        """(N,) the size of a joint's dry friction: that of the world, and what is fitted beside it."""
         track = self.tracks[part]
         column = track.dry[joint]
-        return COLUMN_PRIOR * self.weights[part][column].abs() * track.columns[column].abs().amax()
+        more = COLUMN_PRIOR * self.weights[part][column].abs() * track.columns[column].abs().amax()
+        return track.friction[:, joint] + more
 
     def _highest(self, part: int) -> _Bump:
         """The bump on a part that stands out most beside what is fitted."""

@@ -60,6 +60,7 @@ class LoadTrack:
     reaction: Tensor
     """(K, N, J, J) change of the columns, which follow the modelled motion, per unit of load that nothing explains"""
     dry: tuple[int, ...]  # the column of each joint's dry friction
+    friction: Tensor  # (N, J) dry friction that the world has, which the load may lack where a joint sticks
     at_rest: Tensor  # (N, J) from 0 to 1: whether a joint is so slow that it may stick
     activity: Tensor  # (N, F) logs of speeds, accelerations and changes of commands, with which errors grow
     smoothing: float  # s, deviation of the smoothing Gaussian
@@ -75,6 +76,7 @@ class LoadTrack:
                 load=self.load[a:b],
                 columns=self.columns[:, a:b],
                 reaction=self.reaction[:, a:b],
+                friction=self.friction[a:b],
                 at_rest=self.at_rest[a:b],
                 activity=self.activity[a:b],
             )
@@ -112,6 +114,7 @@ def load_tracks(recording: Recording, world: World) -> list[LoadTrack]:
             load=track.load / unit,
             columns=track.columns / unit / size,
             reaction=track.reaction * unit / unit[:, None] / size[..., None],
+            friction=track.friction / unit,
         )
         for track in found
     ]
@@ -158,7 +161,8 @@ def _track(number: int, episode: Episode, world: World, measured: Sequence[int],
     state[:, velocities] = rate(state[:, positions])
     acceleration = rate(state[:, velocities])
     commanded = smooth(acting, 0.1 * smoothing)
-    found = _Motion(world, time, state, acting, acceleration).loads(rate, commanded)
+    motion = _Motion(world, time, state, acting, acceleration)
+    found = motion.loads(rate, commanded)
     largest = torch.tensor([action.largest for action in system.actions], dtype=torch.float64)
     fastest = torch.tensor([system.states[v].largest for v in velocities], dtype=torch.float64)
     stormy = smooth(acceleration.abs(), 2 * smoothing)
@@ -183,6 +187,7 @@ def _track(number: int, episode: Episode, world: World, measured: Sequence[int],
         smoothed[:, 1:].movedim(1, 0),
         found.reaction[inner].movedim(1, 0),
         found.dry,
+        motion.dry_friction()[inner],
         at_rest[inner],
         activity[inner],
         smoothing,
@@ -221,6 +226,15 @@ class _Motion:
         at = WorldState(self.time, self.state, ())
         system, load = self.world.system_at(at) if bare is None else bare, self.world.load(at)
         return system.response_to_loads(self.state, self.acting, load)
+
+    def dry_friction(self) -> Tensor:
+        """(T, J) the dry friction of the world at rest: half of the jump of its load where a joint turns round."""
+        columns = [velocity for _, velocity in self.world.system.coordinates]
+        forward, backward = (
+            self.world.load(WorldState(self.time, self.state.index_fill(1, torch.tensor(columns), speed), ()))
+            for speed in (1e-9, -1e-9)
+        )
+        return (backward - forward).clamp(min=0) / 2
 
     def loads(self, rate: Callable[[Tensor], Tensor], commanded: Tensor) -> _Loads:
         """The load in question and what may explain it.
