@@ -12,6 +12,7 @@ from tests.diagnosed import record
 from tests.own_systems import DoublePendulum
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.pushes import pushes
+from visadapt.effects import CoulombFriction
 from visadapt.effects.catalogue import catalogue
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole
@@ -195,6 +196,27 @@ def test_feedback_does_not_hide_a_push_and_the_pole_is_not_pushed(force, jitter,
     assert push.impulse == pytest.approx(impulse, rel=0.25)
     assert push.start == pytest.approx(8 - 2.45 * 0.11, abs=0.1)
     assert push.ci90[0] < impulse < push.ci90[1]
+
+
+@pytest.mark.parametrize(
+    ("friction", "noise", "seed"), [(3.0, 3e-3, 1), (6.0, 1e-3, 2), (6.0, 1e-3, 4), (6.0, 1e-3, 6)]
+)
+def test_none_is_named_where_a_cart_sticks_now_and_then(friction, noise, seed):
+    """Under slow forces of up to 1.5 or 3 times its dry friction, read every 30 ms with `noise` in m and rad."""
+    world = World(CartPole(), [CoulombFriction(force=friction)], period=0.03).double().requires_grad_(False)
+    random, time = np.random.default_rng(seed), 0.03 * np.arange(120)
+    frequency, phase = random.uniform(1, 8, (3, 4, 1)), random.uniform(0, 6, (3, 4, 1))
+    command = 0.1 * friction * np.sin(frequency * time + phase).mean(0)
+    at = world.start(torch.tensor([[0.0, 0.0, math.pi, 0.0]]).double().repeat(4, 1))
+    states = []
+    for acting in torch.from_numpy(command.T[..., None]):
+        states.append(at.state.numpy()[:, [0, 2]])
+        at = world.step(at, acting)
+    read = np.stack(states, 1)
+    read += noise * random.normal(size=read.shape)
+    episodes = tuple(Episode(time, each[:, None], rows) for each, rows in zip(command, read, strict=True))
+    with torch.inference_mode():
+        assert pushes(Recording(episodes, ("x", "theta"), 0.03, ("run",) * 4), world) == ()
 
 
 @pytest.mark.parametrize("rate", [0.2, 0.5])
