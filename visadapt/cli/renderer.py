@@ -97,7 +97,8 @@ def _show(options: argparse.Namespace) -> tuple[Tensor, Tensor, Tensor]:
     if not isinstance(target, GymnasiumTarget):
         raise InputError(f"{options.target}: cannot be put into chosen states; give recordings of frames and states")
     x, theta = options.within or WITHIN
-    states = Start(x, 0.0, theta, 0.0).draw(options.show or CALIBRATION_STATES, torch.Generator().manual_seed(options.seed))
+    count, generator = options.show or CALIBRATION_STATES, torch.Generator().manual_seed(options.seed)
+    states = Start(x, 0.0, theta, 0.0).draw(count, generator)
     return states[:, 0], states[:, 2], torch.from_numpy(target.show(states.double().numpy()))
 
 

@@ -26,7 +26,7 @@ DOUBTS = ((3e-4, 3e-4), (3e-3, 1e-3), (3e-2, 1e-2))
 """How little the source is believed: standard deviations, in each row, of the process noise of the velocities, and of a
 state without a reading beside what the source says, as shares of the largest sizes in their ranges."""
 
-WINDOWS_AT_ONCE = 64  # Windows that are filtered together, so that memory is bounded
+WINDOWS_AT_ONCE = 24  # Windows that are filtered together, so that memory is bounded
 
 READING_NOISE = 2.0  # Variance of the readings' noise in these filters, over that which `noise_of_readings` estimates
 
@@ -36,21 +36,22 @@ def with_unmeasured(rows: Segments, system: System) -> Segments:
     columns = unmeasured(rows, system)
     if not columns:
         return rows
+    least = torch.tensor([LEAST_NOISE * system.states[k].largest for k in rows.channels], dtype=torch.float64)
+    noise = torch.maximum(READING_NOISE * noise_of_readings(rows), least.square())
     parts = [rows.select(windows) for windows in torch.arange(rows.shape[0]).split(WINDOWS_AT_ONCE)]
-    estimated = torch.cat([_estimated(part, system, columns) for part in parts])
+    estimated = torch.cat([_estimated(part, system, columns, noise) for part in parts])
     return replace(rows, estimated=estimated) if bool(estimated.isfinite().all()) else rows
 
 
-def _estimated(rows: Segments, system: System, columns: list[int]) -> Tensor:
-    """(W, T, n) the states along the filter of each window that foresees its readings best."""
+def _estimated(rows: Segments, system: System, columns: list[int], noise: Tensor) -> Tensor:
+    """(W, T, n) the states along the filter of each window that foresees its readings, with `noise` (C,), best."""
     starts, model = _starts(system, columns), CandidateModel(system, (), rows, COARSE)
-    tried = [_filtered(model, columns, starts, *doubt) for doubt in DOUBTS]
+    foreseen, states = _filtered(model, columns, starts, noise)
     # Of several values that agree with the readings, as a heading and a turn more, that near the first.
     variance = starts.new_tensor(model.profile.initial_variance)[columns]
     far = 0.5 * ((starts - starts[0]).square() / variance).sum(1, keepdim=True)
-    score = torch.cat([foreseen - far for foreseen, _ in tried])
-    best = score.nan_to_num(nan=-math.inf).argmax(0)
-    return torch.cat([states for _, states in tried])[best, torch.arange(len(best))]
+    best = (foreseen - far.repeat(len(DOUBTS), 1)).nan_to_num(nan=-math.inf).argmax(0)
+    return states[best, torch.arange(len(best))]
 
 
 def _starts(system: System, columns: list[int]) -> Tensor:
@@ -62,38 +63,36 @@ def _starts(system: System, columns: list[int]) -> Tensor:
     return starts
 
 
-def _filtered(
-    model: CandidateModel, columns: list[int], starts: Tensor, doubt: float, wander: float
-) -> tuple[Tensor, Tensor]:
-    """Log likelihoods (S, W), up to a constant, and filtered states (S, W, T, n) of the source in every window, from S
-    values of the states in `columns`."""
-    rows, count, (windows, length) = model.rows, len(starts), model.rows.shape
+def _filtered(model: CandidateModel, columns: list[int], starts: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Log likelihoods (F, W), up to a constant, and filtered states (F, W, T, n) of the source in every window, by
+    filters of each of DOUBTS from each of S values of the states in `columns`: F = len(DOUBTS) S. `noise` (C,) are the
+    variances of the readings."""
+    rows, count, (windows, length) = model.rows, len(DOUBTS) * len(starts), model.rows.shape
     none = starts.new_zeros(0)  # parameters: the source has no effects
     world, acting = model.stepping(none, model.in_windows(model.acting(none[None]))[0])
-    initial, disturbance = _variances(model, columns, count, doubt, wander)
     state = initial_states(rows, model.system)[:, 0].repeat(count, 1, 1)
-    covariance = torch.diag(initial).repeat(count * windows, 1, 1)
-    state[..., columns] = starts[:, None]
+    state[..., columns] = starts.repeat(len(DOUBTS), 1)[:, None]
     state = state.flatten(0, 1)
+    initial, disturbance = _variances(model, columns, len(starts))
+    covariance = torch.diag(initial).repeat(count * windows, 1, 1)
 
     def every(values: Tensor) -> Tensor:
-        """Values (W, T, ...) row by row, for each start."""
+        """Values (W, T, ...) row by row, for each filter."""
         return values.repeat(count, *[1] * (values.dim() - 1)).transpose(0, 1)
 
-    acting, time, duration, disturbance = (every(each) for each in (acting, rows.time, rows.duration, disturbance))
+    acting, time, duration = (every(each) for each in (acting, rows.time, rows.duration))
     measured, used, inside = every(rows.measured), every(rows.used), every(rows.inside) > 0
-    least = torch.tensor([LEAST_NOISE * model.system.states[k].largest for k in rows.channels], dtype=torch.float64)
-    noise = torch.diag(torch.maximum(READING_NOISE * noise_of_readings(rows), least.square()))
     channels = list(rows.channels)
     foreseen, states = state.new_zeros(len(state)), []
     for t in range(length):
         if t:
             step = linearise_step(world, none, time[t - 1], state, acting[t - 1], duration=duration[t - 1])
-            moved = step.by_state @ covariance @ step.by_state.mT + disturbance[t - 1]
+            moved = (step.by_state @ covariance @ step.by_state.mT).unflatten(0, (len(DOUBTS), -1, windows))
+            moved = (moved + disturbance[:, None, :, t - 1]).flatten(0, 2)
             state = torch.where(inside[t, :, None], step.value, state)
             covariance = torch.where(inside[t, :, None, None], moved, covariance)
         seen = used[t, :, :, None] * covariance[:, channels]
-        root, _ = torch.linalg.cholesky_ex(used[t, :, None] * seen[..., channels] + noise)
+        root, _ = torch.linalg.cholesky_ex(used[t, :, None] * seen[..., channels] + torch.diag(noise))
         error = (used[t] * (measured[t] - state[:, channels]))[..., None]
         white = torch.linalg.solve_triangular(root, error, upper=False)
         cross = torch.linalg.solve_triangular(root, seen, upper=False)
@@ -105,14 +104,15 @@ def _filtered(
     return foreseen.unflatten(0, (count, windows)), torch.stack(states, 1).unflatten(0, (count, windows))
 
 
-def _variances(
-    model: CandidateModel, columns: list[int], count: int, doubt: float, wander: float
-) -> tuple[Tensor, Tensor]:
-    """Variances (n,) of the first states, and covariances (W, T - 1, n, n) of the process noise, for filters that start
-    with `count` values of the states in `columns`."""
+def _variances(model: CandidateModel, columns: list[int], count: int) -> tuple[Tensor, Tensor]:
+    """Variances (n,) of the first states, for `count` values of the states in `columns`, and covariances
+    (len(DOUBTS), W, T - 1, n, n) of the process noise."""
     sizes = torch.tensor([variable.largest for variable in model.system.states], dtype=torch.float64)
-    initial, wandering = sizes.new_tensor(model.profile.initial_variance), torch.zeros_like(sizes)
+    initial = sizes.new_tensor(model.profile.initial_variance)
     initial[columns] = (sizes[columns] / count ** (1 / len(columns))).square()
-    wandering[columns] = (wander * sizes[columns]).square()
-    loads = model.noise_directions * doubt * sizes[model.profile.driven_columns]
-    return initial, loads @ loads.mT + torch.diag(wandering)
+    driven, disturbances = model.noise_directions * sizes[model.profile.driven_columns], []
+    for doubt, wander in DOUBTS:
+        wandering = torch.zeros_like(sizes)
+        wandering[columns] = (wander * sizes[columns]).square()
+        disturbances.append(doubt**2 * driven @ driven.mT + torch.diag(wandering))
+    return initial, torch.stack(disturbances)

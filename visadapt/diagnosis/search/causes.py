@@ -209,7 +209,8 @@ def phases_of_episodes(best: ScoredModel) -> list[str]:
         if has_episode_phases(effect):
             pairs = zip(effect.table, values.tolist(), strict=True)
             phases = [math.remainder(value, 2 * math.pi) for p, value in pairs if p.is_phase]
-            shown = ", ".join(f"{phase:.2f}" for phase in phases[:STATED_PHASES]) + ", ..." * (len(phases) > STATED_PHASES)
+            more = ", ..." if len(phases) > STATED_PHASES else ""
+            shown = ", ".join(f"{phase:.2f}" for phase in phases[:STATED_PHASES]) + more
             out.append(
                 f"{effect.name}: its phase differs from episode to episode ({shown} rad); the one given is the first's"
             )
