@@ -22,6 +22,7 @@ MEASURES = {
     "triple: all named": "triples, all named",
     "none: no_gap": "nothing hidden, called no_gap",
     "foreign: unexplained": "foreign effects, called unexplained",
+    "nobody pushed: push named": "nobody pushed, a push named",
     "parameter error, relative": "median parameter error",
     "coverage of 90 % intervals": "coverage of the 90 % intervals",
     "closed where identified, median": "gap closed where identified, median",

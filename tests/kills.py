@@ -65,7 +65,7 @@ def commands(inputs: Path) -> dict[str, Sequence[str]]:
     policy, recording = str(inputs / "policy.safetensors"), str(write(inputs / "recording.csv", a_run(0.2, 1e-3)))
     (inputs / "killed_rig.py").write_text(RIG)
     subprocess.run([sys.executable, "-c", COMMAND, *TRAIN, "3", "--out", policy], check=True)
-    target = ("--target", "killed_rig:pushed", "--samples", "60", "--round", "20", "--iterations", f"{ITERATIONS}")
+    target = ("--target", "killed_rig:pushed", "--samples", "40", "--round", "20", "--iterations", f"{ITERATIONS}")
     return {
         "train": (*TRAIN, f"{ITERATIONS}", "--out", "policy.safetensors"),
         "adapt": ("adapt", "--policy", policy, *target, "--out", "run"),

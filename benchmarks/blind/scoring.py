@@ -75,6 +75,8 @@ class Score:
     """whether a 90 % interval contains the truth, for every parameter of correctly named causes"""
     overlaps: list[float] = field(default_factory=list)
     """intersection over union of the region of a patch, gust or frozen zone with the answer's; 0 if it has none"""
+    pushed: bool | None = None
+    """whether the answer tells of a push where there is none: neither a gust nor a foreign effect"""
 
 
 def _as_in_the_catalogue(effect: str, parameters: dict[str, float]) -> dict[str, float]:
@@ -146,6 +148,8 @@ def score(truth: Truth, answer: Answer) -> Score:
         result.closed = (answer.get("gap") or {}).get("closed")
     # An effect that no recording can show is not to be found.
     groups, effects = classes(answer), set() if truth.kind == "none" else set(truth.effects)
+    if truth.kind != "foreign" and not any((region_of(effect) or ("",))[0] == "time" for effect in truth.effects):
+        result.pushed = bool((answer.get("where") or {}).get("pushes"))
     ranking = answer.get("ranking") or []
     if truth.kind != "foreign" and ranking and ranking[0].get("probability") is not None:
         result.probability = float(ranking[0]["probability"])

@@ -78,6 +78,7 @@ def tabulate(kind: str, diagnoser: str, scores: Sequence[Score], seconds: Sequen
     share("foreign: something named", [s.verdict in ("identified", "ambiguous") for s in of("foreign")])
     share("named gap: no_gap", [s.verdict == "no_gap" for s in scores if s.exact is not None])
     share("named gap: unexplained", [s.verdict == "unexplained" for s in scores if s.exact is not None])
+    share("nobody pushed: push named", [s.pushed for s in scores])
     share("ambiguous", [s.verdict == "ambiguous" for s in scores])
     middle("parameter error, relative", [e for s in scores for e in s.errors])
     middle("parameter error, relative to the change", [e for s in scores for e in s.deviations])

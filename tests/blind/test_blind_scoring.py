@@ -150,6 +150,15 @@ def test_regions_are_compared_by_intersection_over_union():
     assert score(patch, answer("no_gap")).overlaps == [0.0]
 
 
+def test_a_push_is_told_of_wrongly_where_nobody_pushed():
+    said = answer("identified", cause("viscous_friction"))
+    said["where"]["pushes"] = [{"load": "cart_force"}]
+    gust = truth("single", gust={"start": 1.0, "end": 2.0, "force": 4.0})
+    told = [score(one, said).pushed for one in (FRICTION, truth("none"), gust, truth("foreign", kicks={"force": 1.0}))]
+    assert told == [True, True, None, None]
+    assert score(FRICTION, answer("no_gap")).pushed is False
+
+
 def test_tables_hold_shares_with_their_intervals():
     none, foreign = truth("none"), truth("foreign", kicks={"force": 1.0})
     right = answer("identified", cause("viscous_friction", coefficient=(2.0, [1.9, 2.1])))
