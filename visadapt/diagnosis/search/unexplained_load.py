@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import conv1d, pad
 
+from visadapt.effects import DynamicsEffect
 from visadapt.effects.own.dynamics import scalable
 from visadapt.recordings import Episode, Recording
 from visadapt.recordings.runs import runs
@@ -220,6 +221,11 @@ class _Motion:
         at = WorldState(self.time, state, ())
         return self.world.system_at(at).accelerations(state, acting, self.world.load(at))
 
+    def without_dry_friction(self) -> _Motion:
+        """The same motion in a world without dry friction, whose load jumps where a joint turns round."""
+        kept = [e for e in self.world.effects if not (isinstance(e, DynamicsEffect) and e.rubs())]
+        return replace(self, world=self.world.with_effects(kept))
+
     def gain(self, bare: System | None = None) -> tuple[Tensor, Tensor]:
         """(T, J) accelerations of the joints by the world, or by the system `bare`, and (T, J, J) their change per
         unit of each load."""
@@ -248,6 +254,8 @@ class _Motion:
             return torch.linalg.solve(gain, acceleration[..., None])[..., 0]
 
         joints = torch.eye(gain.shape[-1], dtype=state.dtype)
+        sliding = self.without_dry_friction()
+        slides = sliding.acceleration(state, acting)
         columns: list[Tensor] = []
         reactions: dict[int, Tensor] = {}
         dry: list[int] = []
@@ -270,7 +278,7 @@ class _Motion:
             reactions[len(columns)] = joints[j][:, None] * gain[:, j, None, :]
             columns.append(self.measured[:, j, None] * joints[j])
             moved = [_moved(state, column) for column in (position, velocity)]
-            slopes = [(self.acceleration(each, acting) - free) / DIFFERENCE for each in moved]
+            slopes = [(sliding.acceleration(each, acting) - slides) / DIFFERENCE for each in moved]
             for error in (torch.ones_like(v), *commanded.unbind(1), *slack.unbind(1)):
                 first = rate(error)
                 change = -slopes[0] * error[:, None] - slopes[1] * first[:, None] + rate(first)[:, None] * joints[j]
