@@ -34,6 +34,8 @@ MIN_SCORE_FIRST, MIN_SCORE_FURTHER, MIN_SCORE_PUSH = 3.5, 3.0, 5.0
 """Height of a bump, over its standard deviation, from which the first one on a part is fitted with all else, from which
 further ones are, and from which a bump is called a push: high, since errors of a model are not normally distributed."""
 
+MAX_P_VALUE = 1e-3  # of a push that is named, with as many bumps as were tried counted in
+
 MAX_CORRECTION = 0.1  # Height over that of an overlapping bump, below which a bump is a correction of its shape
 
 SHAPE_ERROR = 0.15  # Deviation of an impulse, as a share of it, because a push need not have the shape of a bump
@@ -77,7 +79,8 @@ def pushes(recording: Recording, world: World) -> tuple[Push, ...]:
     tries = round(middles) * tracks[0].load.shape[1]
     loads = world.system.loads
     named = [_named(one, tracks[one.part], loads[one.joint], tries) for one in found]
-    return tuple(sorted(named, key=lambda push: (push.episode, push.start)))
+    sure = [push for push in named if push.p_value <= MAX_P_VALUE]
+    return tuple(sorted(sure, key=lambda push: (push.episode, push.start)))
 
 
 @dataclass(frozen=True)
