@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import conv1d, pad
 
-from visadapt.effects import DynamicsEffect
+from visadapt.effects import DynamicsEffect, Effect
 from visadapt.effects.own.dynamics import scalable
 from visadapt.recordings import Episode, Recording
 from visadapt.recordings.runs import runs
@@ -223,7 +223,8 @@ class _Motion:
 
     def without_dry_friction(self) -> _Motion:
         """The same motion in a world without dry friction, whose load jumps where a joint turns round."""
-        kept = [e for e in self.world.effects if not (isinstance(e, DynamicsEffect) and e.rubs())]
+        named = [effect for effect in self.world.effects if isinstance(effect, Effect)]
+        kept = [effect for effect in named if not (isinstance(effect, DynamicsEffect) and effect.rubs())]
         return replace(self, world=self.world.with_effects(kept))
 
     def gain(self, bare: System | None = None) -> tuple[Tensor, Tensor]:
