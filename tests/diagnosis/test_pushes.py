@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 import torch
 
+import visadapt as va
 from tests.diagnosed import record
 from tests.own_systems import DoublePendulum
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.pushes import pushes
-from visadapt.effects import CoulombFriction
+from visadapt.effects import ActuatorSaturation, CoulombFriction
 from visadapt.effects.catalogue import catalogue
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole
-from visadapt.world import World, WorldState
+from visadapt.world import World
 
 PERIOD, WIDTH = 0.004, 0.08
 SHOULDER, ELBOW = (0, 1.5, 0.4), (1, 3.2, -0.35)
@@ -102,28 +103,42 @@ def test_without_a_joints_position_none_are_looked_for():
     )
 
 
-def test_a_kick_of_the_cart_is_found():
-    system = CartPole()
-    world = World(system, period=0.02)
-    time = 0.02 * np.arange(250)
+TIME = 0.02 * np.arange(250)
+BURST = np.exp(-0.5 * ((TIME - 2.5) / 0.1) ** 2)
+
+
+def hanging(acting, command, effects=()):
+    """5 s of a cart with a hanging pole, on which the commands `acting` act where `command` is recorded."""
+    world = World(CartPole(), effects, period=0.02).double()
     generator = np.random.default_rng(1)
-    command = 0.5 * np.sin(5 * time) + 0.3 * np.sin(11 * time)
-    kick = 4.0 * np.exp(-0.5 * ((time - 2.5) / 0.1) ** 2) / system.max_force
-    at = WorldState(torch.zeros(1), torch.tensor([[0.0, 0.0, math.pi, 0.0]]).double())
     states = []
-    for acting in torch.from_numpy(command + kick)[:, None, None]:
+    at = world.start(torch.tensor([[0.0, 0.0, math.pi, 0.0]]).double())
+    for one in torch.from_numpy(acting)[:, None]:
         states.append(at.state[0].numpy())
         with torch.no_grad():
-            at = world.step(at, acting)
-    state = np.stack(states) + generator.normal(size=(len(time), 4)) * [1e-3, 1e-2, 1e-3, 1e-2]
-    recording = Recording(
-        (Episode(time, command[:, None], state),), ("x", "x_dot", "theta", "theta_dot"), 0.02, ("run",)
-    )
+            at = world.step(at, one[None])
+    state = np.stack(states) + generator.normal(size=(len(TIME), 4)) * [1e-3, 1e-2, 1e-3, 1e-2]
+    return Recording((Episode(TIME, command[:, None], state),), ("x", "x_dot", "theta", "theta_dot"), 0.02, ("run",))
+
+
+def test_a_kick_of_the_cart_is_found():
+    command = 0.5 * np.sin(5 * TIME) + 0.3 * np.sin(11 * TIME)
+    recording = hanging(command + 4.0 * BURST / CartPole().max_force, command)
     with torch.inference_mode():
-        (push,) = pushes(recording, world)
+        (push,) = pushes(recording, World(CartPole(), period=0.02))
     assert push.load == "cart_force"
     assert push.start == pytest.approx(2.5 - 0.245, abs=0.1)
     assert push.impulse == pytest.approx(4.0 * 0.1 * math.sqrt(2 * math.pi), rel=0.3)
+
+
+def test_what_a_cause_explains_is_no_push():
+    command = 0.1 * np.sin(5 * TIME) + 0.1 * np.sin(11 * TIME) + 0.6 * BURST
+    recording = hanging(command, command, [ActuatorSaturation(limit=0.3)])
+    with torch.inference_mode():
+        assert pushes(recording, World(CartPole(), period=0.02))
+    found = va.diagnose(recording, World(CartPole(), period=0.02), catalogue=[ActuatorSaturation])
+    assert found.verdict == "identified"
+    assert found.where.pushes == ()
 
 
 def test_a_joint_that_stands_still_in_one_episode_hides_no_push_of_another():

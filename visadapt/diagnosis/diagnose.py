@@ -48,6 +48,7 @@ from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized, twins
 from visadapt.effects.late_sensors import LateSensors, MeasurementDelay
 from visadapt.estimation.effect_fit import remembers
+from visadapt.estimation.episode_phases import has_episode_phases
 from visadapt.estimation.profiles import profile_of
 from visadapt.processes import one_thread
 from visadapt.progress import Report, staged
@@ -161,7 +162,7 @@ def diagnose(
             stage_shares(search, comparison, groups, found_before),
             measured.errors.by_state(system, rows.channels, bool(found)),
             regions,
-            () if prepared.whole is None else pushes(prepared.whole, world),
+            () if prepared.whole is None else pushes(prepared.whole, _explained(world, comparison) if found else world),
         ),
         causes=found,
         ranking=ranking(comparison, explored.effects, system, measured.closed, repeats),
@@ -231,6 +232,18 @@ def _explore(
     in_use = {effect.name: effect for effect in search.catalogue}
     named = [in_use.get(effect.name, effect) for effect in effects]
     return _Explored(named, prepared, search, comparison, alternatives(comparison, named, system), repeats)
+
+
+def _explained(world: World, comparison: ModelComparison) -> World:
+    """The source with the best set's effects as fitted, without those whose phase differs from episode to episode."""
+    best = comparison.best
+    values = best.fits.theta[0].split([len(effect.table) for effect in best.effects])
+    effects = [
+        effect(**{parameter.name: float(value) for parameter, value in zip(effect.table, each, strict=True)})
+        for effect, each in zip(best.effects, values, strict=True)
+        if not has_episode_phases(effect)
+    ]
+    return world.with_effects(effects).double()
 
 
 def _judge(explored: _Explored, measured: MeasuredGap) -> tuple[str, tuple[Cause, ...], tuple[Cause, ...]]:
