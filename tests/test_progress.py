@@ -40,3 +40,18 @@ def test_a_quicker_one_a_line_every_tenth(clock, monkeypatch):
 
 def test_and_one_of_a_second_no_more_than_its_last(clock, monkeypatch):
     assert lines(clock, monkeypatch, 0.001, 1000) == ["perception: 1000 of 1000 steps, loss 0.5"]
+
+
+def test_a_stage_may_go_back(clock, monkeypatch):
+    """As a search does that goes on from a smaller set."""
+    out = io.StringIO()
+    monkeypatch.setattr(sys, "stdout", out)
+    with progress.reporting() as report:
+        for done in (4, 5, 3, 2, 6):
+            report("search", done, 6, 0.5)
+            clock[0] += 40
+    printed = out.getvalue().splitlines()
+    assert printed == [
+        "search: 5 of 6 steps, loss 0.5, 20 s left",
+        "search: 6 of 6 steps, loss 0.5",
+    ]

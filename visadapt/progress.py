@@ -35,11 +35,11 @@ class _Log:
         self.console = console
         self.stage = ""
         self.first = self.last = (0.0, 0.0)
-        """(s, share done) where this process took the stage up, and of its last line"""
+        """(s, share done) where this process took the stage up, or where it began again, and of its last line"""
 
     def __call__(self, stage: str, done: int, total: int, loss: float) -> None:
         now, share = time.monotonic(), done / total
-        if stage != self.stage:
+        if stage != self.stage or share <= self.first[1]:
             self.stage, self.first = stage, (now, (done - 1) / total)
             self.last = self.first
         waited, advanced = now - self.last[0], int(10 * share) > int(10 * self.last[1])
