@@ -162,7 +162,7 @@ def diagnose(
             stage_shares(search, comparison, groups, found_before),
             measured.errors.by_state(system, rows.channels, bool(found)),
             regions,
-            () if prepared.whole is None else pushes(prepared.whole, _explained(world, comparison)),
+            () if prepared.whole is None else pushes(prepared.whole, _explained(world, comparison) if found else world),
         ),
         causes=found,
         ranking=ranking(comparison, explored.effects, system, measured.closed, repeats),
