@@ -14,11 +14,12 @@ def clock(monkeypatch):
     return now
 
 
-def lines(clock, monkeypatch, seconds_a_step, steps):
+def lines(clock, monkeypatch, seconds_a_step, steps, order=None):
+    """What is printed of a stage of some steps; they are reported in the `order` of their numbers, or in another."""
     out = io.StringIO()
     monkeypatch.setattr(sys, "stdout", out)
     with progress.reporting() as report:
-        for done in range(1, steps + 1):
+        for done in order or range(1, steps + 1):
             report("perception", done, steps, 0.5)
             clock[0] += seconds_a_step
     return out.getvalue().splitlines()
@@ -44,14 +45,7 @@ def test_and_one_of_a_second_no_more_than_its_last(clock, monkeypatch):
 
 def test_a_stage_may_go_back(clock, monkeypatch):
     """As a search does that goes on from a smaller set."""
-    out = io.StringIO()
-    monkeypatch.setattr(sys, "stdout", out)
-    with progress.reporting() as report:
-        for done in (4, 5, 3, 2, 6):
-            report("search", done, 6, 0.5)
-            clock[0] += 40
-    printed = out.getvalue().splitlines()
-    assert printed == [
-        "search: 5 of 6 steps, loss 0.5, 20 s left",
-        "search: 6 of 6 steps, loss 0.5",
+    assert lines(clock, monkeypatch, 40, 6, order=(4, 5, 3, 2, 6)) == [
+        "perception: 5 of 6 steps, loss 0.5, 20 s left",
+        "perception: 6 of 6 steps, loss 0.5",
     ]

@@ -120,6 +120,12 @@ def region_of(effect: str) -> tuple[str, str, str] | None:
     return places[edges[0].unit], edges[0].name, edges[1].name
 
 
+def _is_a_push(effect: str) -> bool:
+    """Whether the effect acts for a stretch of time."""
+    region = region_of(effect)
+    return region is not None and region[0] == "time"
+
+
 def matches(effects: set[str], groups: list[set[str]]) -> bool:
     """Whether every effect is in a class of its own that is small enough."""
     return _one_each(sorted(effects), [group for group in groups if len(group) <= LARGEST_CLASS])
@@ -148,7 +154,7 @@ def score(truth: Truth, answer: Answer) -> Score:
         result.closed = (answer.get("gap") or {}).get("closed")
     # An effect that no recording can show is not to be found.
     groups, effects = classes(answer), set() if truth.kind == "none" else set(truth.effects)
-    if truth.kind != "foreign" and not any((region_of(effect) or ("",))[0] == "time" for effect in truth.effects):
+    if truth.kind != "foreign" and not any(_is_a_push(effect) for effect in effects):
         result.pushed = bool((answer.get("where") or {}).get("pushes"))
     ranking = answer.get("ranking") or []
     if truth.kind != "foreign" and ranking and ranking[0].get("probability") is not None:

@@ -27,6 +27,16 @@ SHOULDER, ELBOW = (0, 1.5, 0.4), (1, 3.2, -0.35)
 RUNS = ((), (ELBOW,), (SHOULDER, ELBOW))
 
 
+def states_under(world, start, commands):
+    """The states (T, B, n) of a world that starts in `start` (B, n), under commands (T, B, n_action)."""
+    at, states = world.start(torch.tensor(start).double()), []
+    with torch.no_grad():
+        for command in torch.from_numpy(commands):
+            states.append(at.state.numpy())
+            at = world.step(at, command)
+    return np.stack(states)
+
+
 @functools.cache
 def every():
     """5 s of double pendulums with friction and a weaker motor than the source's, under torques, and pushes of RUNS."""
@@ -47,18 +57,13 @@ def every():
         for joint, middle, peak in given:
             push[:, run, joint] += peak * np.exp(-0.5 * ((time - middle) / WIDTH) ** 2)
     push[..., 0] /= 0.85  # it acts whole, whatever the motor makes of its command
-    at = machine.start(torch.zeros(len(RUNS), 4, dtype=torch.float64))
-    states = []
-    with torch.no_grad():
-        for command in torch.from_numpy(torque[:, None] + push):
-            states.append(at.state)
-            at = machine.step(at, command)
+    states = states_under(machine, np.zeros((len(RUNS), 4)), torque[:, None] + push)
     noise = np.random.default_rng(0).normal(size=(len(time), 4)) * [2e-4, 2e-4, 0.05, 0.05]
     return {
         given: Recording(
             (Episode(time, torque, clean + noise),), tuple(s.name for s in DoublePendulum.states), PERIOD, ("run",)
         )
-        for given, clean in zip(RUNS, torch.stack(states, 1).numpy(), strict=True)
+        for given, clean in zip(RUNS, states.swapaxes(0, 1), strict=True)
     }
 
 
@@ -104,6 +109,7 @@ def test_without_a_joints_position_none_are_looked_for():
 
 
 TIME = 0.02 * np.arange(250)
+HANGING = (0.0, 0.0, math.pi, 0.0)
 BURST = np.exp(-0.5 * ((TIME - 2.5) / 0.1) ** 2)
 
 
@@ -111,13 +117,8 @@ def hanging(acting, command, effects=()):
     """5 s of a cart with a hanging pole, on which the commands `acting` act where `command` is recorded."""
     world = World(CartPole(), effects, period=0.02).double()
     generator = np.random.default_rng(1)
-    states = []
-    at = world.start(torch.tensor([[0.0, 0.0, math.pi, 0.0]]).double())
-    for one in torch.from_numpy(acting)[:, None]:
-        states.append(at.state[0].numpy())
-        with torch.no_grad():
-            at = world.step(at, one[None])
-    state = np.stack(states) + generator.normal(size=(len(TIME), 4)) * [1e-3, 1e-2, 1e-3, 1e-2]
+    state = states_under(world, [HANGING], acting[:, None, None])[:, 0]
+    state = state + generator.normal(size=(len(TIME), 4)) * [1e-3, 1e-2, 1e-3, 1e-2]
     return Recording((Episode(TIME, command[:, None], state),), ("x", "x_dot", "theta", "theta_dot"), 0.02, ("run",))
 
 
@@ -218,17 +219,12 @@ def test_feedback_does_not_hide_a_push_and_the_pole_is_not_pushed(force, jitter,
 )
 def test_none_is_named_where_a_cart_sticks_now_and_then(friction, noise, seed):
     """Under slow forces of up to 1.5 or 3 times its dry friction, read every 30 ms with `noise` in m and rad."""
-    world = World(CartPole(), [CoulombFriction(force=friction)], period=0.03).double().requires_grad_(False)
+    world = World(CartPole(), [CoulombFriction(force=friction)], period=0.03).double()
     random, time = np.random.default_rng(seed), 0.03 * np.arange(120)
     frequency, phase = random.uniform(1, 8, (3, 4, 1)), random.uniform(0, 6, (3, 4, 1))
     command = 0.1 * friction * np.sin(frequency * time + phase).mean(0)
-    at = world.start(torch.tensor([[0.0, 0.0, math.pi, 0.0]]).double().repeat(4, 1))
-    states = []
-    for acting in torch.from_numpy(command.T[..., None]):
-        states.append(at.state.numpy()[:, [0, 2]])
-        at = world.step(at, acting)
-    read = np.stack(states, 1)
-    read += noise * random.normal(size=read.shape)
+    read = states_under(world, 4 * [HANGING], command.T[..., None])[..., [0, 2]].swapaxes(0, 1)
+    read = read + noise * random.normal(size=read.shape)
     episodes = tuple(Episode(time, each[:, None], rows) for each, rows in zip(command, read, strict=True))
     with torch.inference_mode():
         assert pushes(Recording(episodes, ("x", "theta"), 0.03, ("run",) * 4), world) == ()

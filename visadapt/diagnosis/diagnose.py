@@ -237,10 +237,9 @@ def _explore(
 def _explained(world: World, comparison: ModelComparison) -> World:
     """The source with the best set's effects as fitted, without those whose phase differs from episode to episode."""
     best = comparison.best
-    values = best.fits.theta[0].split([len(effect.table) for effect in best.effects])
     effects = [
-        effect(**{parameter.name: float(value) for parameter, value in zip(effect.table, each, strict=True)})
-        for effect, each in zip(best.effects, values, strict=True)
+        effect(**{parameter.name: value for parameter, value in zip(effect.table, values.tolist(), strict=True)})
+        for effect, values in best.by_effect(best.fits.theta[0]).items()
         if not has_episode_phases(effect)
     ]
     return world.with_effects(effects).double()

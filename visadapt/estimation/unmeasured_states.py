@@ -82,7 +82,7 @@ def _filtered(model: CandidateModel, columns: list[int], starts: Tensor, noise: 
 
     acting, time, duration = (every(each) for each in (acting, rows.time, rows.duration))
     measured, used, inside = every(rows.measured), every(rows.used), every(rows.inside) > 0
-    channels = list(rows.channels)
+    channels, variance = list(rows.channels), torch.diag(noise)
     foreseen, states = state.new_zeros(len(state)), []
     for t in range(length):
         if t:
@@ -92,7 +92,7 @@ def _filtered(model: CandidateModel, columns: list[int], starts: Tensor, noise: 
             state = torch.where(inside[t, :, None], step.value, state)
             covariance = torch.where(inside[t, :, None, None], moved, covariance)
         seen = used[t, :, :, None] * covariance[:, channels]
-        root, _ = torch.linalg.cholesky_ex(used[t, :, None] * seen[..., channels] + torch.diag(noise))
+        root, _ = torch.linalg.cholesky_ex(used[t, :, None] * seen[..., channels] + variance)
         error = (used[t] * (measured[t] - state[:, channels]))[..., None]
         white = torch.linalg.solve_triangular(root, error, upper=False)
         cross = torch.linalg.solve_triangular(root, seen, upper=False)

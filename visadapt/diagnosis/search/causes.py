@@ -138,9 +138,8 @@ Fitted = dict[type[Effect], tuple[Tensor, Tensor]]
 def _fitted(search: Search, model: ScoredModel) -> Fitted:
     """The parameters of a set's effects, with standard deviations that hold under misfit as well."""
     deviation = deviations(CandidateModel(search.system, model.effects, search.rows), model.fits)
-    counts = [len(effect.table) for effect in model.effects]
-    values = model.fits.theta[0, : sum(counts)]
-    return dict(zip(model.effects, zip(values.split(counts), deviation.split(counts), strict=True), strict=True))
+    values, spread = model.by_effect(model.fits.theta[0]), model.by_effect(deviation)
+    return {effect: (values[effect], spread[effect]) for effect in model.effects}
 
 
 def _averaged(
@@ -203,9 +202,8 @@ def _estimates(
 
 def phases_of_episodes(best: ScoredModel) -> list[str]:
     """For each effect of a set with a phase for each episode, a line that gives them."""
-    counts = [len(effect.table) for effect in best.effects]
     out = []
-    for effect, values in zip(best.effects, best.fits.theta[0].split(counts), strict=True):
+    for effect, values in best.by_effect(best.fits.theta[0]).items():
         if has_episode_phases(effect):
             pairs = zip(effect.table, values.tolist(), strict=True)
             phases = [math.remainder(value, 2 * math.pi) for p, value in pairs if p.is_phase]

@@ -53,6 +53,11 @@ class ScoredModel:
         """Standard names of the effects."""
         return tuple(effect.name for effect in self.effects)
 
+    def by_effect(self, values: Tensor) -> dict[type[Effect], Tensor]:
+        """Values (P,) of the parameters of all effects, in their order, by effect."""
+        counts = [len(effect.table) for effect in self.effects]
+        return dict(zip(self.effects, values[: sum(counts)].split(counts), strict=True))
+
 
 @dataclass(frozen=True)
 class WithoutProcessNoise:
