@@ -14,13 +14,14 @@ from unittest.mock import patch
 from visadapt.diagnosis.search import fitted_models, heldout, search
 from visadapt.diagnosis.search.fitted_models import (
     MIN_BETTER,
+    MIN_LEFTOVER,
     FittedModels,
     ScoredModel,
     WithoutProcessNoise,
     less,
 )
-from visadapt.diagnosis.search.model_comparison import MIN_LEFTOVER, ModelComparison
-from visadapt.diagnosis.search.search import TWO_FOR_ONE_UP_TO, WIDEN_ABOVE, Exchanges, Search
+from visadapt.diagnosis.search.model_comparison import ModelComparison
+from visadapt.diagnosis.search.search import TWO_FOR_ONE_UP_TO, Exchanges, Search
 from visadapt.estimation.fit_states import QUICK, Effects
 from visadapt.estimation.likelihood import FitState
 
@@ -114,6 +115,7 @@ _fit_neighbours, _improve_while_unexplained = Search._fit_neighbours, Search._im
 _without_process_noise = FittedModels.without_process_noise
 
 PARTS = {
+    "no further where all is explained": Part(FittedModels, "explains_all", lambda *_: False, lambda out, *_: out),
     "every effect alone": Part(Search, "_alone", lambda _: [], lambda out, _: bool(out)),
     "exchanges": Part(Search, "_fit_neighbours", _remove_only, lambda _, self, centre, made: bool(centre.effects)),
     "two for one": Part(
@@ -133,7 +135,7 @@ PARTS = {
         ),
     ),
     "widening": Part(
-        Search, "_improve_while_unexplained", _without_widening, lambda left, self, made: left > WIDEN_ABOVE
+        Search, "_improve_while_unexplained", _without_widening, lambda left, self, made: left > MIN_LEFTOVER
     ),
     "late sensors": Part(Search, "_fit_late", _nothing, lambda _, self, bases: bool(bases)),
     "phases of episodes": Part(Search, "_phases_of_episodes", _nothing),

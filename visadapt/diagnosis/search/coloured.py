@@ -13,8 +13,8 @@ from dataclasses import replace
 from torch import Tensor
 
 from visadapt.diagnosis.search.all_rows import best_on_all_rows, on_all_rows
-from visadapt.diagnosis.search.fitted_models import ScoredModel
-from visadapt.diagnosis.search.model_comparison import MIN_LEFTOVER, ModelComparison, compare, compare_coloured
+from visadapt.diagnosis.search.fitted_models import MIN_LEFTOVER, ScoredModel
+from visadapt.diagnosis.search.model_comparison import ModelComparison, compare, compare_coloured
 from visadapt.diagnosis.search.search import Search
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.colour import Colour, colour_of

@@ -35,6 +35,8 @@ ROWS_AT_ONCE = 100_000  # Rows times sets that are fitted together, so that memo
 
 MIN_BETTER = 5.0  # Log likelihood by which a fit without process noise must be better to be kept
 
+MIN_LEFTOVER = 5.0  # Log likelihood that process noise must add to a set for something to count as unexplained
+
 
 class NoFitError(ValueError):
     """The source's fit to a recording ends in numbers that are not finite; the message is one line."""
@@ -93,6 +95,7 @@ class FittedModels:
         self._rival = rival
         self.fitted: dict[frozenset[str], ScoredModel] = {}
         self._careful: dict[frozenset[str], ScoredModel] = {}  # what the last careful fit of each set left
+        self._explains: dict[tuple[str, ...], tuple[FitState, bool]] = {}
         self._slopes: tuple[Tensor, Tensor] | None = None
         self._screened: dict[tuple[str, ...], tuple[FitState, list[Candidate]]] = {}
         if source is None:
@@ -168,6 +171,16 @@ class FittedModels:
             WithoutProcessNoise(fits, max(0.0, float(each.fits.likelihood - fits.likelihood)))
             for each, fits in zip(sets, out, strict=True)
         ]
+
+    def explains_all(self, found: ScoredModel) -> bool:
+        """Whether process noise adds next to nothing to a fitted set."""
+        known, explains = self._explains.get(found.names, (None, False))
+        if known is not found.fits:
+            needed = float(found.fits.likelihood[0]) - MIN_LEFTOVER
+            quiet = self._fits([(found.effects, found.fits)], QUICK, needed, process_noise=False)[0]
+            explains = float(quiet.likelihood[0]) >= needed
+            self._explains[found.names] = found.fits, explains
+        return explains
 
     def fit(
         self, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int], process_noise: bool = True

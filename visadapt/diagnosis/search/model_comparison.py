@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from visadapt.diagnosis.search.fitted_models import ScoredModel, key_of
+from visadapt.diagnosis.search.fitted_models import MIN_LEFTOVER, ScoredModel, key_of
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.unexplained import SmoothFunction, smooth_functions
 from visadapt.effects import Effect
@@ -15,10 +15,6 @@ from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.likelihood import FitState
 
 COMPARE_WITHIN = 10.0  # Log posterior odds; models further behind the best are not compared
-
-MIN_LEFTOVER = 5.0
-"""Log likelihood that process noise must add to a model for something to count as unexplained, and the most that a
-model's score is lowered for it."""
 
 CLEAR_LOG_ODDS = 10.0
 """Log odds of a load above which it counts as unexplained although the black box closes no more of the gap."""

@@ -2,7 +2,8 @@
 
 Sets grow from the source and from every effect alone. Those near the best are then tried: with one effect fewer, with
 one exchanged, and, if they are small, with two exchanged for one, since two effects often imitate a third (a weaker
-motor and a lighter pole, a heavier cart).
+motor and a lighter pole, a heavier cart). Where a set explains all, so that process noise adds nothing to it, only sets
+near it grow further.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from copy import copy
 from dataclasses import replace
 from itertools import combinations
 
-from visadapt.diagnosis.search.fitted_models import FittedModels, ScoredModel, key_of, less
+from visadapt.diagnosis.search.fitted_models import MIN_LEFTOVER, FittedModels, ScoredModel, key_of, less
 from visadapt.effects import ActuationEffect, Effect
 from visadapt.effects.late_sensors import LateSensors
 from visadapt.estimation.episode_phases import has_episode_phases, with_episode_phases
@@ -25,7 +26,7 @@ from visadapt.progress import Progress
 
 MAX_EFFECTS = 6  # Effects in a set at most
 
-MAX_CANDIDATES, MAX_EXCHANGES = 8, 5
+MAX_CANDIDATES, MAX_EXCHANGES = 8, 3
 """Most effects that are tried with a set: when sets grow, and in the place of those that are exchanged."""
 
 TWO_FOR_ONE_UP_TO = 4
@@ -40,10 +41,9 @@ EXCHANGE_LOG_PROCESS = math.log(0.003**2)
 """Least log variance of the velocities' process noise, (m/s)^2 and (rad/s)^2, with which a fit starts after an
 exchange: room for what the new effect does not yet explain, and little to shed where it explains all."""
 
-WIDEN_ABOVE = 5.0
 WIDEN_MODELS = 6
-"""Where process noise adds more than WIDEN_ABOVE to the best set's log likelihood, the search is widened: the
-WIDEN_MODELS best sets of one and of two effects get a further effect."""
+"""Where the best set leaves something unexplained, the search is widened: the WIDEN_MODELS best sets of one and of two
+effects get a further effect."""
 
 LATE_SHARE, LATE_BASES = 0.3, 3
 """Late sensors are fitted even where the screening proposes none: added to the source, to the best set and to the
@@ -70,11 +70,12 @@ class Search(FittedModels):
             children = self.extend(beam) if size else self.fit_singles()
             if not children:
                 break
-            beam = sorted(children, key=lambda f: -f.log_odds)[: self.profile.beam_width]
-            if beam[0].log_odds < before.log_odds:
+            ranked = sorted(children, key=lambda f: -f.log_odds)
+            if ranked[0].log_odds < before.log_odds:
                 break
+            beam = self._worth_extending(ranked)
         self._settle(exchanged)
-        if self._improve_while_unexplained(exchanged) > WIDEN_ABOVE:
+        if self._improve_while_unexplained(exchanged) > MIN_LEFTOVER:
             # Perhaps by two effects that only together beat single effects which fit fairly.
             for size in (1, 2):
                 bases = [f for f in self.ranked if len(f.effects) == size and f.log_odds > -math.inf]
@@ -142,16 +143,24 @@ class Search(FittedModels):
             return []
         values = {one.effect: one.values for one in leads}
         order = [*values, *(e for e in self.catalogue if e not in values)]
-        alone = self._in_turn([((e,), with_effect(self.source.fits, values.get(e, neutral(e)))) for e in order])
+        starts = [((e,), with_effect(self.source.fits, values.get(e, neutral(e)))) for e in order]
+        alone = self.fit(starts[:LEADERS], QUICK)
+        if self.explains_all(max(alone, key=lambda each: each.log_odds)):
+            return alone
+        alone += self.fit(starts[LEADERS:], QUICK)
         # Process noise may stand for most of what a large effect does, at a value far from the right one: a delay of 80
         # ms was fitted as one of 45, in steps of 50, and five more effects for the rest.
         best = sorted(alone, key=lambda each: -each.log_odds)[:LEADERS]
         self._fit_from_quiet([(each.effects, each.fits) for each in best], QUICK)
         return [self.fitted[key_of(each.effects)] for each in alone]
 
-    def _in_turn(self, starts: Sequence[tuple[Effects, FitState]]) -> list[ScoredModel]:
-        """Fit the first few sets, which promise most, then the others, which stop early where they fall far behind."""
-        return self.fit(starts[:LEADERS], QUICK) + self.fit(starts[LEADERS:], QUICK)
+    def _worth_extending(self, ranked: Sequence[ScoredModel]) -> list[ScoredModel]:
+        """The best of sets of one size, the most probable first, that may lead to a better one: not those that gain
+        nothing by having more parameters than another and, where the best explains all, not those far behind."""
+        beam = ranked[: self.profile.beam_width]
+        if self.explains_all(beam[0]):
+            beam = [each for each in beam if each.log_odds > beam[0].log_odds - OUT_OF_REACH]
+        return [each for each in beam if not any(_imitates(each, other) for other in beam)]
 
     def _fit_from_quiet(self, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int]) -> None:
         """Fit sets without process noise and, from there, with it."""
@@ -215,7 +224,7 @@ class Search(FittedModels):
     def _phases_of_episodes(self) -> None:
         """Where something is unexplained, try periodic effects with a phase for each episode; keep them if they win."""
         catalogue = tuple(with_episode_phases(effect, len(self.rows.command)) for effect in self.catalogue)
-        if catalogue == self.catalogue or self.without_process_noise([self.best])[0].left <= WIDEN_ABOVE:
+        if catalogue == self.catalogue or self.without_process_noise([self.best])[0].left <= MIN_LEFTOVER:
             return
         periodic = {effect.name for effect in catalogue if has_episode_phases(effect)}
         other = copy(self)
@@ -242,18 +251,26 @@ class Search(FittedModels):
                 starts[key] = effects, with_effect(base.fits, candidate.values)
         far_behind = leads and max(promised) - min(promised) > OUT_OF_REACH
         every = list(starts.values())
-        return known + (self._in_turn(every) if far_behind else self.fit(every, QUICK))
+        if not far_behind:
+            return known + self.fit(every, QUICK)
+        # First the few that promise most: the others then stop early where they fall far behind.
+        return known + self.fit(every[:LEADERS], QUICK) + self.fit(every[LEADERS:], QUICK)
 
     def candidates(self, base: ScoredModel) -> list[Candidate]:
-        """Effects whose screening promises enough to fit them in addition to a set, the largest gain first."""
-        return self._promising(self.screening(base))
+        """Effects whose screening promises enough to fit them in addition to a set, the largest gain first.
 
-    def _promising(self, screened: Sequence[Candidate]) -> list[Candidate]:
+        To a set that explains all, they must add a little less than what one more effect costs in prior odds: the
+        linear response then promises about what a fit gains.
+        """
+        return self._promising(self.screening(base), math.log(len(self.catalogue)) if self.explains_all(base) else 0.0)
+
+    def _promising(self, screened: Sequence[Candidate], least: float = 0.0) -> list[Candidate]:
+        """The candidates that gain `least`, and what the system's profile asks for."""
         profile = self.profile
         relative = profile.min_gain_share * max((one.gain for one in screened), default=0.0)
 
         def required(one: Candidate) -> float:
-            return max(relative, profile.min_gain + profile.min_gain_per_parameter * len(one.values))
+            return max(relative, max(least, profile.min_gain) + profile.min_gain_per_parameter * len(one.values))
 
         return [one for one in screened if one.gain >= required(one)]
 
@@ -298,6 +315,13 @@ class Search(FittedModels):
         close = close[:POLISH_MODELS]
         smaller = [self.fitted.get(frozenset(best.names) - {name}) for name in best.names]
         return close + [f for f in smaller if f is not None and all(f is not other for other in close)]
+
+
+def _imitates(one: ScoredModel, other: ScoredModel) -> bool:
+    """Whether a set has more parameters than another, but fits no better, as friction that differs by direction does
+    where it does not differ."""
+    more = one.fits.theta.shape[1] - other.fits.theta.shape[1]
+    return more > 0 and float(one.fits.likelihood[0] - other.fits.likelihood[0]) < more
 
 
 def _is_slow(effect: type[Effect]) -> bool:
