@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, SensingEffect
-from visadapt.estimation.candidate import COARSEST, CandidateModel, with_loads
+from visadapt.estimation.candidate import COARSEST, SHORT_PERIOD, CandidateModel, with_loads
 from visadapt.estimation.colour import whitened, whitened_adjoint
 from visadapt.estimation.grids import neutral_point
 from visadapt.estimation.kalman import adjoints, forward, respond
@@ -56,10 +56,6 @@ class Innovations:
 PROBE_SHARE = 0.02
 """A parameter to which the effect is proportional is probed at this share of the way from neutral to an end of its
 range."""
-
-LINEAR_UP_TO = 0.06
-"""s, the longest period in which the next state is taken as linear in the loads and commands that act in its middle:
-nothing is integrated, and gains differ by a few percent from those of an integration."""
 
 DIFFERENCE_SHARE = 1e-4  # Share of its range by which a parameter is moved to take a finite difference
 
@@ -140,10 +136,10 @@ class Sensitivity:
         """Change (W, T - 1, n, M) of the next state after each row, with the effect at M parameter vectors `tried`
         (M, P); the effect is not one on sensors.
 
-        For periods up to LINEAR_UP_TO the next state is taken as linear in loads and commands.
+        For periods up to SHORT_PERIOD the next state is taken as linear in loads and commands: nothing is integrated.
         """
         model, theta = self._with(effect, tried)
-        linear = self.rows.period <= LINEAR_UP_TO
+        linear = self.rows.period <= SHORT_PERIOD
         if linear and issubclass(effect, ActuationEffect):
             mean = self._acted(model, theta).mean(3)
             drive = torch.einsum("wtna,mwta->wtnm", self._slopes[0], mean[1:] - mean[:1])

@@ -179,6 +179,8 @@ class FittedModels:
             needed = float(found.fits.likelihood[0]) - MIN_LEFTOVER
             quiet = self._fits([(found.effects, found.fits)], QUICK, needed, process_noise=False)[0]
             explains = float(quiet.likelihood[0]) >= needed
+            if quiet.likelihood > found.fits.likelihood + MIN_BETTER:
+                found = self._keep(found.effects, quiet)
             self._explains[found.names] = found.fits, explains
         return explains
 

@@ -145,13 +145,12 @@ class Search(FittedModels):
         order = [*values, *(e for e in self.catalogue if e not in values)]
         starts = [((e,), with_effect(self.source.fits, values.get(e, neutral(e)))) for e in order]
         alone = self.fit(starts[:LEADERS], QUICK)
-        if self.explains_all(max(alone, key=lambda each: each.log_odds)):
-            return alone
-        alone += self.fit(starts[LEADERS:], QUICK)
-        # Process noise may stand for most of what a large effect does, at a value far from the right one: a delay of 80
-        # ms was fitted as one of 45, in steps of 50, and five more effects for the rest.
-        best = sorted(alone, key=lambda each: -each.log_odds)[:LEADERS]
-        self._fit_from_quiet([(each.effects, each.fits) for each in best], QUICK)
+        if not self.explains_all(max(alone, key=lambda each: each.log_odds)):
+            alone += self.fit(starts[LEADERS:], QUICK)
+            # Process noise may stand for most of what a large effect does, at a value far from the right one: a delay
+            # of 80 ms was fitted as one of 45, in steps of 50, and five more effects for the rest.
+            best = sorted(alone, key=lambda each: -each.log_odds)[:LEADERS]
+            self._fit_from_quiet([(each.effects, each.fits) for each in best], QUICK)
         return [self.fitted[key_of(each.effects)] for each in alone]
 
     def _worth_extending(self, ranked: Sequence[ScoredModel]) -> list[ScoredModel]:
