@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -11,15 +10,8 @@ from importlib import import_module
 from typing import Any
 from unittest.mock import patch
 
-from visadapt.diagnosis.search import fitted_models, heldout, search
-from visadapt.diagnosis.search.fitted_models import (
-    MIN_BETTER,
-    MIN_LEFTOVER,
-    FittedModels,
-    ScoredModel,
-    WithoutProcessNoise,
-    less,
-)
+from visadapt.diagnosis.search import heldout, search
+from visadapt.diagnosis.search.fitted_models import MIN_LEFTOVER, FittedModels, ScoredModel, less
 from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import TWO_FOR_ONE_UP_TO, Exchanges, Search
 from visadapt.estimation.fit_states import QUICK, Effects
@@ -93,26 +85,15 @@ def _one_for_one_only(self: Search, centre: ScoredModel, exchanged: Exchanges) -
         _fit_neighbours(self, centre, exchanged)
 
 
-def _without_widening(self: Search, exchanged: Exchanges) -> float:
-    _improve_while_unexplained(self, exchanged)
-    return 0.0
-
-
 def _fit_with_noise(self: Search, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int]) -> None:
     self.fit(starts, effort)
-
-
-def _measure_what_is_left(self: FittedModels, sets: Sequence[ScoredModel]) -> list[WithoutProcessNoise]:
-    with patch.object(fitted_models, "MIN_BETTER", math.inf):
-        return _without_process_noise(self, sets)
 
 
 def _by_noise_and_black_box(self: ModelComparison, improvable: bool) -> bool:
     return improvable or self.leftover > MIN_LEFTOVER
 
 
-_fit_neighbours, _improve_while_unexplained = Search._fit_neighbours, Search._improve_while_unexplained
-_without_process_noise = FittedModels.without_process_noise
+_fit_neighbours = Search._fit_neighbours
 
 PARTS = {
     "no further where all is explained": Part(FittedModels, "explains_all", lambda *_: False, lambda out, *_: out),
@@ -126,17 +107,7 @@ PARTS = {
     ),
     "careful fits": Part(Search, "_polish", _nothing),
     "starts without process noise": Part(Search, "_fit_from_quiet", _fit_with_noise),
-    "better fits without process noise": Part(
-        FittedModels,
-        "without_process_noise",
-        _measure_what_is_left,
-        lambda out, self, sets: any(
-            one.fits.likelihood > each.fits.likelihood + MIN_BETTER for one, each in zip(out, sets, strict=True)
-        ),
-    ),
-    "widening": Part(
-        Search, "_improve_while_unexplained", _without_widening, lambda left, self, made: left > MIN_LEFTOVER
-    ),
+    "widening": Part(Search, "_widen", _nothing),
     "late sensors": Part(Search, "_fit_late", _nothing, lambda _, self, bases: bool(bases)),
     "phases of episodes": Part(Search, "_phases_of_episodes", _nothing),
     "jumps": Part(DIAGNOSE, "with_jumps", _nothing, lambda out, _: out is not None),
@@ -157,8 +128,11 @@ PARTS = {
 """What may be left out, by the name of the row in the table."""
 
 TOGETHER = (
-    *("every effect alone", "exchanges", "starts without process noise", "better fits without process noise"),
-    *("widening", "phases of episodes"),
+    "every effect alone",
+    "exchanges",
+    "starts without process noise",
+    "widening",
+    "phases of episodes",
 )
 ALL_OF_THEM = "all but growth, removal and careful fits"
 """The row of a search without any of TOGETHER: effects are added to the best sets and removed, and the best sets fitted

@@ -157,19 +157,10 @@ class FittedModels:
         return with_effect(base.fits, found[0].values if found else neutral(effect))
 
     def without_process_noise(self, sets: Sequence[ScoredModel]) -> list[WithoutProcessNoise]:
-        """Fit each set without process noise.
-
-        Where a set is likelier without, that fit replaces the other one, which has ended where process noise explains
-        what other parameters would.
-        """
-        starts = [(each.effects, each.fits) for each in sets]
-        out = self._fits(starts, CAREFUL, -math.inf, process_noise=False)
-        for each, fits in zip(sets, out, strict=True):
-            if fits.likelihood > each.fits.likelihood + MIN_BETTER:
-                self._keep(each.effects, fits)
+        """Fit each set without process noise."""
         return [
             WithoutProcessNoise(fits, max(0.0, float(each.fits.likelihood - fits.likelihood)))
-            for each, fits in zip(sets, out, strict=True)
+            for each, fits in zip(sets, self._quiet(sets), strict=True)
         ]
 
     def explains_all(self, found: ScoredModel) -> bool:
@@ -177,12 +168,21 @@ class FittedModels:
         known, explains = self._explains.get(found.names, (None, False))
         if known is not found.fits:
             needed = float(found.fits.likelihood[0]) - MIN_LEFTOVER
-            quiet = self._fits([(found.effects, found.fits)], QUICK, needed, process_noise=False)[0]
-            explains = float(quiet.likelihood[0]) >= needed
-            if quiet.likelihood > found.fits.likelihood + MIN_BETTER:
-                found = self._keep(found.effects, quiet)
-            self._explains[found.names] = found.fits, explains
+            explains = float(self._quiet([found], needed)[0].likelihood[0]) >= needed
+            self._explains[found.names] = self.fitted[key_of(found.effects)].fits, explains
         return explains
+
+    def _quiet(self, sets: Sequence[ScoredModel], rival: float = -math.inf) -> list[FitState]:
+        """The fits of sets without process noise; those that cannot come near `rival` stop early.
+
+        Where a set is likelier without, that fit replaces the other one, which has ended where process noise explains
+        what other parameters would.
+        """
+        out = self._fits([(each.effects, each.fits) for each in sets], CAREFUL, rival, process_noise=False)
+        for each, fits in zip(sets, out, strict=True):
+            if fits.likelihood > each.fits.likelihood + MIN_BETTER:
+                self._keep(each.effects, fits)
+        return out
 
     def fit(
         self, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int], process_noise: bool = True

@@ -14,7 +14,7 @@ from copy import copy
 from dataclasses import replace
 from itertools import combinations
 
-from visadapt.diagnosis.search.fitted_models import MIN_LEFTOVER, FittedModels, ScoredModel, key_of, less
+from visadapt.diagnosis.search.fitted_models import FittedModels, ScoredModel, key_of, less
 from visadapt.effects import ActuationEffect, Effect
 from visadapt.effects.late_sensors import LateSensors
 from visadapt.estimation.episode_phases import has_episode_phases, with_episode_phases
@@ -75,14 +75,8 @@ class Search(FittedModels):
                 break
             beam = self._worth_extending(ranked)
         self._settle(exchanged)
-        if self._improve_while_unexplained(exchanged) > MIN_LEFTOVER:
-            # Perhaps by two effects that only together beat single effects which fit fairly.
-            for size in (1, 2):
-                bases = [f for f in self.ranked if len(f.effects) == size and f.log_odds > -math.inf]
-                self.extend(bases[:WIDEN_MODELS])
-            self.try_late_sensors()
-            self._settle(exchanged)
-            self._phases_of_episodes()
+        if not self.explains_all(self.best):
+            self._widen(exchanged)
         self._report(progress, MAX_EFFECTS)
 
     def fit_singles(self) -> list[ScoredModel]:
@@ -122,9 +116,7 @@ class Search(FittedModels):
         if self.best.names == before.names:
             return False
         if not self.rows.jumps:
-            exchanged = Exchanges()
-            self._settle(exchanged)
-            self._improve_while_unexplained(exchanged)
+            self._settle(Exchanges())
         return True
 
     def _report(self, progress: Progress | None, step: int) -> None:
@@ -166,27 +158,15 @@ class Search(FittedModels):
         quiet = self.fit(starts, effort, process_noise=False)
         self.fit([(each.effects, each.fits) for each in quiet], effort)
 
-    def _improve_while_unexplained(self, exchanged: Exchanges) -> float:
-        """Refit the best set without process noise, prune and settle, until it stays the best; return the log
-        likelihood that process noise then adds to it."""
-        before, left = None, 0.0
-        while self.best is not before:
-            before = self.best
-            left = self.without_process_noise([before])[0].left
-            if self.best is not before:
-                self._prune()
-                # Sets that were exchanged for the worse fit may be better than they seemed.
-                exchanged.clear()
-                self._settle(exchanged)
-        return left
-
-    def _prune(self) -> None:
-        """Remove effects of the best set one by one while that raises the odds, in fits without process noise: with it,
-        a fit may go back to where noise explains what these effects do."""
-        before = None
-        while self.best is not before:
-            before = self.best
-            self.fit([less(before, [removed]) for removed in before.effects], QUICK, process_noise=False)
+    def _widen(self, exchanged: Exchanges) -> None:
+        """Search further where the best set leaves something unexplained."""
+        # Perhaps two effects explain it that only together beat single effects which fit fairly.
+        for size in (1, 2):
+            bases = [f for f in self.ranked if len(f.effects) == size and f.log_odds > -math.inf]
+            self.extend(bases[:WIDEN_MODELS])
+        self.try_late_sensors()
+        self._settle(exchanged)
+        self._phases_of_episodes()
 
     def try_late_sensors(self) -> None:
         """The source, the best set and the best single effects with each late sensor in addition.
@@ -223,7 +203,7 @@ class Search(FittedModels):
     def _phases_of_episodes(self) -> None:
         """Where something is unexplained, try periodic effects with a phase for each episode; keep them if they win."""
         catalogue = tuple(with_episode_phases(effect, len(self.rows.command)) for effect in self.catalogue)
-        if catalogue == self.catalogue or self.without_process_noise([self.best])[0].left <= MIN_LEFTOVER:
+        if catalogue == self.catalogue or self.explains_all(self.best):
             return
         periodic = {effect.name for effect in catalogue if has_episode_phases(effect)}
         other = copy(self)
