@@ -38,17 +38,28 @@ class Colour:
 
     coefficients: Tensor  # (p, m, m) A
     whitening: Tensor  # (m, m) L^-1
+    first: Tensor
+    """(p m, p m) what whitens the first p rows of a window, which have none before them: the inverse Cholesky factor of
+    the covariance of p successive rows"""
     log_process: Tensor  # (G,) log process noise variances of the filter, by group
     log_noise: Tensor  # (m,) log variances of its measurements
 
     def whitened(self, innovations: Tensor) -> Tensor:
-        """n (N, T, m, M) of innovations (N, T, m, M); before the first row they are taken as 0."""
+        """n (N, T, m, M) of innovations (N, T, m, M)."""
         length, lags = innovations.shape[1], len(self.coefficients)
         padded = pad(innovations, (0, 0, 0, 0, lags, -length % BLOCK))
         blocks = [
             self._block @ padded[:, first : first + lags + BLOCK].flatten(1, 2) for first in range(0, length, BLOCK)
         ]
-        return torch.cat(blocks, 1).unflatten(1, (-1, innovations.shape[2]))[:, :length]
+        later = torch.cat(blocks, 1).unflatten(1, (-1, innovations.shape[2]))[:, lags:length]
+        first = self.first @ innovations[:, :lags].flatten(1, 2)
+        return torch.cat((first.unflatten(1, (lags, -1)), later), 1)
+
+    def log_density(self, weight: Tensor) -> Tensor:
+        """(N,) log determinant of the whitening of rows with weights (N, T)."""
+        lags = len(self.coefficients)
+        first = self.first.logdet() / lags
+        return first * weight[:, :lags].sum(1) + self.whitening.logdet() * weight[:, lags:].sum(1)
 
     @cached_property
     def _block(self) -> Tensor:
@@ -66,10 +77,13 @@ def whitened_adjoint(slopes: Tensor, colour: Colour | None) -> Tensor:
     """Derivatives by innovations (N, T, m, M), from those by the innovations that `whitened` makes of them."""
     if colour is None:
         return slopes
-    back = colour.whitening.mT @ slopes
-    out = back.clone()
+    lags = len(colour.coefficients)
+    out = colour.whitening.mT @ slopes
+    out[:, :lags] = 0.0
+    later = out[:, lags:].clone()
     for lag, matrix in enumerate(colour.coefficients, 1):
-        out[:, :-lag] -= matrix.mT @ back[:, lag:]
+        out[:, lags - lag : -lag] -= matrix.mT @ later
+    out[:, :lags] += (colour.first.mT @ slopes[:, :lags].flatten(1, 2)).unflatten(1, (lags, -1))
     return out
 
 
@@ -105,8 +119,15 @@ def colour_of(
         if gain > best[0]:
             root = torch.linalg.cholesky(left.T @ left / len(left))
             coefficients = weights.unflatten(0, (order, channels)).mT
-            best = gain, Colour(coefficients, torch.linalg.inv(root), log_process, log_noise)
+            together = torch.cat((past.unflatten(1, (order, channels)).flip(1)[:, 1:].flatten(1), now), 1)
+            start = torch.linalg.cholesky(together.T @ together / len(together))
+            best = gain, Colour(coefficients, _inverse(root), _inverse(start), log_process, log_noise)
     return best[1]
+
+
+def _inverse(root: Tensor) -> Tensor:
+    """The inverse of a lower triangular matrix."""
+    return torch.linalg.solve_triangular(root, torch.eye(len(root)).to(root), upper=False)
 
 
 def _log_likelihood(errors: Tensor) -> float:

@@ -255,7 +255,7 @@ def _of_systems(
     if colour is None:
         adjoint, information, score = _by_noise(here, loads, noise, used, drawn, members)
     else:
-        likelihood = likelihood + counted.mean(2).sum(1) * colour.whitening.logdet()
+        likelihood = likelihood + colour.log_density(counted.mean(2))
         adjoint = adjoints(here, here.white)
         score = likelihood.new_zeros(len(likelihood), len(members[0]))
         information = torch.diag_embed(score)
