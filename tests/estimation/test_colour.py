@@ -44,6 +44,15 @@ def test_the_coefficients_of_an_autoregression_are_found_and_whiten_it():
         assert torch.allclose(covariance, torch.eye(2).double() if lag == 0 else torch.zeros(2, 2).double(), atol=0.06)
 
 
+def test_rows_at_the_start_of_a_window_are_white_too():
+    innovations = drawn(RESONANCE)
+    found = colour(innovations)
+    windows = innovations.unflatten(1, (-1, 30)).flatten(0, 1)
+    white = found.whitened(windows[..., None])[..., 0]
+    first = white[:, : len(found.coefficients)]
+    assert float(first.square().mean()) == pytest.approx(1.0, abs=0.2), "far more if rows before it are taken as 0"
+
+
 def test_padding_tells_nothing():
     innovations = drawn(RESONANCE)
     inside = torch.ones(WINDOWS, ROWS)
