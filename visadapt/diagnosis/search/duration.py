@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import time
 
-from visadapt.diagnosis.search.search import FIT_ALL_ABOVE, Search
+from visadapt.diagnosis.search.search import Search
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.likelihood import differentiate
 from visadapt.estimation.segments import Segments
 
-SEARCH_STEPS = {0.0: 5, 10.0: 26, FIT_ALL_ABOVE: 38}
+SEARCH_STEPS = {0.0: 2, 10.0: 20}
 """Duration of a search per effect of the catalogue, in steps of a fit of the source to the rows searched; by the log
 likelihood that the best effect promises. Measured on recordings with hidden effects of many sizes."""
 
-FINAL_STEPS = {0.0: 60, 10.0: 130}  # Duration of the fits to all rows and of the predictions, in steps on all rows
+FINAL_STEPS = {0.0: 80, 10.0: 120}  # Duration of the fits to all rows and of the predictions, in steps on all rows
 
 SHARED = 0.6  # Speed that each process beyond the first adds, as a share of that of the first
 
@@ -21,9 +21,9 @@ SHARED = 0.6  # Speed that each process beyond the first adds, as a share of tha
 def expected(search: Search, rows: Segments) -> float:
     """Expected duration in s, from a step of a fit that is timed here, and from what the best effect promises.
 
-    Within a factor of about two where one effect or two explain the gap. Recordings of real machines that several
-    effects separate from their simulator, and of which much stays unexplained, took two to five times as long (a
-    cart-pole, 302 rows; a double pendulum, 3,990 and 3,748 rows).
+    Within a factor of about three where one effect or two explain the gap: one takes less, two take more. Recordings of
+    a real machine that several effects separate from its simulator, and of which much stays unexplained, took four to
+    six times as long (a double pendulum, 3,988 and 3,990 rows).
 
     Args:
         search: before it has run; it may be on some of the rows.
