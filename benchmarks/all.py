@@ -260,6 +260,17 @@ COMMANDS = (
         )
         for kind in ("rig", "table")
     ),
+    Command(
+        "ablations_diagnosis_explained",
+        "ablations_diagnosis.csv",
+        (
+            "benchmarks.diagnosis_ablations",
+            *("--kinds", "table", "--count", "32", "--effects", "all"),
+            *("--parts", "no further where all is explained"),
+        ),
+        10,
+        work="--work",
+    ),
     _blind("blind_hard", "--seed 2028 --kinds hard --count 100 --jobs 2", 20),
     _blind("blind_easy", "--seed 2028 --kinds easy --count 24 --jobs 2", 20),
     _blind(

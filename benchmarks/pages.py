@@ -58,7 +58,7 @@ TABLES = {
     "ablations": Table(adaptation.ablations, ("ablations",)),
     "ablations, states": Table(adaptation.ablations, ("ablations_states",)),
     "ablations, diagnosis": Table(
-        diagnosis.parts, tuple(f"ablations_diagnosis{of}" for of in ("", "_large", "_rig", "_table"))
+        diagnosis.parts, tuple(f"ablations_diagnosis{of}" for of in ("", "_large", "_rig", "_table", "_explained"))
     ),
     "ablations, flights": Table(adaptation.flight_ablations, ("ablations_flight",)),
     "other targets": Table(adaptation.other_targets, ("other_targets",)),
