@@ -121,13 +121,8 @@ def colour_of(
             coefficients = weights.unflatten(0, (order, channels)).mT
             together = torch.cat((past.unflatten(1, (order, channels)).flip(1)[:, 1:].flatten(1), now), 1)
             start = torch.linalg.cholesky(together.T @ together / len(together))
-            best = gain, Colour(coefficients, _inverse(root), _inverse(start), log_process, log_noise)
+            best = gain, Colour(coefficients, torch.linalg.inv(root), torch.linalg.inv(start), log_process, log_noise)
     return best[1]
-
-
-def _inverse(root: Tensor) -> Tensor:
-    """The inverse of a lower triangular matrix."""
-    return torch.linalg.solve_triangular(root, torch.eye(len(root)).to(root), upper=False)
 
 
 def _log_likelihood(errors: Tensor) -> float:

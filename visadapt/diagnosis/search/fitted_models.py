@@ -35,7 +35,9 @@ ROWS_AT_ONCE = 100_000  # Rows times sets that are fitted together, so that memo
 
 MIN_BETTER = 5.0  # Log likelihood by which a fit without process noise must be better to be kept
 
-MIN_LEFTOVER = 5.0  # Log likelihood that process noise must add to a set for something to count as unexplained
+MIN_LEFTOVER = 5.0
+"""Log likelihood that process noise must add to a set for something to count as unexplained, and the most that a set's
+score is lowered for it where sets are compared."""
 
 
 class NoFitError(ValueError):
