@@ -117,8 +117,8 @@ def read_names(path: str | os.PathLike[str], system: System | type[System]) -> t
     return _tried(path, read)
 
 
-def read_recording(path: str | os.PathLike[str], frames: bool = True) -> list[Episode]:
-    """All episodes of a file that `write_recording` wrote, in order; without their frames if `frames` is False.
+def read_recording(path: str | os.PathLike[str]) -> list[Episode]:
+    """All episodes of a file that `write_recording` wrote, in order.
 
     Raises:
         RecordingError: the file is missing, incomplete, or of another format or version, or its rows are not valid
@@ -131,13 +131,14 @@ def read_recording(path: str | os.PathLike[str], frames: bool = True) -> list[Ep
     >>> va.read_recording(path)[0].samples
     2
     """
-    return [*read_stretches(path, frames)[0].values()]
+    return [*read_stretches(path)[0].values()]
 
 
 def read_stretches(
     path: str | os.PathLike[str], frames: bool = True, most_bytes: float = math.inf
 ) -> tuple[dict[int, Episode], int]:
-    """As `read_recording`: the episodes by their number in the file, and the number of the file's rows.
+    """As `read_recording`: the episodes by their number in the file, and the number of the file's rows; without their
+    frames if `frames` is False.
 
     Where the values take more than `most_bytes`, stretches of rows are left out (`thinning.py`): episodes then have
     gaps, or are missing.

@@ -27,6 +27,7 @@ from visadapt.tasks.differential_flatness import commands
 SPEEDS = ("x_dot", "y_dot", "z_dot")
 
 MAX_PERIODS = 1_000_000  # Periods that a reference of one's own may last: 28 hours of 0.1 s
+MAX_SPEED = 5.0  # m/s: no vehicle of ours was trained to fly faster
 
 LOOP_RADIUS = 7.0
 """m, one for all speeds, so that faster is harder. The rule: the smallest at which the paper's fastest power loop,
@@ -111,7 +112,7 @@ def smallest_loop(speed: float, quadrotor: Quadrotor, margin: float = 0.9) -> fl
 
 
 @np.errstate(over="ignore", invalid="ignore")  # by absurd numbers, which are refused as too fast
-def read_reference(path: str | os.PathLike[str], period: float = 0.1, max_speed: float = 5.0) -> Reference:
+def read_reference(path: str | os.PathLike[str], period: float = 0.1) -> Reference:
     """A reference of one's own: a CSV file with columns time, x, y, z and, if known, x_dot, y_dot, z_dot.
 
     Seconds, metres and metres per second, z up; rows may be any time apart, and other columns are ignored. They
@@ -127,7 +128,7 @@ def read_reference(path: str | os.PathLike[str], period: float = 0.1, max_speed:
     >>> va.read_reference(path).positions.shape
     torch.Size([21, 3])
     """
-    _check_positive(period=period, max_speed=max_speed)
+    _check_positive(period=period)
     path = Path(path)
     table = Table.open(path)
     names = ["time", "x", "y", "z", *(SPEEDS if any(name in table.header for name in SPEEDS) else ())]
@@ -158,11 +159,11 @@ def read_reference(path: str | os.PathLike[str], period: float = 0.1, max_speed:
     while len(motion) < 4:
         motion.append(np.gradient(motion[-1], period, axis=0, edge_order=2))
     speed = np.linalg.norm(motion[1], axis=1)
-    if not (speed <= max_speed).all():
-        first = int((~(speed <= max_speed)).argmax())
+    if not (speed <= MAX_SPEED).all():
+        first = int((~(speed <= MAX_SPEED)).argmax())
         raise RecordingError(
             f"{path}: {first * period:g} s after its start it moves at {speed[first]:.3g} m/s; "
-            f"at most {max_speed:g} m/s is right (are lengths in m and times in s?)"
+            f"at most {MAX_SPEED:g} m/s is right (are lengths in m and times in s?)"
         )
     return Reference.of(torch.from_numpy(np.stack(motion)).to(torch.get_default_dtype()), period)
 
