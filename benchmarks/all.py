@@ -202,11 +202,11 @@ COMMANDS = (
         "baselines_frames.csv",
         (
             "benchmarks.baselines",
-            *("--baselines", "mpc", "mpc_pixels"),
+            *("--baselines", "mpc", "mpc_pixels", "ppo"),
             *("--experiments", "CartPole, pixels, 2(sin t + 1) N", "--episodes", "20"),
             *("--out", "results/baselines_frames.csv", "--picture", "runs/baselines_frames.png"),
         ),
-        40,
+        100,
         work="--work",
         extra="baselines",
     ),

@@ -86,7 +86,7 @@ TABLES = {
     "rotorpy diagnosis": Table(diagnosis.crazyflie, ("rotorpy_diagnosis",)),
     "baselines, constant": Table(paper.baselines_constant, ("baselines",)),
     "baselines, changing": Table(paper.baselines_changing, ("baselines",)),
-    "baselines, PPO": Table(paper.ppo_curve, ("baselines",)),
+    "baselines, PPO": Table(paper.ppo_curve, ("baselines", "baselines_frames")),
     "paper: table 1, CartPole": Table(paper.table_1_cartpole, ("cartpole_states", "baselines")),
     "paper: table 1, vehicles": Table(paper.table_1_vehicles, ("flight", "baselines_flight")),
     "paper: theorem 1": Table(theorem.theorem_1, ("theorem",)),

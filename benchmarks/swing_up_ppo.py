@@ -42,7 +42,7 @@ def main(settings: Settings) -> None:
     torch.set_num_threads(1)
     ppo, course = module_of("ppo"), SwingingUp()
     machines = ppo.Machines(course, no_effects, World(course.system, period=course.period), settings.seed)
-    model = ppo.PPO("MlpPolicy", machines, **ppo.settings_of(settings.seed))
+    model = ppo.model_of(machines, settings.seed)
     rows: list[Row] = []
     while model.num_timesteps < settings.most and (not rows or rows[-1].failed):
         model.learn(settings.every, reset_num_timesteps=False)

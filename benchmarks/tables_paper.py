@@ -192,16 +192,17 @@ def _curves(rows: Rows, experiment: str) -> Lines:
     return lines or [["not run", *[""] * len(CURVE_HEAD)]]
 
 
-def ppo_curve(baselines: Rows) -> Lines:
+def ppo_curve(baselines: Rows, frames: Rows) -> Lines:
     """PPO in the target, over as many samples as it was given, as the paper's figure 7 for the fixed wing."""
-    own = [row for row in baselines if (row["method"], row["measure"]) == (BASELINES["ppo"], SPEED)]
+    own = [row for row in (*baselines, *frames) if (row["method"], row["measure"]) == (BASELINES["ppo"], SPEED)]
     counts = sorted({int(row["samples"]) for row in own if row["domain"] != "source"})
     lines = [["PPO: cart speed, m/s", *(f"{count:,}" for count in counts)]]
     for experiment in dict.fromkeys(row["experiment"] for row in own):
         found = {
             int(row["samples"]): row for row in own if row["experiment"] == experiment if row["domain"] != "source"
         }
-        lines.append([experiment.removeprefix("CartPole, states, "), *(_speed(found.get(count)) for count in counts)])
+        name = experiment.removeprefix("CartPole, states, ").replace("CartPole, pixels", "frames")
+        lines.append([name, *(_speed(found.get(count)) for count in counts)])
     return lines
 
 

@@ -17,6 +17,7 @@ from benchmarks.baselines.cartpole import COST
 from benchmarks.baselines.subjects import CartPoleSubject
 from experiments.swing_up import ANYWHERE, STEPS
 from visadapt.history import History
+from visadapt.learning.transitions import Observe
 from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.policies.flight import FlightPolicy
 from visadapt.systems import CartPole, FixedWing, Quadrotor, System
@@ -90,6 +91,32 @@ class Balancing(Course):
         cost = (weights * state.square()).sum(1) + COST.action * command[:, 0].square()
         fallen = state[:, 2].abs() > 0.3
         return (-cost).exp(), fallen, torch.zeros_like(fallen)
+
+
+class Filmed(Balancing):
+    """The same from frames alone: the network sees the last 5 frames in [0, 1], flattened, and the last 5 actions.
+
+    Args:
+        begin: as of `Balancing`.
+        film: frames (B, H, W) in [0, 1] of states (B, 4).
+        reach: m; an episode also fails where the cart is further from the middle, out of the frame.
+    """
+
+    show = "frame"
+
+    def __init__(self, begin: Begin, film: Observe, reach: float) -> None:
+        super().__init__(begin, with_history=True)
+        self.film, self.reach = film, reach
+
+    def shown(self, history: History) -> Tensor:
+        return torch.cat((history.observations.flatten(1), history.actions.flatten(1)), 1)
+
+    def observed(self, seen: Tensor, task_state: Tensor) -> Tensor:
+        return self.film(seen)
+
+    def judge(self, before: Tensor, command: Tensor, state: Tensor, task_state: Tensor) -> Judged:
+        reward, fallen, over = super().judge(before, command, state, task_state)
+        return reward, fallen | ~(state[:, 0].abs() <= self.reach), over
 
 
 class SwingingUp(Course):

@@ -35,7 +35,7 @@ from visadapt.world import World
 class CartPoleFrames(CartPoleProblem):
     """A CartPole under a hidden effect, of which a camera shows frames and nothing else is known."""
 
-    baselines = ("mpc", "mpc_pixels", "mppi", "pets")
+    baselines = ("mpc", "mpc_pixels", "mppi", "pets", "ppo")
 
     def target(self) -> SyntheticTarget:
         return SyntheticTarget(self.hidden, DrawnCartPole())

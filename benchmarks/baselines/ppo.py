@@ -4,6 +4,9 @@ Rewards are those of `courses`. Settings are the library's defaults, but for man
 speed, and a smaller first deviation of the commands, whose full range throws the pole; none is tuned further. In the
 source the checkpoint that does best there is kept (A.3); in the target the policy is scored as it stands. Its first
 update is after 2,048 samples: before, it is the source's.
+
+From frames, PPO begins with the frame encoder of ours as it was trained to read positions and angles, and trains that
+too. In the source it sees the frames of ours' renderer, in the target those of the camera.
 """
 
 from __future__ import annotations
@@ -14,17 +17,25 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from gymnasium.spaces import Box
 from stable_baselines3 import PPO
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor
 
-from benchmarks.baselines.courses import Balancing, Course, flying, starting
+from benchmarks.baselines.courses import Balancing, Course, Filmed, flying, starting
+from benchmarks.baselines.frames import renderer
 from benchmarks.baselines.machines import MACHINES, Machines
 from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage, unadapted
 from experiments.kept_scores import kept_score
-from visadapt.history import History
-from visadapt.policies import Policy
+from renderers import DrawnCartPole
+from visadapt.history import LENGTH, History
+from visadapt.policies import ImagePolicy, Policy
+from visadapt.policies.networks import N_FEATURES
+from visadapt.setups.cartpole import cartpole_frames
+from visadapt.setups.policy_file import load_policy
 from visadapt.targets import FlightTarget, SyntheticTarget
 from visadapt.targets.synthetic import WorldTarget, no_effects
+from visadapt.weights import shipped
 
 ROLLOUT = 2048
 """samples between updates, the default"""
@@ -53,10 +64,40 @@ class Trained(Policy):
         return out.clamp(-1, 1)
 
 
-def settings_of(seed: int) -> dict[str, Any]:
-    """What is not the library's default."""
+class Eyes(BaseFeaturesExtractor):
+    """The frame encoder of ours, for what `Filmed` shows."""
+
+    def __init__(self, observation_space: Box) -> None:
+        super().__init__(observation_space, N_FEATURES)
+        policy = load_policy(shipped("cartpole_frames"))
+        assert isinstance(policy, ImagePolicy)
+        self.size = policy.observation_shape
+        self.trained = {key: weight.clone() for key, weight in policy.perception.state_dict().items()}
+        # PPO's orthogonal initial weights cannot be written into tensors of another memory format.
+        self.encoder = policy.perception.requires_grad_(True).to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+
+    def restore(self) -> None:
+        """Give the encoder its trained weights, which PPO replaces with new ones when it makes its networks."""
+        self.encoder.load_state_dict(self.trained)
+
+    def forward(self, shown: Tensor) -> Tensor:
+        frames, actions = shown[:, : LENGTH * math.prod(self.size)], shown[:, LENGTH * math.prod(self.size) :]
+        history = History(frames.unflatten(1, (LENGTH, *self.size)), actions.unflatten(1, (LENGTH, -1)))
+        features: Tensor = self.encoder(history)
+        return features
+
+
+def model_of(machines: Machines, seed: int) -> PPO:
+    """A new PPO policy, with what is not the library's default."""
     args = {"n_steps": ROLLOUT // MACHINES, "batch_size": BATCH, "gamma": GAMMA, "seed": seed, "device": "cpu"}
-    return {**args, "policy_kwargs": {"log_std_init": LOG_STD}}
+    networks: dict[str, Any] = {"log_std_init": LOG_STD}
+    if not isinstance(machines.course, Filmed):
+        return PPO("MlpPolicy", machines, **args, policy_kwargs=networks)
+    model = PPO("MlpPolicy", machines, **args, policy_kwargs={**networks, "features_extractor_class": Eyes})
+    eyes = model.policy.features_extractor
+    assert isinstance(eyes, Eyes)
+    eyes.restore()
+    return model
 
 
 def courses(problem: Problem, sizes: Sizes) -> tuple[Course, Course]:
@@ -70,7 +111,26 @@ def courses(problem: Problem, sizes: Sizes) -> tuple[Course, Course]:
         own = target.task
         return flying(own, target.system, wide), flying(own, target.system, own.evaluation_start)
     assert isinstance(target, SyntheticTarget)
+    if target.camera is not None:
+        return filmed(target, target.camera)
     return Balancing(wide, problem.with_history), Balancing(starting(target.initial), problem.with_history)
+
+
+def filmed(target: SyntheticTarget, drawn: DrawnCartPole) -> tuple[Filmed, Filmed]:
+    """The courses of a cart-pole that is seen by a camera."""
+    task, learnt, reach = cartpole_frames().settings.source.task, renderer(), drawn.camera.reach
+
+    def wide(batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        return task.training_start(batch, 1.0, generator)
+
+    def rendered(state: Tensor) -> Tensor:
+        frames: Tensor = learnt(state[:, 0], state[:, 2])
+        return frames
+
+    def filmed(state: Tensor) -> Tensor:
+        return torch.from_numpy(drawn(state[:, 0].double().numpy(), state[:, 2].double().numpy())).to(state) / 255
+
+    return Filmed(wide, rendered, reach), Filmed(starting(target.initial), filmed, reach)
 
 
 def pretrained(problem: Problem, course: Course, sizes: Sizes, path: Path, seed: int) -> PPO:
@@ -78,7 +138,7 @@ def pretrained(problem: Problem, course: Course, sizes: Sizes, path: Path, seed:
     machines = Machines(course, no_effects, problem.setup(sizes).source, seed)
     if path.exists():
         return PPO.load(path, env=machines, device="cpu")
-    model = PPO("MlpPolicy", machines, **settings_of(seed))
+    model = model_of(machines, seed)
     best, kept_so_far = (math.inf, math.inf), path.with_name("source-best.zip")
     for look in range(LOOKS):
         model.learn(sizes.source_steps // LOOKS, reset_num_timesteps=False)

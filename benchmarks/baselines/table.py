@@ -3,7 +3,7 @@
     python -m benchmarks.baselines [--baselines ppo mpc] [--smoke]
     python -m benchmarks.baselines --baselines mpc ppo pets --experiments 'quadrotor, drag' 'fixed wing, drag' \
         --out results/baselines_flight.csv --picture assets/baselines_flight.png
-    python -m benchmarks.baselines --baselines mpc mpc_pixels --experiments 'CartPole, pixels, 2(sin t + 1) N' \
+    python -m benchmarks.baselines --baselines mpc mpc_pixels ppo --experiments 'CartPole, pixels, 2(sin t + 1) N' \
         --out results/baselines_frames.csv --picture runs/baselines_frames.png
 
 CartPole from states under hidden effects (`cartpole`) and from frames (`frames`), and the vehicles under drag

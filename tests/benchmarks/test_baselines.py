@@ -7,7 +7,7 @@ import torch
 
 from benchmarks.baselines.frames import path_through
 from benchmarks.baselines.mpc_pixels import PixelPredictive
-from benchmarks.baselines.problem import drawn
+from benchmarks.baselines.problem import SMOKE, drawn
 from benchmarks.baselines.table import BASELINES, PROBLEMS, Settings, main
 from benchmarks.cartpole_pixels import EXPERIMENT
 from benchmarks.cartpole_states import SINE
@@ -184,6 +184,37 @@ def test_episodes_of_ppo_are_those_of_the_target():
         assert torch.allclose(seen.state[standing], machines.at.state[standing], atol=1e-6)
     assert not bool(standing.any())  # so that episodes have begun anew
     assert bool((machines.age < 60).all())
+
+
+def test_frames_of_ppo_are_those_of_the_target():
+    pytest.importorskip("stable_baselines3")
+    from benchmarks.baselines.machines import MACHINES, Machines
+    from benchmarks.baselines.ppo import courses, model_of
+
+    problem = PROBLEMS[EXPERIMENT]
+    wide, course = courses(problem, SMOKE)
+    target = problem.target()
+    assert isinstance(target, SyntheticTarget)
+    machines = Machines(course, target.draw_effects, None, seed=0)
+    machines.reset()
+    seen = target.reset(MACHINES, torch.Generator().manual_seed(0))
+    for _ in range(2):
+        assert seen.frame is not None
+        assert torch.equal((255 * machines.history.observations[:, -1]).round().to(torch.uint8), seen.frame)
+        seen = target.step(torch.zeros(MACHINES, 1))
+        machines.step_async(torch.zeros(MACHINES, 1).numpy())
+        machines.step_wait()
+
+    far = torch.tensor([[1.4, 0, 0, 0], [1.6, 0, 0, 0], [0, 0, 0.31, 0]])
+    _, failed, _ = course.judge(far, torch.zeros(3, 1), far, far[:, :0])
+    assert failed.tolist() == [False, True, True]
+
+    # PPO's encoder begins as ours, which reads the cart's position from the frame.
+    machines = Machines(wide, target.draw_effects, problem.setup(SMOKE).source, seed=0)
+    eyes = model_of(machines, seed=0).policy.features_extractor
+    machines.reset()
+    read = eyes.encoder.kinematics(machines.history)[:, 0].detach()
+    assert float(torch.stack((read, machines.at.state[:, 0])).corrcoef()[0, 1]) > 0.99
 
 
 @pytest.mark.parametrize(("task", "vehicle"), [(Follow(waves(4)), Quadrotor()), (Reach(), FixedWing())])
