@@ -21,7 +21,7 @@ from visadapt.learning.feedforward import initialise_feedforward
 from visadapt.learning.grounding import GroundLoss, fit_named, ground, rescale
 from visadapt.learning.ledger import Ledger
 from visadapt.learning.setup_settings import SetupSettings
-from visadapt.learning.stability import stable
+from visadapt.learning.stability import cost_in, stable
 from visadapt.learning.transitions import Observe, Transitions
 from visadapt.learning.tuning import TuneSettings, tune
 from visadapt.policies import Policy
@@ -122,9 +122,10 @@ class JointLearning:
     grounded: bool = False  # whether the residual has been fitted
 
     def __post_init__(self) -> None:
-        weights = self.policy.state_dict()
-        self.first = {key: value.clone() for key, value in weights.items() if not key.startswith("residual.")}
+        self.first = self._weights()
         """weights of the policy before the first round, with its feed-forward once that is known"""
+        self.tuned: dict[str, Tensor] | None = None
+        """weights of the policy after the last round that tuned it with the residual"""
         self.untrained = copy.deepcopy(self.residual.network.state_dict())
         """weights of a new residual, which it gets back where named causes explain the gap"""
         if self.policy.residual is not None:
@@ -234,7 +235,26 @@ class JointLearning:
         """Tune the policy in the source with the named effects and the residual; the loss of every iteration."""
         self._begin_tuning()
         self.grounded = True
-        return self._tune(folder, self._learnt, self.settings.tuning, transitions)
+        world, settings = self._learnt, self.settings.tuning
+        if self.settings.later is not None and self._goes_on(folder, world, transitions):
+            settings = replace(settings, iterations=self.settings.later)
+        losses = self._tune(folder, world, settings, transitions)
+        self.tuned = self._weights()
+        return losses
+
+    def _goes_on(self, folder: RoundFolder, world: World, transitions: Transitions) -> bool:
+        """Give the policy the weights of the round before, if it then costs less in `world` than with those it has;
+        returns whether it does."""
+        if self.tuned is None:
+            return False
+        weights, costs = (self._weights(), self.tuned), []
+        for each in weights:
+            self.policy.load_state_dict(each, strict=False)
+            about = (self.settings.tuning, folder.generator(ACCEPTING), transitions)
+            costs.append(cost_in(self.policy, world, self.observe, *about))
+        goes_on = costs[1] < costs[0]
+        self.policy.load_state_dict(weights[goes_on], strict=False)
+        return goes_on
 
     def _tune_with_names(self, folder: RoundFolder) -> list[float]:
         """Tune the policy in the source with the named effects alone; where there is no gap, it gets its weights from
@@ -244,6 +264,11 @@ class JointLearning:
         if no_gap or not self.settings.tunes_on:
             self._start_anew()
         return self._tune(folder, world, replace(settings, iterations=0) if no_gap else settings)
+
+    def _weights(self) -> dict[str, Tensor]:
+        """A copy of the policy's weights, without those of the residual."""
+        weights = self.policy.state_dict()
+        return {key: value.clone() for key, value in weights.items() if not key.startswith("residual.")}
 
     def _start_anew(self) -> None:
         """Give the policy its weights from before the first round."""

@@ -29,6 +29,9 @@ class SetupSettings:
     """begin with a feed-forward that opposes the residual's correction; False where no one command can cancel it"""
     tunes_on: bool = False
     """a round tunes on from the weights of the round before; False: it begins with those before the first round"""
+    later: int | None = None
+    """iterations of a round that tunes on because the policy of the round before costs less in the newly grounded
+    source than the one before the first round; None: `tunes_on` alone decides, and every round has those of `tuning`"""
     refinement: TuneSettings | None = None
     """second training of the policy in the source, after `source`: near rest, say, where it is scored"""
     named: TuneSettings | None = None

@@ -6,6 +6,10 @@ grow from step to step. Streams that go on from plan to plan drift into that mot
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from itertools import count, islice
+
 import torch
 
 from visadapt.learning.transitions import Observe, Transitions
@@ -22,6 +26,10 @@ GROWTH = 3.0
 a world with 5.5 lost 35 of 40 episodes, with 1.6 none; in most worlds it is below 1."""
 
 
+COMPARED = 5
+"""Plans of 10 steps by which the cost of a policy in a world is compared with that of another."""
+
+
 @torch.no_grad()
 def stable(
     policy: Policy,
@@ -35,8 +43,39 @@ def stable(
 
     The arguments are those of `learning.tuning.tune`.
     """
+    costs = _costs(policy, world, observe, settings, generator, transitions)
+    first = next(costs)
+    # A cost that is not a number is not within the bound either.
+    return first < math.inf and all(cost <= GROWTH * first for cost in islice(costs, PLANS - 1))
+
+
+@torch.no_grad()
+def cost_in(
+    policy: Policy,
+    world: World,
+    observe: Observe | None,
+    settings: TuneSettings,
+    generator: torch.Generator,
+    transitions: Transitions,
+) -> float:
+    """The mean cost of the policy's first COMPARED plans in `world`, from where its tuning would start.
+
+    The arguments are those of `learning.tuning.tune`.
+    """
+    costs = _costs(policy, world, observe, settings, generator, transitions)
+    return sum(islice(costs, COMPARED)) / COMPARED
+
+
+def _costs(
+    policy: Policy,
+    world: World,
+    observe: Observe | None,
+    settings: TuneSettings,
+    generator: torch.Generator,
+    transitions: Transitions,
+) -> Iterator[float]:
+    """Mean costs of plans that are imagined one after the other."""
     plans = plans_of(policy, world, observe, settings, generator, transitions)
     plans.streams.start(1.0, generator)
-    first = float(plans.loss(0, 1.0))
-    # A cost that is not a number is not within the bound either.
-    return first < float("inf") and all(float(plans.loss(number, 1.0)) <= GROWTH * first for number in range(1, PLANS))
+    for number in count():
+        yield float(plans.loss(number, 1.0))

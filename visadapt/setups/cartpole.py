@@ -92,6 +92,7 @@ def from_frames(source: World) -> SetupSettings:
         refinement=replace(rendered, iterations=2500, learning_rate=1e-3),
         # An iteration takes 0.3 s of CPU; 60 are too few.
         tuning=replace(rendered, iterations=100, learning_rate=1e-3),
+        later=30,
         named=rendered,
         # After 50 samples of a force that changes, six seeds reach cart speeds of 0.023 to 0.285 m/s with the ridge 0.1
         # alone, and of 0.023 to 0.045 m/s with these ridges to choose from.
