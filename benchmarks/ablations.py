@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from experiments.cartpole_targets import TARGETS, Shown, experiment, source, target, unadapted_score
 from experiments.kept_scores import kept_score
-from experiments.parallel import in_processes
+from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import print_speed, speed_row, write_rows
 from renderers import load_renderer
 from visadapt.effects import Residual
@@ -205,7 +205,7 @@ class Settings:
     """which of TARGETS"""
     variants: tuple[str, ...] = ()
     """which of VARIANTS and KNOWING; by default all that there are for what the policy sees"""
-    jobs: int = 2
+    jobs: Jobs = 2
     """adaptations at once, one core each"""
     work: Path = Path("runs/ablations")
     out: Path = Path("results/ablations.csv")

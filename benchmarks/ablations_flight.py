@@ -19,7 +19,7 @@ from benchmarks.ablations import with_an_mlp
 from datasets import quadrotor_references
 from experiments.flights import EXPERIMENTS, flight_target
 from experiments.kept_scores import kept_score
-from experiments.parallel import in_processes
+from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import miss_row, write_rows
 from visadapt.evaluation import FlightScore
 from visadapt.policies import Policy
@@ -74,7 +74,7 @@ class Settings:
     """which of experiments.flights.EXPERIMENTS"""
     variants: tuple[str, ...] = tuple(VARIANTS)
     """which of VARIANTS"""
-    jobs: int = 2
+    jobs: Jobs = 2
     """adaptations at once, one core each"""
     work: Path = Path("runs/ablations_flight")
     out: Path = Path("results/ablations_flight.csv")

@@ -20,7 +20,7 @@ import tyro
 
 from experiments.curves import plot_curve
 from experiments.kept_scores import kept_score
-from experiments.parallel import in_processes
+from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import print_speed, read_rows, speed_row, write_rows
 from renderers import DrawnCartPole
 from visadapt.evaluation import CartPoleScore
@@ -60,7 +60,7 @@ class Settings:
     episodes: int = 100
     variants: tuple[int, ...] = tuple(range(len(VARIANTS)))
     """which of VARIANTS are run and tabled"""
-    jobs: int = 2
+    jobs: Jobs = 2
     """adaptations at once, one core each"""
     work: Path = Path("runs/cartpole_pixels")
     out: Path = Path("results/cartpole_pixels.csv")

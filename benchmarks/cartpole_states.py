@@ -22,7 +22,7 @@ import tyro
 
 from experiments.curves import plot_curve
 from experiments.kept_scores import kept_score
-from experiments.parallel import in_processes
+from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import print_speed, read_rows, speed_row, write_rows
 from visadapt.evaluation import CartPoleScore
 from visadapt.policies import Policy
@@ -47,7 +47,7 @@ class Settings:
     experiments: tuple[str, ...] = tuple(PLANS)
     """which of PLANS are run and tabled"""
     episodes: int = 100
-    jobs: int = 2
+    jobs: Jobs = 2
     """seeds at once, one core each"""
     work: Path = Path("runs/cartpole_states")
     out: Path = Path("results/cartpole_states.csv")

@@ -28,7 +28,7 @@ from benchmarks.flight import prepared
 from experiments.curves import Chart, plot_charts
 from experiments.flights import EXPERIMENTS, flight_target
 from experiments.kept_scores import kept_score
-from experiments.parallel import in_processes
+from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import Row, miss_row, read_rows, write_rows
 from visadapt.effects import Residual
 from visadapt.evaluation import SCORE_SEED, FlightScore
@@ -83,7 +83,7 @@ class Settings:
     experiments: tuple[str, ...] = tuple(EXPERIMENTS)
     flights: int = 100
     """that each policy is scored on"""
-    jobs: int = 2
+    jobs: Jobs = 2
     """seeds at once, one core each"""
     current: Path = Path("runs/flight")
     """where benchmarks.flight keeps its adaptations"""

@@ -26,7 +26,7 @@ from datasets import quadrotor_references
 from experiments.curves import Chart, plot_charts, plot_losses
 from experiments.flights import EXPERIMENTS, flight_target
 from experiments.kept_scores import kept_score
-from experiments.parallel import in_processes
+from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import miss_row, read_rows, write_rows
 from visadapt.evaluation import FlightScore
 from visadapt.policies import Policy
@@ -48,7 +48,7 @@ class Settings:
     """which of EXPERIMENTS are run and tabled"""
     flights: int = 100
     """that each policy is scored on"""
-    jobs: int = 2
+    jobs: Jobs = 2
     """seeds at once, one core each"""
     pictures: Path = Path("assets")
     work: Path = Path("runs/flight")

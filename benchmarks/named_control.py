@@ -37,7 +37,7 @@ import tyro
 from torch import Tensor
 
 from experiments.kept_scores import kept_score
-from experiments.parallel import in_processes
+from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import print_speed, speed_row, write_rows
 from renderers import DrawnCartPole
 from visadapt.effects import (
@@ -125,7 +125,7 @@ class Settings:
     """of the source policy, from states"""
     iterations: int = 400
     """of the tuning with a residual, from states"""
-    jobs: int = 2
+    jobs: Jobs = 2
     """of what is hidden and seeds at once, one core each"""
     work: Path = Path("runs/named_control")
     out: Path = Path("results/named_control.csv")

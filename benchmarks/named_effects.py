@@ -21,7 +21,7 @@ import tyro
 from datasets import quadrotor_references
 from experiments.flights import EXPERIMENTS, flight_target
 from experiments.kept_scores import kept_score
-from experiments.parallel import in_processes
+from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import miss_row, write_rows
 from visadapt.effects import ConstantForce, Effect, LinearDrag, ThrustGain
 from visadapt.evaluation import FlightScore
@@ -47,7 +47,7 @@ class Settings:
 
     seeds: int = 3
     flights: int = 100
-    jobs: int = 2
+    jobs: Jobs = 2
     """runs at once, one core each"""
     work: Path = Path("runs/named_effects")
     out: Path = Path("results/named_effects.csv")

@@ -19,7 +19,7 @@ import tyro
 
 from experiments.cartpole_targets import Shown, experiment, source, target, unadapted_score
 from experiments.kept_scores import kept_score
-from experiments.parallel import in_processes
+from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import print_speed, speed_row, write_rows
 from visadapt.evaluation import CartPoleScore
 from visadapt.storage.run_folder import open_run
@@ -40,7 +40,7 @@ class Settings:
     episodes: int = 100
     targets: tuple[str, ...] = NAMES
     """which of the targets of experiments/cartpole_targets.py"""
-    jobs: int = 2
+    jobs: Jobs = 2
     """adaptations at once, one core each"""
     work: Path = Path("runs/other_targets")
     out: Path = Path("results/other_targets.csv")

@@ -24,7 +24,7 @@ import tyro
 from torch import Tensor
 
 import visadapt as va
-from experiments.parallel import in_processes
+from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import Row, write_rows
 from visadapt import effects
 from visadapt.diagnosis.result import AMBIGUOUS, Diagnosis, without_slight
@@ -81,7 +81,7 @@ class Settings:
     """recordings of each hidden effect"""
     hidden: tuple[str, ...] = tuple(HIDDEN)
     """which of HIDDEN"""
-    jobs: int = 2
+    jobs: Jobs = 2
     """recordings at once, one core each"""
     work: Path = Path("runs/planned_experiments")
     out: Path = Path("results/planned_experiments.csv")

@@ -24,7 +24,7 @@ import torch
 import tyro
 
 import visadapt as va
-from experiments.parallel import in_processes
+from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import Row, write_rows
 from visadapt import effects
 from visadapt.effects.catalogue import catalogue as every_effect
@@ -55,7 +55,7 @@ class Settings:
 
     seeds: int = 4
     """recordings of each hidden effect"""
-    jobs: int = 2
+    jobs: Jobs = 2
     """recordings at once, one core each"""
     work: Path = Path("runs/vibrations")
     out: Path = Path("results/vibrations.csv")

@@ -27,7 +27,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from experiments.parallel import in_processes
+from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import Row, write_rows
 from experiments.swing_up import ANYWHERE, STEPS, SWING, Score, score
 from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
@@ -74,7 +74,7 @@ class Settings:
 
     seeds: int = 3
     episodes: int = 100
-    jobs: int = 2
+    jobs: Jobs = 2
     """seeds at once, one core each"""
     work: Path = Path("runs/swing_up")
     out: Path = Path("results/swing_up.csv")

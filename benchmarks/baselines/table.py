@@ -32,7 +32,7 @@ from benchmarks.baselines.frames import FRAMES
 from benchmarks.baselines.problem import SMOKE, Problem, Sizes, score_path
 from experiments.curves import Chart, plot_charts
 from experiments.kept_scores import kept_score
-from experiments.parallel import in_processes
+from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import ACTION_TIME, Row, read_rows, write_rows
 from visadapt.policies import Policy
 from visadapt.storage.run_folder import open_run, read_json, write_json
@@ -70,7 +70,7 @@ class Settings:
     """of a score"""
     smoke: bool = False
     """see that all runs; the numbers mean nothing"""
-    jobs: int = 2
+    jobs: Jobs = 2
     """of (baseline, experiment, seed) at once, one core each"""
     work: Path = Path("runs/baselines")
     out: Path = Path("results/baselines.csv")
