@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from itertools import pairwise
 
 import torch
@@ -59,13 +60,12 @@ class Ensemble(nn.Module):
             optimiser.step()
 
 
-def source_ensemble(world: World, subject: Subject, updates: int, seed: int) -> Ensemble:
-    """An ensemble of the source, on short runs from random states under random commands."""
-    torch.manual_seed(seed)
-    generator = torch.Generator().manual_seed(seed)
+def source_runs(world: World, subject: Subject, generator: torch.Generator) -> tuple[History, Tensor]:
+    """Short runs of the source from random states under random commands: N histories that end with the command which is
+    then executed, and the states (N, n_state) that follow."""
     state = subject.draw(4000, generator)
     at, history = world.start(state), History.start(state, len(world.system.actions))
-    inputs, changes = [], []
+    before, after = [], []
     with torch.no_grad():
         for k in range(2 * LENGTH):
             command = torch.rand(history.actions[:, 0].shape, generator=generator) ** 2
@@ -73,10 +73,18 @@ def source_ensemble(world: World, subject: Subject, updates: int, seed: int) -> 
             at = world.step(at, command)
             history = history.acting(command)
             if k >= LENGTH or not subject.with_history:
-                inputs.append(subject.inputs(history))
-                changes.append(at.state - history.observations[:, -1])
+                before.append(history)
+                after.append(at.state)
             history = history.observing(at.state)
-    seen, change = torch.cat(inputs), torch.cat(changes)
+    return reduce(History.joined, before), torch.cat(after)
+
+
+def source_ensemble(world: World, subject: Subject, updates: int, seed: int) -> Ensemble:
+    """An ensemble of the source, fitted to `source_runs`."""
+    torch.manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
+    history, after = source_runs(world, subject, generator)
+    seen, change = subject.inputs(history), after - history.observations[:, -1]
     ensemble = Ensemble(seen.shape[1], change.shape[1])
     ensemble.centre.copy_(seen.mean(0))
     ensemble.width.copy_(seen.std(0))

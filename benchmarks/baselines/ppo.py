@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +103,10 @@ def model_of(machines: Machines, seed: int) -> PPO:
 
 def courses(problem: Problem, sizes: Sizes) -> tuple[Course, Course]:
     """Those of the pretraining, which start as widely as those of ours, and of the target."""
-    task, target = problem.setup(sizes).settings.source.task, problem.target()
+    target = problem.target()
+    camera = target.camera if isinstance(target, SyntheticTarget) else None
+    setup = problem.setup(sizes) if camera is None else cartpole_frames()
+    task = setup.settings.source.task
 
     def wide(batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         return task.training_start(batch, 1.0, generator)
@@ -111,26 +115,22 @@ def courses(problem: Problem, sizes: Sizes) -> tuple[Course, Course]:
         own = target.task
         return flying(own, target.system, wide), flying(own, target.system, own.evaluation_start)
     assert isinstance(target, SyntheticTarget)
-    if target.camera is not None:
-        return filmed(target, target.camera)
-    return Balancing(wide, problem.with_history), Balancing(starting(target.initial), problem.with_history)
+    begin = starting(target.initial)
+    if camera is None:
+        return Balancing(wide, problem.with_history), Balancing(begin, problem.with_history)
+    reach = camera.camera.reach
+    return Filmed(wide, rendered, reach), Filmed(begin, partial(drawn, camera), reach)
 
 
-def filmed(target: SyntheticTarget, drawn: DrawnCartPole) -> tuple[Filmed, Filmed]:
-    """The courses of a cart-pole that is seen by a camera."""
-    task, learnt, reach = cartpole_frames().settings.source.task, renderer(), drawn.camera.reach
+def rendered(state: Tensor) -> Tensor:
+    """Frames (B, H, W) in [0, 1] of states (B, 4), by the renderer of ours."""
+    frames: Tensor = renderer()(state[:, 0], state[:, 2])
+    return frames
 
-    def wide(batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        return task.training_start(batch, 1.0, generator)
 
-    def rendered(state: Tensor) -> Tensor:
-        frames: Tensor = learnt(state[:, 0], state[:, 2])
-        return frames
-
-    def filmed(state: Tensor) -> Tensor:
-        return torch.from_numpy(drawn(state[:, 0].double().numpy(), state[:, 2].double().numpy())).to(state) / 255
-
-    return Filmed(wide, rendered, reach), Filmed(starting(target.initial), filmed, reach)
+def drawn(camera: DrawnCartPole, state: Tensor) -> Tensor:
+    """The same, as the camera of the target sees them."""
+    return torch.from_numpy(camera(state[:, 0].double().numpy(), state[:, 2].double().numpy())).to(state) / 255
 
 
 def pretrained(problem: Problem, course: Course, sizes: Sizes, path: Path, seed: int) -> PPO:
