@@ -236,8 +236,9 @@ class JointLearning:
         self._begin_tuning()
         self.grounded = True
         world, settings = self._learnt, self.settings.tuning
-        if self.settings.later is not None and self._goes_on(folder, world, transitions):
-            settings = replace(settings, iterations=self.settings.later)
+        later = self.settings.later
+        if later is not None and not folder.policy.exists() and self._goes_on(folder, world, transitions):
+            settings = replace(settings, iterations=min(later, settings.iterations))
         losses = self._tune(folder, world, settings, transitions)
         self.tuned = self._weights()
         return losses

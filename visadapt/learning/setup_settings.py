@@ -20,7 +20,7 @@ class SetupSettings:
     source: TuneSettings
     """training of the policy in the source"""
     tuning: TuneSettings
-    """tuning of the policy in the grounded source, in each round"""
+    """tuning of the policy in the grounded source, in each round that `later` does not shorten"""
     ground: GroundSettings = field(default_factory=GroundSettings)
     """fit of the residual"""
     longest_episode: int = 250
@@ -30,8 +30,8 @@ class SetupSettings:
     tunes_on: bool = False
     """a round tunes on from the weights of the round before; False: it begins with those before the first round"""
     later: int | None = None
-    """iterations of a round that tunes on because the policy of the round before costs less in the newly grounded
-    source than the one before the first round; None: `tunes_on` alone decides, and every round has those of `tuning`"""
+    """iterations, at most those of `tuning`, of a round that tunes on because the policy of the round before costs less
+    in the newly grounded source than the one before the first round; None: `tunes_on` alone decides"""
     refinement: TuneSettings | None = None
     """second training of the policy in the source, after `source`: near rest, say, where it is scored"""
     named: TuneSettings | None = None

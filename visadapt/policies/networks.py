@@ -44,12 +44,14 @@ class FrameEncoder(nn.Module):
 
     background: Tensor
     contrast: Tensor
+    mix: Tensor
 
     def __init__(self, background: Tensor, contrast: float, n_action: int) -> None:
         super().__init__()
         self.n_action = n_action
         self.register_buffer("background", background.clone())
         self.register_buffer("contrast", torch.as_tensor(contrast, dtype=background.dtype))
+        self.register_buffer("mix", frames_to_inputs().to(background.dtype), persistent=False)
         layers = [nn.Conv2d(i, o, 3, stride=2, padding=1) for i, o in pairwise((LENGTH, 8, 16, 32, 32))]
         self.convolutions = nn.ModuleList(layers).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         rows, columns = (-(-size // 2 ** len(layers)) for size in background.shape)
@@ -80,13 +82,18 @@ class FrameEncoder(nn.Module):
         Since that map of the frames is linear, it is folded into the kernel, which saves a pass over large tensors.
         """
         first = self.convolutions[0]
-        mix = frames.new_zeros(LENGTH, LENGTH)
-        mix[0, -1] = 1.0
-        for k in range(1, LENGTH):
-            mix[k, k], mix[k, k - 1] = 2.0, -2.0
-        kernel = torch.einsum("ocij,cf->ofij", first.weight, mix / self.contrast)
+        kernel = torch.einsum("ocij,cf->ofij", first.weight, self.mix / self.contrast)
         still = F.conv2d(self.background[None, None], first.weight[:, :1] / self.contrast, stride=2, padding=1)
         return F.conv2d(frames, kernel, first.bias, stride=2, padding=1) - still
+
+
+def frames_to_inputs() -> Tensor:
+    """(LENGTH, LENGTH) the map from frames, oldest first, to a `FrameEncoder`'s inputs, but for the background."""
+    mix = torch.zeros(LENGTH, LENGTH)
+    mix[0, -1] = 1.0
+    for k in range(1, LENGTH):
+        mix[k, k], mix[k, k - 1] = 2.0, -2.0
+    return mix
 
 
 def mlp(*widths: int) -> nn.Sequential:
