@@ -1,13 +1,15 @@
 """PETS of mbrl-lib (Pineda et al. 2021), the paper's, on the cart-pole, beside ours: is ours as good?
 
-    python -m venv .mbrl && .mbrl/bin/pip install -e . mbrl==0.2.0
+    python -m venv .mbrl && .mbrl/bin/pip install -e . hydra-core imageio termcolor tqdm
+    .mbrl/bin/pip install --no-deps mbrl==0.2.0
     .mbrl/bin/python -m benchmarks.baselines.mbrl_check
 
-mbrl-lib needs an old gym, so it has an environment of its own. Networks, their training, the propagation of particles
-and the cross-entropy method are mbrl-lib's; the source's runs, the cost of a plan, the numbers of members, plans and
-iterations and the width of the networks are those of `pets`. Two things are compared: mbrl-lib's defaults draw the
-first plans from the whole range of commands (a standard deviation of 0.5) and bound the networks' standard deviation of
-a state's change from below at 0.0067, in SI units; ours draws them with 0.03, and scales the changes first.
+mbrl-lib asks for an older gymnasium than ours, so it has an environment of its own. Networks, their training, the
+propagation of particles and the cross-entropy method are mbrl-lib's; the source's runs, the cost of a plan, the numbers
+of members, plans and iterations and the width of the networks are those of `pets`. mbrl-lib's defaults draw the first
+plans from the whole range of commands (a standard deviation of 0.5) and bound the networks' standard deviation of a
+state's change from below at 0.0067, in SI units. Ours draws them with 0.03, and scales the changes first; so does the
+last row here.
 
 Writes results/pets_mbrl.csv.
 """

@@ -26,7 +26,7 @@ from torch import Tensor
 from benchmarks.baselines.courses import Balancing, Course, Filmed, flying, starting
 from benchmarks.baselines.frames import renderer
 from benchmarks.baselines.machines import MACHINES, Machines
-from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage, unadapted
+from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage
 from experiments.kept_scores import kept_score
 from renderers import DrawnCartPole
 from visadapt.history import LENGTH, History
@@ -159,7 +159,8 @@ def stages(problem: Problem, sizes: Sizes, folder: Path, seed: int) -> Iterator[
     wide, course = courses(problem, sizes)
     model = pretrained(problem, wide, sizes, folder / "source.zip", seed)
     policy = Trained(model, course)
-    yield from unadapted(problem, lambda: policy)
+    for domain in ("source", "target"):
+        yield Stage(domain, 0, policy)
     target = problem.target()
     assert isinstance(target, WorldTarget)
     model.set_env(Machines(course, target.draw_effects, None, seed))
