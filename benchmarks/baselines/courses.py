@@ -94,12 +94,12 @@ class Balancing(Course):
 
 
 class Filmed(Balancing):
-    """The same from frames alone: the network sees the last 5 frames in [0, 1], flattened, and the last 5 actions.
+    """A cart-pole that is held up, from frames: the network sees the last 5 in [0, 1], flattened, and 5 actions.
 
     Args:
         begin: as of `Balancing`.
         film: frames (B, H, W) in [0, 1] of states (B, 4).
-        reach: m; an episode also fails where the cart is further from the middle, out of the frame.
+        reach: m; an episode fails, too, where the cart is further than this from the middle, out of the frame.
     """
 
     show = "frame"

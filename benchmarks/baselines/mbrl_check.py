@@ -43,6 +43,7 @@ from visadapt.world import World
 
 SUBJECT = CartPoleSubject(with_history=False)
 BATCH = 256
+"""samples of a gradient step"""
 CHANGE_UNIT = 0.1
 """by which changes of the state are divided where they are scaled, in SI units: about their standard deviation"""
 
