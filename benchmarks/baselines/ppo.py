@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +23,9 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor
 
 from benchmarks.baselines.courses import Balancing, Course, Filmed, flying, starting
-from benchmarks.baselines.frames import renderer
 from benchmarks.baselines.machines import MACHINES, Machines
 from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage
 from experiments.kept_scores import kept_score
-from renderers import DrawnCartPole
 from visadapt.history import LENGTH, History
 from visadapt.policies import ImagePolicy, Policy
 from visadapt.policies.networks import N_FEATURES
@@ -119,18 +116,8 @@ def courses(problem: Problem, sizes: Sizes) -> tuple[Course, Course]:
     if camera is None:
         return Balancing(wide, problem.with_history), Balancing(begin, problem.with_history)
     reach = camera.camera.reach
-    return Filmed(wide, rendered, reach), Filmed(begin, partial(drawn, camera), reach)
-
-
-def rendered(state: Tensor) -> Tensor:
-    """Frames (B, H, W) in [0, 1] of states (B, 4), by the renderer of ours."""
-    frames: Tensor = renderer()(state[:, 0], state[:, 2])
-    return frames
-
-
-def drawn(camera: DrawnCartPole, state: Tensor) -> Tensor:
-    """The same, as the camera of the target sees them."""
-    return torch.from_numpy(camera(state[:, 0].double().numpy(), state[:, 2].double().numpy())).to(state) / 255
+    assert setup.observe is not None
+    return Filmed(wide, setup.observe, reach), Filmed(begin, target.draw, reach)
 
 
 def pretrained(problem: Problem, course: Course, sizes: Sizes, path: Path, seed: int) -> PPO:

@@ -9,7 +9,7 @@ from torch import nn
 from visadapt.effects import Residual
 from visadapt.learning import stability
 from visadapt.learning.grounding import GroundSettings
-from visadapt.learning.stability import stable
+from visadapt.learning.stability import plan_costs, stable
 from visadapt.learning.transitions import Transitions
 from visadapt.policies.networks import ResidualNetwork
 from visadapt.setups.cartpole import cartpole_states
@@ -64,7 +64,7 @@ class TestStable:
         made = setup()
         world = made.source.with_effects([residual])
         about = made.settings.tuning, torch.Generator().manual_seed(0), transitions
-        assert stable(policy(), world, None, *about) == expected
+        assert stable(plan_costs(policy(), world, None, *about)) == expected
 
 
 class TestRidge:

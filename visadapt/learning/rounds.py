@@ -7,7 +7,7 @@ interrupted run goes on after the last complete stage.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,7 +21,7 @@ from visadapt.learning.feedforward import initialise_feedforward
 from visadapt.learning.grounding import GroundLoss, fit_named, ground, rescale
 from visadapt.learning.ledger import Ledger
 from visadapt.learning.setup_settings import SetupSettings
-from visadapt.learning.stability import cost_in, stable
+from visadapt.learning.stability import early_cost, plan_costs, stable
 from visadapt.learning.transitions import Observe, Transitions
 from visadapt.learning.tuning import TuneSettings, tune
 from visadapt.policies import Policy
@@ -217,8 +217,7 @@ class JointLearning:
         world = self._learnt
 
         def accept() -> bool:
-            generator = folder.generator(ACCEPTING)
-            return stable(self.policy, world, self.observe, self.settings.tuning, generator, transitions)
+            return stable(self._plan_costs(folder, world, transitions))
 
         generator, progress = folder.generator(GROUNDING), self._progress(folder, "ground")
         return ground(self.residual, self.known, transitions, self.settings.ground, generator, progress, accept)
@@ -248,14 +247,17 @@ class JointLearning:
         returns whether it does."""
         if self.tuned is None:
             return False
-        weights, costs = (self._weights(), self.tuned), []
-        for each in weights:
-            self.policy.load_state_dict(each, strict=False)
-            about = (self.settings.tuning, folder.generator(ACCEPTING), transitions)
-            costs.append(cost_in(self.policy, world, self.observe, *about))
-        goes_on = costs[1] < costs[0]
-        self.policy.load_state_dict(weights[goes_on], strict=False)
+        has, cost = self._weights(), early_cost(self._plan_costs(folder, world, transitions))
+        self.policy.load_state_dict(self.tuned, strict=False)
+        goes_on = early_cost(self._plan_costs(folder, world, transitions)) < cost
+        if not goes_on:
+            self.policy.load_state_dict(has, strict=False)
         return goes_on
+
+    def _plan_costs(self, folder: RoundFolder, world: World, transitions: Transitions) -> Iterator[float]:
+        """Costs of the policy's plans in `world`; all policies of a round start in the same states."""
+        generator = folder.generator(ACCEPTING)
+        return plan_costs(self.policy, world, self.observe, self.settings.tuning, generator, transitions)
 
     def _tune_with_names(self, folder: RoundFolder) -> list[float]:
         """Tune the policy in the source with the named effects alone; where there is no gap, it gets its weights from

@@ -25,48 +25,24 @@ GROWTH = 3.0
 """Ratio of a plan's mean cost to that of the first beyond which a world counts as unstable. A policy that was tuned in
 a world with 5.5 lost 35 of 40 episodes, with 1.6 none; in most worlds it is below 1."""
 
-
 COMPARED = 5
-"""Plans of 10 steps by which the cost of a policy in a world is compared with that of another."""
+"""Plans of 10 steps by whose cost a policy is compared with another in the same world."""
 
 
-@torch.no_grad()
-def stable(
-    policy: Policy,
-    world: World,
-    observe: Observe | None,
-    settings: TuneSettings,
-    generator: torch.Generator,
-    transitions: Transitions,
-) -> bool:
-    """Whether the policy, from where its tuning starts, keeps the cost of its plans in `world` near that of the first.
-
-    The arguments are those of `learning.tuning.tune`.
-    """
-    costs = _costs(policy, world, observe, settings, generator, transitions)
+def stable(costs: Iterator[float]) -> bool:
+    """Whether the `plan_costs` of a policy, from where its tuning starts, stay near the first."""
     first = next(costs)
     # A cost that is not a number is not within the bound either.
     return first < math.inf and all(cost <= GROWTH * first for cost in islice(costs, PLANS - 1))
 
 
+def early_cost(costs: Iterator[float]) -> float:
+    """The sum of the first COMPARED `plan_costs` of a policy, by which it is compared with another."""
+    return sum(islice(costs, COMPARED))
+
+
 @torch.no_grad()
-def cost_in(
-    policy: Policy,
-    world: World,
-    observe: Observe | None,
-    settings: TuneSettings,
-    generator: torch.Generator,
-    transitions: Transitions,
-) -> float:
-    """The mean cost of the policy's first COMPARED plans in `world`, from where its tuning would start.
-
-    The arguments are those of `learning.tuning.tune`.
-    """
-    costs = _costs(policy, world, observe, settings, generator, transitions)
-    return sum(islice(costs, COMPARED)) / COMPARED
-
-
-def _costs(
+def plan_costs(
     policy: Policy,
     world: World,
     observe: Observe | None,
@@ -74,7 +50,10 @@ def _costs(
     generator: torch.Generator,
     transitions: Transitions,
 ) -> Iterator[float]:
-    """Mean costs of plans that are imagined one after the other."""
+    """Mean costs of the policy's plans, without end, imagined one after the other from where its tuning starts.
+
+    The arguments are those of `learning.tuning.tune`.
+    """
     plans = plans_of(policy, world, observe, settings, generator, transitions)
     plans.streams.start(1.0, generator)
     for number in count():

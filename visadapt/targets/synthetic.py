@@ -162,13 +162,13 @@ class SyntheticTarget(WorldTarget):
             alive &= state[:, 0].abs() <= self.camera.camera.reach
             assert self._world is not None
             with torch.no_grad():
-                seen_by_camera, self._at = self._world.show(self._at, self._draw, self._generator)
+                seen_by_camera, self._at = self._world.show(self._at, self.draw, self._generator)
             frame = (255 * seen_by_camera).round().clamp(0, 255).to(torch.uint8)
         assert seen.force is not None
         return replace(seen, alive=alive, frame=frame, force=seen.force[:, 0])
 
-    def _draw(self, state: Tensor) -> Tensor:
-        """Frames (B, H, W) in [0, 1] of states (B, 4)."""
+    def draw(self, state: Tensor) -> Tensor:
+        """Frames (B, H, W) in [0, 1] of states (B, 4), by the camera."""
         assert self.camera is not None
         # The state of a fallen cart-pole may be huge or nan: it is drawn at finite values within +-10.
         shown = state.nan_to_num().clamp(-10, 10).double().numpy()

@@ -27,7 +27,7 @@ from visadapt.tasks.differential_flatness import commands
 SPEEDS = ("x_dot", "y_dot", "z_dot")
 
 MAX_PERIODS = 1_000_000  # Periods that a reference of one's own may last: 28 hours of 0.1 s
-MAX_SPEED = 5.0  # m/s: no vehicle of ours was trained to fly faster
+MAX_SPEED = 5.0  # m/s: the quadrotor's policy was trained on references up to this speed
 
 LOOP_RADIUS = 7.0
 """m, one for all speeds, so that faster is harder. The rule: the smallest at which the paper's fastest power loop,
