@@ -157,27 +157,27 @@ PUSHED = [(2.0, 0.0, 0), (2.0, 0.2, 2), (2.0, 0.2, 7), (-4.0, 0.0, 3), (-4.0, 0.
 """Runs of a balanced cart-pole: force in N, jitter of the clock, seed."""
 
 
-@functools.cache
-def every_balanced():
+def drive(world, runs, liveliness):
     """12 s of cart-poles that are balanced by feedback, read by encoders, with a push of `force` N for about 0.5 s at
-    8 s; steps of the clock are up to `jitter` longer than 20 ms."""
-    runs = (*STEADY, *PUSHED, (4.0, 0.0, 0))
+    8 s; steps of the clock are up to `jitter` longer than 20 ms. The `liveliness` multiplies what wanders in their
+    commands."""
     force, jitter = np.array(runs)[:, 0], np.array(runs)[:, 1]
     randoms = [np.random.default_rng(seed) for _, _, seed in runs]
-    world = World(CartPole(), period=0.02)
+    gain = [0.05, 0.12, 1.6, 0.35]
     at = torch.tensor([[0.1, 0.0, 0.03, 0.0]]).double().repeat(len(runs), 1)
     time, wander, rows = np.zeros(len(runs)), np.zeros(len(runs)), []
     while time.min() < 12:
         read = np.round(at.numpy()[:, [0, 2]] / STEPS) * STEPS
         drawn = np.array([(random.normal(), random.uniform()) for random in randoms])
-        wander = 0.97 * wander + 0.03 * drawn[:, 0]
-        command = np.clip(at.numpy() @ [0.05, 0.12, 1.6, 0.35] + wander, -1, 1)
+        wander = 0.97 * wander + 0.03 * liveliness * drawn[:, 0]
+        command = np.clip(at.numpy() @ np.multiply(gain, (1 + liveliness) / 2) + wander, -1, 1)
         rows.append(np.column_stack((time, read, command)))
         step = 0.02 * (1 + jitter * drawn[:, 1])
         for _ in range(4):
             push = force * np.exp(-0.5 * ((time - 8) / 0.11) ** 2) / CartPole().max_force
             acting = torch.from_numpy(command + push)[:, None, None]
-            at = world.integrate(torch.zeros(len(runs)), at, acting, torch.from_numpy(step / 4))
+            with torch.no_grad():
+                at = world.integrate(torch.zeros(len(runs)), at, acting, torch.from_numpy(step / 4))
             time = time + step / 4
     tables = [table[table[:, 0] < 12] for table in np.stack(rows, 1)]
     return {
@@ -189,6 +189,12 @@ def every_balanced():
         )
         for run, table in zip(runs, tables, strict=True)
     }
+
+
+@functools.cache
+def every_balanced():
+    """These runs, of carts without friction."""
+    return drive(World(CartPole(), period=0.02), (*STEADY, *PUSHED, (4.0, 0.0, 0)), 1.0)
 
 
 def balanced(force, jitter, seed=0):
@@ -228,6 +234,31 @@ def test_none_is_named_where_a_cart_sticks_now_and_then(friction, noise, seed):
     episodes = tuple(Episode(time, each[:, None], rows) for each, rows in zip(command, read, strict=True))
     with torch.inference_mode():
         assert pushes(Recording(episodes, ("x", "theta"), 0.03, ("run",) * 4), world) == ()
+
+
+@functools.cache
+def every_sticking():
+    """Runs of carts with 4 N of dry friction that stick in between, pushed or not."""
+    runs = [(force, 0.2, seed) for force, seeds in ((0.0, range(8)), (6.0, (2, 5))) for seed in seeds]
+    return drive(STICKING, runs, 2.0)
+
+
+STICKING = World(CartPole(), [CoulombFriction(force=4.0)], period=0.02)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_friction_that_holds_a_cart_is_no_push(seed):
+    with torch.inference_mode():
+        assert pushes(every_sticking()[0.0, 0.2, seed], STICKING) == ()
+
+
+@pytest.mark.parametrize("seed", [2, 5])
+def test_a_cart_that_sticks_hides_no_push_that_moves_it(seed):
+    with torch.inference_mode():
+        (push,) = pushes(every_sticking()[6.0, 0.2, seed], STICKING)
+    assert push.load == "cart_force"
+    assert push.start == pytest.approx(8 - 2.45 * 0.11, abs=0.1)
+    assert push.impulse == pytest.approx(6.0 * 0.11 * math.sqrt(2 * math.pi), rel=0.3)
 
 
 @pytest.mark.parametrize("rate", [0.2, 0.5])

@@ -4,7 +4,7 @@ Because of noise, a sensor in motion hardly gives the same number twice; where i
 repeated. Such readings do not measure the state: they are excluded from fits, and counted here. An encoder gives the
 same number twice where the quantity moves by less than one of its steps: at turning points, and at rest. Equal readings
 therefore count as repeated only in runs that readings enter and leave at speed, and only where there are more of them
-than the encoder's steps explain.
+than the encoder's steps explain. Of a row that was lost all readings are equal, and one that moves at speed shows it.
 """
 
 from __future__ import annotations
@@ -62,7 +62,9 @@ def find_repeats(
     angle = channels.index(angle_sensor[0]) if angle_sensor and angle_sensor[0] in channels else None
     same = [torch.stack([_repeats(values[:, k], steps[k]) for k in range(len(channels))], 1) for values in measured]
     resting = [_resting(values) for values in measured]
-    whole_rows = [each.all(1) & ~rest for each, rest in zip(same, resting, strict=True)]
+    whole_rows = [
+        _equal(values) & each.any(1) & ~rest for values, each, rest in zip(measured, same, resting, strict=True)
+    ]
     lost = _unless_by_chance(whole_rows, min(by_chance))
     # A rate from a separate sensor may go on while the angle stands still.
     frozen = [torch.zeros_like(whole) for whole in lost]
@@ -93,6 +95,11 @@ def _between_held(angles: Sequence[Tensor], frozen: Sequence[Tensor]) -> list[Te
     low, high = held.min(), held.max()
     equal = [angle.diff(prepend=angle[:1] - 1) == 0 for angle in angles]
     return [same & (angle >= low) & (angle <= high) for same, angle in zip(equal, angles, strict=True)]
+
+
+def _equal(values: Tensor) -> Tensor:
+    """(T,) rows (T, m) that equal the row before."""
+    return torch.cat((torch.zeros(1, dtype=torch.bool), (values.diff(dim=0) == 0).all(1)))
 
 
 def _resting(values: Tensor) -> Tensor:

@@ -5,40 +5,36 @@ grow with speed, acceleration and changes of the command, and neighbouring ones 
 much. A bump is tried at every instant, in several widths, on every joint: a matched filter, by generalised least
 squares (Kay 1998, Fundamentals of Statistical Signal Processing II, section 4.4). Those that stand out are fitted
 together with all else, and those that then do not stand out clearly are dropped, the weakest first.
+
+Where a joint is at rest, dry friction holds it with any load up to its size. This is a load of its own, smooth in time
+and as large at random as the friction: errors of such a size, but independent from instant to instant, would let a load
+that holds a cart for half a second pass for a push.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool1d, pad
 
 from visadapt.diagnosis.result import Push
-from visadapt.diagnosis.search.causes import Z_90
+from visadapt.diagnosis.search.bumps import Bump, SummedBumps, bumps_at, overlapping
 from visadapt.diagnosis.search.unexplained_load import LoadTrack, load_tracks
 from visadapt.recordings import Recording
-from visadapt.systems import Variable
 from visadapt.world import World
 
 WIDTHS = (0.06, 0.085, 0.12, 0.17)  # s, deviations of the Gaussian bumps that are tried
 
 SPACING = 0.3  # Distance between the bumps of a width that are tried, over that width
 
-EDGE = 2.45  # Deviations of a bump from its middle where it has 5 % of its peak: there a push starts and ends
-
 MIN_SCORE_FIRST, MIN_SCORE_FURTHER, MIN_SCORE_PUSH = 3.5, 3.0, 5.0
 """Height of a bump, over its standard deviation, from which the first one on a part is fitted with all else, from which
 further ones are, and from which a bump is called a push: high, since errors of a model are not normally distributed."""
 
 MAX_P_VALUE = 1e-3  # of a push that is named, with as many bumps as were tried counted in
-
-MAX_CORRECTION = 0.1  # Height over that of an overlapping bump, below which a bump is a correction of its shape
-
-SHAPE_ERROR = 0.15  # Deviation of an impulse, as a share of it, because a push need not have the shape of a bump
 
 MAX_BUMPS = 6  # Bumps on a part at most
 
@@ -61,6 +57,10 @@ count as this."""
 
 WHITE_SHARE = 0.03  # Share of the errors' variance that is taken as white, so that errors can be whitened
 
+MIN_AT_REST = 0.01  # Least share of the time about an instant for which a joint may stick, if it counts as at rest
+
+MIN_WEIGHT = 1e-3  # of an instant at rest where the size of a moving joint's errors is fitted
+
 MIN_DISTINCT = 0.15  # Least share of a bump's information that columns and other bumps leave to it
 
 BUMP_PRIOR = 7.0  # Prior standard deviation of a bump's height, over that of the unexplained load
@@ -77,57 +77,20 @@ def pushes(recording: Recording, world: World) -> tuple[Push, ...]:
         return ()  # errors too small, or too large, for any push to stand out
     middles = sum(float(track.time[-1] - track.time[0]) / (SPACING * width) for track in tracks for width in WIDTHS)
     tries = round(middles) * tracks[0].load.shape[1]
-    loads = world.system.loads
-    named = [_named(one, tracks[one.part], loads[one.joint], tries) for one in found]
+    named = [one.push(tracks, world.system.loads, tries) for one in found]
     sure = [push for push in named if push.p_value <= MAX_P_VALUE]
     return tuple(sorted(sure, key=lambda push: (push.episode, push.start)))
 
 
-@dataclass(frozen=True)
-class _Bump:
-    """A Gaussian bump of load on a joint."""
-
-    part: int
-    joint: int
-    middle: float  # s
-    width: float  # s, deviation
-    height: float = 0.0  # over the root mean square of the joint's load
-    deviation: float = math.inf  # of the height
-
-    @property
-    def score(self) -> float:
-        return abs(self.height) / self.deviation
-
-    def corrects(self, other: _Bump) -> bool:
-        """Whether it only corrects the shape of a higher bump on the same joint: its middle lies in that one, or it is
-        far lower and overlaps it."""
-        apart, share = abs(self.middle - other.middle), abs(self.height) / abs(other.height)
-        reach = other.width + (self.width if share < MAX_CORRECTION else 0.0)
-        return share < 1 and apart < EDGE * reach and (self.part, self.joint) == (other.part, other.joint)
-
-    def on(self, track: LoadTrack) -> Tensor:
-        """(N, J) the bump with unit height, smoothed as the track is."""
-        out = torch.zeros_like(track.load)
-        out[:, self.joint] = _bumps(track, torch.tensor([self.middle], dtype=torch.float64), self.width)[0]
-        return out
-
-
-def _bumps(track: LoadTrack, middles: Tensor, width: float) -> Tensor:
-    """(M, N) bumps of unit height at M instants, smoothed as the track is."""
-    whole = math.hypot(width, track.smoothing)
-    return width / whole * torch.exp(-0.5 * ((track.time - middles[:, None]) / whole).square())
-
-
-def _named(bump: _Bump, track: LoadTrack, load: Variable, tries: int) -> Push:
-    unit = float(track.unit[bump.joint])
-    size, area = unit * bump.height, bump.width * math.sqrt(2 * math.pi)
-    impulse = size * area
-    spread = Z_90 * math.hypot(unit * bump.deviation * area, SHAPE_ERROR * impulse)
-    reach = EDGE * bump.width
-    p_value = min(1.0, tries * math.erfc(bump.score / math.sqrt(2)))
-    ends = max(0.0, bump.middle - reach), bump.middle + reach
-    ci90 = impulse - spread, impulse + spread
-    return Push(track.episode, load.name, *ends, size, load.unit, impulse, ci90, p_value)
+def _held(track: LoadTrack, friction: Tensor) -> Tensor:
+    """(K, N, J) loads by which dry friction (N, J) may hold each joint where it is at rest, K times one instant of one
+    joint: together a random load of the friction's size, smoothed as the track is."""
+    kernel = torch.exp(-0.5 * ((track.time - track.time[:, None]) / track.smoothing).square())
+    kernel = kernel / kernel.square().sum(1, keepdim=True).sqrt()
+    instants, joints = (track.at_rest > MIN_AT_REST).nonzero(as_tuple=True)
+    held = torch.zeros(len(instants), *track.load.shape, dtype=torch.float64)
+    held[torch.arange(len(instants)), :, joints] = kernel[instants] * (friction * track.at_rest)[instants, joints, None]
+    return held
 
 
 class _Fit:
@@ -135,7 +98,7 @@ class _Fit:
 
     def __init__(self, tracks: Sequence[LoadTrack]) -> None:
         self.tracks = tracks
-        self.bumps: list[_Bump] = []
+        self.bumps: list[Bump] = []
         joints = tracks[0].load.shape[1]
         # At first all of the load, so that `_design` takes the columns along the world's motion: along the measured
         # motion, one factor common to all columns would explain a push away.
@@ -147,9 +110,10 @@ class _Fit:
         self.innovation = torch.ones(joints, dtype=torch.float64)
         # Cholesky factors of the covariances of a part's first LAGS errors, which follow none.
         self.first = torch.eye(LAGS, dtype=torch.float64).repeat(joints, 1, 1)
+        self.held = [_held(track, track.friction) for track in tracks]
 
-    def pushes(self) -> list[_Bump]:
-        """The bumps that stand out clearly."""
+    def pushes(self) -> list[SummedBumps]:
+        """The bumps that stand out clearly, summed where they overlap."""
         self._fit(ROUNDS)
         searched: Sequence[int] = range(len(self.tracks))
         for k in range(MAX_BUMPS):
@@ -160,6 +124,7 @@ class _Fit:
             self.bumps += found
             searched = [one.part for one in found]
             self._fit(ROUNDS_AGAIN)
+        self._refine()
         while self.bumps:
             self.bumps = self._measured()
             weakest = {
@@ -169,14 +134,24 @@ class _Fit:
                 break
             self.bumps = [one for one in self.bumps if one not in weakest.values()]
             self._fit(ROUNDS_AGAIN)
-        return [one for one in self.bumps if not any(one.corrects(other) for other in self.bumps if other is not one)]
+        return [SummedBumps(group, self._impulse_deviation(group)) for group in overlapping(self.bumps)]
+
+    def _refine(self) -> None:
+        """Choose middle and width of each bump that overlaps no other again: the errors are better known by now."""
+        alone = [group[0] for group in overlapping(self.bumps) if len(group) == 1]
+        for one in alone:
+            self.bumps.remove(one)
+            self._weigh(robust=True)
+            self.bumps.append(self._highest(one.part, near=one))
+        if alone:
+            self._fit(ROUNDS_AGAIN)
 
     def _design(self, part: int) -> Tensor:
-        """(K, N, J) loads of unit prior deviation: of the columns, and of the bumps on this part."""
+        """(K, N, J) loads of unit prior deviation: of columns, of dry friction at rest, and of this part's bumps."""
         track = self.tracks[part]
         columns = track.columns - torch.einsum("knij,nj->kni", track.reaction, self.left[part])
         bumps = [BUMP_PRIOR * one.on(track) for one in self.bumps if one.part == part]
-        return torch.cat((COLUMN_PRIOR * columns, *(one[None] for one in bumps)))
+        return torch.cat((COLUMN_PRIOR * columns, self.held[part], *(one[None] for one in bumps)))
 
     def _whitened(self, part: int, values: Tensor) -> Tensor:
         """Loads (..., N, J) over the errors' deviation, less their autoregressive prediction; (..., N J)."""
@@ -231,7 +206,7 @@ class _Fit:
             self.left[part] = self.tracks[part].load - explained
 
     def _size_errors(self) -> None:
-        """How errors grow with activity, and their autoregression (Yule-Walker), joint by joint.
+        """How errors grow with activity, and their autoregression (Yule-Walker), joint by joint, where it moves.
 
         What is left is smaller than the errors, since the weights fit a part of them: the weights' covariance is added.
         """
@@ -247,66 +222,76 @@ class _Fit:
         for j in range(len(self.innovation)):
             left = [each[:, j] for each in self.left]
             absorbed = [each[..., j] for each in taken]
-            most = MAX_POWER * torch.cat(left).square().median()
+            moving = (1 - torch.cat([track.at_rest[:, j] for track in self.tracks])).clamp(min=MIN_WEIGHT)
+            most = MAX_POWER * torch.cat(left).square()[moving >= moving.max() / 2].median()
             power = torch.cat(
                 [
                     _local_mean(e.square().clamp(max=most) + v.square().sum(0))
                     for e, v in zip(left, absorbed, strict=True)
                 ]
             )
-            deviation = (0.5 * _log_power(basis, power)).exp()
-            at_rest = torch.cat([track.at_rest[:, j] for track in self.tracks])
-            friction = torch.cat([self._dry_friction(part, j) for part in range(len(lengths))])
-            # At rest, dry friction is what holds the joint.
-            deviations = torch.hypot(deviation, friction * at_rest).split(lengths)
+            deviations = (0.5 * _log_power(basis, power, moving)).exp().split(lengths)
             moments = torch.zeros(LAGS + 1, dtype=torch.float64)
-            for part, each in enumerate(deviations):
+            for part, (each, weight) in enumerate(zip(deviations, moving.split(lengths), strict=True)):
                 self.spread[part] = self.spread[part].clone()
                 self.spread[part][:, j] = each
-                white, more = (left[part] / each).clamp(-3, 3), absorbed[part] / each
+                white, more = weight * (left[part] / each).clamp(-3, 3), weight * absorbed[part] / each
                 for lag in range(LAGS + 1):
                     end = len(each) - lag
                     moments[lag] += white[lag:] @ white[:end] + (more[:, lag:] * more[:, :end]).sum()
-            moments = moments / sum(lengths)
+            moments = moments / moving.square().sum()
             moments[0] *= 1 + WHITE_SHARE
             lags = torch.arange(LAGS)
             covariance = moments[(lags[:, None] - lags).abs()]
             self.first[j] = torch.linalg.cholesky(covariance)
             self.autoregression[j] = torch.linalg.solve(covariance, moments[1:])
             self.innovation[j] = (moments[0] - self.autoregression[j] @ moments[1:]).clamp(min=1e-9).sqrt()
+        self.held = [_held(track, self._dry_friction(part)) for part, track in enumerate(self.tracks)]
 
-    def _dry_friction(self, part: int, joint: int) -> Tensor:
-        """(N,) the size of a joint's dry friction: that of the world, and what is fitted beside it."""
-        track = self.tracks[part]
-        column = track.dry[joint]
-        more = COLUMN_PRIOR * self.weights[part][column].abs() * track.columns[column].abs().amax()
-        return track.friction[:, joint] + more
+    def _dry_friction(self, part: int) -> Tensor:
+        """(N, J) the size of each joint's dry friction: that of the world, and what is fitted beside it."""
+        track, dry = self.tracks[part], list(self.tracks[part].dry)
+        more = COLUMN_PRIOR * self.weights[part][dry].abs() * track.columns[dry].abs().amax((1, 2))
+        return track.friction + more
 
-    def _highest(self, part: int) -> _Bump:
-        """The bump on a part that stands out most beside what is fitted."""
+    def _highest(self, part: int, near: Bump | None = None) -> Bump:
+        """The bump on a part that stands out most beside what is fitted; if given, with its middle within `near`."""
         time, joints = self.tracks[part].time, self.tracks[part].load.shape[1]
         shape = (-1, len(time), joints)
         design = self._whitened(part, self._design(part)).unflatten(1, shape[1:])
         left = self._whitened(part, self.left[part]).unflatten(0, shape[1:])
 
-        def best(joint: int, middles: Tensor, width: float) -> _Bump:
-            tried = _bumps(self.tracks[part], middles, width)[..., None]
+        def best(joint: int, middles: Tensor, width: float) -> Bump:
+            tried = bumps_at(self.tracks[part], middles, width)[..., None]
             shapes = self._whitened(part, pad(tried, (joint, joints - 1 - joint)))[:, joint::joints]
             shared = torch.linalg.solve_triangular(self.roots[part], design[..., joint] @ shapes.mT, upper=False)
             alone = shapes.square().sum(1)
             information = (alone - shared.square().sum(0)).clamp(min=MIN_DISTINCT * alone)
             height = shapes @ left[:, joint] / information
             k = int((height.abs() * information.sqrt()).argmax())
-            return _Bump(part, joint, float(middles[k]), width, float(height[k]), float(information[k] ** -0.5))
+            return Bump(part, joint, float(middles[k]), width, float(height[k]), float(information[k] ** -0.5))
 
-        tried = (
-            best(joint, torch.arange(float(time[0]) + width, float(time[-1]) - width, SPACING * width).double(), width)
-            for width in WIDTHS
-            for joint in range(joints)
-        )
+        on = range(joints) if near is None else (near.joint,)
+
+        def middles(width: float) -> Tensor:
+            first, last = float(time[0]) + width, float(time[-1]) - width
+            if near is not None:
+                first, last = max(first, near.middle - 2 * near.width), min(last, near.middle + 2 * near.width)
+            return torch.arange(first, last, SPACING * width, dtype=torch.float64)
+
+        tried = (best(joint, middles(width), width) for width in WIDTHS for joint in on)
         return max(tried, key=lambda one: one.score)
 
-    def _measured(self) -> list[_Bump]:
+    def _impulse_deviation(self, group: Sequence[Bump]) -> float:
+        """Standard deviation of the impulse of some bumps on a part."""
+        part = group[0].part
+        bumps = [one for one in self.bumps if one.part == part]
+        areas = torch.tensor([BUMP_PRIOR * one.area if one in group else 0.0 for one in bumps], dtype=torch.float64)
+        root = self.roots[part]
+        along = pad(areas, (len(root) - len(bumps), 0))[:, None]
+        return float(torch.linalg.solve_triangular(root, along, upper=False).square().sum().sqrt())
+
+    def _measured(self) -> list[Bump]:
         """The bumps with their heights as fitted together."""
         out = []
         for part in range(len(self.tracks)):
@@ -320,14 +305,16 @@ class _Fit:
         return out
 
 
-def _log_power(basis: Tensor, power: Tensor) -> Tensor:
-    """Logs (N,) of an expected power that grows with the columns of `basis` (N, F), the first of which is 1."""
+def _log_power(basis: Tensor, power: Tensor, weight: Tensor) -> Tensor:
+    """Logs (N,) of an expected power that grows with the columns of `basis` (N, F), the first of which is 1; fitted
+    with a weight (N,) for each row."""
     logs = (power + 1e-4 * power.mean()).log()
     ridge = torch.full((basis.shape[1],), 24.0, dtype=torch.float64)
     ridge[0] = 0.0
-    slopes = torch.linalg.solve(basis.T @ basis + torch.diag(ridge), basis.T @ logs)
+    weighted = weight[:, None] * basis
+    slopes = torch.linalg.solve(basis.T @ weighted + torch.diag(ridge), weighted.T @ logs)
     expected = basis @ torch.cat((slopes[:1], slopes[1:].clamp(min=0)))
-    return expected + (power / expected.exp()).clamp(max=MAX_POWER).mean().log()
+    return expected + ((power / expected.exp()).clamp(max=MAX_POWER) @ weight / weight.sum()).log()
 
 
 def _local_mean(values: Tensor, reach: int = 4) -> Tensor:

@@ -175,7 +175,7 @@ def _track(number: int, episode: Episode, world: World, measured: Sequence[int],
         ),
         1,
     )
-    at_rest = smooth((-(state[:, velocities] / (SLOW * fastest)).square()).exp())
+    at_rest = smooth((-(_slowest(state[:, velocities]) / (SLOW * fastest)).square()).exp())
     edge, stride = round(EDGE * smoothing / period), max(1, round(STEP / period))
     inner = slice(edge, len(time) - edge, stride)
     both = torch.cat((found.load[:, None], found.columns), 1)
@@ -309,6 +309,13 @@ def _mean_commands(acting: Tensor, stamps: Tensor, held: Tensor, time: Tensor, p
     row = (torch.searchsorted(edges, ends, right=True) - 1).clamp(0, len(stamps) - 1)
     until = total[row] + acting[row] * (ends - edges[row])[..., None]
     return (until[1] - until[0]) / (ends[1] - ends[0])[:, None]
+
+
+def _slowest(velocity: Tensor) -> Tensor:
+    """The least speeds (T, J) of each joint from the row before to the row after; 0 where it turns round."""
+    three = pad(velocity.T[None], (1, 1), mode="replicate")[0].T.unfold(0, 3, 1)
+    turns = three.amin(-1) * three.amax(-1) <= 0
+    return three.abs().amin(-1).masked_fill(turns, 0.0)
 
 
 def _moved(state: Tensor, column: int) -> Tensor:
