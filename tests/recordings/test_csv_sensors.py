@@ -175,3 +175,14 @@ def test_a_sensor_that_is_dead_in_one_of_several_files_is_named_with_that_file(t
     recording = load(other, write(tmp_path / "rate.csv", dead | {"x_dot": still(dead["x_dot"])}))
     assert recording.measured == ("x", "theta", "theta_dot")
     assert any("rate.csv: x_dot never changes although its position does" in text for text in recording.warnings)
+
+
+def test_an_angle_that_stands_still_in_one_of_several_episodes_is_read(file):
+    """As where the sensor has a zone in which it stands still."""
+    moves, still_there = (a_run(0.05, 1e-3, seed=seed) for seed in (0, 1))
+    still_there["theta"] = still(still_there["theta"])
+    table = {name: np.concatenate((moves[name], still_there[name])) for name in moves}
+    table["episode"] = np.repeat((0, 1), [len(moves["time"]), len(still_there["time"])])
+    assert len(load(write(file, table)).episodes) == 2
+    table["theta"] = still(table["theta"])
+    refuses("column 'theta' is .*, as in every row", write(file, table))

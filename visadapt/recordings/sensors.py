@@ -138,7 +138,7 @@ def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) ->
         )
     rates = {system.rate_of(name) for name in measured}
     dead: set[str] = set()
-    for _, of_file in groupby(episodes, key=lambda raw: raw.source):
+    for _, of_file in groupby(episodes, key=lambda raw: raw.path):
         file = list(of_file)
         for name in measured:
             still = all(_is_still(raw.states[name], system, name) for raw in file)
@@ -150,7 +150,7 @@ def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) ->
                     "commanded and measured moves it: is the sensor dead, or does the machine stick? a recording in "
                     "which it moves is right"
                 )
-            note(f"{name} never changes although its position does: a dead sensor; it was left out", file[0].source)
+            note(f"{name} never changes although its position does: a dead sensor; it was left out", str(file[0].path))
             dead.add(name)
     kept = [column for column, name in enumerate(measured) if name not in dead]
     return [replace(raw, measured=tuple(measured[k] for k in kept), state=raw.state[:, kept]) for raw in episodes]
