@@ -78,7 +78,7 @@ def pushes(recording: Recording, world: World) -> tuple[Push, ...]:
     middles = sum(float(track.time[-1] - track.time[0]) / (SPACING * width) for track in tracks for width in WIDTHS)
     tries = round(middles) * tracks[0].load.shape[1]
     named = [one.push(tracks, world.system.loads, tries) for one in found]
-    sure = [push for push in named if push.p_value <= MAX_P_VALUE]
+    sure = [push for push in named if push.p_value <= MAX_P_VALUE and push.ci90[0] * push.ci90[1] > 0]
     return tuple(sorted(sure, key=lambda push: (push.episode, push.start)))
 
 
