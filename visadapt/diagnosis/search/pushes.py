@@ -57,7 +57,7 @@ count as this."""
 
 WHITE_SHARE = 0.03  # Share of the errors' variance that is taken as white, so that errors can be whitened
 
-MIN_AT_REST = 0.01  # Least share of the time about an instant for which a joint may stick, if it counts as at rest
+MIN_HELD = 0.01  # Least load that counts by which dry friction holds a joint, over that of the unexplained load
 
 MIN_WEIGHT = 1e-3  # of an instant at rest where the size of a moving joint's errors is fitted
 
@@ -85,11 +85,12 @@ def pushes(recording: Recording, world: World) -> tuple[Push, ...]:
 def _held(track: LoadTrack, friction: Tensor) -> Tensor:
     """(K, N, J) loads by which dry friction (N, J) may hold each joint where it is at rest, K times one instant of one
     joint: together a random load of the friction's size, smoothed as the track is."""
+    size = friction * track.at_rest
     kernel = torch.exp(-0.5 * ((track.time - track.time[:, None]) / track.smoothing).square())
-    kernel = kernel / kernel.square().sum(1, keepdim=True).sqrt()
-    instants, joints = (track.at_rest > MIN_AT_REST).nonzero(as_tuple=True)
-    held = torch.zeros(len(instants), *track.load.shape, dtype=torch.float64)
-    held[torch.arange(len(instants)), :, joints] = kernel[instants] * (friction * track.at_rest)[instants, joints, None]
+    kernel = kernel / kernel.square().sum(0).sqrt()
+    instants, joints = (size > MIN_HELD).nonzero(as_tuple=True)
+    held = torch.zeros(len(instants), *size.shape, dtype=torch.float64)
+    held[torch.arange(len(instants)), :, joints] = kernel[instants] * size[instants, joints, None]
     return held
 
 
@@ -137,13 +138,18 @@ class _Fit:
         return [SummedBumps(group, self._impulse_deviation(group)) for group in overlapping(self.bumps)]
 
     def _refine(self) -> None:
-        """Choose middle and width of each bump that overlaps no other again: the errors are better known by now."""
+        """Choose middle and width of each bump that overlaps no other again: the errors are better known by now.
+
+        In each step one bump of every part.
+        """
         alone = [group[0] for group in overlapping(self.bumps) if len(group) == 1]
-        for one in alone:
-            self.bumps.remove(one)
+        while alone:
+            chosen = list({one.part: one for one in alone}.values())
+            alone = [one for one in alone if one not in chosen]
+            self.bumps = [one for one in self.bumps if one not in chosen]
             self._weigh(robust=True)
-            self.bumps.append(self._highest(one.part, near=one))
-        if alone:
+            self.bumps += [self._highest(one.part, near=one) for one in chosen]
+        if self.bumps:
             self._fit(ROUNDS_AGAIN)
 
     def _design(self, part: int) -> Tensor:
