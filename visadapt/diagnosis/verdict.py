@@ -93,7 +93,8 @@ def next_step(
         first = comparison.functions[0]
         if not gap.closed >= MIN_CLOSED_TO_EXPLAIN:
             source = CandidateModel(search.system, (), search.rows)
-            first = smooth_functions(source, search.source.fits)[0]
+            fits = search.source.fits
+            first = smooth_functions(source, fits, fits.state[0])[0]
         return next_experiment.explain(first)
     carrying = {cause.effect for cause in without_slight(found)}
     classes = [[one.effect for one in group] for group in groups]

@@ -91,13 +91,14 @@ def compare(search: Search) -> ModelComparison:
     close = [search.fitted[key_of(f.effects)] for f in close]  # some of which may now have a better fit
     models = _weighed(search, close, [each.left for each in quiet])
     best = models[0].model
-    functions = smooth_functions(CandidateModel(search.system, best.effects, search.rows), best.fits)
     gained = float(best.fits.likelihood[0] - search.source.fits.likelihood[0])
     threshold = search.profile.smooth_function_threshold
     # The source, which is not refitted, is best only where it is close.
     alone = {f.names: each for f, each in zip(close, quiet, strict=True)}.get(best.names)
     left = alone.left if alone else 0.0
     predicting = alone.fits if alone and left <= MIN_LEFTOVER else best.fits
+    model = CandidateModel(search.system, best.effects, search.rows)
+    functions = smooth_functions(model, best.fits, predicting.state[0])
     return ModelComparison(models, predicting, left, functions, _alternatives_to(models), gained, threshold)
 
 

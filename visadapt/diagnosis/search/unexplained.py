@@ -48,24 +48,26 @@ class Block:
     reading: Tensor  # (W, T, m, BUMPS) to the readings
 
 
-def smooth_functions(model: CandidateModel, fits: FitState) -> list[SmoothFunction]:
-    """Every function added alone to a fitted set, the largest log odds first."""
+def smooth_functions(model: CandidateModel, fits: FitState, along: Tensor) -> list[SmoothFunction]:
+    """Every function added alone to a fitted set, the largest log odds first; evaluated at the states `along` (W, T, n).
+
+    Where process noise moves a state after its readings, an error of the reading is a function of that state.
+    """
     innovations = Innovations(model, fits)
     out = []
     # One after the other: together they would need much memory.
-    for block in _blocks(model, fits):
+    for block in _blocks(model, fits, along):
         response = innovations.response(block.drive, block.reading)
         log_odds = _log_odds(response, innovations.error)
         out.append(SmoothFunction(block.port, block.of_reading, block.variable, log_odds))
     return sorted(out, key=lambda function: -function.log_odds)
 
 
-def _blocks(model: CandidateModel, fits: FitState) -> Iterator[Block]:
+def _blocks(model: CandidateModel, fits: FitState, along: Tensor) -> Iterator[Block]:
     rows, system = model.rows, model.system
-    state = fits.state[0]
     loads = loads_of(model, fits)
-    variables = variables_of(model, state)
-    no_drive = torch.zeros(*state[:, 1:].shape, BUMPS, dtype=torch.float64)
+    variables = variables_of(model, along)
+    no_drive = torch.zeros(*along[:, 1:].shape, BUMPS, dtype=torch.float64)
     used = model.shown(fits.theta[0])[1]
     no_reading = torch.zeros(*used.shape, BUMPS, dtype=torch.float64)
     for name, values in variables.items():
