@@ -49,7 +49,7 @@ class Block:
 
 
 def smooth_functions(model: CandidateModel, fits: FitState, along: Tensor) -> list[SmoothFunction]:
-    """Every function added alone to a fitted set, the largest log odds first; evaluated at the states `along` (W, T, n).
+    """Every function of states `along` (W, T, n), added alone to a fitted set, the largest log odds first.
 
     Where process noise moves a state after its readings, an error of the reading is a function of that state.
     """
