@@ -63,7 +63,7 @@ def find_repeats(
     same = [torch.stack([_repeats(values[:, k], steps[k]) for k in range(len(channels))], 1) for values in measured]
     resting = [_resting(values) for values in measured]
     whole_rows = [
-        _equal(values) & each.any(1) & ~rest for values, each, rest in zip(measured, same, resting, strict=True)
+        _equal(values).all(1) & each.any(1) & ~rest for values, each, rest in zip(measured, same, resting, strict=True)
     ]
     lost = _unless_by_chance(whole_rows, min(by_chance))
     # A rate from a separate sensor may go on while the angle stands still.
@@ -93,13 +93,12 @@ def _between_held(angles: Sequence[Tensor], frozen: Sequence[Tensor]) -> list[Te
     if not len(held):
         return list(frozen)
     low, high = held.min(), held.max()
-    equal = [angle.diff(prepend=angle[:1] - 1) == 0 for angle in angles]
-    return [same & (angle >= low) & (angle <= high) for same, angle in zip(equal, angles, strict=True)]
+    return [_equal(angle) & (angle >= low) & (angle <= high) for angle in angles]
 
 
 def _equal(values: Tensor) -> Tensor:
-    """(T,) rows (T, m) that equal the row before."""
-    return torch.cat((torch.zeros(1, dtype=torch.bool), (values.diff(dim=0) == 0).all(1)))
+    """Which values (T, ...) equal those of the row before."""
+    return torch.cat((torch.zeros_like(values[:1], dtype=torch.bool), values.diff(dim=0) == 0))
 
 
 def _resting(values: Tensor) -> Tensor:
