@@ -49,7 +49,8 @@ from visadapt.processes import shared_out
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore interrupts
 def work(indices):
     os.write(1, b"at work\\n")
-    time.sleep(60)
+    for _ in range(600):  # one long sleep would not see a signal that comes just before it
+        time.sleep(0.1)
     return list(indices)
 try:
     shared_out(work, 2, 2)
