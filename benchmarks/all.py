@@ -97,7 +97,7 @@ COMMANDS = (
             *("--variants", "as shipped", "no tuning", "no feed-forward", "output layer alone"),
             *("gradient past the renderer", "gradient past the residual", "correction held over a plan"),
             *("no unexplained accelerations", "MLP residual", "MLP renderer", "smallest ridge"),
-            *("each round tunes on", "true effect, tuned"),
+            *("each round tunes on", "each round from the source policy", "true effect, tuned"),
         ),
         40,
         work="--work",
