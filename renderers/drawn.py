@@ -35,7 +35,7 @@ class Camera:
 
     @property
     def reach(self) -> float:
-        """Largest |x| in m at which the hinge is in the frame."""
+        """Largest |x| in m at which the hinge is in the frame on either side of x = 0."""
         return min(self.column + 0.5, self.width - 0.5 - self.column) / self.scale
 
 

@@ -1,6 +1,6 @@
 """PETS of mbrl-lib (Pineda et al. 2021), the paper's, on the cart-pole, beside ours: is ours as good?
 
-    python -m venv .mbrl && .mbrl/bin/pip install -e . hydra-core imageio termcolor tqdm
+    python -m venv .mbrl && .mbrl/bin/pip install -e . tyro hydra-core imageio termcolor tqdm
     .mbrl/bin/pip install --no-deps mbrl==0.2.0
     .mbrl/bin/python -m benchmarks.baselines.mbrl_check
 

@@ -1,4 +1,4 @@
-"""Films and plots of runs and results."""
+"""Films and stills of runs."""
 
 from visadapt.films.filming import film
 

@@ -89,10 +89,9 @@ class Policy(nn.Module):
 
 
 class AutoregressivePolicy(Policy):
-    """A random policy: commands of a first-order autoregressive process about `rest` (n_action,).
+    """Commands that decay towards `rest` (n_action,): each differs from it `keep` times as much as the last one.
 
-    A command's difference from `rest` is `keep` times that of the last one. The noise is that of `rollout.run`: the
-    policy itself draws nothing, so a resumed run draws the same.
+    With the noise that `rollout.run` adds to commands they are a first-order autoregressive process.
     """
 
     rest: Tensor

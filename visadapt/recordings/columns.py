@@ -21,7 +21,7 @@ OTHER_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 def needed(system: System) -> tuple[str, ...]:
-    """Columns that a recording must have, unless `given` says that one was not measured: time, all states but
+    """Columns that a recording must have, unless --columns says that one was not measured: time, all states but
     velocities, and actions."""
     names = [variable.name for variable in system.states]
     rates = {system.rate_of(name) for name in names} | {names[velocity] for _, velocity in system.coordinates}
@@ -29,7 +29,7 @@ def needed(system: System) -> tuple[str, ...]:
 
 
 def may_be_unmeasured(system: System) -> list[str]:
-    """States that a recording may lack where `given` says so: of a vehicle velocities alone."""
+    """States that a recording may lack where --columns says so: of a vehicle velocities alone."""
     states = [state.name for state in system.states]
     return [name for name in states if name not in needed(system)] if isinstance(system, RigidBody) else states
 
