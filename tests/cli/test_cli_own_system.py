@@ -77,6 +77,16 @@ def test_what_names_no_system_is_said(rig, capsys, system, right):
     assert right in refused(capsys, "effects", "--system", system)
 
 
+def test_a_system_may_import_a_file_beside_it_from_any_folder(rig, tmp_path, monkeypatch, capsys):
+    (rig / "mine_only.py").write_text("import furuta\n\nFuruta = furuta.Furuta\n")
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    assert cli.main(["effects", "--system", f"{rig / 'mine_only.py'}:Furuta"]) == 0
+    assert "arm_axis.coulomb_friction" in capsys.readouterr().out
+
+
 def test_a_class_that_lacks_something_is_refused_by_every_command(rig, capsys):
     text = page_code()[0].replace('"arm", "rad"', '"arm", ""').replace('"voltage", "V"', '"voltage", " "')
     (rig / "furuta.py").write_text(text)

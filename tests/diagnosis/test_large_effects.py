@@ -1,11 +1,21 @@
 """Single effects so large that process noise stands for most of what they do, and ones that explain all."""
 
+import math
+
 import pytest
 
 from tests.diagnosed import record
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.search import Search
-from visadapt.effects import CartMass, CoulombFriction, MeasurementDelay, QuadraticDrag, ViscousFriction
+from visadapt.effects import (
+    CartMass,
+    CoulombFriction,
+    MeasurementDelay,
+    QuadraticDrag,
+    StribeckFriction,
+    ViscousFriction,
+)
+from visadapt.estimation.fit_states import QUICK, with_effect
 from visadapt.systems import CartPole
 
 
@@ -28,3 +38,14 @@ def test_where_one_effect_explains_all_only_sets_with_it_grow():
     assert search.explains_all(search.best)
     assert not search.explains_all(search.single(QuadraticDrag))
     assert all("viscous_friction" in names for names in search.fitted if len(names) > 1)
+
+
+def test_an_effect_that_does_what_a_simpler_one_does_is_exchanged_for_it():
+    recording = record([CoulombFriction(force=2.0)], measured=[state.name for state in CartPole.states])
+    search = Search(CartPole(), prepare(recording, CartPole()).rows, [CoulombFriction, StribeckFriction])
+    (stribeck,) = search.fit([((StribeckFriction,), with_effect(search.source.fits, [2.0, 1.0, 0.5]))], QUICK)
+    assert stribeck.log_odds == -math.inf, "its breakaway is below its force, so it is dry friction"
+    assert search.best is search.source
+    search.exchange_in_rejected()
+    assert search.best.names == ("coulomb_friction",)
+    assert search.best.fits.theta.item() == pytest.approx(2.0, rel=0.01)

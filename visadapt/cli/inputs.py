@@ -223,6 +223,8 @@ def import_file(given: str) -> ModuleType:
     sys.modules[name] = module
     OWN_FILES.add(str(path))
     OWN_FOLDERS.add(path.parent)
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))  # for the files beside it; last, so that none of them hides a library
     with own_code(lambda error: f"{path}: {describe(error, str(path))}"):
         spec.loader.exec_module(module)
     sys.modules.setdefault(path.stem, module)  # so that another file of the user's that imports it gets these classes

@@ -25,6 +25,7 @@ def best_on_all_rows(
     for group, how in ((close[:1], effort), (close[1:], FINAL)):
         # From the states of the best set so far, which a start from the readings would first have to find.
         whole.fit([(each.effects, replace(each.fits, state=whole.best.fits.state)) for each in group], how)
+    whole.exchange_in_rejected()
     return whole
 
 

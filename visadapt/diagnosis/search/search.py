@@ -14,7 +14,7 @@ from copy import copy
 from dataclasses import replace
 from itertools import combinations
 
-from visadapt.diagnosis.search.fitted_models import FittedModels, ScoredModel, key_of, less
+from visadapt.diagnosis.search.fitted_models import MIN_BETTER, FittedModels, ScoredModel, key_of, less
 from visadapt.effects import ActuationEffect, Effect
 from visadapt.effects.late_sensors import LateSensors
 from visadapt.estimation.episode_phases import has_episode_phases, with_episode_phases
@@ -277,6 +277,18 @@ class Search(FittedModels):
         self.fit(exchanges, QUICK)
         # A lag and a few more effects imitate a delay, which the screening does not see (`try_late_sensors`).
         self._fit_late(slow)
+
+    def exchange_in_rejected(self) -> None:
+        """Where the set that fits best cannot be named, try the sets near it.
+
+        Of an effect that does what a simpler one does, as Stribeck friction whose breakaway is its force at speed, the
+        simpler one may be named.
+        """
+        finite = [f for f in self.fitted.values() if math.isfinite(f.fits.likelihood[0])]
+        likeliest = max(finite, key=lambda f: float(f.fits.likelihood[0]))
+        better = float(likeliest.fits.likelihood[0] - self.best.fits.likelihood[0]) > MIN_BETTER
+        if better and likeliest.log_odds == -math.inf:
+            self._fit_neighbours(likeliest, Exchanges())
 
     def _polish(self) -> None:
         """Fit carefully the sets close to the best, and the best set less each effect, with which it is compared, but
