@@ -29,15 +29,18 @@ START_FROM = 4  # Best sets of a search from which the next one begins
 def with_coloured_noise(
     search: Search, comparison: ModelComparison, searched: Tensor, progress: Progress | None = None
 ) -> tuple[Search, ModelComparison]:
-    """The search and its comparison continued with coloured noise, if something is unexplained that is not white; else
-    unchanged.
+    """The search and its comparison continued with coloured noise, if what is unexplained is not negligible and not
+    white; else unchanged.
 
     First, sets only grow from the best ones, with the colour of the best one's innovations. Then, with the colour of
     the innovations of the set so found, sets near the best are tried too. The most probable set is also fitted with
     white noise, where it may explain everything; what counts as unexplained is what the best set with white noise
     leaves. `searched` are the indices of the windows in which sets are looked for.
     """
-    colour = colour_left_by(search, comparison.best) if comparison.leftover > MIN_LEFTOVER else None
+    # Too little has no colour that could be told: of two effects found to 0.01 %, one came out 1.6 % off with it.
+    colour = None
+    if comparison.leftover > MIN_LEFTOVER and not comparison.negligible:
+        colour = colour_left_by(search, comparison.best)
     if colour is None:
         return search, comparison
     begin = [(each.effects, each.fits.on(searched)) for each in search.near_best()[:START_FROM]]
