@@ -274,6 +274,10 @@ class TestClosedLoop:
         with pytest.raises(ValueError, match=r"closed_loop decides at every step, .* got streams = 4"):
             TuneSettings(Balance(PAPER_CARTPOLE), 1, streams=4, closed_loop=True)
 
+    def test_a_task_that_no_policy_file_could_keep_is_refused(self):
+        with pytest.raises(TypeError, match=r"^task: object is no frozen dataclass: write @dataclass"):
+            TuneSettings(object(), 1)  # type: ignore[arg-type]
+
     def test_streams_go_on_after_the_last_step_as_the_policy_would_have_gone(self):
         torch.manual_seed(0)
         policy, world = StatePolicy(4, with_history=True), World(CartPole(), [ConstantForce(force=1.0)])

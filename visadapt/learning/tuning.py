@@ -12,7 +12,7 @@ estimate of the correction that acts, and would learn to oppose only a part of i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 
 import torch
@@ -36,6 +36,7 @@ class TuneSettings:
     """How a policy is trained in a world.
 
     Raises:
+        TypeError: the task is no dataclass, so it could not be kept in a policy's file.
         ValueError: `closed_loop` with `streams`, whose visited states are kept to be planned from.
     """
 
@@ -57,6 +58,9 @@ class TuneSettings:
     observation_noise: float = 0.01  # standard deviation of white noise on what the policy sees
 
     def __post_init__(self) -> None:
+        if not is_dataclass(self.task):
+            name = type(self.task).__name__
+            raise TypeError(f"task: {name} is no frozen dataclass: write @dataclass(frozen=True) above it")
         if self.closed_loop and self.streams is not None:
             raise ValueError(f"closed_loop decides at every step, so no states are kept: got streams = {self.streams}")
 

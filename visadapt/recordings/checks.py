@@ -175,7 +175,7 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable) -> None:
         row = int(np.abs(values).argmax())
         raise RecordingError(
             f"{raw.cell(row, variable.name)} is {values[row]:g} {variable.unit}, and it changes by up to "
-            f"{np.abs(coarse).max():.3g} {rate.unit}; {right}, and seconds for the clock"
+            f"{np.abs(coarse).max():.3g} {rate.unit}; {right}; or is the clock not in seconds?"
         )
     if measured is None:
         return

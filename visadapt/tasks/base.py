@@ -10,7 +10,9 @@ from torch import Tensor
 
 
 class Task(ABC):
-    """Base of tasks. A task state (B, ...) is how far episodes are in their task: a tensor that the task alone reads.
+    """Base of tasks, which are frozen dataclasses: their fields are kept in a policy's file and in a run's settings.
+
+    A task state (B, ...) is how far episodes are in their task: a tensor that the task alone reads.
 
     `progress` in [0, 1] is the share of the training that is done. It drives the curriculum: early on, streams start
     near the goal and are cut off near it (delta_div, section 2.2 of the paper).
