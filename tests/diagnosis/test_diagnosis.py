@@ -177,6 +177,16 @@ def test_effects_that_no_data_can_separate_are_named_together(pushed):
     assert "motor" in result.next_experiment
 
 
+def test_twins_have_intervals_of_the_same_relative_width():
+    clean = record([ConstantForce(force=2.0)], measured=[v.name for v in CartPole.states], noise=(1e-6,) * 4)
+    result = diagnose(clean, World(CartPole()), catalogue=[ActuatorBias, ConstantForce, ViscousFriction])
+    offset, force = (next(iter(cause.parameters.values())) for cause in result.causes)
+    assert force.value == pytest.approx(2.0, rel=1e-3)
+    widths = [(each.ci90[1] - each.ci90[0]) / each.value for each in (offset, force)]
+    assert widths[1] == pytest.approx(widths[0], rel=0.3), "noise of the fit without either widened the second's"
+
+
+
 def test_two_simultaneous_effects_are_both_named(only_effects):
     only_effects("viscous_friction", "coulomb_friction", "actuator_gain", "cart_mass", "actuator_lag")
     result = diagnose(record([ViscousFriction(coefficient=1.5), ActuatorGain(scale=0.8)]), SOURCE)

@@ -149,9 +149,12 @@ class FittedModels:
         return self.fitted.get(key_of(start[0])) or self.fit([start], QUICK)[0]
 
     def exchange(self, whole: ScoredModel, removed: type[Effect], new: type[Effect]) -> ScoredModel:
-        """A set with one of its effects exchanged for another."""
+        """A set with one of its effects exchanged for another, fitted with and without process noise: noise left from
+        the set without either would widen the intervals."""
         base = self.without(whole, removed)
-        return self.fit([((*base.effects, new), self._start(base, new))], CAREFUL)[0]
+        found = self.fit([((*base.effects, new), self._start(base, new))], CAREFUL)[0]
+        self._quiet([found])
+        return self.fitted[key_of(found.effects)]
 
     def _start(self, base: ScoredModel, effect: type[Effect]) -> FitState:
         """A start for a set with one more effect, at the best values of its screening."""
