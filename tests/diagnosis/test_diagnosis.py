@@ -186,7 +186,6 @@ def test_twins_have_intervals_of_the_same_relative_width():
     assert widths[1] == pytest.approx(widths[0], rel=0.3), "noise of the fit without either widened the second's"
 
 
-
 def test_two_simultaneous_effects_are_both_named(only_effects):
     only_effects("viscous_friction", "coulomb_friction", "actuator_gain", "cart_mass", "actuator_lag")
     result = diagnose(record([ViscousFriction(coefficient=1.5), ActuatorGain(scale=0.8)]), SOURCE)

@@ -58,9 +58,11 @@ class TuneSettings:
     observation_noise: float = 0.01  # standard deviation of white noise on what the policy sees
 
     def __post_init__(self) -> None:
-        if not is_dataclass(self.task):
-            name = type(self.task).__name__
-            raise TypeError(f"task: {name} is no frozen dataclass: write @dataclass(frozen=True) above it")
+        task: object = self.task  # of the user's, so perhaps no Task either
+        if not is_dataclass(task):
+            raise TypeError(
+                f"task: {type(task).__name__} is no frozen dataclass: write @dataclass(frozen=True) above it"
+            )
         if self.closed_loop and self.streams is not None:
             raise ValueError(f"closed_loop decides at every step, so no states are kept: got streams = {self.streams}")
 
