@@ -296,8 +296,11 @@ def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effec
 
 
 def _of_readings(effects: Sequence[type[Effect]], measured: set[int]) -> list[type[Effect]]:
-    """The effects that readings of these columns may show, without those of a camera, and without the delay of some
-    sensors where it is that of none or, if that is searched too, of all that were read."""
+    """The effects that readings of the columns `measured` can show.
+
+    Left out are effects of a camera; a delay of sensors none of which was read; and a delay of exactly the sensors that
+    were read, if `MeasurementDelay`, which then does the same, is searched too.
+    """
     all_late = any(issubclass(effect, MeasurementDelay) for effect in effects)
 
     def shows(effect: type[Effect]) -> bool:

@@ -25,8 +25,8 @@ LEAST_UNCHANGED = 0.01
 """Probability of the unchanged simulator below which a recording without a gap half a second ahead has one in the long
 run."""
 CLEAR_OF_NOISE = 3.0
-"""Error of predictions over the noise above which there is a gap. Where the error with the causes is above it, the
-share of the gap that they close decides the verdict."""
+"""Ratio of prediction error to measurement noise above which there is a gap. Where the ratio with the causes is still
+above it, the share of the gap that they close decides the verdict."""
 
 CLOSES_BUT = "the causes close the gap but do not explain everything"
 """What the warning of `left_unexplained` begins with."""

@@ -144,7 +144,8 @@ def unmeasured(rows: Segments, system: System) -> list[int]:
 
 def initial_states(rows: Segments, system: System) -> Tensor:
     """Initial guess (W, T, n) of the states: the measurements that may be used, those in between interpolated,
-    difference quotients for missing velocities, and what is `estimated` of states that no reading gives."""
+    difference quotients for missing velocities (0 in the last row of a full window, and not to be relied on in the last
+    row of a shorter one), and what is `estimated` of states that no reading gives."""
     out = torch.zeros(*rows.shape, len(system.states), dtype=torch.float64)
     if rows.estimated is not None:
         columns = unmeasured(rows, system)

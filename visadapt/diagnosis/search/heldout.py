@@ -95,7 +95,7 @@ def overall(errors: Tensor) -> Tensor:
     return errors.square().mean(-1).sqrt()
 
 
-MIN_GAP = 1.02  # Error of predictions over the noise floor, up to which they are as good as the noise allows
+MIN_GAP = 1.02  # Ratio of prediction error to noise floor up to which predictions are as good as the noise allows
 
 
 def closed(before: float, after: float, floor: float) -> float:

@@ -69,8 +69,8 @@ class ModelComparison:
         if improvable or self.leftover > MIN_LEFTOVER:
             return True
         # A load that improves no held-out prediction must be clear; errors of readings are not in the black box.
-        required = {True: self.threshold, False: max(self.threshold, CLEAR_LOG_ODDS)}
-        return any(each.log_odds > required[each.of_reading] for each in self.functions)
+        for_load = max(self.threshold, CLEAR_LOG_ODDS)
+        return any(each.log_odds > (self.threshold if each.of_reading else for_load) for each in self.functions)
 
     @property
     def misread(self) -> bool:

@@ -110,7 +110,10 @@ class Search(FittedModels):
             self.extend([before])
 
     def resume(self, found: ScoredModel) -> bool:
-        """Fit a set that another search has found, and go on from it where it is the best; return whether it is."""
+        """Fit a set that another search has found; return whether the best set is another one than before.
+
+        If it is, sets near it are tried, unless process noise is jumps.
+        """
         before = self.best
         self._fit_from_quiet([(found.effects, found.fits)], CAREFUL)
         if self.best.names == before.names:
