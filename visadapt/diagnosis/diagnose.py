@@ -19,6 +19,7 @@ from visadapt.diagnosis.result import (
     UNEXPLAINED,
     Cause,
     Diagnosis,
+    Push,
     RecordingSummary,
     Region,
     Where,
@@ -42,7 +43,7 @@ from visadapt.diagnosis.search.preparation import PreparedRecording, limited, pr
 from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.verdict import at_bounds, is_slow, left_unexplained, next_step, verdict_of
+from visadapt.diagnosis.verdict import at_bounds, is_slow, left_by_source, left_unexplained, next_step, verdict_of
 from visadapt.diagnosis.words import listed, printable
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized, twins
@@ -162,7 +163,7 @@ def diagnose(
             stage_shares(search, comparison, groups, found_before),
             measured.errors.by_state(system, rows.channels, bool(found)),
             regions,
-            () if prepared.whole is None else pushes(prepared.whole, _explained(world, comparison) if found else world),
+            () if prepared.whole is None else _pushes(prepared.whole, world, search, comparison, bool(found)),
         ),
         causes=found,
         ranking=ranking(comparison, explored.effects, system, measured.closed, repeats),
@@ -234,6 +235,15 @@ def _explore(
     return _Explored(named, prepared, search, comparison, alternatives(comparison, named, system), repeats)
 
 
+def _pushes(
+    recording: Recording, world: World, search: Search, comparison: ModelComparison, explained: bool
+) -> tuple[Push, ...]:
+    """The pushes beyond the best set where it explains the recording, else beyond the source."""
+    if explained:
+        return pushes(recording, _explained(world, comparison), comparison.functions)
+    return pushes(recording, world, left_by_source(search))
+
+
 def _explained(world: World, comparison: ModelComparison) -> World:
     """The source with the best set's effects as fitted, without those whose phase differs from episode to episode."""
     best = comparison.best
@@ -246,14 +256,14 @@ def _explained(world: World, comparison: ModelComparison) -> World:
 
 
 def _judge(explored: _Explored, measured: MeasuredGap) -> tuple[str, tuple[Cause, ...], tuple[Cause, ...]]:
-    """The verdict, the causes that go with it, and what explains a part of a gap that is unexplained."""
+    """The verdict, the causes that go with it, and those that close a part of a gap that is unexplained."""
     comparison, groups = explored.comparison, explored.groups
     repeats = [cause for cause, _ in explored.repeats]
     explaining = (*repeats, *causes(explored.search, comparison, groups, measured.closed))
     unexplained, coarse = comparison.unexplained(measured.improvable), bool(explored.prepared.coarse)
     verdict = verdict_of(comparison, measured.gap, unexplained, measured.improvable, explaining, bool(repeats), coarse)
     found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
-    return verdict, found, explaining if verdict == UNEXPLAINED else ()
+    return verdict, found, tuple(without_slight(explaining)) if verdict == UNEXPLAINED else ()
 
 
 def _warnings(

@@ -12,7 +12,7 @@ from visadapt.diagnosis.search.heldout import MIN_GAP
 from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import CoarseSteps
-from visadapt.diagnosis.search.unexplained import smooth_functions
+from visadapt.diagnosis.search.unexplained import SmoothFunction, smooth_functions
 from visadapt.diagnosis.words import with_unit
 from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel
@@ -90,15 +90,17 @@ def next_step(
     if verdict == UNEXPLAINED and coarse:
         return next_experiment.finer([position.state for position in coarse])
     if verdict == UNEXPLAINED:
-        first = comparison.functions[0]
-        if not gap.closed >= MIN_CLOSED_TO_EXPLAIN:
-            source = CandidateModel(search.system, (), search.rows)
-            fits = search.source.fits
-            first = smooth_functions(source, fits, fits.state[0])[0]
-        return next_experiment.explain(first)
+        closed = gap.closed >= MIN_CLOSED_TO_EXPLAIN
+        return next_experiment.explain((comparison.functions if closed else left_by_source(search))[0])
     carrying = {cause.effect for cause in without_slight(found)}
     classes = [[one.effect for one in group] for group in groups]
     return next_experiment.separate([c for c in classes if carrying & {one.name for one in c}], search.system)
+
+
+def left_by_source(search: Search) -> list[SmoothFunction]:
+    """The functions that the source leaves unexplained, the most probable first."""
+    fits = search.source.fits
+    return smooth_functions(CandidateModel(search.system, (), search.rows), fits, fits.state[0])
 
 
 def is_slow(comparison: ModelComparison, verdict: str) -> bool:

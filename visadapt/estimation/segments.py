@@ -144,8 +144,8 @@ def unmeasured(rows: Segments, system: System) -> list[int]:
 
 def initial_states(rows: Segments, system: System) -> Tensor:
     """Initial guess (W, T, n) of the states: the measurements that may be used, those in between interpolated,
-    difference quotients for missing velocities (0 in the last row of a full window, and not to be relied on in the last
-    row of a shorter one), and what is `estimated` of states that no reading gives."""
+    difference quotients for missing velocities (one-sided in a window's first and last row), and what is `estimated` of
+    states that no reading gives."""
     out = torch.zeros(*rows.shape, len(system.states), dtype=torch.float64)
     if rows.estimated is not None:
         columns = unmeasured(rows, system)
@@ -154,12 +154,20 @@ def initial_states(rows: Segments, system: System) -> Tensor:
         out[..., channel] = rows.filled[..., k]
     for channel, position_column in profile_of(system).position_of.items():
         if channel not in rows.channels and position_column in rows.channels:
-            position = out[..., position_column]
-            change = torch.zeros_like(position)
-            change[:, 1:-1] = (position[:, 2:] - position[:, :-2]) / (rows.time[:, 2:] - rows.time[:, :-2])
-            change[:, 0] = (position[:, 1] - position[:, 0]) / rows.duration[:, 0]
-            out[..., channel] = change
+            out[..., channel] = _difference_quotients(out[..., position_column], rows)
     return out * rows.inside[..., None]
+
+
+def _difference_quotients(position: Tensor, rows: Segments) -> Tensor:
+    """(W, T) rate of a position (W, T): central differences, one-sided in a window's first and last row."""
+    ahead = position.diff(dim=1) / rows.duration[:, :-1]
+    rate = torch.zeros_like(position)
+    rate[:, 1:-1] = (position[:, 2:] - position[:, :-2]) / (rows.time[:, 2:] - rows.time[:, :-2])
+    rate[:, 0] = ahead[:, 0]
+    lasts = rows.inside.sum(1).long() - 1
+    windows = torch.arange(len(lasts))
+    rate[windows, lasts] = ahead[windows, (lasts - 1).clamp(min=0)]
+    return rate
 
 
 def noise_of_readings(rows: Segments) -> Tensor:

@@ -9,15 +9,12 @@ import torch
 
 from visadapt.diagnosis.search.fitted_models import MIN_LEFTOVER, ScoredModel, key_of
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.search.unexplained import SmoothFunction, smooth_functions
+from visadapt.diagnosis.search.unexplained import CLEAR_LOG_ODDS, SmoothFunction, smooth_functions
 from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.likelihood import FitState
 
 COMPARE_WITHIN = 10.0  # Log posterior odds; models further behind the best are not compared
-
-CLEAR_LOG_ODDS = 10.0
-"""Log odds of a load above which it counts as unexplained although the black box closes no more of the gap."""
 
 SLIGHT_SHARE = 0.05
 """Share of the best model's gain in log likelihood below which what it leaves unexplained is negligible."""

@@ -22,6 +22,7 @@ from torch.nn.functional import avg_pool1d, pad
 
 from visadapt.diagnosis.result import Push
 from visadapt.diagnosis.search.bumps import Bump, SummedBumps, bumps_at, overlapping
+from visadapt.diagnosis.search.unexplained import CLEAR_LOG_ODDS, SmoothFunction
 from visadapt.diagnosis.search.unexplained_load import LoadTrack, load_tracks
 from visadapt.recordings import Recording
 from visadapt.world import World
@@ -66,10 +67,15 @@ MIN_DISTINCT = 0.15  # Least share of a bump's information that columns and othe
 BUMP_PRIOR = 7.0  # Prior standard deviation of a bump's height, over that of the unexplained load
 
 
-def pushes(recording: Recording, world: World) -> tuple[Push, ...]:
-    """The pushes in a recording beyond what a world explains, in the order of time."""
+def pushes(recording: Recording, world: World, unexplained: Sequence[SmoothFunction] = ()) -> tuple[Push, ...]:
+    """The pushes in a recording beyond what a world explains, in the order of time.
+
+    Of the loads that are `unexplained`, the most probable first, the first that is a clear function of states is no
+    push.
+    """
+    functions = (one for one in unexplained if one.states is not None and one.log_odds > CLEAR_LOG_ODDS)
     try:
-        tracks = load_tracks(recording, world)
+        tracks = load_tracks(recording, world, next(functions, None))
         if not tracks:
             return ()
         found = _Fit(tracks).pushes()

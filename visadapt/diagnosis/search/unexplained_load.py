@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import conv1d, pad
 
+from visadapt.diagnosis.search.unexplained import SmoothFunction
 from visadapt.effects import DynamicsEffect, Effect
 from visadapt.effects.own.dynamics import scalable
 from visadapt.recordings import Episode, Recording
@@ -85,8 +86,11 @@ class LoadTrack:
         ]
 
 
-def load_tracks(recording: Recording, world: World) -> list[LoadTrack]:
-    """The unexplained loads in each episode that is long enough; none where a joint's position was not measured."""
+def load_tracks(recording: Recording, world: World, known: SmoothFunction | None = None) -> list[LoadTrack]:
+    """The unexplained loads in each episode that is long enough; none where a joint's position was not measured.
+
+    `known` is a load that acts as a function of states, beyond the world's.
+    """
     system = world.system
     measured = [system.index(name) for name in recording.measured]
     if not system.coordinates or len(system.coordinates) < len(system.loads):
@@ -99,7 +103,7 @@ def load_tracks(recording: Recording, world: World) -> list[LoadTrack]:
         part
         for number, episode in enumerate(recording.episodes)
         for stretch in _measured(episode, recording.usable[number] if recording.usable else None)
-        for part in _track(number, stretch, world, measured, recording.period)
+        for part in _track(number, stretch, world, measured, recording.period, known)
     ]
     if not found:
         return []
@@ -133,7 +137,14 @@ def _measured(episode: Episode, usable: NDArray[np.bool_] | None) -> Iterator[Ep
             yield Episode(episode.time[rows], episode.action[rows], episode.state[rows])
 
 
-def _track(number: int, episode: Episode, world: World, measured: Sequence[int], period: float) -> list[LoadTrack]:
+def _track(
+    number: int,
+    episode: Episode,
+    world: World,
+    measured: Sequence[int],
+    period: float,
+    known: SmoothFunction | None,
+) -> list[LoadTrack]:
     system = world.system
     stamps, readings, given = (
         torch.as_tensor(values, dtype=torch.float64) for values in (episode.time, episode.state, episode.action)
@@ -163,7 +174,7 @@ def _track(number: int, episode: Episode, world: World, measured: Sequence[int],
     acceleration = rate(state[:, velocities])
     commanded = smooth(acting, 0.1 * smoothing)
     motion = _Motion(world, time, state, acting, acceleration)
-    found = motion.loads(rate, commanded)
+    found = motion.loads(rate, commanded, known)
     largest = torch.tensor([action.largest for action in system.actions], dtype=torch.float64)
     fastest = torch.tensor([system.states[v].largest for v in velocities], dtype=torch.float64)
     stormy = smooth(acceleration.abs(), 2 * smoothing)
@@ -243,10 +254,11 @@ class _Motion:
         )
         return (backward - forward).clamp(min=0) / 2
 
-    def loads(self, rate: Callable[[Tensor], Tensor], commanded: Tensor) -> _Loads:
+    def loads(self, rate: Callable[[Tensor], Tensor], commanded: Tensor, known: SmoothFunction | None = None) -> _Loads:
         """The load in question and what may explain it.
 
-        `rate` differentiates by time, `commanded` (T, n_action) are the commands that act, slightly smoothed.
+        `rate` differentiates by time, `commanded` (T, n_action) are the commands that act, slightly smoothed, and
+        `known` is a function of states that acts as a load.
         """
         system, state, acting = self.world.system, self.state, self.acting
         free, gain = self.gain()
@@ -284,6 +296,8 @@ class _Motion:
                 first = rate(error)
                 change = -slopes[0] * error[:, None] - slopes[1] * first[:, None] + rate(first)[:, None] * joints[j]
                 columns.append(load(change))
+        if known is not None and known.loads is not None and known.states is not None:
+            columns += [each[:, None] * known.loads for each in known.basis(state @ known.states).unbind(-1)]
         bare: Any = system
         plain = self.gain(bare)
         for name in scalable(system):
