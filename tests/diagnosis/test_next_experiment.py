@@ -77,5 +77,15 @@ def test_a_disturbance_is_a_load_or_an_error_of_a_reading(port, of_reading, said
     assert explain(SmoothFunction(port, of_reading, "x_dot", 12.0)).startswith(said)
 
 
+def test_what_repeats_in_every_turn_is_looked_for_in_whole_turns():
+    advice = explain(SmoothFunction("motor_shaft", False, "motor_within_a_turn", 264.3))
+    assert advice.startswith("An unexplained load (motor shaft) depends on motor within a turn: record runs that cover")
+    assert "whole turns of motor slowly and fast" in advice
+
+
+def test_what_shows_as_no_function_is_not_described():
+    assert "no function of one state" in explain(SmoothFunction("motor_shaft", False, "time", 1.2))
+
+
 def test_what_depends_on_time_is_looked_for_in_repeated_runs():
     assert "several long runs under the same commands" in explain(SmoothFunction("cart_force", False, "time", 12.0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from visadapt.diagnosis.search.unexplained import SmoothFunction
+from visadapt.diagnosis.search.unexplained import TURN_SUFFIX, SmoothFunction
 from visadapt.diagnosis.words import listed, plain
 from visadapt.effects import Effect, Stage
 from visadapt.effects.catalogue import separable
@@ -36,6 +36,14 @@ ALONG = (
 )
 """For a film of a track without features."""
 
+
+MIN_LOG_ODDS = 3.0  # Log odds (20 to 1) above which an unexplained disturbance is described
+
+UNSPECIFIC = (
+    "What is unexplained shows as no function of one state, command or time: record the same commands twice, to see "
+    "what returns, then motions of one kind at a time."
+)
+"""For a gap that no disturbance describes."""
 
 LONGER = (
     "Half a second ahead nothing departs from the source beyond the noise. What acts more slowly shows in long runs "
@@ -72,11 +80,16 @@ def disturbance_in_words(function: SmoothFunction) -> str:
 
 def explain(function: SmoothFunction) -> str:
     """The experiment that shows an unexplained disturbance more clearly."""
+    if not function.log_odds > MIN_LOG_ODDS:
+        return UNSPECIFIC
     said = disturbance_in_words(function)
-    whole = f"the whole range of {plain(function.variable)} slowly and fast"
-    runs = f"runs that cover {whole}, with all else as constant as possible"
     if function.variable == "time":
         runs = "several long runs under the same commands, to see what returns in each"
+    else:
+        angle = function.variable.removesuffix(TURN_SUFFIX)
+        turns = angle != function.variable
+        covered = f"whole turns of {plain(angle)}" if turns else f"the whole range of {plain(angle)}"
+        runs = f"runs that cover {covered} slowly and fast, with all else as constant as possible"
     return f"{said[0].upper()}{said[1:]}: record {runs}, and add an effect of your own for it (--effects)."
 
 

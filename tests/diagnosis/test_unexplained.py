@@ -1,0 +1,118 @@
+"""Which smooth function of states a source leaves unexplained, and that it is no push."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+
+import visadapt as va
+from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.pushes import pushes
+from visadapt.diagnosis.search.search import Search
+from visadapt.diagnosis.verdict import left_by_source
+from visadapt.recordings import Episode, Recording
+from visadapt.systems import System, Variable
+
+PERIOD, ROWS = 0.01, 400
+ENCODER = 2 * np.pi / 8192  # rad, a step of the motor's angle
+PUSHED, PUSH = (1, 1.5, 0.08), 0.006
+"""A push of the motor: the episode, its middle and its deviation in s; its peak in N m."""
+
+
+@dataclass(frozen=True)
+class Drive(System):
+    """A motor that turns a disc by a compliant coupling."""
+
+    inertia: float | torch.Tensor = 1e-4  # kg m2, of the motor
+    disc: float | torch.Tensor = 4e-4  # kg m2
+    stiffness: float | torch.Tensor = 0.15  # N m/rad
+    damping: float | torch.Tensor = 4e-4  # N m s/rad, of the coupling
+    friction: float | torch.Tensor = 1.3e-3  # N m s/rad, of the motor
+
+    name = "drive"
+    states: ClassVar[tuple[Variable, ...]] = (
+        Variable("motor", "rad", -40.0, 40.0),
+        Variable("disc", "rad", -40.0, 40.0),
+        Variable("motor_rate", "rad/s", -60.0, 60.0),
+        Variable("disc_rate", "rad/s", -60.0, 60.0),
+    )
+    actions: ClassVar[tuple[Variable, ...]] = (Variable("torque", "N m", -0.2, 0.2),)
+    loads = (Variable("motor_shaft", "N m", -0.05, 0.05), Variable("disc_shaft", "N m", -0.05, 0.05))
+    coordinates = ((0, 2), (1, 3))
+
+    def derivative(self, state, command, load):
+        motor, disc, motor_rate, disc_rate = state.unbind(-1)
+        shaft = self.stiffness * (motor - disc) + self.damping * (motor_rate - disc_rate)
+        first = (command[:, 0] - shaft - self.friction * motor_rate + load[:, 0]) / self.inertia
+        return torch.stack((motor_rate, disc_rate, first, (shaft + load[:, 1]) / self.disc), -1)
+
+
+def cogging(state):
+    """Loads (B, 2) of a motor whose magnets hold it at eight angles of a turn."""
+    load = -0.012 * (8 * state[:, 0]).sin()
+    return torch.stack((load, torch.zeros_like(load)), -1)
+
+
+def play(state):
+    """Loads (B, 2) that undo the coupling's torque within 0.04 rad."""
+    lost = 0.15 * (state[:, 0] - state[:, 1]).clamp(-0.04, 0.04)
+    return torch.stack((lost, -lost), -1)
+
+
+@cache
+def recorded(acting, push=0.0):
+    """Four runs of 4 s of a drive with loads `acting` by its states, and a push of the motor."""
+    generator = np.random.default_rng(3)
+    time = PERIOD * np.arange(ROWS)
+    speeds, phases = generator.uniform(2.5, 16.0, (4, 3)), generator.uniform(0, 6.3, (4, 3))
+    command = 0.05 * np.sin(speeds[:, :, None] * time + phases[:, :, None]).sum(1)
+    state, states = torch.zeros(4, 4, dtype=torch.float64), []
+    for row in range(ROWS):
+        states.append(state)
+        pushed = torch.zeros(4, 2, dtype=torch.float64)
+        episode, middle, width = PUSHED
+        pushed[episode, 0] = push * np.exp(-0.5 * ((time[row] - middle) / width) ** 2)
+        for _ in range(20):
+            half = state + PERIOD / 40 * rate(state, command[:, row], acting, pushed)
+            state = state + PERIOD / 20 * rate(half, command[:, row], acting, pushed)
+    angles = torch.stack(states, 1)[..., :2].numpy()
+    angles = np.round(angles / ENCODER) * ENCODER
+    episodes = tuple(Episode(time, command[k, :, None], angles[k]) for k in range(4))
+    return Recording(episodes, ("motor", "disc"), PERIOD, ("a", "b", "c", "d"))
+
+
+def rate(state, torque, acting, pushed):
+    return Drive().derivative(state, torch.from_numpy(torque)[:, None], acting(state) + pushed)
+
+
+@cache
+def left(acting, push=0.0):
+    """What the source leaves unexplained of these runs."""
+    with torch.inference_mode():
+        prepared = prepare(recorded(acting, push), Drive(), [])
+        return left_by_source(Search(Drive(), prepared.rows, [], prepared.source, 1))
+
+
+@pytest.mark.parametrize(
+    ("acting", "port", "variable"),
+    [
+        (cogging, "motor_shaft", "motor_within_a_turn"),
+        (play, "between_motor_shaft_and_disc_shaft", "motor_minus_disc"),
+    ],
+)
+def test_cogging_and_play_of_a_coupling_are_told_by_what_they_depend_on(acting, port, variable):
+    first, second = left(acting)[:2]
+    assert (first.port, first.variable) == (port, variable)
+    assert first.log_odds > 1.5 * second.log_odds + 50
+
+
+def test_cogging_is_no_push_and_hides_none():
+    world = va.World(Drive(), period=PERIOD)
+    with torch.inference_mode():
+        assert pushes(recorded(cogging), world, left(cogging)) == ()
+        (found,) = pushes(recorded(cogging, PUSH), world, left(cogging, PUSH))
+    assert (found.load, found.episode) == ("motor_shaft", PUSHED[0])
+    assert found.impulse == pytest.approx(PUSH * PUSHED[2] * np.sqrt(2 * np.pi), rel=0.3)
