@@ -12,8 +12,8 @@ import torch
 
 from visadapt import diagnose
 from visadapt.cli.main import main
-from visadapt.diagnosis.diagnose import searched
 from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.searched_effects import searched
 from visadapt.effects import ActuatorDelay, ConstantForce, LiftSlope, LinearDrag, ThrustGain, Wind
 from visadapt.effects.catalogue import catalogue
 from visadapt.estimation.profiles import PROFILES

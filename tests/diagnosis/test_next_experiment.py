@@ -83,8 +83,9 @@ def test_what_repeats_in_every_turn_is_looked_for_in_whole_turns():
     assert "whole turns of motor slowly and fast" in advice
 
 
-def test_what_shows_as_no_function_is_not_described():
-    assert "no function of one state" in explain(SmoothFunction("motor_shaft", False, "time", 1.2))
+def test_a_variable_that_the_data_do_not_show_is_not_named():
+    advice = explain(SmoothFunction("motor_shaft", False, "time", -0.5))
+    assert advice.startswith("An unexplained load (motor shaft) depends on no single state, command or time: record")
 
 
 def test_what_depends_on_time_is_looked_for_in_repeated_runs():

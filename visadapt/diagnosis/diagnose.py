@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,7 +11,7 @@ from torch import nn
 
 from visadapt.diagnosis import policy_bound
 from visadapt.diagnosis.figures_data import disturbances, figure_data, film_frames
-from visadapt.diagnosis.frames import UNSEEN, FramesError, watch, with_camera
+from visadapt.diagnosis.frames import UNSEEN, Film, FramesError, watch, with_camera
 from visadapt.diagnosis.measured_gap import MeasuredGap, measure
 from visadapt.diagnosis.result import (
     AMBIGUOUS,
@@ -43,11 +43,11 @@ from visadapt.diagnosis.search.preparation import PreparedRecording, limited, pr
 from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
+from visadapt.diagnosis.search.searched_effects import searched, shown_by
 from visadapt.diagnosis.verdict import at_bounds, is_slow, left_by_source, left_unexplained, next_step, verdict_of
 from visadapt.diagnosis.words import listed, printable
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
-from visadapt.effects.catalogue import catalogue as all_effects, sized, twins
-from visadapt.effects.late_sensors import LateSensors, MeasurementDelay
+from visadapt.effects.catalogue import catalogue as all_effects, sized
 from visadapt.estimation.effect_fit import remembers
 from visadapt.estimation.episode_phases import has_episode_phases
 from visadapt.estimation.profiles import profile_of
@@ -110,6 +110,62 @@ def diagnose(
     >>> found.verdict, [cause.effect for cause in found.causes]
     ('identified', ['constant_force'])
     """
+    _check(recording, world, policy)
+    system = world.system
+    effects = all_effects(system) if catalogue is None else [sized(effect, system) for effect in catalogue]
+    film = None if recording.measured else _watched(recording, system, renderer, progress)
+    if film is None:
+        effects = shown_by(effects, {system.index(name) for name in recording.measured})
+    else:
+        effects, recording = [effect for effect in effects if effect not in UNSEEN], film.positions
+    used = limited(recording, system)
+    explored = _explore(used, system, effects, FrameDrop if film else Dropout, jobs, progress, announce)
+    search, comparison, groups = explored.search, explored.comparison, explored.groups
+    repeats = [cause for cause, _ in explored.repeats]
+    with_repeats = errors_with_repeats(explored.prepared, search) if repeats else None
+    measured = measure(search, comparison, groups, with_repeats, jobs, staged(progress, "predictions"))
+    verdict, found, partial = _judge(explored, measured)
+    before, after = disturbances(search, comparison)
+    regions = _regions(found, before if found else after, explored.effects, profile_of(system).region_variables, seed)
+    found_in_motion = Diagnosis(
+        system=system.name,
+        recording=RecordingSummary(
+            len(recording.episodes),
+            recording.samples,
+            float(f"{recording.period:.9g}"),
+            tuple(printable(source) for source in used.sources),
+        ),
+        verdict=verdict,
+        where=Where(
+            stage_shares(search, comparison, groups, _found_before(explored, film)),
+            measured.errors.by_state(system, explored.prepared.rows.channels, bool(found)),
+            regions,
+            _pushes(explored, world, bool(found)),
+        ),
+        causes=found,
+        ranking=ranking(comparison, explored.effects, system, measured.closed, repeats),
+        gap=measured.gap,
+        next_experiment=next_step(search, comparison, verdict, groups, found, measured.gap, explored.prepared.coarse),
+        warnings=(
+            *used.warnings,
+            *(f"{effect.name}: {NOT_SEARCHED}" for effect in effects if remembers(effect, system)),
+            *_warnings(explored, measured, verdict, found, recording.sources[0]),
+        ),
+        figures=replace(
+            figure_data(search, measured.source, measured.corrected, measured.errors, before, after, regions),
+            # Of a film that is too long, stretches were used, whose episodes are not the film's.
+            film=film_frames(film, explored.prepared.rows, measured.corrected) if film and used is recording else None,
+        ),
+        policy=None
+        if policy is None
+        else policy_bound.policy_terms(policy, system, explored.prepared.rows, comparison.best),
+        partial=partial,
+    )
+    return found_in_motion if film is None else with_camera(found_in_motion, film, system)
+
+
+def _check(recording: Recording, world: World, policy: policy_bound.StatesToActions | None) -> None:
+    """Raises what `diagnose` does of a world, or a policy, that does not go with the recording."""
     if not isinstance(world, World):
         raise TypeError(f"diagnose: {type(world).__name__} is no World; World(system, period=...) is right")
     if len(world.effects):
@@ -122,67 +178,18 @@ def diagnose(
             f"the recording has {commands.pop()} commands in a row; a {system.name} has {len(system.actions)}: "
             f"{', '.join(action.name for action in system.actions)}"
         )
-    profile = profile_of(system)
+    profile_of(system)
     if policy is not None:
         policy_bound.check(policy, system)
-    effects = all_effects(system) if catalogue is None else [sized(effect, system) for effect in catalogue]
-    film = None
-    if recording.measured:
-        effects = _of_readings(effects, {system.index(name) for name in recording.measured})
-    else:
-        if renderer is None:
-            raise FramesError(
-                f"{recording.sources[0]}: holds frames alone: give the scene's renderer, by renderer= or --renderer"
-            )
-        effects = [effect for effect in effects if effect not in UNSEEN]
-        film = watch(recording, system, renderer, progress)
-        recording = film.positions
-    used = limited(recording, system)
-    explored = _explore(used, system, effects, FrameDrop if film else Dropout, jobs, progress, announce)
-    prepared, search, comparison = explored.prepared, explored.search, explored.comparison
-    groups, rows = explored.groups, prepared.rows
-    repeats = [cause for cause, _ in explored.repeats]
-    with_repeats = errors_with_repeats(prepared, search) if repeats else None
-    measured = measure(search, comparison, groups, with_repeats, jobs, staged(progress, "predictions"))
-    verdict, found, partial = _judge(explored, measured)
-    before, after = disturbances(search, comparison)
-    regions = _regions(found, before if found else after, explored.effects, profile.region_variables, seed)
-    found_before = [(EFFECTS[cause.effect].stage, cost) for cause, cost in explored.repeats]
-    if film is not None and film.camera.best.camera:
-        found_before.append((Stage.CAMERA, film.camera.lost))
-    found_in_motion = Diagnosis(
-        system=system.name,
-        recording=RecordingSummary(
-            len(recording.episodes),
-            recording.samples,
-            float(f"{recording.period:.9g}"),
-            tuple(printable(source) for source in used.sources),
-        ),
-        verdict=verdict,
-        where=Where(
-            stage_shares(search, comparison, groups, found_before),
-            measured.errors.by_state(system, rows.channels, bool(found)),
-            regions,
-            () if prepared.whole is None else _pushes(prepared.whole, world, search, comparison, bool(found)),
-        ),
-        causes=found,
-        ranking=ranking(comparison, explored.effects, system, measured.closed, repeats),
-        gap=measured.gap,
-        next_experiment=next_step(search, comparison, verdict, groups, found, measured.gap, prepared.coarse),
-        warnings=(
-            *used.warnings,
-            *(f"{effect.name}: {NOT_SEARCHED}" for effect in effects if remembers(effect, system)),
-            *_warnings(explored, measured, verdict, found, recording.sources[0]),
-        ),
-        figures=replace(
-            figure_data(search, measured.source, measured.corrected, measured.errors, before, after, regions),
-            # Of a film that is too long, stretches were used, whose episodes are not the film's.
-            film=film_frames(film, rows, measured.corrected) if film and used is recording else None,
-        ),
-        policy=None if policy is None else policy_bound.policy_terms(policy, system, rows, comparison.best),
-        partial=partial,
-    )
-    return found_in_motion if film is None else with_camera(found_in_motion, film, system)
+
+
+def _watched(recording: Recording, system: System, renderer: nn.Module | None, progress: Report | None) -> Film:
+    """The motion that the frames of a recording show."""
+    if renderer is None:
+        raise FramesError(
+            f"{recording.sources[0]}: holds frames alone: give the scene's renderer, by renderer= or --renderer"
+        )
+    return watch(recording, system, renderer, progress)
 
 
 @dataclass(frozen=True)
@@ -235,13 +242,22 @@ def _explore(
     return _Explored(named, prepared, search, comparison, alternatives(comparison, named, system), repeats)
 
 
-def _pushes(
-    recording: Recording, world: World, search: Search, comparison: ModelComparison, explained: bool
-) -> tuple[Push, ...]:
+def _found_before(explored: _Explored, film: Film | None) -> list[tuple[Stage, float]]:
+    """The stages of causes that were found before the search, with the log likelihood lost without each."""
+    found = [(EFFECTS[cause.effect].stage, lost) for cause, lost in explored.repeats]
+    if film is not None and film.camera.best.camera:
+        found.append((Stage.CAMERA, film.camera.lost))
+    return found
+
+
+def _pushes(explored: _Explored, world: World, explained: bool) -> tuple[Push, ...]:
     """The pushes beyond the best set where it explains the recording, else beyond the source."""
+    whole, comparison = explored.prepared.whole, explored.comparison
+    if whole is None:
+        return ()
     if explained:
-        return pushes(recording, _explained(world, comparison), comparison.functions)
-    return pushes(recording, world, left_by_source(search))
+        return pushes(whole, _explained(world, comparison), comparison.functions)
+    return pushes(whole, world, left_by_source(explored.search))
 
 
 def _explained(world: World, comparison: ModelComparison) -> World:
@@ -289,37 +305,6 @@ def _warnings(
             yield f"the unchanged simulator has a probability of {bare:.2f}: that there is a gap at all is not certain"
     carrying = {cause.effect for cause in without_slight(found)}
     yield from (f"{one.name}: {one.caveat}" for one in comparison.best.effects if one.caveat and one.name in carrying)
-
-
-def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effect]]:
-    """The effects that are searched: one of each group of twins. Left out are effects that repeat readings, which are
-    found by another method; sensors with memory, which candidate models cannot linearise by the present state alone
-    (late sensors are kept); and effects of a camera, which are fitted to pixels."""
-    out: list[type[Effect]] = []
-    # Late commands and late readings are twins. The readings are kept: commands then change only between rows, not
-    # within a step, which is exact also where a joint stops.
-    for effect in sorted(effects, key=lambda effect: not issubclass(effect, LateSensors)):
-        fitted_here = not (effect.repeats_readings or remembers(effect, system) or effect.stage is Stage.CAMERA)
-        if fitted_here and not twins(effect, out, system):
-            out.append(effect)
-    return out
-
-
-def _of_readings(effects: Sequence[type[Effect]], measured: set[int]) -> list[type[Effect]]:
-    """The effects that readings of the columns `measured` can show.
-
-    Left out are effects of a camera; a delay of sensors none of which was read; and a delay of exactly the sensors that
-    were read, if `MeasurementDelay`, which then does the same, is searched too.
-    """
-    all_late = any(issubclass(effect, MeasurementDelay) for effect in effects)
-
-    def shows(effect: type[Effect]) -> bool:
-        if not issubclass(effect, LateSensors) or issubclass(effect, MeasurementDelay):
-            return effect.stage is not Stage.CAMERA
-        late = measured & set(effect.late)
-        return bool(late) and not (all_late and late == measured)
-
-    return [effect for effect in effects if shows(effect)]
 
 
 def _regions(

@@ -37,13 +37,7 @@ ALONG = (
 """For a film of a track without features."""
 
 
-MIN_LOG_ODDS = 3.0  # Log odds (20 to 1) above which an unexplained disturbance is described
-
-UNSPECIFIC = (
-    "What is unexplained shows as no function of one state, command or time: record the same commands twice, to see "
-    "what returns, then motions of one kind at a time."
-)
-"""For a gap that no disturbance describes."""
+MIN_LOG_ODDS = 0.0  # Log odds above which the variable of an unexplained disturbance is named: likelier than not
 
 LONGER = (
     "Half a second ahead nothing departs from the source beyond the noise. What acts more slowly shows in long runs "
@@ -72,18 +66,19 @@ def separate(classes: Sequence[Collection[type[Effect]]], system: System) -> str
 
 
 def disturbance_in_words(function: SmoothFunction) -> str:
-    """An unexplained disturbance in words: a load, or an error of a state's reading, that depends on a variable."""
+    """An unexplained disturbance in words: a load, or an error of a state's reading, and what it depends on."""
     port = plain(function.port)
     what = f"error of the reading of {port}" if function.of_reading else f"load ({port})"
-    return f"an unexplained {what} depends on {plain(function.variable)}"
+    by = plain(function.variable) if function.log_odds > MIN_LOG_ODDS else "no single state, command or time"
+    return f"an unexplained {what} depends on {by}"
 
 
 def explain(function: SmoothFunction) -> str:
     """The experiment that shows an unexplained disturbance more clearly."""
-    if not function.log_odds > MIN_LOG_ODDS:
-        return UNSPECIFIC
     said = disturbance_in_words(function)
-    if function.variable == "time":
+    if not function.log_odds > MIN_LOG_ODDS:
+        runs = "the same commands twice, to see what returns, and motions of one kind at a time"
+    elif function.variable == "time":
         runs = "several long runs under the same commands, to see what returns in each"
     else:
         angle = function.variable.removesuffix(TURN_SUFFIX)

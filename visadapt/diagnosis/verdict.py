@@ -139,8 +139,6 @@ def at_bound(effect: str, parameter: str, end: float, unit: str) -> str:
 
 def left_unexplained(comparison: ModelComparison, verdict: str, unexplained: bool) -> list[str]:
     """A warning where causes are named although they leave something."""
-    if verdict not in (IDENTIFIED, AMBIGUOUS) or not unexplained:
-        return []
-    first = comparison.functions[0]
-    described = first.log_odds > next_experiment.MIN_LOG_ODDS
-    return [f"{CLOSES_BUT}: {next_experiment.disturbance_in_words(first)}" if described else CLOSES_BUT]
+    if verdict in (IDENTIFIED, AMBIGUOUS) and unexplained:
+        return [f"{CLOSES_BUT}: {next_experiment.disturbance_in_words(comparison.functions[0])}"]
+    return []
