@@ -53,6 +53,11 @@ class SmoothFunction:
     """(n,) weights of the states whose sum is the variable; None: it is no state, or the function has a factor"""
     centres: Tensor | None = field(default=None, compare=False)  # (BUMPS,) of its bumps; None: waves within a turn
 
+    @property
+    def terms(self) -> int:
+        """M, how many bumps or waves it has."""
+        return 2 * WAVES if self.centres is None else BUMPS
+
     def basis(self, values: Tensor) -> Tensor:
         """(..., M) its bumps or waves at values (...) of its variable."""
         if self.centres is None:

@@ -47,6 +47,9 @@ SLOW = 0.01  # Speed over the largest of its range below which a joint may stick
 
 SLACK = 0.1  # Command over the largest of its range at which the play of a drive is taken up
 
+KNOWN_SIZE = 3.0
+"""Size of the columns of a function that is known to act: as large weights are as probable as small ones of others."""
+
 DIFFERENCE = 1e-4  # Finite difference of a state in its unit, and of the log of a parameter
 
 
@@ -58,7 +61,9 @@ class LoadTrack:
     time: Tensor  # (N,) s since the episode began
     unit: Tensor  # (J,) root mean square of each joint's load over the recording, in its own unit: N or N m
     load: Tensor  # (N, J) in these units
-    columns: Tensor  # (K, N, J) loads that state and command may explain, of unit root mean square over the recording
+    columns: Tensor
+    """(K, N, J) loads that state and command may explain, of unit root mean square over the recording; those of a
+    function that is known to act, which are last, of KNOWN_SIZE"""
     reaction: Tensor
     """(K, N, J, J) change of the columns, which follow the modelled motion, per unit of load that nothing explains"""
     dry: tuple[int, ...]  # the column of each joint's dry friction
@@ -112,6 +117,8 @@ def load_tracks(recording: Recording, world: World, known: SmoothFunction | None
     # Only over a unit of its own for each joint do the loads of a slide and a hinge compare.
     columns = [(track.columns / unit).square().flatten(1) for track in found]
     size = (torch.cat(columns, 1).mean(1).sqrt() + 1e-300)[:, None, None]
+    if known is not None:
+        size[-known.terms :] /= KNOWN_SIZE
     return [
         replace(
             track,
@@ -296,8 +303,6 @@ class _Motion:
                 first = rate(error)
                 change = -slopes[0] * error[:, None] - slopes[1] * first[:, None] + rate(first)[:, None] * joints[j]
                 columns.append(load(change))
-        if known is not None and known.loads is not None and known.states is not None:
-            columns += [each[:, None] * known.loads for each in known.basis(state @ known.states).unbind(-1)]
         bare: Any = system
         plain = self.gain(bare)
         for name in scalable(system):
@@ -305,6 +310,8 @@ class _Motion:
             loads = [torch.linalg.solve(g, (self.measured - f)[..., None])[..., 0] for f, g in (plain, scaled)]
             reactions[len(columns)] = (joints - torch.linalg.solve(scaled[1], plain[1])) / DIFFERENCE
             columns.append((loads[0] - loads[1]) / DIFFERENCE)
+        if known is not None and known.loads is not None and known.states is not None:
+            columns += [each[:, None] * known.loads for each in known.basis(state @ known.states).unbind(-1)]
         reaction = state.new_zeros(len(state), len(columns), len(joints), len(joints))
         for k, each in reactions.items():
             reaction[:, k] = each
