@@ -74,26 +74,26 @@ def overlapping(bumps: Sequence[Bump]) -> list[list[Bump]]:
     return groups
 
 
-@dataclass(frozen=True)
-class SummedBumps:
-    """Overlapping bumps, whose sum has the shape of one push."""
+def summed(
+    bumps: Sequence[Bump], deviation: float, tracks: Sequence[LoadTrack], loads: Sequence[Variable], tries: int
+) -> Push:
+    """The push whose shape is the sum of overlapping bumps.
 
-    bumps: Sequence[Bump]
-    deviation: float  # of their impulse, over the root mean square of the joint's load
-
-    def push(self, tracks: Sequence[LoadTrack], loads: Sequence[Variable], tries: int) -> Push:
-        """The push, where as many bumps were tried on the tracks."""
-        track, load = tracks[self.bumps[0].part], loads[self.bumps[0].joint]
-        unit = float(track.unit[self.bumps[0].joint])
-        reach = [(one.middle - EDGE * one.width, one.middle + EDGE * one.width) for one in self.bumps]
-        time = np.linspace(min(a for a, _ in reach), max(b for _, b in reach), SHAPE_POINTS)
-        heights, middles, widths = np.array([(one.height, one.middle, one.width) for one in self.bumps]).T
-        shape = unit * np.exp(-0.5 * ((time[:, None] - middles) / widths) ** 2) @ heights
-        peak = shape[np.abs(shape).argmax()]
-        during = time[shape / peak >= EDGE_SHARE]
-        impulse = unit * sum(one.height * one.area for one in self.bumps)
-        spread = Z_90 * math.hypot(unit * self.deviation, SHAPE_ERROR * impulse)
-        p_value = min(1.0, tries * math.erfc(max(one.score for one in self.bumps) / math.sqrt(2)))
-        start, end = max(0.0, float(during[0])), float(during[-1])
-        ci90 = impulse - spread, impulse + spread
-        return Push(track.episode, load.name, start, end, float(peak), load.unit, impulse, ci90, p_value)
+    Args:
+        deviation: of the bumps' impulse, over the root mean square of the joint's load.
+        tries: how many bumps were tried on the tracks.
+    """
+    track, load = tracks[bumps[0].part], loads[bumps[0].joint]
+    unit = float(track.unit[bumps[0].joint])
+    reach = [(one.middle - EDGE * one.width, one.middle + EDGE * one.width) for one in bumps]
+    time = np.linspace(min(a for a, _ in reach), max(b for _, b in reach), SHAPE_POINTS)
+    heights, middles, widths = np.array([(one.height, one.middle, one.width) for one in bumps]).T
+    shape = unit * np.exp(-0.5 * ((time[:, None] - middles) / widths) ** 2) @ heights
+    peak = shape[np.abs(shape).argmax()]
+    during = time[shape / peak >= EDGE_SHARE]
+    impulse = unit * sum(one.height * one.area for one in bumps)
+    spread = Z_90 * math.hypot(unit * deviation, SHAPE_ERROR * impulse)
+    p_value = min(1.0, tries * math.erfc(max(one.score for one in bumps) / math.sqrt(2)))
+    start, end = max(0.0, float(during[0])), float(during[-1])
+    ci90 = impulse - spread, impulse + spread
+    return Push(track.episode, load.name, start, end, float(peak), load.unit, impulse, ci90, p_value)

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d, pad
 
 from visadapt.diagnosis.result import Push
-from visadapt.diagnosis.search.bumps import Bump, SummedBumps, bumps_at, overlapping
+from visadapt.diagnosis.search.bumps import Bump, bumps_at, overlapping, summed
 from visadapt.diagnosis.search.unexplained import CLEAR_LOG_ODDS, SmoothFunction
 from visadapt.diagnosis.search.unexplained_load import LoadTrack, load_tracks
 from visadapt.recordings import Recording
@@ -49,6 +49,8 @@ deviation."""
 LAGS = 8  # Order of the autoregression of errors
 
 ROUNDS, ROUNDS_AGAIN = 6, 3  # Rounds in which columns and errors are fitted in turn, at first and with another bump
+
+NEIGHBOURS = 4  # Instants on either side over which the power of errors is averaged
 
 OUTLIER = 2.5  # Errors, in deviations, above which they count less (Huber)
 
@@ -83,7 +85,7 @@ def pushes(recording: Recording, world: World, unexplained: Sequence[SmoothFunct
         return ()  # errors too small, or too large, for any push to stand out
     middles = sum(float(track.time[-1] - track.time[0]) / (SPACING * width) for track in tracks for width in WIDTHS)
     tries = round(middles) * tracks[0].load.shape[1]
-    named = [one.push(tracks, world.system.loads, tries) for one in found]
+    named = [summed(bumps, deviation, tracks, world.system.loads, tries) for bumps, deviation in found]
     sure = [push for push in named if push.p_value <= MAX_P_VALUE and push.ci90[0] * push.ci90[1] > 0]
     return tuple(sorted(sure, key=lambda push: (push.episode, push.start)))
 
@@ -103,24 +105,36 @@ def _held(track: LoadTrack, friction: Tensor) -> Tensor:
 class _Fit:
     """Columns, errors and bumps, fitted to all parts of a recording together."""
 
+    tracks: Sequence[LoadTrack]  # P parts, of N instants each (N differs), with J joints and K columns
+    bumps: list[Bump]  # B on a part
+    residual: list[Tensor]  # P times (N, J): the load less all that is fitted
+    weights: list[Tensor]  # P times (M,): of the columns, the loads held by dry friction, and the bumps
+    roots: list[Tensor]  # P times (M, M): Cholesky factors of the weights' precision
+    held: list[Tensor]  # P times (H, N, J): loads by which dry friction may hold a joint at rest (H differs)
+    spread: list[Tensor]  # P times (N, J): deviation of the errors
+    autoregression: Tensor  # (J, LAGS) of the errors over their deviation
+    innovation: Tensor  # (J,) deviation of what the autoregression leaves
+    first: (
+        Tensor  # (J, LAGS, LAGS) Cholesky factors of the covariances of a part's first LAGS errors, which follow none
+    )
+
     def __init__(self, tracks: Sequence[LoadTrack]) -> None:
         self.tracks = tracks
-        self.bumps: list[Bump] = []
+        self.bumps = []
         joints = tracks[0].load.shape[1]
         # At first all of the load, so that `_design` takes the columns along the world's motion: along the measured
         # motion, one factor common to all columns would explain a push away.
-        self.left = [track.load.clone() for track in tracks]
+        self.residual = [track.load.clone() for track in tracks]
         self.weights = [torch.zeros(0, dtype=torch.float64) for _ in tracks]
         self.roots = [torch.zeros(0, 0, dtype=torch.float64) for _ in tracks]
+        self.held = [_held(track, track.friction) for track in tracks]
         self.spread = [torch.ones_like(track.load) for track in tracks]
         self.autoregression = torch.zeros(joints, LAGS, dtype=torch.float64)
         self.innovation = torch.ones(joints, dtype=torch.float64)
-        # Cholesky factors of the covariances of a part's first LAGS errors, which follow none.
         self.first = torch.eye(LAGS, dtype=torch.float64).repeat(joints, 1, 1)
-        self.held = [_held(track, track.friction) for track in tracks]
 
-    def pushes(self) -> list[SummedBumps]:
-        """The bumps that stand out clearly, summed where they overlap."""
+    def pushes(self) -> list[tuple[list[Bump], float]]:
+        """The bumps that stand out clearly, those that overlap together, with the deviation of their impulse."""
         self._fit(ROUNDS)
         searched: Sequence[int] = range(len(self.tracks))
         for k in range(MAX_BUMPS):
@@ -141,7 +155,7 @@ class _Fit:
                 break
             self.bumps = [one for one in self.bumps if one not in weakest.values()]
             self._fit(ROUNDS_AGAIN)
-        return [SummedBumps(group, self._impulse_deviation(group)) for group in overlapping(self.bumps)]
+        return [(group, self._impulse_deviation(group)) for group in overlapping(self.bumps)]
 
     def _refine(self) -> None:
         """Choose middle and width of each bump that overlaps no other again: the errors are better known by now.
@@ -161,7 +175,7 @@ class _Fit:
     def _design(self, part: int) -> Tensor:
         """(K, N, J) loads of unit prior deviation: of columns, of dry friction at rest, and of this part's bumps."""
         track = self.tracks[part]
-        columns = track.columns - torch.einsum("knij,nj->kni", track.reaction, self.left[part])
+        columns = track.columns - torch.einsum("knij,nj->kni", track.reaction, self.residual[part])
         bumps = [BUMP_PRIOR * one.on(track) for one in self.bumps if one.part == part]
         return torch.cat((COLUMN_PRIOR * columns, self.held[part], *(one[None] for one in bumps)))
 
@@ -194,7 +208,7 @@ class _Fit:
             design, target = self._whitened(part, self._design(part)), self._whitened(part, track.load)
             weighted = design
             if robust:
-                error = self._whitened(part, self.left[part]).abs()
+                error = self._whitened(part, self.residual[part]).abs()
                 weighted = design * (OUTLIER / error.clamp(min=1e-9)).clamp(max=1)
             normal, gradient = weighted @ design.T, weighted @ target
             problems.append((normal, gradient))
@@ -215,16 +229,16 @@ class _Fit:
             self.roots[part] = torch.linalg.cholesky(normal + torch.diag(precision))
             self.weights[part] = torch.cholesky_solve(gradient[:, None], self.roots[part])[:, 0]
             explained = torch.einsum("k,knj->nj", self.weights[part], self._design(part))
-            self.left[part] = self.tracks[part].load - explained
+            self.residual[part] = self.tracks[part].load - explained
 
     def _size_errors(self) -> None:
         """How errors grow with activity, and their autoregression (Yule-Walker), joint by joint, where it moves.
 
-        What is left is smaller than the errors, since the weights fit a part of them: the weights' covariance is added.
+        The residual is smaller than the errors, since the weights fit a part of them: the weights' covariance is added.
         """
         taken = [
             torch.linalg.solve_triangular(root, self._design(part).flatten(1), upper=False).unflatten(
-                1, self.left[part].shape
+                1, self.residual[part].shape
             )
             for part, root in enumerate(self.roots)
         ]
@@ -232,14 +246,14 @@ class _Fit:
         basis = pad(activity - activity.mean(0), (1, 0), value=1.0)
         lengths = [len(track.time) for track in self.tracks]
         for j in range(len(self.innovation)):
-            left = [each[:, j] for each in self.left]
+            residual = [each[:, j] for each in self.residual]
             absorbed = [each[..., j] for each in taken]
             moving = (1 - torch.cat([track.at_rest[:, j] for track in self.tracks])).clamp(min=MIN_WEIGHT)
-            most = MAX_POWER * torch.cat(left).square()[moving >= moving.max() / 2].median()
+            most = MAX_POWER * torch.cat(residual).square()[moving >= moving.max() / 2].median()
             power = torch.cat(
                 [
                     _local_mean(e.square().clamp(max=most) + v.square().sum(0))
-                    for e, v in zip(left, absorbed, strict=True)
+                    for e, v in zip(residual, absorbed, strict=True)
                 ]
             )
             deviations = (0.5 * _log_power(basis, power, moving)).exp().split(lengths)
@@ -247,7 +261,7 @@ class _Fit:
             for part, (each, weight) in enumerate(zip(deviations, moving.split(lengths), strict=True)):
                 self.spread[part] = self.spread[part].clone()
                 self.spread[part][:, j] = each
-                white, more = weight * (left[part] / each).clamp(-3, 3), weight * absorbed[part] / each
+                white, more = weight * (residual[part] / each).clamp(-3, 3), weight * absorbed[part] / each
                 for lag in range(LAGS + 1):
                     end = len(each) - lag
                     moments[lag] += white[lag:] @ white[:end] + (more[:, lag:] * more[:, :end]).sum()
@@ -271,7 +285,7 @@ class _Fit:
         time, joints = self.tracks[part].time, self.tracks[part].load.shape[1]
         shape = (-1, len(time), joints)
         design = self._whitened(part, self._design(part)).unflatten(1, shape[1:])
-        left = self._whitened(part, self.left[part]).unflatten(0, shape[1:])
+        residual = self._whitened(part, self.residual[part]).unflatten(0, shape[1:])
 
         def best(joint: int, middles: Tensor, width: float) -> Bump:
             tried = bumps_at(self.tracks[part], middles, width)[..., None]
@@ -279,7 +293,7 @@ class _Fit:
             shared = torch.linalg.solve_triangular(self.roots[part], design[..., joint] @ shapes.mT, upper=False)
             alone = shapes.square().sum(1)
             information = (alone - shared.square().sum(0)).clamp(min=MIN_DISTINCT * alone)
-            height = shapes @ left[:, joint] / information
+            height = shapes @ residual[:, joint] / information
             k = int((height.abs() * information.sqrt()).argmax())
             return Bump(part, joint, float(middles[k]), width, float(height[k]), float(information[k] ** -0.5))
 
@@ -329,6 +343,7 @@ def _log_power(basis: Tensor, power: Tensor, weight: Tensor) -> Tensor:
     return expected + ((power / expected.exp()).clamp(max=MAX_POWER) @ weight / weight.sum()).log()
 
 
-def _local_mean(values: Tensor, reach: int = 4) -> Tensor:
-    """Values (N,) averaged over `reach` neighbours on either side."""
-    return avg_pool1d(pad(values[None], (reach, reach), mode="replicate"), 2 * reach + 1, 1)[0]
+def _local_mean(values: Tensor) -> Tensor:
+    """Values (N,) averaged over NEIGHBOURS on either side."""
+    padded = pad(values[None], (NEIGHBOURS, NEIGHBOURS), mode="replicate")
+    return avg_pool1d(padded, 2 * NEIGHBOURS + 1, 1)[0]
