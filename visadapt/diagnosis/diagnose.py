@@ -152,7 +152,7 @@ def diagnose(
             *_warnings(explored, measured, verdict, found, recording.sources[0]),
         ),
         figures=replace(
-            figure_data(search, measured.source, measured.corrected, measured.errors, before, after, regions),
+            figure_data(search, measured, before, after, regions),
             # Of a film that is too long, stretches were used, whose episodes are not the film's.
             film=film_frames(film, explored.prepared.rows, measured.corrected) if film and used is recording else None,
         ),
@@ -276,8 +276,8 @@ def _judge(explored: _Explored, measured: MeasuredGap) -> tuple[str, tuple[Cause
     comparison, groups = explored.comparison, explored.groups
     repeats = [cause for cause, _ in explored.repeats]
     explaining = (*repeats, *causes(explored.search, comparison, groups, measured.closed))
-    unexplained, coarse = comparison.unexplained(measured.improvable), bool(explored.prepared.coarse)
-    verdict = verdict_of(comparison, measured.gap, unexplained, measured.improvable, explaining, bool(repeats), coarse)
+    coarse = bool(explored.prepared.coarse)
+    verdict = verdict_of(comparison, measured.gap, measured.improvable, explaining, bool(repeats), coarse)
     found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
     return verdict, found, tuple(without_slight(explaining)) if verdict == UNEXPLAINED else ()
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from visadapt.diagnosis.frames import Film
+from visadapt.diagnosis.measured_gap import MeasuredGap
 from visadapt.diagnosis.prediction_errors import PredictionErrors
 from visadapt.diagnosis.result import Chart, Curve, FigureData, FilmFrames, Prediction, Region
 from visadapt.diagnosis.search import heldout
@@ -40,25 +41,19 @@ def disturbances(search: Search, comparison: ModelComparison) -> tuple[Disturban
 
 
 def figure_data(
-    search: Search,
-    source: RolloutErrors,
-    corrected: RolloutErrors,
-    errors: PredictionErrors,
-    before: Disturbance,
-    after: Disturbance,
-    regions: Sequence[Region],
+    search: Search, measured: MeasuredGap, before: Disturbance, after: Disturbance, regions: Sequence[Region]
 ) -> FigureData:
-    """What the report plots."""
+    """What the report plots; the disturbances are those of the source, and of the best set."""
     units = {v.name: v.unit for v in (*search.system.states, *search.system.actions)} | {"time": "s"}
     plotted = [region.variable for region in regions] + list(search.profile.plotted_variables)
     names = [name for name in dict.fromkeys(plotted) if name in units][:MAX_PROFILES]
     residual = search.profile.residual_name, search.system.loads[0].unit
     return FigureData(
-        _predictions(search, source, corrected),
+        _predictions(search, measured.source, measured.corrected),
         tuple(_profile(name, units[name], residual, before, after) for name in names),
-        _growth(errors, search.rows.period),
+        _growth(measured.errors, search.rows.period),
         _spectrum(residual, before, after, search.rows.period),
-        held_out=errors.held_out,
+        held_out=measured.errors.held_out,
     )
 
 

@@ -39,7 +39,6 @@ is about what the source leaves."""
 def verdict_of(
     comparison: ModelComparison,
     gap: Gap,
-    unexplained: bool,
     improvable: bool,
     explaining: Sequence[Cause],
     repeats: bool,
@@ -48,7 +47,6 @@ def verdict_of(
     """The verdict where these causes are what explains the gap best.
 
     Args:
-        unexplained: they leave something unexplained.
         improvable: a black box beside them clearly closes more of the gap.
         repeats: readings are repeated.
         coarse: a position is read in steps that are coarse for the motion.
@@ -56,6 +54,7 @@ def verdict_of(
     # Coarse steps, and errors of a velocity's reading, are fitted as noise: a source that predicts within it may still
     # have a gap.
     nothing = UNEXPLAINED if coarse or comparison.misread else NO_GAP
+    unexplained = comparison.unexplained(improvable)
     if math.isnan(gap.closed) and not repeats:
         return nothing  # the source predicts as well as the noise allows
     if unexplained:

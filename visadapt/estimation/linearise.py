@@ -101,7 +101,6 @@ def linearise_step(
         by_state, by_command: whether to compute these derivatives; that by the command is by a constant added to
             `acting` over the period.
     """
-    width = acting.shape[-1]
     given = acting if acting.dim() == 4 else acting[None].expand(1 + values.shape[-1], *acting.shape)
 
     def step(rows: Tensor, states: Tensor, moved: Sequence[int], pushed: Tensor) -> Tensor:
@@ -112,7 +111,7 @@ def linearise_step(
         return integrate(world, rows, time.repeat(len(moved)), states, commands.flatten(0, 1), lasting)
 
     columns = _columns(world, sensing=False)
-    return _tangent(step, world, values, state, by_state, columns, width if by_command else 0, width)
+    return _tangent(step, world, values, state, columns, by_state, by_command)
 
 
 def linearise_reading(
@@ -121,7 +120,7 @@ def linearise_reading(
     state: Tensor,
     following: Sequence[Following],
     applied: Sequence[Tensor],
-    by_state: bool = True,
+    by_state: bool,
 ) -> Tangent:
     """Sensor readings (N, n) that show N states, with derivatives.
 
@@ -141,7 +140,7 @@ def linearise_reading(
         identity = torch.eye(n, dtype=state.dtype, device=state.device).expand(count, n, n)[..., : n if by_state else 0]
         return Tangent(state, identity, state.new_zeros(count, n, values.shape[-1]), state.new_zeros(count, n, 0))
     columns = _columns(world, sensing=True) + (_columns(world, sensing=False) if following or applied else [])
-    return _tangent(read, world, values, state, by_state, columns, 0, len(world.system.actions))
+    return _tangent(read, world, values, state, columns, by_state, by_command=False)
 
 
 def _columns(world: World, sensing: bool) -> list[int]:
@@ -157,15 +156,16 @@ def _tangent(
     world: World,
     values: Tensor,
     state: Tensor,
-    by_state: bool,
     columns: Sequence[int],
-    commands: int,
-    width: int,
+    by_state: bool,
+    by_command: bool,
 ) -> Tangent:
     """Evaluate the base point, and with each state, parameter of `columns` and command moved, as one batch.
 
-    The other parameters change nothing; `commands` is `width`, the number of commands, or 0 without their derivatives.
+    The other parameters change nothing.
     """
+    width = len(world.system.actions)
+    commands = width if by_command else 0
     (count, n), parameters = state.shape, len(columns)
     states = n if by_state else 0
     replicas = 1 + states + parameters + commands
