@@ -8,9 +8,10 @@ import torch
 from scipy.interpolate import CubicHermiteSpline
 
 from tests.diagnosed import record
+from visadapt.diagnosis.search.angle_defect import between, shortest_arc
 from visadapt.diagnosis.search.heldout import folds
 from visadapt.diagnosis.search.preparation import prepare
-from visadapt.diagnosis.search.sensor_checks import between, derived_velocities, shortest_arc
+from visadapt.diagnosis.search.sensor_checks import derived_velocities
 from visadapt.effects import ViscousFriction
 from visadapt.estimation.segments import cut
 from visadapt.recordings import Episode

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from visadapt.diagnosis.search import sensor_checks
+from visadapt.diagnosis.search import angle_defect, sensor_checks, sign_conventions
 from visadapt.diagnosis.search.heldout import PREDICTION_TIME
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.words import OPPOSITE
@@ -117,8 +117,8 @@ class _Readings:
         """Episodes from their first usable row on, in the signs of the source. Repeated and missing readings are filled
         in; rows of longer runs of these are marked as not usable."""
         convention = convention or Convention("", ())
-        sign = sensor_checks.signs(convention.columns, self.channels)
-        command_sign = sensor_checks.signs(convention.commands, range(len(self.system.actions)))
+        sign = sign_conventions.signs(convention.columns, self.channels)
+        command_sign = sign_conventions.signs(convention.commands, range(len(self.system.actions)))
         parts = zip(self.stamps, self.commands, self.states, self.repeats.used, strict=True)
         episodes, usable = [], []
         for rows, first in zip(parts, self.first_usable, strict=True):
@@ -219,25 +219,25 @@ def _without_defective_angles(draft: _Draft, source: FitState) -> _Draft:
     """Without readings of the angle where its sensor is defective; `source` is the source's fit to the draft's rows."""
     readings = draft.readings
     sensor = profile_of(readings.system).angle_sensor
-    defect = sensor_checks.angle_defect(readings.system, draft.rows.select(draft.searched), source)
+    defect = angle_defect.defective_band(readings.system, draft.rows.select(draft.searched), source)
     if defect is None:
         return draft
     band, full_turns = defect
     angle, name = readings.channels.index(sensor[0]), readings.system.states[sensor[0]].name
-    bad = [sensor_checks.between(values[:, angle], *band) for values in readings.states]
+    bad = [angle_defect.between(values[:, angle], *band) for values in readings.states]
     told = (
         f"{sum(int(b.sum()) for b in bad)} readings of {name} between {band[0]:.2f} and {band[1]:.2f} rad "
         "contradict those around them and the physics: the sensor is defective there; they were set aside"
     )
-    stretches = sensor_checks.stretches_without(bad)
+    stretches = angle_defect.stretches_without(bad)
     if full_turns and stretches:
         # A potentiometer's dead zone has an unknown width, so windows end at it, and the angle runs from one of its
         # edges to the other, so that an error of the sensor's scale is symmetric about upright.
-        states = [sensor_checks.on_one_turn(values, angle, 0.5 * (band[0] + band[1])) for values in readings.states]
+        states = [angle_defect.on_one_turn(values, angle, 0.5 * (band[0] + band[1])) for values in readings.states]
         readings = replace(readings, states=states)
         turned = readings.draft(stretches)
         return replace(draft, readings=readings, defect=band).changed(turned.rows, turned.raw, told)
-    rows = sensor_checks.without_angles(draft.rows, sensor, *band)
+    rows = angle_defect.without_angles(draft.rows, sensor, *band)
     return replace(draft, defect=band).changed(rows, draft.raw, told)
 
 
@@ -259,13 +259,13 @@ def _in_signs_of_source(draft: _Draft, first: FitState, catalogue: Sequence[type
     """In the signs in which the recording is likeliest; `first` is the source's fit before readings were left out."""
     system, band = draft.readings.system, draft.defect
     rows = draft.rows.select(draft.searched)
-    convention = sensor_checks.opposite_signs(system, rows, catalogue, first, draft.source)
+    convention = sign_conventions.opposite_signs(system, rows, catalogue, first, draft.source)
     if convention is None:
         return draft
     if band is not None and profile_of(system).angle_sensor[0] in convention.columns:
         band = (-band[1], -band[0])
     told = f"{convention.name}{OPPOSITE}; it was inverted"
-    rows, raw = (sensor_checks.to_source(each, convention) for each in (draft.rows, draft.raw))
+    rows, raw = (sign_conventions.to_source(each, convention) for each in (draft.rows, draft.raw))
     rows, raw = _with_unmeasured(rows, raw, system)
     return replace(draft, convention=convention, defect=band).changed(rows, raw, told)
 

@@ -1,0 +1,90 @@
+"""Whether a recording has other signs than the source: of the angle, the command or the position."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from visadapt.diagnosis.search.search import Search
+from visadapt.diagnosis.words import listed
+from visadapt.effects import Effect
+from visadapt.estimation.likelihood import FitState
+from visadapt.estimation.profiles import Convention, profile_of
+from visadapt.estimation.segments import Segments
+from visadapt.estimation.unmeasured_states import with_unmeasured
+from visadapt.systems import System
+
+SUSPICIOUS_LOG_PROCESS = math.log(0.02**2)
+"""Log variance of the velocities' process noise, (m/s)^2 and (rad/s)^2, above which the source fits so badly that signs
+and sensors are checked."""
+
+MIN_GAIN_PER_READING = 0.1
+"""Log likelihood per reading that another convention must gain to be taken for that of the recording."""
+
+ALIKE = 10.0  # Log likelihood of the source within which two conventions are as likely
+
+EFFECTS_WITH_SIGNS, MOST_EFFECTS_WITH_SIGNS, LEADS_WITH_SIGNS = 2, 6, 3
+"""Before a sign convention is decided on, EFFECTS_WITH_SIGNS effects are added one by one to the source in both, the
+source's convention and the best other one, since a large effect can look like a wrong sign. While the other one is
+ahead, but not clearly, further effects are added, up to MOST_EFFECTS_WITH_SIGNS. LEADS_WITH_SIGNS effects are tried for
+each one added."""
+
+
+def opposite_signs(
+    system: System, rows: Segments, catalogue: Sequence[type[Effect]], source: FitState, fitted: FitState | None
+) -> Convention | None:
+    """The convention in which the recording is far likelier than in the source's, if there is one. Where a mirror image
+    moves alike, several are as likely: it then has the names of all, and the signs of the first.
+
+    `catalogue` are the effects that may be present, `source` is a fit of the source before bad readings were excluded,
+    `fitted` that to `rows`, if known.
+    """
+    every = [
+        each for each in profile_of(system).sign_conventions if each.commands or {*each.columns} & {*rows.channels}
+    ]
+    if not every or float(source.log_process.max()) < SUSPICIOUS_LOG_PROCESS:
+        return None
+    required = MIN_GAIN_PER_READING * float(rows.used.sum())
+    as_given = Search(system, rows, catalogue, fitted)
+    conventions = [with_unmeasured(to_source(rows, convention), system) for convention in every]
+    others = [Search(system, each, catalogue, rival=_likelihood(as_given)) for each in conventions]
+    most = max(_likelihood(each) for each in others)
+    alike = [k for k, each in enumerate(others) if _likelihood(each) >= most - ALIKE]
+    other = others[alike[0]]
+    if _ahead(other, as_given) <= required:
+        return None
+    # A sensor that is late by a period can look like a wrong sign, and the screening does not see it.
+    for search in (as_given, other):
+        search.try_late_sensors()
+    for added in range(MOST_EFFECTS_WITH_SIGNS):
+        if added >= EFFECTS_WITH_SIGNS and not 0 < _ahead(other, as_given) <= required:
+            break
+        for search in (as_given, other):
+            search.extend([search.best], LEADS_WITH_SIGNS)
+    if _ahead(other, as_given) <= required:
+        return None
+    return replace(every[alike[0]], name=listed([every[k].name for k in alike], "or"))
+
+
+def _ahead(one: Search, other: Search) -> float:
+    return _likelihood(one) - _likelihood(other)
+
+
+def _likelihood(search: Search) -> float:
+    return float(search.best.fits.likelihood[0])
+
+
+def signs(turned: Sequence[int], columns: Iterable[int]) -> Tensor:
+    """(m,) factors of these columns: -1 of those that are `turned`, else 1."""
+    return torch.tensor([-1.0 if column in turned else 1.0 for column in columns], dtype=torch.float64)
+
+
+def to_source(rows: Segments, convention: Convention) -> Segments:
+    """Rows of another convention in that of the source."""
+    measured = rows.measured * signs(convention.columns, rows.channels)
+    command = rows.command * signs(convention.commands, range(rows.command.shape[-1]))
+    return replace(rows, measured=measured, command=command)
