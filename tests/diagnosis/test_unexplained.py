@@ -1,4 +1,4 @@
-"""Which smooth function of states a source leaves unexplained, and that it is no push."""
+"""Loads by a shaft's angle within a turn and between two joints: what is said of them, and that they are no pushes."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -13,6 +13,7 @@ from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.verdict import left_by_source
+from visadapt.effects.catalogue import catalogue
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import System, Variable
 
@@ -116,3 +117,15 @@ def test_cogging_is_no_push_and_hides_none():
         (found,) = pushes(recorded(cogging, PUSH), world, left(cogging, PUSH))
     assert (found.load, found.episode) == ("motor_shaft", PUSHED[0])
     assert found.impulse == pytest.approx(PUSH * PUSHED[2] * np.sqrt(2 * np.pi), rel=0.3)
+
+
+def test_cogging_is_named_among_other_loads():
+    wanted = ("motor_shaft.cogging", "motor_shaft.coulomb_friction", "motor_shaft.periodic_load", "stiffness.scale")
+    effects = [effect for effect in catalogue(Drive()) if effect.name in wanted]
+    found = va.diagnose(recorded(cogging), va.World(Drive(), period=PERIOD), effects)
+    assert found.verdict == "identified"
+    (cause,) = (cause for cause in found.causes if not cause.slight)
+    assert cause.effect == "motor_shaft.cogging"
+    # -sin(8 q) is cos(8 q + pi / 2)
+    for name, truth in {"torque": 0.012, "waves": 8.0, "phase": np.pi / 2}.items():
+        assert cause.parameters[name].value == pytest.approx(truth, rel=2e-3)

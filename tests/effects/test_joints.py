@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.own_systems import Pendulum, Rover, furuta
+from tests.own_systems import Pendulum, Rover, Winch, furuta
 from tests.worlds import columns
 from visadapt.effects import EFFECTS
 from visadapt.effects.catalogue import catalogue, catalogue_text, twins
@@ -37,6 +37,16 @@ def test_the_load_of_a_joint_acts_on_it_alone(name, values, unit, expected):
     at = World(FURUTA, [effect]).start(STATE, torch.full((1,), 1.5, dtype=torch.float64))
     load = World(FURUTA, [effect]).load(at)[0]
     torch.testing.assert_close(load, torch.tensor(expected, dtype=torch.float64), rtol=1e-6, atol=1e-9)
+
+
+def test_cogging_returns_in_every_turn_of_a_joint_that_turns():
+    named = {effect.name: effect for effect in catalogue(Winch())}
+    world = World(Winch(), [named["axis.cogging"](torque=0.02, waves=6.0, phase=0.4)])
+    drum = torch.tensor([0.3, 0.3 + 2 * torch.pi], dtype=torch.float64)
+    load = world.load(world.start(torch.stack((drum, torch.zeros_like(drum)), 1)))[:, 0]
+    torch.testing.assert_close(load, 0.02 * (6 * drum + 0.4).cos(), rtol=1e-6, atol=1e-8)
+    assert load[0].item() == pytest.approx(load[1].item(), abs=1e-7)
+    assert "joint.cogging" not in {effect.name for effect in catalogue(Pendulum())}  # it swings
 
 
 def test_added_inertia_is_that_of_a_heavier_arm():

@@ -42,6 +42,7 @@ class Role(StrEnum):
     FREQUENCY = "frequency"  # In Hz; searched on a logarithmic grid
     PHASE = "phase"  # In rad; equal modulo a turn
     EPISODE_PHASE = "episode phase"  # Phase of one episode after the first, where each has its own
+    WAVES = "waves"  # How often something returns within a turn; tried at whole numbers
     COMMAND = "command"  # A size of the command; tried at values up to the largest that was recorded
 
 

@@ -96,6 +96,20 @@ class PeriodicLaw(JointLoad):
         return self.value("amplitude", state) * angle.cos() + self.value("offset", state)
 
 
+class CoggingLaw(JointLoad):
+    """A load that returns a whole number of times in every turn: a motor's cogging, a gear's mesh, an eccentric wheel.
+
+    Its phase is that at the zero of the joint's angle.
+    """
+
+    abrupt = True  # a fast shaft passes several waves within a period
+    source = "Hendershot and Miller (2010), Design of Brushless Permanent-Magnet Machines, section 4.9"
+
+    def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
+        angle = self.value("waves", state) * self.joint_position(state, system) + self.value("phase", state)
+        return self.value("torque", state) * angle.cos()
+
+
 class PulseLaw(JointLoad):
     """A constant load between two times, counted from the start of the episode.
 

@@ -182,7 +182,11 @@ def _within_a_turn(effect: type[Effect], values: Tensor) -> Tensor:
 
 def _shifts(effects: Effects, columns: Mapping[type[Effect], slice], theta: Tensor, episodes: int) -> Tensor:
     """(E,) s by which each episode's phase is ahead of the first's; zeros unless one effect alone depends on time."""
-    timed = [effect for effect in effects if any(p.is_phase or (p.is_edge and p.unit == "s") for p in effect.table)]
+    timed = [
+        effect
+        for effect in effects
+        if any(p.role is Role.FREQUENCY or (p.is_edge and p.unit == "s") for p in effect.table)
+    ]
     if len(timed) != 1 or not has_episode_phases(timed[0]):
         return theta.new_zeros(episodes)
     pairs = list(zip(timed[0].table, theta[columns[timed[0]]].tolist(), strict=True))

@@ -109,6 +109,8 @@ def values_of(parameter: Parameter) -> Tensor:
     if parameter.role is Role.FREQUENCY:
         ends = torch.tensor([low, high]).log10().tolist()
         return torch.logspace(ends[0], ends[1], FREQUENCY_POINTS, dtype=torch.float64)
+    if parameter.role is Role.WAVES:
+        return torch.arange(math.ceil(low), math.floor(high) + 1, dtype=torch.float64)
     if parameter.role is Role.PHASE:
         return torch.linspace(low, high, PHASE_POINTS + 1, dtype=torch.float64)[:-1]
     if neutral is None:

@@ -15,6 +15,9 @@ from visadapt.effects.parameters import ParameterScale
 from visadapt.systems import System, Variable
 from visadapt.systems.base import parameters
 
+MIN_RANGE = 4 * math.pi
+"""Range of a joint's angle, rad, above which what returns in every turn is told from loads at single angles."""
+
 
 def on_joints(system: type[System]) -> Iterator[Made]:
     """The effects on each joint: loads, and added inertia."""
@@ -42,9 +45,11 @@ def _per(load: Variable, variable: Variable, power: int = 1) -> str:
     return f"{load.unit}{times}/{unit}{power if power > 1 else ''}"
 
 
-def _laws(
-    load: Variable, position: Variable | None, velocity: Variable
-) -> dict[str, tuple[type[laws.JointEffect], str, tuple[Parameter, ...]]]:
+_Laws = dict[str, tuple[type[laws.JointEffect], str, tuple[Parameter, ...]]]
+"""Of each effect of a joint: its law, its equation, and its parameters"""
+
+
+def _laws(load: Variable, position: Variable | None, velocity: Variable) -> _Laws:
     most, fastest = load.largest, velocity.largest
     size = "torque" if load.unit == "N m" else "force"
     v, unit = velocity.name, load.unit
@@ -57,14 +62,24 @@ def _laws(
 
     # A coefficient is searched up to the one with which a third of the range of motion makes the largest load.
     per_velocity = 3 * most / fastest
-    spring: dict[str, tuple[type[laws.JointEffect], str, tuple[Parameter, ...]]] = {}
+    by_position: _Laws = {}
     if position is not None:
-        spring["spring"] = (
+        by_position["spring"] = (
             laws.SpringLaw,
             f"Q = -stiffness ({position.name} - rest)",
             (
                 linear("stiffness", 0.0, _per(load, position), 3 * most / position.largest),
                 Parameter("rest", position.unit, position.low, position.high, None),
+            ),
+        )
+    if position is not None and position.unit == "rad" and position.high - position.low > MIN_RANGE:
+        by_position["cogging"] = (
+            laws.CoggingLaw,
+            f"Q = torque cos(waves {position.name} + phase)",
+            (
+                linear("torque", 0.0),
+                Parameter("waves", "1", 1.0, 24.0, None, role=Role.WAVES),
+                Parameter("phase", "rad", -math.pi, math.pi, None, role=Role.PHASE),
             ),
         )
     return {
@@ -98,7 +113,7 @@ def _laws(
             f"Q = -share |motor {size}| sign({v}); at rest, what holds the joint, up to share |motor {size}|",
             (Parameter("share", "1", 0.0, 0.8, 0.0),),
         ),
-        **spring,
+        **by_position,
         "constant_load": (laws.ConstantLaw, f"Q = {size}", (linear(size, -most),)),
         "periodic_load": (
             laws.PeriodicLaw,
