@@ -57,6 +57,15 @@ def cogging(state):
     return torch.stack((load, torch.zeros_like(load)), -1)
 
 
+ZEROS = torch.tensor([0.0, 1.1, 2.5, 0.7], dtype=torch.float64)
+"""Angles, rad, at which an encoder that counts from 0 in every run began to count."""
+
+
+def cogging_from_zeros(state):
+    """The same, of the angles that such an encoder reads."""
+    return cogging(state + ZEROS[:, None] * torch.eye(4, dtype=torch.float64)[0])
+
+
 def play(state):
     """Loads (B, 2) that undo the coupling's torque within 0.04 rad."""
     lost = 0.15 * (state[:, 0] - state[:, 1]).clamp(-0.04, 0.04)
@@ -129,3 +138,11 @@ def test_cogging_is_named_among_other_loads():
     # -sin(8 q) is cos(8 q + pi / 2)
     for name, truth in {"torque": 0.012, "waves": 8.0, "phase": np.pi / 2}.items():
         assert cause.parameters[name].value == pytest.approx(truth, rel=2e-3)
+
+
+def test_an_encoder_may_count_from_another_zero_in_every_run():
+    (effect,) = (effect for effect in catalogue(Drive()) if effect.name == "motor_shaft.cogging")
+    found = va.diagnose(recorded(cogging_from_zeros), va.World(Drive(), period=PERIOD), [effect])
+    assert found.causes[0].parameters["torque"].value == pytest.approx(0.012, rel=2e-3)
+    assert found.where.pushes == ()
+    assert any("its phase differs from episode to episode" in warning for warning in found.warnings)

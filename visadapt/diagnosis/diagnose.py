@@ -49,7 +49,7 @@ from visadapt.diagnosis.words import listed, printable
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized
 from visadapt.estimation.effect_fit import remembers
-from visadapt.estimation.episode_phases import has_episode_phases
+from visadapt.estimation.episode_phases import in_episode
 from visadapt.estimation.profiles import profile_of
 from visadapt.processes import one_thread
 from visadapt.progress import Report, staged
@@ -256,17 +256,16 @@ def _pushes(explored: _Explored, world: World, explained: bool) -> tuple[Push, .
     if whole is None:
         return ()
     if explained:
-        return pushes(whole, _explained(world, comparison), comparison.functions)
+        explained_worlds = [_explained(world, comparison, episode) for episode in range(len(whole.episodes))]
+        return pushes(whole, explained_worlds, comparison.functions)
     return pushes(whole, world, left_by_source(explored.search))
 
 
-def _explained(world: World, comparison: ModelComparison) -> World:
-    """The source with the best set's effects as fitted, without those whose phase differs from episode to episode."""
+def _explained(world: World, comparison: ModelComparison, episode: int) -> World:
+    """The source with the best set's effects as fitted, with their phases in an episode."""
     best = comparison.best
     effects = [
-        effect(**{parameter.name: value for parameter, value in zip(effect.table, values.tolist(), strict=True)})
-        for effect, values in best.by_effect(best.fits.theta[0]).items()
-        if not has_episode_phases(effect)
+        in_episode(effect, values.tolist(), episode) for effect, values in best.by_effect(best.fits.theta[0]).items()
     ]
     return world.with_effects(effects).double()
 

@@ -44,6 +44,21 @@ def with_own_phases(effect: type[Effect], values: Sequence[float]) -> tuple[floa
     return (*values, *phases * (len(effect.table) - len(values)))
 
 
+def in_episode(effect: type[Effect], values: Sequence[float], episode: int) -> Effect:
+    """The effect with these parameter values as it acts in an episode, counted from 0.
+
+    >>> import visadapt as va
+    >>> kind = with_episode_phases(va.effects.PeriodicForce, 2)
+    >>> round(in_episode(kind, (2.0, 0.5, 0.1, 0.0, 0.7), 1).phase.item(), 6)
+    0.7
+    """
+    given = dict(zip((p.name for p in effect.table), values, strict=True))
+    phases = [p.name for p in effect.table if p.is_phase]
+    plain = with_common_phase(effect)
+    own = {phases[0]: given[phases[episode]]} if has_episode_phases(effect) else {}
+    return plain(**{p.name: given[p.name] for p in plain.table} | own)
+
+
 def has_episode_phases(effect: type[Effect]) -> bool:
     """Whether the effect has a phase for each episode."""
     return any(p.role is Role.EPISODE_PHASE for p in effect.table)

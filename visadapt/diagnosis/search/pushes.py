@@ -69,15 +69,18 @@ MIN_DISTINCT = 0.15  # Least share of a bump's information that columns and othe
 BUMP_PRIOR = 7.0  # Prior standard deviation of a bump's height, over that of the unexplained load
 
 
-def pushes(recording: Recording, world: World, unexplained: Sequence[SmoothFunction] = ()) -> tuple[Push, ...]:
-    """The pushes in a recording beyond what a world explains, in the order of time.
+def pushes(
+    recording: Recording, world: World | Sequence[World], unexplained: Sequence[SmoothFunction] = ()
+) -> tuple[Push, ...]:
+    """The pushes in a recording beyond what a world, or one for each episode, explains; in the order of time.
 
     Of the loads that are `unexplained`, the most probable first, the first that is a clear function of states is no
     push.
     """
     functions = (one for one in unexplained if one.states is not None and one.log_odds > CLEAR_LOG_ODDS)
+    worlds = [world] * len(recording.episodes) if isinstance(world, World) else world
     try:
-        tracks = load_tracks(recording, world, next(functions, None))
+        tracks = load_tracks(recording, worlds, next(functions, None))
         if not tracks:
             return ()
         found = _Fit(tracks).pushes()
@@ -85,7 +88,7 @@ def pushes(recording: Recording, world: World, unexplained: Sequence[SmoothFunct
         return ()  # errors too small, or too large, for any push to stand out
     middles = sum(float(track.time[-1] - track.time[0]) / (SPACING * width) for track in tracks for width in WIDTHS)
     tries = round(middles) * tracks[0].load.shape[1]
-    named = [summed(bumps, deviation, tracks, world.system.loads, tries) for bumps, deviation in found]
+    named = [summed(bumps, deviation, tracks, worlds[0].system.loads, tries) for bumps, deviation in found]
     sure = [push for push in named if push.p_value <= MAX_P_VALUE and push.ci90[0] * push.ci90[1] > 0]
     return tuple(sorted(sure, key=lambda push: (push.episode, push.start)))
 

@@ -73,12 +73,14 @@ class LoadTrack:
         ]
 
 
-def load_tracks(recording: Recording, world: World, known: SmoothFunction | None = None) -> list[LoadTrack]:
+def load_tracks(recording: Recording, worlds: Sequence[World], known: SmoothFunction | None = None) -> list[LoadTrack]:
     """The unexplained loads in each episode that is long enough; none where a joint's position was not measured.
 
-    `known` is a load that acts as a function of states, beyond the world's.
+    Args:
+        worlds: what explains each episode.
+        known: a load that acts as a function of states, beyond those of the worlds.
     """
-    system = world.system
+    system = worlds[0].system
     measured = [system.index(name) for name in recording.measured]
     if not system.coordinates or len(system.coordinates) < len(system.loads):
         return []
@@ -90,7 +92,7 @@ def load_tracks(recording: Recording, world: World, known: SmoothFunction | None
         part
         for number, episode in enumerate(recording.episodes)
         for stretch in _measured(episode, recording.usable[number] if recording.usable else None)
-        for part in _track(number, stretch, world, measured, recording.period, known)
+        for part in _track(number, stretch, worlds[number], measured, recording.period, known)
     ]
     if not found:
         return []
