@@ -7,8 +7,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from visadapt.cli.inputs import InputError, asked_for, checked, given_effects, import_effects, progress
+from visadapt.cli.errors import InputError
+from visadapt.cli.own_classes import import_effects
+from visadapt.cli.progress import progress
+from visadapt.cli.run_folders import asked_for
+from visadapt.cli.simulator import given_effects
 from visadapt.cli.target import load_both
+from visadapt.cli.user_code import checked
 from visadapt.diagnosis.words import number, with_unit
 from visadapt.effects import Effect, Parameter
 from visadapt.learning.explanation import Explanation

@@ -8,6 +8,8 @@ import re
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from visadapt.cli.errors import InputError
+
 if TYPE_CHECKING:
     from visadapt.systems import System
 
@@ -262,8 +264,7 @@ def _system(text: str) -> type[System]:
         raise argparse.ArgumentTypeError(
             f"there is no system {text!r}; there are {', '.join(SYSTEMS)}, and your own as my_rig.py:Class"
         )
-    from visadapt.cli.inputs import InputError
-    from visadapt.cli.own_system import find_system
+    from visadapt.cli.own_classes import find_system
 
     try:
         return find_system(text)

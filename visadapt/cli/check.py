@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from visadapt.cli.inputs import InputError
+from visadapt.cli.errors import InputError
 from visadapt.effects.catalogue import catalogue
 from visadapt.systems.contract import complaints
 

@@ -8,7 +8,10 @@ from pathlib import Path
 
 from renderers import load_renderer
 from visadapt import diagnosis
-from visadapt.cli.inputs import InputError, import_effects, progress, the_system
+from visadapt.cli.errors import InputError
+from visadapt.cli.own_classes import import_effects
+from visadapt.cli.progress import progress
+from visadapt.cli.simulator import the_system
 from visadapt.diagnosis import Diagnosis
 from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.report.html import write_report

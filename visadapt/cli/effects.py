@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from visadapt.cli.inputs import import_effects, the_system
+from visadapt.cli.own_classes import import_effects
+from visadapt.cli.simulator import the_system
 from visadapt.effects.catalogue import catalogue_text
 
 

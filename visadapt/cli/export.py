@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from visadapt.cli.inputs import import_effects
+from visadapt.cli.own_classes import import_effects
 from visadapt.setups.onnx_file import about, export_policy
 from visadapt.setups.policy_file import load_policy, load_source
 

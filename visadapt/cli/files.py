@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from visadapt.cli.inputs import InputError, check_run_folder
+from visadapt.cli.errors import InputError
+from visadapt.cli.run_folders import check_run_folder
 from visadapt.storage.atomic_files import check_writable
 from visadapt.systems import SYSTEMS
 

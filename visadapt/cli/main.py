@@ -13,6 +13,7 @@ from contextlib import suppress
 from typing import Any, NoReturn
 
 from visadapt.cli import arguments as asked
+from visadapt.cli.user_code import own_line
 
 COMMANDS = {
     asked.diagnose: "where a rig departs from the simulator, which effects cause it, and how much they explain",
@@ -57,8 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The messages of our own exceptions, of the system's and of the user's code are for whoever runs the command.
         message: object = error
         if not isinstance(error, OSError) and type(error).__module__.partition(".")[0] not in ("visadapt", "renderers"):
-            inputs: Any = sys.modules.get("visadapt.cli.inputs")  # by which code of the user's is imported
-            message = inputs.own_line(error) if inputs else None
+            message = own_line(error)
             if message is None:
                 raise
         print(f"visadapt: {in_one_line(message)}", file=sys.stderr)

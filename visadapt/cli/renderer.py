@@ -14,7 +14,9 @@ from torch import Tensor
 
 from renderers import LayeredRenderer, save_renderer
 from renderers.training import fit
-from visadapt.cli.inputs import InputError, asked_for, progress, unfinished
+from visadapt.cli.errors import InputError
+from visadapt.cli.progress import progress
+from visadapt.cli.run_folders import asked_for, unfinished
 from visadapt.cli.target import load_target
 from visadapt.estimation.frame_residuals import size_of, structure
 from visadapt.progress import staged

@@ -6,8 +6,9 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from visadapt.cli.inputs import checked, import_effects
+from visadapt.cli.own_classes import import_effects
 from visadapt.cli.target import load_both
+from visadapt.cli.user_code import checked
 from visadapt.evaluation import score
 from visadapt.films.filming import film
 from visadapt.storage.run_folder import versions, write_json

@@ -11,7 +11,8 @@ from typing import Any
 
 import torch
 
-from visadapt.cli.inputs import InputError, describe, find_factory, own_code
+from visadapt.cli.errors import InputError
+from visadapt.cli.user_code import describe, find_factory, own_code
 from visadapt.policies import Policy
 from visadapt.setups.policy_file import load_policy, load_source
 from visadapt.targets import Target

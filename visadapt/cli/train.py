@@ -7,16 +7,12 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-from visadapt.cli.inputs import (
-    InputError,
-    asked_for,
-    checked,
-    given_effects,
-    import_effects,
-    progress,
-    the_system,
-    unfinished,
-)
+from visadapt.cli.errors import InputError
+from visadapt.cli.own_classes import import_effects
+from visadapt.cli.progress import progress
+from visadapt.cli.run_folders import asked_for, unfinished
+from visadapt.cli.simulator import given_effects, the_system
+from visadapt.cli.user_code import checked
 from visadapt.learning.perception import PerceptionSettings
 from visadapt.setups.base import Setup
 from visadapt.setups.training import setup_to_train

@@ -1,0 +1,93 @@
+"""The system and the effects that the arguments name, of which the simulator is made."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import sys
+from pathlib import Path
+
+import torch
+
+from visadapt.cli.errors import InputError
+from visadapt.diagnosis.saved import load_effects
+from visadapt.diagnosis.words import printable, with_unit
+from visadapt.effects import EFFECTS, Effect
+from visadapt.effects.base import require_system
+from visadapt.effects.catalogue import catalogue, sized
+from visadapt.storage.run_folder import read_json
+from visadapt.systems import SYSTEMS, System
+from visadapt.systems.contract import complaints
+from visadapt.systems.parameter_file import load_parameters
+from visadapt.world import World
+
+
+def the_system(options: argparse.Namespace) -> System:
+    """The system of --system with the parameters of --params.
+
+    Raises:
+        InputError: a system of the user's own that is not what visadapt can work with.
+        ParameterFileError: a parameter file that cannot be used.
+    """
+    if options.system not in SYSTEMS.values() and (wrong := complaints(options.system)):
+        more = f" (and {len(wrong) - 1} more: `visadapt check` lists them)" if len(wrong) > 1 else ""
+        raise InputError(f"{options.system.__name__}: {wrong[0]}{more}")
+    return load_parameters(options.params, options.system) if getattr(options, "params", None) else options.system()
+
+
+def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
+    """The effects of --diagnosis but those that --effect gives too, then those of --effect.
+
+    Raises:
+        InputError: an unknown effect, one given twice or without its parameters, or one that does not act on the
+            system.
+        DiagnosisFileError: a diagnosis that named nothing.
+    """
+    effects: list[Effect] = []
+    if options.diagnosis:
+        diagnosed, effects = load_effects(options.diagnosis)
+        if diagnosed != system.name:
+            raise InputError(f"{options.diagnosis}: a diagnosis of a {diagnosed}, where a {system.name} is given")
+        for warning in read_json(Path(options.diagnosis)).get("warnings") or ():
+            print(f"visadapt: {options.diagnosis}: {printable(str(warning))}", file=sys.stderr)
+    given = [_effect(text, system) for text in options.effect]
+    names = [effect.name for effect in given]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"--effect: {twice[0]} is given more than once")
+    return [effect for effect in effects if effect.name not in names] + given
+
+
+def _effect(text: str, system: System) -> Effect:
+    name, _, rest = text.partition(":")
+    if name not in EFFECTS or EFFECTS[name] not in catalogue():
+        near = difflib.get_close_matches(name, [effect.name for effect in catalogue()], 1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise InputError(f"--effect {text}: there is no effect {name!r}; {hint}`visadapt effects` lists them")
+    try:
+        require_system(system, EFFECTS[name])
+    except TypeError as error:
+        raise InputError(f"--effect {text}: {error}") from error
+    values: dict[str, float] = {}
+    for part in rest.split(",") if rest else ():
+        asked, _, number = part.partition("=")
+        if asked in values:
+            raise InputError(f"--effect {text}: {asked} is given twice")
+        try:
+            values[asked] = float(number)
+        except ValueError:
+            raise InputError(f"--effect {text}: {part!r} is not of the form PARAMETER=NUMBER") from None
+        if not abs(values[asked]) < float("inf"):
+            raise InputError(f"--effect {text}: {asked} must be finite")
+    try:
+        effect = EFFECTS[name](**values)
+        world = World(system, [effect])
+        world.step(world.start(torch.zeros(1, len(system.states))), torch.zeros(1, len(system.actions)))
+    except ValueError as error:
+        raise InputError(f"--effect {text}: {error}") from error
+    for parameter in sized(EFFECTS[name], system).table:
+        value = values[parameter.name]
+        if not parameter.low <= value <= parameter.high:
+            given, high = (with_unit(f"{one:g}", parameter.unit) for one in (value, parameter.high))
+            searched = f"a diagnosis looks for it from {parameter.low:g} to {high}"
+            print(f"visadapt: --effect {text}: {parameter.name} is {given}; {searched}", file=sys.stderr)
+    return effect
