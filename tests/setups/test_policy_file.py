@@ -95,6 +95,15 @@ class TestOwnSetup:
             assert torch.equal(value, read.state_dict()[key]), key
         assert load_source(path).effects[0].name == "joint.viscous_friction"
 
+    def test_a_system_without_a_name_of_its_own_is_refused(self):
+        """Its policies would be read with the class that it derives from."""
+
+        class Renamed(WeakPendulum):
+            pass
+
+        with pytest.raises(ValueError, match="Renamed has the name of the class that it derives from, 'weak_pendulum'"):
+            own_setup(va.World(Renamed()))
+
     def test_a_system_that_is_not_known_is_named(self, tmp_path):
         path = tmp_path / "policy.safetensors"
         save_policy(path, StatePolicy(4), {"source": {**describe(va.World(va.CartPole())), "system": "unicycle"}})

@@ -84,6 +84,12 @@ class Setup:
                     f"the source's {effect.name} has {rows} values of a parameter, one for each row of a batch; a "
                     "setup needs one value of each, which holds for batches of any size"
                 )
+        system = type(self.source.system)
+        if "name" not in vars(system):
+            raise ValueError(
+                f"{system.__name__} has the name of the class that it derives from, {system.name!r}, which a policy's "
+                "file would be read with: give it a name of its own"
+            )
         for action in self.source.system.actions:
             if (action.low, action.high) != (-1.0, 1.0):
                 raise ValueError(
