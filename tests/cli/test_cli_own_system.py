@@ -1,10 +1,14 @@
 """A system of one's own on the command line: named by file and class, checked, and refused in one line."""
 
+import os
 import runpy
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+import visadapt as va
 from tests.own_systems import page_code
 from visadapt.cli import main as cli
 
@@ -103,6 +107,60 @@ def test_a_class_that_lacks_something_is_refused_by_every_command(rig, capsys):
         line = refused(capsys, *command, "--system", "furuta.py:Furuta")
         assert line.startswith("visadapt: Furuta: states: arm has no unit")
         assert line.endswith("(and 1 more: `visadapt check` lists them)")
+
+
+BELT = """
+from dataclasses import dataclass
+
+import visadapt as va
+
+
+@dataclass(frozen=True)
+class BeltCart(va.CartPole):
+    slip: float = 0.1
+
+    name = "belt_cart"
+
+    def derivative(self, state, command, load):
+        return super().derivative(state, command * (1 - self.slip * state[:, 1].abs()).unsqueeze(1), load)
+
+
+def make():
+    return va.SyntheticTarget(system=BeltCart())
+"""
+
+
+def command(*arguments):
+    """The command as a process of its own, in which no class of the user's is known before it begins."""
+    script = "import sys; from visadapt.cli.main import main; sys.exit(main())"
+    environment = {**os.environ, "PYTHONPATH": str(Path(va.__file__).parents[1])}
+    run = [sys.executable, "-c", script, *arguments]
+    return subprocess.run(run, capture_output=True, text=True, env=environment, check=False)
+
+
+def test_a_policy_for_it_is_read_where_system_names_its_class(rig):
+    (rig / "belt.py").write_text(BELT)
+    own, target = ("--system", "belt.py:BeltCart"), ("--target", "belt:make")
+    done = command("train", *own, "--iterations", "2", "--out", "p.safetensors")
+    assert done.returncode == 0, done.stderr
+    score = ("score", "--policy", "p.safetensors", *target, "--episodes", "1")
+    done = command(*score)
+    assert done.returncode == 2
+    assert "p.safetensors: needs 'belt_cart', which is not known here" in done.stderr
+    assert done.stderr.endswith("or name it by --system\n")
+    few = ("--samples", "20", "--round", "20", "--iterations", "1", "--out", "run")
+    for working in (
+        (*score, *own),
+        ("adapt", "--policy", "p.safetensors", *target, *few, *own),
+        ("export", "run/policy.safetensors", "--out", "p.onnx", *own),
+    ):
+        done = command(*working)
+        assert done.returncode == 0, done.stderr
+    done = command(*score, "--system", "furuta.py:Furuta")
+    assert "needs 'belt_cart'" in done.stderr
+    shipped = ("score", "--policy", str(va.shipped("cartpole_states")), *target)
+    done = command(*shipped, *own)
+    assert done.stderr.endswith("a policy of a cartpole; --system is a belt_cart\n")
 
 
 def test_no_policy_is_trained_on_it(rig, capsys):

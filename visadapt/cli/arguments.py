@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 SYSTEMS_HELP = "cartpole, quadrotor or fixed_wing"
 OWN_HELP = "or my_rig.py:Class, a system of your own (docs/own_system.md)"
+POLICY_HELP = "as `visadapt train` or `visadapt adapt` wrote it"
 LONGEST_NUMBER = 18  # Digits of a whole number
 SCORE_SEED = 2026
 """Equal to `evaluation.SCORE_SEED`, as a test checks."""
@@ -28,7 +29,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     )
     add = parser.add_argument
     add("recording", nargs="+", metavar="RECORDING", help="CSV or HDF5 files, logs of ROS or PX4, or folders of these")
-    _add_system(parser)
+    _add_system(parser, OWN_HELP)
     columns_help = (
         "our name=the name in the file, as in x=position,theta=phi; theta= is a state that was not measured; may be "
         "repeated"
@@ -102,7 +103,7 @@ def train(parser: argparse.ArgumentParser) -> None:
         "where it was."
     )
     add = parser.add_argument
-    _add_system(parser, own=False)
+    _add_system(parser, "or my_rig.py:Class, a system of your own that derives from one of these")
     add("--out", required=True, metavar="P.safetensors", help="write the policy here")
     add("--period", metavar="S", type=_positive_number, help="s between commands (default: 0.05; quadrotor: 0.1)")
     add("--frames", action="store_true", help="the policy is shown a camera's frames, not states")
@@ -166,14 +167,15 @@ def export(parser: argparse.ArgumentParser) -> None:
         "Writes a policy, with the residual that it reads, as an ONNX file: the last five observations and actions to "
         "the next ten actions in [-1, 1], of which the first is executed. Its actions are checked against the policy's."
     )
-    parser.add_argument("policy", metavar="P.safetensors", help="as `visadapt train` or `visadapt adapt` wrote it")
+    parser.add_argument("policy", metavar="P.safetensors", help=POLICY_HELP)
+    _add_policys_system(parser)
     parser.add_argument("--out", metavar="P.onnx", required=True, help="the file to write")
     effects_help = "a file that defines effects the policy was trained with"
     parser.add_argument("--effects", metavar="FILE.py", help=effects_help)
 
 
-def _add_system(parser: argparse.ArgumentParser, own: bool = True) -> None:
-    system_help = f"the source physics: {SYSTEMS_HELP}" + (f", {OWN_HELP}" if own else "")
+def _add_system(parser: argparse.ArgumentParser, own_help: str) -> None:
+    system_help = f"the source physics: {SYSTEMS_HELP}, {own_help}"
     parser.add_argument("--system", required=True, type=_system, metavar="NAME", help=system_help)
     parser.add_argument("--params", metavar="RIG.toml", help="the rig's own parameters, in a table [parameters]")
 
@@ -200,9 +202,19 @@ def _add_effects(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_policy_and_target(parser: argparse.ArgumentParser) -> None:
-    policy_help = "as `visadapt train` or `visadapt adapt` wrote it"
-    parser.add_argument("--policy", required=True, metavar="P.safetensors", help=policy_help)
+    parser.add_argument("--policy", required=True, metavar="P.safetensors", help=POLICY_HELP)
+    _add_policys_system(parser)
     _add_target(parser, required=True)
+
+
+def _add_policys_system(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--system",
+        type=_system,
+        metavar="my_rig.py:Class",
+        help="the system that the policy was trained for, if it is one of your own: the policy's file has its name, "
+        "not its class",
+    )
 
 
 def _add_target(parser: argparse.ArgumentParser, required: bool) -> None:

@@ -40,10 +40,11 @@ def check_run_folder(folder: Path) -> None:
 def asked_for(options: argparse.Namespace, *files: str) -> dict[str, Any]:
     """The settings of a run: it is resumed only if they are the same.
 
-    These are all options but --out. In place of the options in `files`, which name a file or a list of files, stands
-    the SHA-256 of each file, so that the files may be moved.
+    These are all options but --out and --system, whose class the caller or the policy's file names. In place of the
+    options in `files`, which name a file or a list of files, stands the SHA-256 of each file, so that the files may be
+    moved.
     """
-    settings = {name: value for name, value in vars(options).items() if name != "out"}
+    settings = {name: value for name, value in vars(options).items() if name not in ("out", "system")}
     for name in files:
         given = settings[name]
         settings[name] = [_fingerprint(path) for path in given] if isinstance(given, list) else _fingerprint(given)

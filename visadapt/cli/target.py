@@ -29,10 +29,23 @@ def load_both(options: argparse.Namespace) -> tuple[Policy, World, Target]:
         InputError, TargetError: either cannot be had, or the two do not go together.
         CheckpointError: the policy's file is missing, torn, or holds something else.
     """
-    policy, source = load_policy(options.policy), load_source(options.policy)
+    policy, source = load_with_source(options)
     target = load_target(options, source, policy.shown == "frame")
     _check(options.policy, policy, source, target)
     return policy, source, target
+
+
+def load_with_source(options: argparse.Namespace) -> tuple[Policy, World]:
+    """The policy and the world that it was trained in.
+
+    Raises:
+        InputError: the policy is for another system than that of --system.
+        CheckpointError: the policy's file is missing, torn, or holds something else.
+    """
+    policy, source = load_policy(options.policy), load_source(options.policy)
+    if options.system and options.system.name != source.system.name:
+        raise InputError(f"{options.policy}: a policy of a {source.system.name}; --system is a {options.system.name}")
+    return policy, source
 
 
 def load_target(options: argparse.Namespace, source: World, frames: bool) -> Target:

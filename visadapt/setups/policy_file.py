@@ -161,7 +161,7 @@ def parameters_of(system: System) -> dict[str, float]:
 def _world(description: Mapping[str, Any], path: Path) -> World:
     """The world that `describe` described; raises CheckpointError where its system or an effect is not known."""
 
-    def known(name: str, where: Mapping[str, Any], option: str = "") -> Any:
+    def known(name: str, where: Mapping[str, Any], option: str) -> Any:
         if not isinstance(name, str):
             raise CheckpointError(f"{path}: the name of a system or an effect is no text but a {type(name).__name__}")
         if name not in where:
@@ -169,7 +169,7 @@ def _world(description: Mapping[str, Any], path: Path) -> World:
             raise CheckpointError(line)
         return where[name]
 
-    kind = known(description["system"], {**NAMED, **SYSTEMS})
+    kind = known(description["system"], {**NAMED, **SYSTEMS}, ", or name it by --system")
     if is_own(kind):
         own_effects(kind)  # which makes them known
     given = [dict(one) for one in description["effects"]]
