@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +45,24 @@ def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], n
     wanted: dict[str, set[str]] = {}
     for topic, field in places.values():
         wanted.setdefault(topic, set()).add(field)
-    return _rows(path, system, places, _topics(path, read, wanted), note)
+    log = _Log(path, system, places, _topics(path, read, wanted))
+    log.check_stamps()
+    rows = log.rows(note)
+    time = log.topics[log.slowest].time[rows]
+    action = np.column_stack([log.command(one.name, time) for one in system.actions])
+    states = np.column_stack([log.state(name, rows) for name in log.measured])
+    kept = _without_gaps_at_the_ends(np.column_stack([action, states]))
+    if dropped := len(rows) - len(rows[kept]):
+        note(f"{dropped} rows before the first or after the last whole set of numbers are left out", str(path))
+    time, rows = time[kept], rows[kept]
+    others = "".join(f"; {name} is interpolated to them" for name in log.of_states if name != log.slowest)
+    note(f"rows are the readings of {log.slowest}{others}; a command is the mean until the next row", str(path))
+
+    def message(row: int) -> str:
+        return f"message {rows[row] + 1} of {log.slowest}"
+
+    names = {name: ".".join(place) for name, place in places.items()}
+    return RawEpisode(path, time - time[0], action[kept], states[kept], log.measured, message, names)
 
 
 def _topics(path: Path, read: Read, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
@@ -57,72 +76,97 @@ def _topics(path: Path, read: Read, wanted: Mapping[str, set[str]]) -> dict[str,
     raise RecordingError(f"{path}: cannot be read as a log, is it cut short or damaged? {reason}")
 
 
-def _rows(
-    path: Path, system: System, places: Mapping[str, tuple[str, str]], topics: Mapping[str, Topic], note: Note
-) -> RawEpisode:
-    measured = tuple(state.name for state in system.states if state.name in places)
-    for name in {topic for topic, _ in places.values()}:
-        stamps = topics[name].time
-        if not len(stamps):
-            raise RecordingError(f"{path}: {name} has no messages")
-        if len(stamps) < 2 and any(places[state][0] == name for state in measured):
-            raise RecordingError(f"{path}: {name} has a single message; readings all along are right")
-        if (back := np.flatnonzero(np.diff(stamps) < 0)).size:
-            raise RecordingError(f"{path}: the clock of {name} runs backwards after its message {back[0] + 1}")
-    read = list(dict.fromkeys(places[name][0] for name in measured))
-    commanded = list(dict.fromkeys(places[action.name][0] for action in system.actions))
-    every = (*read, *commanded)
-    slowest = max(read, key=lambda name: np.median(np.diff(topics[name].time)))
-    begins = {name: topics[name].time[0] for name in every}
-    ends = {name: topics[name].time[-1] if name in read else _held_until(topics[name].time) for name in every}
-    last_to_begin, first_to_end = max(begins, key=begins.__getitem__), min(ends, key=ends.__getitem__)
-    time = topics[slowest].time
-    early, late = time < begins[last_to_begin], time > ends[first_to_end]
-    used = ~early & ~late
-    for name in read:
-        if name != slowest:
-            used &= _between_readings(time, topics[name].time)
-    rows = np.flatnonzero(used)
-    if len(rows) < 2:
-        raise RecordingError(f"{path}: {', '.join(every)} have no time in common")
-    time = time[rows]
-    if early.any():
-        note(f"{early.sum()} rows before the first message of {last_to_begin} are left out", str(path))
-    if late.any():
-        note(f"{late.sum()} rows after the last message of {first_to_end} are left out", str(path))
-    quaternion = [state.name for state in system.states[ATTITUDE]] if isinstance(system, RigidBody) else []
+@dataclass(frozen=True)
+class _Log:
+    """The topics of a log that a system's states and actions come from."""
 
-    def state(name: str) -> NDArray[np.float64]:
-        topic, field = places[name]
-        values = topics[topic].values[field]
-        if topic == slowest:
+    path: Path
+    system: System
+    places: Mapping[str, tuple[str, str]]
+    """topic and field of each measured state and each action"""
+    topics: Mapping[str, Topic]
+
+    @cached_property
+    def measured(self) -> tuple[str, ...]:
+        """The states that were measured."""
+        return tuple(state.name for state in self.system.states if state.name in self.places)
+
+    @cached_property
+    def of_states(self) -> list[str]:
+        """The topics of these, each once."""
+        return list(dict.fromkeys(self.places[name][0] for name in self.measured))
+
+    @cached_property
+    def of_actions(self) -> list[str]:
+        """The topics of the actions, each once."""
+        return list(dict.fromkeys(self.places[action.name][0] for action in self.system.actions))
+
+    @cached_property
+    def slowest(self) -> str:
+        """The topic of states whose messages are furthest apart, which gives the rows."""
+        return max(self.of_states, key=lambda name: np.median(np.diff(self.topics[name].time)))
+
+    def check_stamps(self) -> None:
+        """Raises RecordingError where a topic has too few messages, or a clock that runs backwards."""
+        for name in {topic for topic, _ in self.places.values()}:
+            stamps = self.topics[name].time
+            if not len(stamps):
+                raise RecordingError(f"{self.path}: {name} has no messages")
+            if len(stamps) < 2 and name in self.of_states:
+                raise RecordingError(f"{self.path}: {name} has a single message; readings all along are right")
+            if (back := np.flatnonzero(np.diff(stamps) < 0)).size:
+                raise RecordingError(f"{self.path}: the clock of {name} runs backwards after its message {back[0] + 1}")
+
+    def rows(self, note: Note) -> NDArray[np.intp]:
+        """The messages of the slowest topic (T,) for which all other topics have a value."""
+        topics = (*self.of_states, *self.of_actions)
+        begins = {name: self.topics[name].time[0] for name in topics}
+        ends = {name: self.topics[name].time[-1] for name in self.of_states}
+        ends |= {name: _held_until(self.topics[name].time) for name in self.of_actions if name not in ends}
+        last_to_begin, first_to_end = max(begins, key=begins.__getitem__), min(ends, key=ends.__getitem__)
+        time = self.topics[self.slowest].time
+        early, late = time < begins[last_to_begin], time > ends[first_to_end]
+        used = ~early & ~late
+        for name in self.of_states:
+            if name != self.slowest:
+                used &= _between_readings(time, self.topics[name].time)
+        rows = np.flatnonzero(used)
+        if len(rows) < 2:
+            raise RecordingError(f"{self.path}: {', '.join(topics)} have no time in common")
+        if early.any():
+            note(f"{early.sum()} rows before the first message of {last_to_begin} are left out", str(self.path))
+        if late.any():
+            note(f"{late.sum()} rows after the last message of {first_to_end} are left out", str(self.path))
+        return rows
+
+    def state(self, name: str, rows: NDArray[np.intp]) -> NDArray[np.float64]:
+        """A measured state in these rows (T,): as read there, or interpolated to the rows' stamps."""
+        topic, field = self.places[name]
+        stamps, values = self.topics[topic].time, self.topics[topic].values[field]
+        if topic == self.slowest:
             return values[rows]
+        quaternion = (
+            [state.name for state in self.system.states[ATTITUDE]] if isinstance(self.system, RigidBody) else []
+        )
         if name in quaternion:
-            same = [places[other] for other in quaternion if other in places and places[other][0] == topic]
-            whole = np.column_stack([topics[topic].values[each] for _, each in same])
-            values = continuous_quaternion(torch.from_numpy(whole)).numpy()[:, same.index((topic, field))]
-        angle = system.states[system.index(name)].unit == "rad"
-        return np.interp(time, topics[topic].time, np.unwrap(values) if angle else values)
+            places = [self.places[each] for each in quaternion if each in self.places]
+            fields = [other for where, other in places if where == topic]
+            whole = np.column_stack([self.topics[topic].values[each] for each in fields])
+            values = continuous_quaternion(torch.from_numpy(whole)).numpy()[:, fields.index(field)]
+        if self.system.states[self.system.index(name)].unit == "rad":
+            values = np.unwrap(values)
+        return np.interp(self.topics[self.slowest].time[rows], stamps, values)
 
-    def command(name: str) -> NDArray[np.float64]:
-        topic, field = places[name]
-        return _held(time, topics[topic].time, topics[topic].values[field])
+    def command(self, name: str, time: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The command of an action in rows with these stamps (T,)."""
+        topic, field = self.places[name]
+        return _held(time, self.topics[topic].time, self.topics[topic].values[field])
 
-    action = np.column_stack([command(one.name) for one in system.actions])
-    states = np.column_stack([state(name) for name in measured])
-    known = np.isfinite(np.column_stack([action, states]).sum(1))
-    kept = slice(int(known.argmax()), len(known) - int(known[::-1].argmax())) if known.any() else slice(None)
-    if dropped := len(known) - len(known[kept]):
-        note(f"{dropped} rows before the first or after the last whole set of numbers are left out", str(path))
-    time, rows = time[kept], rows[kept]
-    others = "".join(f"; {name} is interpolated to them" for name in read if name != slowest)
-    note(f"rows are the readings of {slowest}{others}; a command is the mean until the next row", str(path))
-    names = {name: ".".join(place) for name, place in places.items()}
 
-    def message(row: int) -> str:
-        return f"message {rows[row] + 1} of {slowest}"
-
-    return RawEpisode(path, time - time[0], action[kept], states[kept], measured, message, names)
+def _without_gaps_at_the_ends(numbers: NDArray[np.float64]) -> slice:
+    """The rows (T, n) from the first to the last whose numbers are all known; all rows where none is."""
+    known = np.isfinite(numbers.sum(1))
+    return slice(int(known.argmax()), len(known) - int(known[::-1].argmax())) if known.any() else slice(None)
 
 
 def _held_until(stamps: NDArray[np.float64]) -> float:
