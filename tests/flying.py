@@ -7,8 +7,10 @@ import torch
 
 from visadapt.effects import ConstantForce, LinearDrag
 from visadapt.setups.flight import quadrotor
-from visadapt.tasks.differential_flatness import demanded
+from visadapt.systems import Quadrotor
+from visadapt.tasks.differential_flatness import commands, demanded
 from visadapt.tasks.references import Reference
+from visadapt.world import World
 
 PERIOD = 0.1
 
@@ -62,3 +64,23 @@ def drag(rate):
 def push(newtons):
     """Draws a force along x."""
     return lambda batch, generator: (ConstantForce(force=newtons),)
+
+
+def asked_by(reference):
+    """Commands (..., T, 4) that a reference asks for; its snap by differences."""
+    jerks = reference.jerks.double()
+    snaps = torch.gradient(jerks, spacing=reference.period, dim=-2)[0]
+    return commands(reference.accelerations.double(), jerks, snaps, Quadrotor())
+
+
+def fly_blind(reference):
+    """How far in m (T, B) the simulator is off the references when fed what they ask for, and nothing else."""
+    asked = asked_by(reference)
+    assert asked.abs().max() <= 1
+    world = World(Quadrotor(), period=reference.period)
+    at = world.start(states_on(reference)[:, 0].double())
+    away = []
+    for row in range(1, asked.shape[1]):
+        at = world.step(at, (asked[:, row - 1] + asked[:, row]) / 2)
+        away.append((at.state[:, :3] - reference.positions[:, row]).norm(dim=1))
+    return torch.stack(away)

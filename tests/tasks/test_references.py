@@ -1,5 +1,4 @@
 import dataclasses
-import math
 from itertools import pairwise
 
 import numpy as np
@@ -7,14 +6,13 @@ import pytest
 import torch
 
 from datasets.quadrotor_references import SPLINE_DEGREE, Settings, basis, main, make, read
-from tests.flying import states_on
+from tests.flying import asked_by, fly_blind, states_on
 from visadapt.interpolation import cubic
 from visadapt.recordings import RecordingError
 from visadapt.systems import Quadrotor
 from visadapt.systems.rigid_body import rotation
 from visadapt.tasks.differential_flatness import commands, demanded
-from visadapt.tasks.references import LOOP_RADIUS, Reference, power_loop, read_reference, smallest_loop
-from visadapt.world import World
+from visadapt.tasks.references import Reference, read_reference
 
 SMALL = Settings(train=60, test=20)
 
@@ -30,34 +28,9 @@ def fine():
     return make(Settings(train=8, test=0, period=0.005))[0]
 
 
-def asked_by(reference):
-    """Commands (..., T, 4) that a reference asks for; its snap by differences."""
-    jerks = reference.jerks.double()
-    snaps = torch.gradient(jerks, spacing=reference.period, dim=-2)[0]
-    return commands(reference.accelerations.double(), jerks, snaps, Quadrotor())
-
-
-def fly_blind(reference):
-    """How far in m (T, B) the simulator is off the references when fed what they ask for, and nothing else."""
-    asked = asked_by(reference)
-    assert asked.abs().max() <= 1
-    world = World(Quadrotor(), period=reference.period)
-    at = world.start(states_on(reference)[:, 0].double())
-    away = []
-    for row in range(1, asked.shape[1]):
-        at = world.step(at, (asked[:, row - 1] + asked[:, row]) / 2)
-        away.append((at.state[:, :3] - reference.positions[:, row]).norm(dim=1))
-    return torch.stack(away)
-
-
 def test_what_a_reference_asks_for_flies_it_in_the_simulator(fine):
     # Open loop for 10 s: an attitude off by a milliradian throughout would end half a metre off.
     assert fly_blind(Reference.of(fine.motion[:, :, ::2], 2 * fine.period)).max() < 0.01
-
-
-@pytest.mark.parametrize("speed", [2.6, 5.0])
-def test_what_a_power_loop_asks_for_flies_it_in_the_simulator(speed):
-    assert fly_blind(power_loop(speed, period=0.02).as_many()).max() < 0.02
 
 
 def test_the_demand_of_a_motion_is_the_thrust_that_makes_it_with_yaw_zero():
@@ -196,43 +169,6 @@ def test_between_rows_cubics_are_the_reference_itself(fine):
     at = time[-1] * torch.linspace(0, 1, 10 * (len(time) - 1) + 1)
     between = cubic(time, fine.positions[:, ::20], fine.velocities[:, ::20], at)
     torch.testing.assert_close(between, fine.positions[:, : 20 * (len(time) - 1) + 1 : 2], atol=2e-5, rtol=0)
-
-
-@pytest.mark.parametrize("speed", [2.6, 3.4, 4.1, 4.6, 5.0])
-def test_a_power_loop_is_closed_steady_and_feasible(speed):
-    loop = power_loop(speed, period=0.02)
-    torch.testing.assert_close(loop.velocities.norm(dim=1), torch.full((len(loop.velocities),), speed))
-    # Level in, level out, once around, at the height that it began with.
-    for end in (loop.velocities[0], loop.velocities[-1]):
-        assert end.tolist() == pytest.approx([speed, 0, 0], abs=1e-4)
-    assert float(loop.positions[-1, 2]) == pytest.approx(0, abs=1e-4)
-    assert (loop.positions[:, 1] == 0).all()
-    inclination = torch.atan2(loop.velocities[:, 2], loop.velocities[:, 0])
-    assert float((inclination.diff() + math.pi).remainder(2 * math.pi).sub(math.pi).sum()) == pytest.approx(
-        2 * math.pi, abs=1e-3
-    )
-    # Most of the way is a circle of the radius.
-    curved = loop.accelerations.norm(dim=1) / speed**2 * LOOP_RADIUS
-    assert ((curved - 1).abs() < 1e-4).float().sum() * 0.02 > 5 * LOOP_RADIUS / speed
-    assert 0 <= float(loop.positions[:, 2].max()) - 2 * LOOP_RADIUS < 0.2
-    # Upright all along, within nine tenths of the commands.
-    assert (rotation(states_on(loop)[:, 6:10])[:, 2, 2] > 0.5).all()
-    assert smallest_loop(speed, Quadrotor()) < LOOP_RADIUS
-    assert demanded(loop.accelerations, loop.jerks).rates.abs().max() < 0.45
-
-
-def test_the_smallest_loop_is_where_the_top_turns_as_fast_as_allowed():
-    # On a circle the thrust points along g z + a n, a = v^2 / R; at the top it turns by v / R a / (g - a).
-    speed = 5.0
-    radius = smallest_loop(speed, Quadrotor(), margin=1.0)
-    a = speed**2 / radius
-    # The command is a little ahead of the rate, and more.
-    assert speed / radius * a / (9.81 - a) == pytest.approx(0.5, rel=1e-2)
-    assert radius == pytest.approx(6.49, abs=0.01)
-    # The rule for the radius of all loops.
-    assert math.ceil(2 * smallest_loop(5.0, Quadrotor(), margin=0.9)) / 2 == LOOP_RADIUS
-    # With faster rates, thrust decides: at least 2.21 is g - a at the top.
-    assert smallest_loop(2.0, Quadrotor(max_rate=1e4), margin=1.0) == pytest.approx(4 / (9.81 - 2.21), rel=0.01)
 
 
 def written(path, text):

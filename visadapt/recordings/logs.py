@@ -145,9 +145,8 @@ class _Log:
         stamps, values = self.topics[topic].time, self.topics[topic].values[field]
         if topic == self.slowest:
             return values[rows]
-        quaternion = (
-            [state.name for state in self.system.states[ATTITUDE]] if isinstance(self.system, RigidBody) else []
-        )
+        attitude = self.system.states[ATTITUDE] if isinstance(self.system, RigidBody) else ()
+        quaternion = [state.name for state in attitude]
         if name in quaternion:
             places = [self.places[each] for each in quaternion if each in self.places]
             fields = [other for where, other in places if where == topic]

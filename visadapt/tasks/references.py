@@ -1,18 +1,20 @@
 """References that a vehicle is to follow: positions and velocities on a steady clock, and their derivatives.
 
-The power loop, or one's own from a CSV file; `datasets.quadrotor_references` draws random ones.
+One's own is read from a CSV file; `datasets.quadrotor_references` draws random ones, and `benchmarks.power_loop` flies
+vertical circles.
 """
 
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from math import ceil, isfinite, pi
+from math import isfinite
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from visadapt.history import LENGTH
@@ -21,20 +23,11 @@ from visadapt.recordings import RecordingError
 from visadapt.recordings.checks import check_finite
 from visadapt.recordings.clock import RawEpisode, check_forward
 from visadapt.recordings.csv import Table
-from visadapt.systems import Quadrotor
-from visadapt.tasks.differential_flatness import commands
 
 SPEEDS = ("x_dot", "y_dot", "z_dot")
 
 MAX_PERIODS = 1_000_000  # Periods that a reference of one's own may last: 28 hours of 0.1 s
 MAX_SPEED = 5.0  # m/s: the quadrotor's policy was trained on references up to this speed
-
-LOOP_RADIUS = 7.0
-"""m, one for all speeds, so that faster is harder. The rule: the smallest at which the paper's fastest power loop,
-5 m/s, leaves the controller a tenth of the range of commands (`smallest_loop`), rounded up to half a metre."""
-RAMP = 0.5
-"""rad, by which a power loop turns while its curvature grows from none to the circle's, and again on the way out."""
-STRAIGHT = 1.0  # s of straight flight at least, before and after a power loop
 
 
 @dataclass(frozen=True)
@@ -67,50 +60,6 @@ class Reference:
         return self if self.positions.dim() > 2 else type(self).of(self.motion[:, None], self.period)
 
 
-def power_loop(speed: float, radius: float = LOOP_RADIUS, period: float = 0.1) -> Reference:
-    """A vertical circle in the x-z plane at a steady speed in m/s, flown into and out of on level straight lines.
-
-    The manoeuvre of Kaufmann, Loquercio, Ranftl, Müller, Koltun and Scaramuzza (2020), Deep drone acrobatics, RSS,
-    as gentle as it can be: a step of the curvature would ask for an infinite jerk, so it grows and falls smoothly (a
-    polynomial of degree 5 of the way) while the path turns by `RAMP`. The reference begins at the origin, in motion
-    along x, and ends at the same height.
-
-    Raises:
-        ValueError: a speed, radius or period that is not positive.
-    """
-    _check_positive(speed=speed, radius=radius, period=period)
-    rows = ceil(_loop_length(radius) / (speed * period) + 2 * STRAIGHT / period) + 1
-    motion = _loop(speed, radius, torch.arange(rows, dtype=torch.float64) * period)
-    return Reference.of(motion[:4].to(torch.get_default_dtype()), period)
-
-
-def smallest_loop(speed: float, quadrotor: Quadrotor, margin: float = 0.9) -> float:
-    """Smallest radius in m, to a millimetre, of a power loop that a quadrotor flies upright within its commands.
-
-    The circle's top decides: the thrust is least there, and its direction turns fastest. Loops on which the quadrotor
-    turns upside down do not count, though one with more thrust and faster rates could fly them, and smaller ones.
-
-    Args:
-        speed: m/s.
-        margin: share of the range of commands that the loop may ask for.
-    """
-
-    def feasible(radius: float) -> bool:
-        length = _loop_length(radius) / speed + 2 * STRAIGHT
-        motion = _loop(speed, radius, torch.linspace(0, length, 4001, dtype=torch.float64))
-        upright = motion[2, :, 2].min() > -float(quadrotor.gravity)
-        asked = commands(motion[2], motion[3], motion[4], quadrotor)
-        return bool(upright and asked.abs().max() <= margin)
-
-    low = high = speed**2 / float(quadrotor.gravity)  # weightless at the top
-    while not feasible(high):
-        low, high = high, 2 * high
-    while high - low > 1e-3:
-        middle = (low + high) / 2
-        low, high = (low, middle) if feasible(middle) else (middle, high)
-    return high
-
-
 @np.errstate(over="ignore", invalid="ignore")  # by absurd numbers, which are refused as too fast
 def read_reference(path: str | os.PathLike[str], period: float = 0.1) -> Reference:
     """A reference of one's own: a CSV file with columns time, x, y, z and, if known, x_dot, y_dot, z_dot.
@@ -128,18 +77,10 @@ def read_reference(path: str | os.PathLike[str], period: float = 0.1) -> Referen
     >>> va.read_reference(path).positions.shape
     torch.Size([21, 3])
     """
-    _check_positive(period=period)
+    if not (period > 0 and isfinite(period)):
+        raise ValueError(f"period is {period}, must be positive")
     path = Path(path)
-    table = Table.open(path)
-    names = ["time", "x", "y", "z", *(SPEEDS if any(name in table.header for name in SPEEDS) else ())]
-    for name in names:
-        if name not in table.header:
-            raise RecordingError(f"{path}: has no column {name!r}; its columns are {', '.join(table.header)}")
-    rows = table.rows([table.header.index(name) for name in names])
-    values = rows.values
-    raw = RawEpisode(path, values[:, 0], values[:, :0], values[:, 1:], tuple(names[1:]), rows.place)
-    check_finite(raw, ())
-    check_forward(raw)
+    values, with_speeds = _read(path)
     lasts = values[-1, 0] - values[0, 0]
     if len(values) < 3 or lasts < LENGTH * period * (1 - 1e-6):
         raise RecordingError(
@@ -149,15 +90,7 @@ def read_reference(path: str | os.PathLike[str], period: float = 0.1) -> Referen
         raise RecordingError(
             f"{path}: it lasts {lasts:g} s; at most {MAX_PERIODS * period:g} s are right (are times in s?)"
         )
-    time, places = torch.from_numpy(values[:, 0] - values[0, 0]), values[:, 1:4]
-    slopes = values[:, 4:] if len(names) > 4 else np.gradient(places, values[:, 0], axis=0, edge_order=2)
-    at = torch.arange(int(float(time[-1]) / period + 1e-5) + 1, dtype=torch.float64) * period
-    motion = [cubic(time, torch.from_numpy(places), torch.from_numpy(slopes), at).numpy()]
-    if len(names) > 4:
-        turns = np.gradient(slopes, values[:, 0], axis=0, edge_order=2)
-        motion.append(cubic(time, torch.from_numpy(slopes), torch.from_numpy(turns), at).numpy())
-    while len(motion) < 4:
-        motion.append(np.gradient(motion[-1], period, axis=0, edge_order=2))
+    motion = _motion(values[:, 0], values[:, 1:4], values[:, 4:] if with_speeds else None, period)
     speed = np.linalg.norm(motion[1], axis=1)
     if not (speed <= MAX_SPEED).all():
         first = int((~(speed <= MAX_SPEED)).argmax())
@@ -168,54 +101,44 @@ def read_reference(path: str | os.PathLike[str], period: float = 0.1) -> Referen
     return Reference.of(torch.from_numpy(np.stack(motion)).to(torch.get_default_dtype()), period)
 
 
-def _check_positive(**values: float) -> None:
-    for name, value in values.items():
-        if not (value > 0 and isfinite(value)):
-            raise ValueError(f"{name} is {value}, must be positive")
+def _read(path: Path) -> tuple[NDArray[np.float64], bool]:
+    """The file's rows: time, three positions and, where the file has them, three velocities; and whether it has them.
+
+    Raises:
+        RecordingError: as `read_reference`.
+    """
+    table = Table.open(path)
+    with_speeds = any(name in table.header for name in SPEEDS)
+    names = ["time", "x", "y", "z", *(SPEEDS if with_speeds else ())]
+    for name in names:
+        if name not in table.header:
+            raise RecordingError(f"{path}: has no column {name!r}; its columns are {', '.join(table.header)}")
+    rows = table.rows([table.header.index(name) for name in names])
+    values = rows.values
+    raw = RawEpisode(path, values[:, 0], values[:, :0], values[:, 1:], tuple(names[1:]), rows.place)
+    check_finite(raw, ())
+    check_forward(raw)
+    return values, with_speeds
 
 
-def _loop_length(radius: float) -> float:
-    """m along the path from the first bend to the last: a ramp turns half as far as a circle of its length would."""
-    return (2 * pi + 2 * RAMP) * radius
+def _motion(
+    stamps: NDArray[np.float64], places: NDArray[np.float64], speeds: NDArray[np.float64] | None, period: float
+) -> list[NDArray[np.float64]]:
+    """Positions, velocities, accelerations and jerks, each (T, 3), a period apart, of positions and, if known,
+    velocities (N, 3) at rising times (N,) in s."""
+    time = torch.from_numpy(stamps - stamps[0])
+    at = torch.arange(int(float(time[-1]) / period + 1e-5) + 1, dtype=torch.float64) * period
 
+    def at_periods(values: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+        return cubic(time, torch.from_numpy(values), torch.from_numpy(slopes), at).numpy()
 
-def _loop(speed: float, radius: float, time: Tensor) -> Tensor:
-    """Position of a power loop and four derivatives (5, T, 3) at rising times (T,) in s, the first of them 0."""
+    def slopes_of(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.gradient(values, stamps, axis=0, edge_order=2)
 
-    def bend(at: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Inclination in rad and curvature in 1/m, with two derivatives by the way, at times of any shape."""
-        way = speed * (at - STRAIGHT)
-        ramp = 2 * RAMP * radius
-        total = torch.zeros(4, *at.shape, dtype=at.dtype)
-        for begins, sign in ((0.0, 1.0), (_loop_length(radius) - ramp, -1.0)):
-            s = ((way - begins) / ramp).clamp(0, 1)
-            past = (way - begins - ramp).clamp(min=0)
-            angle = ramp * s**4 * (2.5 - 3 * s + s**2) + past
-            rising = (s**3 * (10 - 15 * s + 6 * s**2), 30 * (s * (1 - s)) ** 2 / ramp)
-            bending = 60 * s * (1 - s) * (1 - 2 * s) / ramp**2
-            total += sign * torch.stack((angle, *rising, bending)) / radius
-        return total[0], total[1], total[2], total[3]
-
-    def axes(inclination: Tensor) -> tuple[Tensor, Tensor]:
-        """Directions (..., 3) along the path and towards the inside of its bend."""
-        c, s, nothing = inclination.cos(), inclination.sin(), torch.zeros_like(inclination)
-        return torch.stack((c, nothing, s), -1), torch.stack((-s, nothing, c), -1)
-
-    angle, bent, bending, bends = bend(time)
-    along, inward = axes(angle)
-    bent, bending, bends = bent[:, None], bending[:, None], bends[:, None]
-    # Gauss and Legendre's rule with 5 points in each interval: right to rounding, as the path is smooth.
-    points, weights = (torch.from_numpy(part) / 2 for part in np.polynomial.legendre.leggauss(5))
-    step = time.diff()
-    within = axes(bend(time[:-1, None] + step[:, None] * (points + 0.5))[0])[0]
-    steps = speed * step[:, None] * (within * weights[:, None]).sum(1)
-    position = torch.cat((torch.zeros_like(along[:1]), steps.cumsum(0)))
-    return torch.stack(
-        (
-            position,
-            speed * along,
-            speed**2 * bent * inward,
-            speed**3 * (bending * inward - bent**2 * along),
-            speed**4 * ((bends - bent**3) * inward - 3 * bent * bending * along),
-        )
-    )
+    if speeds is None:
+        motion = [at_periods(places, slopes_of(places))]
+    else:
+        motion = [at_periods(places, speeds), at_periods(speeds, slopes_of(speeds))]
+    while len(motion) < 4:
+        motion.append(np.gradient(motion[-1], period, axis=0, edge_order=2))
+    return motion
