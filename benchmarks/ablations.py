@@ -28,7 +28,13 @@ from visadapt.effects import Residual
 from visadapt.evaluation import CartPoleScore
 from visadapt.history import History
 from visadapt.policies import ImagePolicy, Policy, StatePolicy
-from visadapt.policies.networks import ImageResidualNetwork, ResidualNetwork, StateResidualNetwork, mlp
+from visadapt.policies.networks import (
+    ImageResidualNetwork,
+    ResidualNetwork,
+    StateHistoryResidualNetwork,
+    StateResidualNetwork,
+    mlp,
+)
 from visadapt.setups.base import Setup
 from visadapt.setups.cartpole import from_states
 from visadapt.storage.run_folder import open_run
@@ -117,7 +123,7 @@ def without_unexplained_accelerations(setup: Setup, policy: Policy) -> Setup:
 
     def change(made: Residual) -> Residual:
         network = made.network
-        assert isinstance(network, (ImageResidualNetwork, StateResidualNetwork))
+        assert isinstance(network, (ImageResidualNetwork, StateHistoryResidualNetwork))
         all_of_them = network.unexplained
         network.unexplained = lambda *given: torch.zeros_like(all_of_them(*given))  # type: ignore[method-assign]
         return made

@@ -4,7 +4,7 @@ import torch
 
 from renderers import LayeredRenderer
 from visadapt.learning.perception import PerceptionSettings, scale
-from visadapt.policies.networks import ImageResidualNetwork, StateResidualNetwork
+from visadapt.policies.networks import ImageResidualNetwork, StateHistoryResidualNetwork, StateResidualNetwork
 from visadapt.systems import CartPole
 
 HEIGHT, WIDTH = 20, 24
@@ -54,4 +54,4 @@ def image_residual_network(renderer):
 
 def state_residual_network(with_history):
     """A residual network for states 0.05 s apart of the default cart-pole."""
-    return StateResidualNetwork(4, system=CartPole() if with_history else None, period=0.05)
+    return StateHistoryResidualNetwork(CartPole(), 0.05) if with_history else StateResidualNetwork(4)

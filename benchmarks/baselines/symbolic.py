@@ -20,6 +20,7 @@ from visadapt.policies.networks import (
     HISTORY_ACCELERATION_UNIT,
     FlightResidualNetwork,
     ResidualNetwork,
+    StateHistoryResidualNetwork,
     StateResidualNetwork,
 )
 from visadapt.systems import CartPole, FixedWing, Quadrotor, RigidBody, System
@@ -156,9 +157,9 @@ def read(network: ResidualNetwork, source: World, states: Any, commands: Any) ->
         turned = ca.vec(rotation(each[-1][ATTITUDE]).T)
         own = ca.vertcat(each[-1][VELOCITY], turned, each[-1][RATES], done[-1])
         return own if network.predict is None else ca.vertcat(own, *unexplained_changes(source, each, done))
-    assert isinstance(network, StateResidualNetwork)
-    if network.system is None:
+    if isinstance(network, StateResidualNetwork):
         return ca.vertcat(each[-1], done[-1])
+    assert isinstance(network, StateHistoryResidualNetwork)
     unexplained = []
     for k in range(LENGTH - 1):
         ends = [derivative(source.system, each[end], done[k]) for end in (k, k + 1)]

@@ -14,7 +14,7 @@ from benchmarks.cartpole_states import SINE
 from tests.flying import waves
 from visadapt.effects import ConstantForce, LinearDrag, PeriodicForce, Residual
 from visadapt.history import HORIZON, LENGTH, History
-from visadapt.policies.networks import FlightResidualNetwork, StateResidualNetwork
+from visadapt.policies.networks import FlightResidualNetwork, StateHistoryResidualNetwork, StateResidualNetwork
 from visadapt.systems import CartPole, FixedWing, Quadrotor
 from visadapt.targets import FlightTarget, SyntheticTarget
 from visadapt.tasks.follow import Follow
@@ -24,7 +24,7 @@ from visadapt.world import World
 
 def residual_that_is_not_zero(with_history):
     torch.manual_seed(0)
-    network = StateResidualNetwork(4, 1, CartPole() if with_history else None, 0.05)
+    network = StateHistoryResidualNetwork(CartPole(), 0.05) if with_history else StateResidualNetwork(4)
     for weight in network.parameters():
         torch.nn.init.normal_(weight, std=0.3)
     return Residual(network, torch.tensor([0.1, 0.2, 0.3, 0.4])).requires_grad_(False)

@@ -18,7 +18,7 @@ from visadapt.effects import ConstantForce, Residual
 from visadapt.effects.catalogue import catalogue
 from visadapt.history import LENGTH, History
 from visadapt.policies import StatePolicy
-from visadapt.policies.networks import FrameEncoder, StateResidualNetwork
+from visadapt.policies.networks import FrameEncoder, StateHistoryResidualNetwork, StateResidualNetwork
 from visadapt.systems import CartPole
 from visadapt.world import World
 
@@ -188,9 +188,7 @@ def test_on_states_a_force_is_left_and_without_one_nothing():
         for _ in range(LENGTH - 1):
             at = world.step(at, action)
             seen.append(at.state)
-        left = state_residual_network(True).unexplained(
-            CartPole(), torch.stack(seen, 1), action[:, None].expand(1, LENGTH, 1)
-        )
+        left = state_residual_network(True).unexplained(torch.stack(seen, 1), action[:, None].expand(1, LENGTH, 1))
         cart = newtons / (1.1 - 0.75 * 0.1)
         torch.testing.assert_close(left.mean((0, 1)), torch.tensor([cart, -0.75 * cart / 0.5]), rtol=0.02, atol=0.02)
 
@@ -199,14 +197,14 @@ def test_on_states_a_force_is_left_and_without_one_nothing():
 def test_on_states_of_ones_own_system_a_load_is_left_as_the_accelerations_it_gives(system, load):
     constant = {effect.name: effect for effect in catalogue(system())}[f"{load}.constant_load"]
     machine = World(system(), [constant(torque=0.02)], 0.002).requires_grad_(False)
-    network = StateResidualNetwork(4, len(system.actions), system(), machine.period)
+    network = StateHistoryResidualNetwork(system(), machine.period)
     at = machine.start(torch.tensor([[0.1, 0.3, 0.5, -0.4]]))
     rows = [at.state]
     for _ in range(LENGTH - 1):
         at = machine.step(at, torch.zeros(1, len(system.actions)))
         rows.append(at.state)
     history = History(torch.stack(rows, 1), torch.zeros(1, LENGTH, len(system.actions)))
-    left = network.unexplained(network.system, history.observations, history.actions)[0, -1]
+    left = network.unexplained(history.observations, history.actions)[0, -1]
     none, given = torch.zeros(1, len(system.loads)), torch.zeros(1, len(system.actions))
     one = none.clone()
     one[0, [each.name for each in system.loads].index(load)] = 0.02

@@ -200,57 +200,66 @@ class ImageResidualNetwork(ResidualNetwork):
 
 
 class StateResidualNetwork(ResidualNetwork):
-    """The residual of a policy that is shown states.
+    """The paper's MLP on the last state and action, with two hidden layers of 64, tanh (3.2.1)."""
 
-    On the last state and action it is the paper's MLP with two hidden layers of 64, tanh (3.2.1). On 5 of each (3.2.2),
-    for which it needs the source's `system` and the `period` in s, it also reads the accelerations between the states
-    that the source does not explain, the only inputs that show a force that changes. It is linear then, without a bias,
-    for the reason that `ImageResidualNetwork` gives.
+    def __init__(self, n_state: int, n_action: int = 1) -> None:
+        # Not used: its random numbers are drawn so that a seed gives the weights that it gave the published tables.
+        nn.Linear(LENGTH * (n_state + n_action), n_state, bias=False)
+        super().__init__(mlp(n_state + n_action, 64, 64, n_state))
+
+    def embed(self, history: History) -> Tensor:
+        return torch.cat((history.observations[:, -1], history.actions[:, -1]), 1)
+
+
+class StateHistoryResidualNetwork(ResidualNetwork):
+    """A linear map, without a bias, of the last 5 states and actions and of the accelerations between these states that
+    the source does not explain, the only inputs that show a force that changes.
+
+    The paper's residual of states with a history (3.2.2) is an MLP; this is linear for the reason that
+    `ImageResidualNetwork` gives.
+
+    Args:
+        system: the source physics.
+        period: s between actions.
     """
 
-    def __init__(self, n_state: int, n_action: int = 1, system: System | None = None, period: float = 0.0) -> None:
-        inputs = LENGTH * (n_state + n_action) + (LENGTH - 1) * (len(system.coordinates) if system else 0)
-        of_history = nn.Linear(inputs, n_state, bias=False)
-        super().__init__(of_history if system else mlp(n_state + n_action, 64, 64, n_state))
-        self.n_state = n_state
+    def __init__(self, system: System, period: float) -> None:
+        self.n_state, self.n_action = len(system.states), len(system.actions)
+        inputs = LENGTH * (self.n_state + self.n_action) + (LENGTH - 1) * len(system.coordinates)
+        super().__init__(nn.Linear(inputs, self.n_state, bias=False))
         self.system = system
         self.period = period
 
     def embed(self, history: History) -> Tensor:
         states, actions = history.observations, history.actions
-        if self.system is None:
-            return torch.cat((states[:, -1], actions[:, -1]), 1)
-        unexplained = self.unexplained(self.system, states, actions) / ACCELERATION_UNIT
+        unexplained = self.unexplained(states, actions) / ACCELERATION_UNIT
         return torch.cat((states.flatten(1), actions.flatten(1), unexplained.flatten(1)), 1)
 
     def informed(self, inputs: Tensor) -> Tensor:
-        """(B,) False in the first LENGTH - 1 rows of an episode, whose history is incomplete; True if none is read."""
-        if self.system is None:
-            return super().informed(inputs)
+        """(B,) False in the first LENGTH - 1 rows of an episode, whose history is incomplete."""
         states = inputs[:, : LENGTH * self.n_state].unflatten(1, (LENGTH, self.n_state))
         return states.diff(dim=1).any(2).all(1)
 
     def penalties(self, inputs: Tensor) -> Tensor:
-        """(inputs,) ACTION_UNIT squared for the actions of a history, else 1.
+        """(inputs,) ACTION_UNIT squared for the actions, else 1.
 
         Near rest the commands are small, so their weights must be large to represent a late or weak motor. With the
         same penalty as the other inputs, they represented only a quarter of that effect after 200 samples, and policies
         that were tuned with such a residual fell.
         """
         every = super().penalties(inputs)
-        if self.system is not None:
-            states = LENGTH * self.n_state
-            every[states : states + LENGTH * len(self.system.actions)] = ACTION_UNIT**2
+        states = LENGTH * self.n_state
+        every[states : states + LENGTH * self.n_action] = ACTION_UNIT**2
         return every
 
-    def unexplained(self, system: System, states: Tensor, actions: Tensor) -> Tensor:
+    def unexplained(self, states: Tensor, actions: Tensor) -> Tensor:
         """Mean accelerations minus the system's over the periods between states, (B, LENGTH - 1, J) of J joints.
 
         The system's is the mean of those at both ends of a period, under the action held in between. `held_back` fills
         the periods before an episode.
         """
-        ends = [accelerations(system, part, actions[:, :-1]) for part in (states[:, :-1], states[:, 1:])]
-        measured = states.diff(dim=1)[..., [velocity for _, velocity in system.coordinates]] / self.period
+        ends = [accelerations(self.system, part, actions[:, :-1]) for part in (states[:, :-1], states[:, 1:])]
+        measured = states.diff(dim=1)[..., [velocity for _, velocity in self.system.coordinates]] / self.period
         left = measured - (ends[0] + ends[1]) / 2
         return held_back(left, states.diff(dim=1).any(2, keepdim=True))
 

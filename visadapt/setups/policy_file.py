@@ -18,7 +18,13 @@ from visadapt.effects import EFFECTS, Effect, Residual
 from visadapt.effects.own import is_own, own_effects
 from visadapt.learning.perception import PerceptionSettings, scale
 from visadapt.policies import FlightPolicy, FollowPolicy, ImagePolicy, Policy, ReachPolicy, StatePolicy
-from visadapt.policies.networks import FlightResidualNetwork, ImageResidualNetwork, StateResidualNetwork
+from visadapt.policies.networks import (
+    FlightResidualNetwork,
+    ImageResidualNetwork,
+    ResidualNetwork,
+    StateHistoryResidualNetwork,
+    StateResidualNetwork,
+)
 from visadapt.storage.checkpoints import CheckpointError, check_sizes, fitting, load_tree, load_weights, save_network
 from visadapt.systems import SYSTEMS, RigidBody, System
 from visadapt.systems.base import NAMED, parameters
@@ -192,15 +198,16 @@ def residual_for(
         TypeError: a policy of a class that has no residual here; make a `Setup` with one of your own.
     """
     system, period = source.system, source.period
-    network: FlightResidualNetwork | ImageResidualNetwork | StateResidualNetwork
+    network: ResidualNetwork
     if isinstance(policy, ImagePolicy):
         eyes = policy.perception
         unit = scale(perception or PerceptionSettings(), period)
         network = ImageResidualNetwork(eyes.background, float(eyes.contrast), system, period, unit)
         network.to(eyes.background).encoder.load_state_dict(eyes.state_dict())
+    elif isinstance(policy, StatePolicy) and policy.with_history:
+        network = StateHistoryResidualNetwork(system, period)
     elif isinstance(policy, StatePolicy):
-        physics = system if policy.with_history else None
-        network = StateResidualNetwork(policy.n_state, policy.n_action, physics, period)
+        network = StateResidualNetwork(policy.n_state, policy.n_action)
     elif isinstance(policy, FlightPolicy) and isinstance(system, RigidBody):
         network = FlightResidualNetwork(system, period, source.steps_along if with_history else None)
     else:
