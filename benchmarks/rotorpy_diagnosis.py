@@ -30,6 +30,7 @@ import tyro
 
 from datasets import quadrotor_references
 from datasets.blind import flights as blind_flights
+from experiments.endings import ends_in_one_line
 from experiments.result_tables import write_csv
 from experiments.rotorpy_published import published
 from visadapt import diagnose
@@ -43,7 +44,6 @@ from visadapt.progress import reporting
 from visadapt.recordings import Episode, load_recording, write_recording
 from visadapt.setups.policy_file import load_policy
 from visadapt.storage.run_folder import once, open_run
-from visadapt.targets import TargetError
 from visadapt.targets.rollout import run
 from visadapt.targets.rotorpy import BREEZE, SOURCE, Air, RotorpyTarget
 from visadapt.tasks.follow import Follow
@@ -184,9 +184,5 @@ def _number(value: float | None) -> str:
 
 
 if __name__ == "__main__":
-    try:
+    with ends_in_one_line("rotorpy_diagnosis"):
         main(tyro.cli(Settings, description=__doc__))
-    except (TargetError, ValueError, OSError) as error:
-        raise SystemExit(f"rotorpy_diagnosis: {error}") from error
-    except KeyboardInterrupt:
-        raise SystemExit("interrupted: run it again to go on") from None

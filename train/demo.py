@@ -23,6 +23,7 @@ from pathlib import Path
 import tyro
 
 from experiments.curves import plot_losses
+from experiments.endings import ends_in_one_line
 from experiments.film_runs import film_run
 from experiments.kept_scores import kept_score
 from renderers import DrawnCartPole
@@ -32,7 +33,7 @@ from visadapt.films.cartpole_film import CartPoleFilm, CartPolePanel
 from visadapt.progress import reporting, staged
 from visadapt.setups.cartpole import cartpole_frames
 from visadapt.storage.run_folder import open_run, write_json
-from visadapt.targets import SyntheticTarget, Target, TargetError, no_effects, sine_force
+from visadapt.targets import SyntheticTarget, Target, no_effects, sine_force
 from visadapt.targets.rollout import Run
 from visadapt.weights import shipped
 
@@ -98,9 +99,5 @@ def _renderer(settings: Settings, out: Path) -> Path:
 
 
 if __name__ == "__main__":
-    try:
+    with ends_in_one_line("demo"):
         main(tyro.cli(Settings, description=__doc__))
-    except (TargetError, ValueError, OSError) as error:
-        raise SystemExit(f"demo: {error}") from error
-    except KeyboardInterrupt:
-        raise SystemExit("interrupted: run it again to go on") from None

@@ -23,13 +23,13 @@ import torch
 import tyro
 
 from datasets import quadrotor_references
+from experiments.endings import ends_in_one_line
 from experiments.flights import EXPERIMENTS, flight_target
 from visadapt.films.flight_film import FlightFilm
 from visadapt.films.flight_panel import FlightPanel
 from visadapt.policies import Policy
 from visadapt.progress import reporting, staged
 from visadapt.setups.base import Setup
-from visadapt.targets import TargetError
 from visadapt.targets.rollout import run
 from visadapt.targets.synthetic import DrawEffects, no_effects
 from visadapt.weights import shipped
@@ -88,9 +88,5 @@ def flown(setup: Setup, draw_effects: DrawEffects, policy: Policy, seed: int, ti
 
 
 if __name__ == "__main__":
-    try:
+    with ends_in_one_line("flight_film"):
         main(tyro.cli(Settings, description=__doc__))
-    except (TargetError, ValueError, OSError) as error:
-        raise SystemExit(f"flight_film: {error}") from error
-    except KeyboardInterrupt:
-        raise SystemExit("interrupted: run it again to go on") from None

@@ -28,6 +28,7 @@ import torch
 import tyro
 
 from experiments.curves import plot_losses
+from experiments.endings import ends_in_one_line
 from experiments.film_runs import film_run
 from experiments.kept_scores import kept_score
 from experiments.learnt_camera import learnt_renderer
@@ -40,7 +41,7 @@ from visadapt.progress import Report, reporting, staged
 from visadapt.setups.base import Setup
 from visadapt.setups.cartpole import cartpole_frames
 from visadapt.storage.run_folder import open_run, write_json
-from visadapt.targets import Observation, SyntheticTarget, Target, TargetError
+from visadapt.targets import Observation, SyntheticTarget, Target
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.targets.inverted_pendulum import MAP, REACH_M, SOURCE, START, inverted_pendulum
 from visadapt.targets.rollout import Run
@@ -172,9 +173,5 @@ def _rows(settings: Settings, scores: dict[str, CartPoleScore]) -> list[Row]:
 
 
 if __name__ == "__main__":
-    try:
+    with ends_in_one_line("inverted_pendulum"):
         main(tyro.cli(Settings, description=__doc__))
-    except (TargetError, ValueError, OSError) as error:
-        raise SystemExit(f"inverted_pendulum: {error}") from error
-    except KeyboardInterrupt:
-        raise SystemExit("interrupted: run it again to go on") from None

@@ -31,6 +31,7 @@ import tyro
 from torch import Tensor
 
 from datasets import quadrotor_references
+from experiments.endings import ends_in_one_line
 from experiments.flights import flight_target
 from experiments.kept_scores import kept_score
 from experiments.result_tables import Row, miss_row, write_rows
@@ -42,7 +43,6 @@ from visadapt.recordings import Episode
 from visadapt.setups.flight import quadrotor
 from visadapt.storage.run_folder import once, open_run, write_json
 from visadapt.systems.rigid_body import ATTITUDE, VELOCITY, matvec, rotation
-from visadapt.targets import TargetError
 from visadapt.targets.rotorpy import BREEZE, SOURCE, RotorpyTarget
 from visadapt.targets.synthetic import FlightTarget
 from visadapt.tasks.follow import Follow
@@ -200,9 +200,5 @@ def _rows(
 
 
 if __name__ == "__main__":
-    try:
+    with ends_in_one_line("rotorpy_quadrotor"):
         main(tyro.cli(Settings, description=__doc__))
-    except (TargetError, ValueError, OSError) as error:
-        raise SystemExit(f"rotorpy_quadrotor: {error}") from error
-    except KeyboardInterrupt:
-        raise SystemExit("interrupted: run it again to go on") from None
