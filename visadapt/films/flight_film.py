@@ -21,7 +21,7 @@ from matplotlib.patches import FancyArrowPatch, Polygon
 
 from visadapt.evaluation.scoring import FAR
 from visadapt.films import widgets
-from visadapt.films.camera import FARTHEST_PX, FOLLOWING_CAMERA, PASSING_CAMERA, axes_towards, ground_grid
+from visadapt.films.camera import FARTHEST_PX, FOLLOWING_CAMERA, PASSING_CAMERA, ChaseCamera, axes_towards, ground_grid
 from visadapt.films.film import Film
 from visadapt.films.flight_panel import INSTANT_PERIOD_S, FlightPanel, length
 from visadapt.films.vehicle_shapes import ROUND, drawn_parts, hull, vehicle_parts
@@ -38,6 +38,8 @@ SECOND = round(1 / INSTANT_PERIOD_S)
 """instants in 1 s, for which the reference ahead is highlighted"""
 OVERVIEW_DIRECTION = (0.55, 1.0, -0.6)
 """direction of view of the whole course, in world axes"""
+Seen = Callable[[Floats], Floats]
+"""Points (..., 3) in m to where they are seen (..., 2)."""
 ERROR_COLOURS = LinearSegmentedColormap.from_list("error", [TEAL, AMBER, RED])
 
 
@@ -89,18 +91,57 @@ class FlightFilm(Film):
         """The vehicle in its true size and attitude with its thrust, the hidden force, and the course around it."""
         camera, half = FOLLOWING_CAMERA if self.follows else PASSING_CAMERA, np.array([PANEL_WIDTH, SCENE_HEIGHT]) / 2
         scene = widgets.framed(page, 0, SCENE_TOP, *(2 * half), xlim=(-half[0], half[0]), ylim=(-half[1], half[1]))
-        # The ground fades into the sky over the 150 px below the horizon.
-        ahead = np.subtract(camera.looks_at, camera.place)
-        horizon = camera.project(1e6 * ahead * (1, 1, 0), np.zeros(3))[0][1]
-        rows = ((horizon - np.linspace(half[1], -half[1], SCENE_HEIGHT)) / 150).clip(0, 1)[:, None]
-        shades = LinearSegmentedColormap.from_list("ground", [SKY, GROUND])
-        scene.imshow(rows, shades, vmin=0, vmax=1, extent=(-half[0], half[0], -half[1], half[1]), aspect="auto")
-        step, place, goal = 1.0 if self.follows else 5.0, panel.position, panel.goal
+        _draw_sky(scene, camera, half)
+        draw_grid = self._grid(scene, half)  # what is added later is drawn over what was added before
+        draw_shadow = _shadow(scene)
+        lines = self._lines(scene, panel)
+        draw_path = self._path(scene, panel)
+        draw_vehicle = _vehicle(scene, panel)
+        draw_forces = self._forces(scene, panel)
+        draw_words = self._words(scene, panel)
+
+        def move(i: int) -> None:
+            moving = self._camera_moves_with(panel, i)
+
+            def seen(points: Floats) -> Floats:
+                return camera.project(points, moving)[0]
+
+            draw_grid(seen, moving)
+            for line, points in lines:
+                line.set_data(*seen(points(i)).T)
+            draw_path(seen, i)
+            corners = draw_vehicle(lambda points: camera.project(points, moving), i)
+            draw_shadow(seen(self._dropped(corners)))
+            draw_forces(seen, i)
+            draw_words(i)
+
+        return move
+
+    def _camera_moves_with(self, panel: FlightPanel, i: int) -> Floats:
+        """The point (3,) that the close-up's camera moves with at instant i: that of the reference; or the vehicle, up
+        to 4 m before the point that it flies through."""
+        if self.follows:
+            return panel.goal[i]
+        arrived = np.flatnonzero(panel.position[: i + 1, 0] > panel.goal[0, 0] - 4.0)
+        return panel.position[arrived[0] if len(arrived) else i]
+
+    def _grid(self, scene: Axes, half: Floats) -> Callable[[Seen, Floats], None]:
+        """The grid on the ground around what the camera moves with; `half` (2,) px is half the scene's size."""
+        step = 1.0 if self.follows else 5.0
         scene.text(half[0] - 10, 10 - half[1], f"grid {step:g} m", fontsize=11, color=MUTED, ha="right")
         grid, colours = ground_grid(step)
         tiles: Any = scene.add_collection(LineCollection([], animated=True), autolim=False)
-        shadow = Polygon(np.zeros((3, 2)), facecolor=MUTED, alpha=0.16, animated=True)
-        scene.add_patch(shadow)
+
+        def draw(seen: Seen, moving: Floats) -> None:
+            pieces: Any = seen(grid + np.array([*np.round(moving[:2] / step) * step, self.ground]))
+            visible = np.isfinite(pieces).all((1, 2)) & (np.abs(pieces) < half).all(-1).any(-1)
+            tiles.set(segments=pieces[visible], colors=colours[visible])
+
+        return draw
+
+    def _lines(self, scene: Axes, panel: FlightPanel) -> list[tuple[Line2D, Callable[[int], Floats]]]:
+        """The course, the goal and their shadows: lines, and the points (n, 3) of each at an instant."""
+        place, goal = panel.position, panel.goal
         lines: list[tuple[Line2D, Callable[[int], Floats]]] = [
             (_line(scene, HAIRLINE, 1), lambda i: self._dropped(panel.reference)),
             (_line(scene, MUTED, 1, alpha=0.5), lambda i: self._dropped(place[: i + 1])),
@@ -108,49 +149,40 @@ class FlightFilm(Film):
             (_line(scene, MUTED, 1, linestyle="-" if self.follows else "--"), lambda i: panel.reference),
         ]
         if self.follows:
-            lines += [
+            return [
+                *lines,
                 (_line(scene, INK, 2), lambda i: panel.reference[i : i + SECOND + 1]),
                 (_line(scene, RED, 2, zorder=4), lambda i: np.stack([place[i], goal[i]])),
                 (_line(scene, INK, 0, marker="o", markersize=8, mec=PAPER, zorder=4), lambda i: goal[i : i + 1]),
             ]
-        else:
-            ring = np.column_stack([np.zeros(len(ROUND)), ROUND])
-            lines += [
-                (_line(scene, MUTED, 2), lambda i: self._plumb(goal[0] - (0, 0, FAR))),
-                (_line(scene, INK, 3), lambda i: goal[0] + FAR * ring),
-                (_line(scene, INK, 1), lambda i: goal[0] + 0.25 * FAR * ring),
-                (_line(scene, RED, 0, marker="o", markersize=5), lambda i: goal[:1]),
-            ]
-        draw_path, parts = self._path(scene, panel), vehicle_parts(panel.vehicle)
-        vehicle = scene.add_collection(PolyCollection([], animated=True, zorder=3), autolim=False)
+        ring = np.column_stack([np.zeros(len(ROUND)), ROUND])
+        return [
+            *lines,
+            (_line(scene, MUTED, 2), lambda i: self._plumb(goal[0] - (0, 0, FAR))),
+            (_line(scene, INK, 3), lambda i: goal[0] + FAR * ring),
+            (_line(scene, INK, 1), lambda i: goal[0] + 0.25 * FAR * ring),
+            (_line(scene, RED, 0, marker="o", markersize=5), lambda i: goal[:1]),
+        ]
+
+    def _forces(self, scene: Axes, panel: FlightPanel) -> Callable[[Seen, int], None]:
+        """Arrows of the commanded thrust and of the hidden force."""
         show_thrust, show_force = _arrow(scene, BLUE), _arrow(scene, VIOLET)
+        longest = 0.45 if self.follows else 1.2  # m, of the largest hidden force
+
+        def draw(seen: Seen, i: int) -> None:
+            place = panel.position[i]
+            newtons, way = _thrust(panel, i)
+            show_thrust(seen(place + np.outer([0, newtons], way)), f"thrust {newtons:.1f} N")
+            way = longest / self.most_force * panel.force[i]
+            show_force(seen(place + np.outer([0, 1], way)), f"{np.linalg.norm(panel.force[i]):.2f} N")
+
+        return draw
+
+    def _words(self, scene: Axes, panel: FlightPanel) -> Callable[[int], None]:
+        """How far off the vehicle is, or how far off it passed the point; from a failure on, what failed."""
         distance, show_failure = widgets.note(scene, 22), widgets.banner(scene)
 
-        def move(i: int) -> None:
-            moving = goal[i]
-            if not self.follows:
-                arrived = np.flatnonzero(place[: i + 1, 0] > goal[0, 0] - 4.0)
-                moving = place[arrived[0] if len(arrived) else i]
-
-            def seen(points: Floats) -> Floats:
-                return camera.project(points, moving)[0]
-
-            pieces: Any = seen(grid + np.array([*np.round(moving[:2] / step) * step, self.ground]))
-            visible = np.isfinite(pieces).all((1, 2)) & (np.abs(pieces) < half).all(-1).any(-1)
-            tiles.set(segments=pieces[visible], colors=colours[visible])
-            for line, points in lines:
-                line.set_data(*seen(points(i)).T)
-            draw_path(seen, i)
-            corners, looks = drawn_parts(parts, place[i], panel.attitude[i], lambda p: camera.project(p, moving))
-            vehicle.set(**looks)
-            dropped = seen(self._dropped(corners))
-            shadow.set_visible(bool(np.isfinite(dropped).all()))
-            if shadow.get_visible():
-                shadow.set_xy(hull(dropped))
-            newtons, way = _thrust(panel, i)
-            show_thrust(seen(place[i] + np.outer([0, newtons], way)), f"thrust {newtons:.1f} N")
-            way = (0.45 if self.follows else 1.2) / self.most_force * panel.force[i]
-            show_force(seen(place[i] + np.outer([0, 1], way)), f"{np.linalg.norm(panel.force[i]):.2f} N")
+        def draw(i: int) -> None:
             failed = panel.failed is not None and panel.times[i] >= panel.failed - 1e-6
             show_failure(panel.failure(i) if failed else "", panel.lost(i))
             off = panel.away[i] if self.follows else panel.worst
@@ -158,7 +190,7 @@ class FlightFilm(Film):
             distance.set(text=words, color=self._colours(off))
             distance.set_visible(not failed and (self.follows or panel.times[i] >= panel.passed))
 
-        return move
+        return draw
 
     def _overview(self, page: Axes, panel: FlightPanel) -> Callable[[int], None]:
         """The whole course from afar, above its shadow on the ground."""
@@ -257,7 +289,7 @@ class FlightFilm(Film):
         draw = widgets.trace(axes, panel.times, panel.away, panel.score, lambda metres: score.format(length(metres)))
         return lambda i: draw(i, panel.lost(i))
 
-    def _path(self, axes: Axes, panel: FlightPanel) -> Callable[[Callable[[Floats], Floats], int], object]:
+    def _path(self, axes: Axes, panel: FlightPanel) -> Callable[[Seen, int], object]:
         """The path, coloured by its distance from the reference, or by how far off it passes the point."""
         colours = self._colours(panel.away if self.follows else np.full(len(panel.times), panel.worst))
         pieces = np.stack([panel.position[:-1], panel.position[1:]], 1)
@@ -276,6 +308,42 @@ class FlightFilm(Film):
     def _plumb(self, point: Floats) -> Floats:
         """(2, 3), from a point to the ground."""
         return np.stack([point, self._dropped(point)])
+
+
+def _draw_sky(scene: Axes, camera: ChaseCamera, half: Floats) -> None:
+    """The ground, which fades into the sky over the 150 px below the horizon; `half` (2,) px is half the scene's
+    size."""
+    ahead = np.subtract(camera.looks_at, camera.place)
+    horizon = camera.project(1e6 * ahead * (1, 1, 0), np.zeros(3))[0][1]
+    rows = ((horizon - np.linspace(half[1], -half[1], SCENE_HEIGHT)) / 150).clip(0, 1)[:, None]
+    shades = LinearSegmentedColormap.from_list("ground", [SKY, GROUND])
+    scene.imshow(rows, shades, vmin=0, vmax=1, extent=(-half[0], half[0], -half[1], half[1]), aspect="auto")
+
+
+def _shadow(scene: Axes) -> Callable[[Floats], None]:
+    """The vehicle's shadow around points (n, 2) px; none where one of them is not seen."""
+    shadow = Polygon(np.zeros((3, 2)), facecolor=MUTED, alpha=0.16, animated=True)
+    scene.add_patch(shadow)
+
+    def draw(points: Floats) -> None:
+        shadow.set_visible(bool(np.isfinite(points).all()))
+        if shadow.get_visible():
+            shadow.set_xy(hull(points))
+
+    return draw
+
+
+def _vehicle(scene: Axes, panel: FlightPanel) -> Callable[[Callable[[Floats], tuple[Floats, Floats]], int], Floats]:
+    """The vehicle; what is returned draws it as a camera projects it, and gives its corners (n, 3)."""
+    parts = vehicle_parts(panel.vehicle)
+    vehicle = scene.add_collection(PolyCollection([], animated=True, zorder=3), autolim=False)
+
+    def draw(project: Callable[[Floats], tuple[Floats, Floats]], i: int) -> Floats:
+        corners, looks = drawn_parts(parts, panel.position[i], panel.attitude[i], project)
+        vehicle.set(**looks)
+        return corners
+
+    return draw
 
 
 def _thrust(panel: FlightPanel, i: int) -> tuple[float, Floats]:
