@@ -224,7 +224,7 @@ def test_a_flight_that_strays_beyond_all_bounds_is_drawn_all_the_same():
     film, other = FlightFilm([strayed, panel]), FlightFilm([panel, panel])
     for t in (0.45, 0.5, 1.0):
         assert film.still(t).shape == other.still(t).shape
-    assert film.far == FlightFilm([panel]).far
+    assert film.scales.far == FlightFilm([panel]).scales.far
 
 
 def test_a_flight_of_one_row_is_a_picture():
