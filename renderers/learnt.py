@@ -54,7 +54,7 @@ class Layer(nn.Module):
     centre: Tensor
     extent: Tensor
 
-    def __init__(self, window: tuple[float, float, float, float], turns: bool, detail: float = 2.0) -> None:
+    def __init__(self, window: tuple[float, float, float, float], turns: bool, detail: float) -> None:
         super().__init__()
         left, right, top, bottom = window
         columns, rows = int((right - left) * detail) + 1, int((bottom - top) * detail) + 1
