@@ -18,32 +18,25 @@ import hashlib
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from visadapt.recordings.episode import Episode, RecordingError
+from visadapt.recordings.guarded import tried
 from visadapt.recordings.thinning import kept
 from visadapt.storage.atomic_files import replacing
 from visadapt.systems import System
-
-Read = TypeVar("Read")
 
 FORMAT, VERSION = "visadapt recording", 2
 READABLE = (1, VERSION)
 COMPRESSION = 1100
 """Highest ratio of bytes to stored bytes that compression reaches; a dataset that claims more is damaged."""
-READING_S, READING_BYTES_PER_S = 5, 50e6
-"""CPU time in s that opening any file may take, and bytes of its values, unpacked, for each second more."""
-READING_BYTES, COPIES = 2**30, 8
-"""Bytes of memory that opening any file may take, and how many times the bytes of its values in addition."""
-MEMORY = Path("/proc/self/statm")
-"""Pages of memory of this process, on Linux; the sixth number is that of its data."""
 DATASETS = ("time", "action", "state", "task_state", "frame")
 PART_BYTES = 2**24
 """Bytes of a dataset that are read at once where not all of its rows are used."""
@@ -114,7 +107,7 @@ def read_names(path: str | os.PathLike[str], system: System | type[System]) -> t
                 _names(file, "action") or [variable.name for variable in system.actions],
             )
 
-    return _tried(path, read)
+    return tried(path, read)
 
 
 def read_recording(path: str | os.PathLike[str]) -> list[Episode]:
@@ -169,61 +162,7 @@ def read_stretches(
         _check_alike(path, [*episodes.values()])
         return episodes, starts[-1]
 
-    return _tried(path, read)
-
-
-def _tried(path: str | os.PathLike[str], read: Callable[[Callable[[int], None]], Read]) -> Read:
-    """The result of `read`, tried first in a process of its own: a damaged file can make HDF5 hang, or end the process.
-
-    `read` is given a function that it calls with the bytes that it is going to unpack: they take time and memory.
-
-    Raises:
-        RecordingError: that process was ended by either; or whatever `read` raises.
-    """
-    with _limited_memory() as allow_memory:
-        if hasattr(os, "fork") and Path(path).is_file():
-            import resource  # not on every system, as fork
-
-            def allow(size: int) -> None:
-                hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
-                resource.setrlimit(resource.RLIMIT_CPU, (READING_S + int(size / READING_BYTES_PER_S), hard))
-                allow_memory(size)
-
-            if (child := os.fork()) == 0:
-                try:
-                    allow(0)
-                    with suppress(Exception):
-                        read(allow)
-                finally:
-                    os._exit(0)
-            if os.waitpid(child, 0)[1]:
-                raise RecordingError(f"{path}: is damaged: to read it ends the process, or takes far too long")
-        return read(allow_memory)
-
-
-@contextmanager
-def _limited_memory() -> Iterator[Callable[[int], None]]:
-    """Limits how much more memory the process takes, since a damaged file can make HDF5 ask for gigabytes.
-
-    Gives a function that allows for so many bytes of values. There is no limit on systems other than Linux.
-    """
-    if not MEMORY.exists():
-        yield lambda size: None
-        return
-    import resource
-
-    before = resource.getrlimit(resource.RLIMIT_DATA)
-    used = int(MEMORY.read_text().split()[5]) * resource.getpagesize()
-
-    def allow(size: int) -> None:
-        most = used + READING_BYTES + COPIES * size
-        resource.setrlimit(resource.RLIMIT_DATA, (most if before[0] < 0 else min(most, before[0]), before[1]))
-
-    try:
-        allow(0)
-        yield allow
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, before)
+    return tried(path, read)
 
 
 @contextmanager
