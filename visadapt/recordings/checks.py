@@ -93,16 +93,7 @@ def check_units(episodes: Sequence[RawEpisode], system: System) -> None:
     columns = judged[0].states
     angles = [name for name in columns if variables[name].unit == "rad"]
     for raw in judged:
-        for name in angles:
-            steps = np.abs(np.diff(raw.states[name]))
-            lasting = np.diff(raw.time)
-            steps[lasting > GAP_PERIODS * np.median(lasting)] = 0.0  # a joint turns on while rows are missing
-            row = int(steps.argmax()) + 1
-            if steps.max() > 1.25 * TURN:
-                raise RecordingError(
-                    f"{raw.cell(row, name)} jumps from {raw.states[name][row - 1]:g} to {raw.states[name][row]:g}; "
-                    "radians are right (these look like degrees)"
-                )
+        _check_jumps(raw, angles)
         _check_clock(raw, system)
     _check_exchanged(judged, variables, {name: rate for name in columns if (rate := system.rate_of(name))})
     for raw in judged:
@@ -110,6 +101,26 @@ def check_units(episodes: Sequence[RawEpisode], system: System) -> None:
             if (rate := system.rate_of(name)) is not None:
                 _check_rate(raw, variables[name], variables[rate])
         check_attitude(raw, system)
+    _check_answers(judged, system, angles, [name for name in columns if variables[name].unit == "m"])
+
+
+def _check_jumps(raw: RawEpisode, angles: Sequence[str]) -> None:
+    """Raises RecordingError where an angle jumps by more than a turn from row to row."""
+    for name in angles:
+        steps = np.abs(np.diff(raw.states[name]))
+        lasting = np.diff(raw.time)
+        steps[lasting > GAP_PERIODS * np.median(lasting)] = 0.0  # a joint turns on while rows are missing
+        row = int(steps.argmax()) + 1
+        if steps.max() > 1.25 * TURN:
+            raise RecordingError(
+                f"{raw.cell(row, name)} jumps from {raw.states[name][row - 1]:g} to {raw.states[name][row]:g}; "
+                "radians are right (these look like degrees)"
+            )
+
+
+def _check_answers(judged: Sequence[RawEpisode], system: System, angles: Sequence[str], lengths: Sequence[str]) -> None:
+    """Raises RecordingError where states answer the commands as the source says only with another sign, zero, unit, or
+    as each other; `angles` and `lengths` name the states in rad and in m."""
     whole = judged[0]
     if isinstance(system, RigidBody) and is_turned_round(judged, system, "z"):
         raise RecordingError(
@@ -127,7 +138,7 @@ def check_units(episodes: Sequence[RawEpisode], system: System) -> None:
             f"{whole.source}: {whole.column(name)} goes from {values.min():.3g} to {values.max():.3g} and answers the "
             f"command as if in degrees; radians are right"
         )
-    for name, other in product((name for name in columns if variables[name].unit == "m"), angles):
+    for name, other in product(lengths, angles):
         if exchanged(judged, system, name, other):
             raise RecordingError(
                 f"{whole.source}: {whole.column(name)} answers the command as {other} should, and "
