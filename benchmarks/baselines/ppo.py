@@ -28,7 +28,7 @@ from benchmarks.baselines.problem import TUNING_SEED, Problem, Sizes, Stage
 from experiments.kept_scores import kept_score
 from visadapt.history import LENGTH, History
 from visadapt.policies import ImagePolicy, Policy
-from visadapt.policies.networks import N_FEATURES
+from visadapt.policies.frame_encoder import N_FEATURES
 from visadapt.setups.cartpole import cartpole_frames
 from visadapt.setups.policy_file import load_policy
 from visadapt.targets import FlightTarget, SyntheticTarget

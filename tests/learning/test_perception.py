@@ -4,7 +4,7 @@ import torch
 from tests.scenes import CONTRAST, background, small_renderer
 from visadapt.history import LENGTH, History
 from visadapt.learning.perception import Paths, PerceptionSettings, kinematics, learn_to_see
-from visadapt.policies.networks import FrameEncoder
+from visadapt.policies.frame_encoder import FrameEncoder
 
 PERIOD = 0.05
 

@@ -18,7 +18,8 @@ from visadapt.effects import ConstantForce, Residual
 from visadapt.effects.catalogue import catalogue
 from visadapt.history import LENGTH, History
 from visadapt.policies import StatePolicy
-from visadapt.policies.networks import FrameEncoder, StateHistoryResidualNetwork, StateResidualNetwork
+from visadapt.policies.frame_encoder import FrameEncoder
+from visadapt.policies.networks import StateHistoryResidualNetwork, StateResidualNetwork
 from visadapt.systems import CartPole
 from visadapt.world import World
 

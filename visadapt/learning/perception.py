@@ -15,7 +15,7 @@ from torch import Tensor
 
 from visadapt.history import LENGTH, History
 from visadapt.learning.training_state import TrainingState
-from visadapt.policies.networks import FrameEncoder
+from visadapt.policies.frame_encoder import FrameEncoder
 from visadapt.progress import Progress
 
 BEND_WEIGHT = 8.0  # Weight in the loss of the second differences of positions: they alone show a force

@@ -7,7 +7,8 @@ from torch import Tensor, nn
 
 from visadapt.history import HORIZON, LENGTH, History
 from visadapt.policies.base import Policy, ignore_correction
-from visadapt.policies.networks import N_FEATURES, FrameEncoder, mlp
+from visadapt.policies.frame_encoder import N_FEATURES, FrameEncoder
+from visadapt.policies.networks import mlp
 
 
 class ImagePolicy(Policy):
