@@ -25,7 +25,7 @@ Progress = Callable[[int, int, float], None]
 """Called with (steps done, steps in total, loss): the report of one stage."""
 
 SECONDS_APART, SECONDS_AT_MOST = 5.0, 30.0
-"""s from one line of a log to the next: at least, and at most while progress is reported at all."""
+"""s from one line of a log to the next: at least, and at most, if steps are reported that often."""
 
 
 class _Log:

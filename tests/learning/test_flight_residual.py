@@ -137,8 +137,8 @@ class TestForceThatChanges:
         network, transitions = a_network(True), Transitions.cut(flights(swaying(8, 0), 8, 11))
         fitted(network, transitions)
         seen = network.embed(transitions.history(torch.arange(len(transitions))).acting(transitions.action))
-        assert network.informed(seen).tolist() == ([False] * 4 + [True] * 6) * 8
-        assert a_network().informed(seen).all()
+        assert network.has_full_history(seen).tolist() == ([False] * 4 + [True] * 6) * 8
+        assert a_network().has_full_history(seen).all()
 
     def test_what_the_source_left_unexplained_is_the_force_over_the_mass_and_nothing_else(self):
         force = PeriodicForce(amplitude=2.0, frequency=0.2, phase=0.5, offset=0.0)

@@ -10,10 +10,10 @@ from typing import Any
 from visadapt.cli.errors import InputError
 from visadapt.cli.own_classes import import_effects
 from visadapt.cli.progress import progress
-from visadapt.cli.run_folders import asked_for
+from visadapt.cli.run_folders import run_settings
 from visadapt.cli.simulator import given_effects
-from visadapt.cli.target import load_both
-from visadapt.cli.user_code import checked
+from visadapt.cli.target import load_policy_and_target
+from visadapt.cli.user_code import as_input_error
 from visadapt.diagnosis.words import number, with_unit
 from visadapt.effects import Effect, Parameter
 from visadapt.learning.explanation import Explanation
@@ -26,7 +26,7 @@ from visadapt.tasks.references import read_reference
 def run(options: argparse.Namespace) -> None:
     """Adapt the policy in the folder of the run."""
     import_effects(options)
-    policy, source, target = load_both(options)
+    policy, source, target = load_policy_and_target(options)
     effects = given_effects(options, source.system)
     if options.diagnose and effects:
         raise InputError("--diagnose names the effects itself: leave --diagnosis and --effect out")
@@ -37,13 +37,13 @@ def run(options: argparse.Namespace) -> None:
     if options.renderer and not isinstance(policy, ImagePolicy):
         raise InputError(f"{options.policy}: is shown states, for which --renderer has no use: leave it out")
     references = read_reference(options.references, source.period) if options.references else None
-    with checked():  # before the machine is run
+    with as_input_error():  # before the machine is run
         setup = setup_to_adapt(policy, source, target, options.renderer, references, options.with_history)
         setup.check_adaptation(policy, target)
     if options.round and options.round > options.samples:
         raise InputError(f"--round {options.round} is more than --samples {options.samples}: lower it, or raise those")
     folder = Path(options.out)
-    open_run(folder, asked_for(options, "policy", "renderer", "references", "diagnosis", "map", "effects"))
+    open_run(folder, run_settings(options, "policy", "renderer", "references", "diagnosis", "map", "effects"))
     with progress() as report:
         names = ("seed", "iterations", "renderer", "with_history", "diagnose")
         given: dict[str, Any] = {name: getattr(options, name) for name in names}

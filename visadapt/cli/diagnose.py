@@ -11,7 +11,7 @@ from visadapt import diagnosis
 from visadapt.cli.errors import InputError
 from visadapt.cli.own_classes import import_effects
 from visadapt.cli.progress import progress
-from visadapt.cli.simulator import the_system
+from visadapt.cli.simulator import given_system
 from visadapt.diagnosis import Diagnosis
 from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.report.html import write_report
@@ -34,7 +34,7 @@ PERIOD_TOLERANCE = 0.05
 
 def run(options: argparse.Namespace) -> None:
     """Diagnose, print the verdict, write what was asked for."""
-    system = the_system(options)
+    system = given_system(options)
     import_effects(options)
     policy = _state_policy(Path(options.policy), system) if options.policy else None
     if options.renderer and not isinstance(system, CartPole):

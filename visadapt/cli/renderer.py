@@ -16,7 +16,7 @@ from renderers import LayeredRenderer, save_renderer
 from renderers.training import fit
 from visadapt.cli.errors import InputError
 from visadapt.cli.progress import progress
-from visadapt.cli.run_folders import asked_for, unfinished
+from visadapt.cli.run_folders import run_settings, unfinished
 from visadapt.cli.target import load_target
 from visadapt.estimation.frame_residuals import size_of, structure
 from visadapt.progress import staged
@@ -50,26 +50,12 @@ def run(options: argparse.Namespace) -> None:
     if options.recording and (options.map or options.show or options.within):
         raise InputError("--map, --show and --within are for --target: recordings have their frames")
     x, theta, frames = _read(options.recording) if options.recording else _show(options)
-    if len(frames) < 2 * HELD_OUT:
-        raise InputError(f"{len(frames)} frames are too few to learn from; some hundred are right")
-    if options.iterations < 3:
-        raise InputError(f"--iterations {options.iterations}: at least 3 are right")
+    _check(options, x, frames)
     (height, width), (column, row) = frames.shape[1:], options.hinge
-    if not (-width <= column <= 2 * width and -height <= row <= 2 * height):
-        raise InputError(
-            f"--hinge {column:g},{row:g}: more than a frame's size outside the frames, which are {width} px wide and "
-            f"{height} px high; the column and row at which the hinge is seen at x = 0 are right"
-        )
-    away = options.scale * float(x.abs().median())
-    if away > 2 * width:
-        raise InputError(
-            f"x goes from {float(x.min()):.3g} to {float(x.max()):.3g}: at --scale {options.scale:g} px a metre the "
-            f"cart is mostly {away:.0f} px or more from x = 0, in frames {width} px wide; x in m is right"
-        )
     torch.manual_seed(options.seed)
     renderer = LayeredRenderer(height, width, column, row, options.scale, options.pole)
     held = torch.arange(len(frames)) % HELD_OUT == 0
-    settings = asked_for(options, "recording", "map")
+    settings = run_settings(options, "recording", "map")
     out = Path(options.out)
     with unfinished(out, settings) as folder, progress() as report:
         state = folder / "training.safetensors"
@@ -91,6 +77,26 @@ def run(options: argparse.Namespace) -> None:
         f"{out}: {error:.2f} grey levels of 255 off where cart and pole are, on average, in {len(drawn)} frames left "
         f"out of the training; hinge at {column:.1f},{row:.1f} px, {renderer.gain[0]:.1f} px a metre"
     )
+
+
+def _check(options: argparse.Namespace, x: Tensor, frames: Tensor) -> None:
+    """Raises InputError where nothing could be learnt: too few frames, or a first guess of the camera far off them."""
+    if len(frames) < 2 * HELD_OUT:
+        raise InputError(f"{len(frames)} frames are too few to learn from; some hundred are right")
+    if options.iterations < 3:
+        raise InputError(f"--iterations {options.iterations}: at least 3 are right")
+    (height, width), (column, row) = frames.shape[1:], options.hinge
+    if not (-width <= column <= 2 * width and -height <= row <= 2 * height):
+        raise InputError(
+            f"--hinge {column:g},{row:g}: more than a frame's size outside the frames, which are {width} px wide and "
+            f"{height} px high; the column and row at which the hinge is seen at x = 0 are right"
+        )
+    away = options.scale * float(x.abs().median())
+    if away > 2 * width:
+        raise InputError(
+            f"x goes from {float(x.min()):.3g} to {float(x.max()):.3g}: at --scale {options.scale:g} px a metre the "
+            f"cart is mostly {away:.0f} px or more from x = 0, in frames {width} px wide; x in m is right"
+        )
 
 
 def _show(options: argparse.Namespace) -> tuple[Tensor, Tensor, Tensor]:

@@ -37,7 +37,7 @@ def check_run_folder(folder: Path) -> None:
         raise InputError(f"{folder} has files in it that are no run of visadapt: name another by --out")
 
 
-def asked_for(options: argparse.Namespace, *files: str) -> dict[str, Any]:
+def run_settings(options: argparse.Namespace, *files: str) -> dict[str, Any]:
     """The settings of a run: it is resumed only if they are the same.
 
     These are all options but --out and --system, whose class the caller or the policy's file names. In place of the

@@ -7,8 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from visadapt.cli.own_classes import import_effects
-from visadapt.cli.target import load_both
-from visadapt.cli.user_code import checked
+from visadapt.cli.target import load_policy_and_target
+from visadapt.cli.user_code import as_input_error
 from visadapt.evaluation import score
 from visadapt.films.filming import film
 from visadapt.storage.run_folder import versions, write_json
@@ -17,15 +17,15 @@ from visadapt.storage.run_folder import versions, write_json
 def run(options: argparse.Namespace) -> None:
     """Score, print, write what was asked for."""
     import_effects(options)
-    policy, _, target = load_both(options)
-    with checked():
+    policy, _, target = load_policy_and_target(options)
+    with as_input_error():
         found = score(policy, target, options.episodes, options.seed)
     if options.json:
         about = {"policy": options.policy, "target": target.name, "seed": options.seed, "versions": versions()}
         write_json(Path(options.json), {**asdict(found), **about})
     try:
         if options.film:
-            with checked():
+            with as_input_error():
                 film(policy, target, options.film, seed=options.seed)
     finally:
         print(found)  # last, since whoever reads it may stop reading

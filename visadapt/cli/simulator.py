@@ -22,7 +22,7 @@ from visadapt.systems.parameter_file import load_parameters
 from visadapt.world import World
 
 
-def the_system(options: argparse.Namespace) -> System:
+def given_system(options: argparse.Namespace) -> System:
     """The system of --system with the parameters of --params.
 
     Raises:

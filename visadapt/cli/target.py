@@ -18,24 +18,24 @@ from visadapt.setups.policy_file import load_policy, load_source
 from visadapt.targets import Target
 from visadapt.targets.env_map import EnvMap
 from visadapt.targets.gymnasium import GymnasiumTarget
-from visadapt.targets.rollout import SHOWN, checked
+from visadapt.targets.rollout import SHOWN, checked_copy
 from visadapt.world import World
 
 
-def load_both(options: argparse.Namespace) -> tuple[Policy, World, Target]:
+def load_policy_and_target(options: argparse.Namespace) -> tuple[Policy, World, Target]:
     """The policy, the world that it was trained in, and the target.
 
     Raises:
         InputError, TargetError: either cannot be had, or the two do not go together.
         CheckpointError: the policy's file is missing, torn, or holds something else.
     """
-    policy, source = load_with_source(options)
+    policy, source = load_policy_and_source(options)
     target = load_target(options, source, policy.shown == "frame")
     _check(options.policy, policy, source, target)
     return policy, source, target
 
 
-def load_with_source(options: argparse.Namespace) -> tuple[Policy, World]:
+def load_policy_and_source(options: argparse.Namespace) -> tuple[Policy, World]:
     """The policy and the world that it was trained in.
 
     Raises:
@@ -104,7 +104,7 @@ def _check(path: str, policy: Policy, source: World, target: Target) -> None:
     if own.name != system.name:
         raise InputError(f"{path}: a policy of a {system.name}; {target.name} is a {own.name}")
     # Only what is observed says how large it is. A reset is no step: it is not counted.
-    observed = checked(target, target.reset(1, torch.Generator().manual_seed(0)), 1)
+    observed = checked_copy(target, target.reset(1, torch.Generator().manual_seed(0)), 1)
     shown = SHOWN[policy.shown](observed).shape[1:]
     if shown != (needed := policy.observation_shape):
         differ = f"{shown[0]} numbers of {policy.shown}; {path} was trained on {needed[0]}"

@@ -10,9 +10,9 @@ from pathlib import Path
 from visadapt.cli.errors import InputError
 from visadapt.cli.own_classes import import_effects
 from visadapt.cli.progress import progress
-from visadapt.cli.run_folders import asked_for, unfinished
-from visadapt.cli.simulator import given_effects, the_system
-from visadapt.cli.user_code import checked
+from visadapt.cli.run_folders import run_settings, unfinished
+from visadapt.cli.simulator import given_effects, given_system
+from visadapt.cli.user_code import as_input_error
 from visadapt.learning.perception import PerceptionSettings
 from visadapt.setups.base import Setup
 from visadapt.setups.training import setup_to_train
@@ -31,7 +31,7 @@ def run(options: argparse.Namespace) -> None:
     import_effects(options)
     out = Path(options.out)
     setup = _setup(options)
-    settings = asked_for(options, "renderer", "references", "diagnosis", "params", "effects")
+    settings = run_settings(options, "renderer", "references", "diagnosis", "params", "effects")
     with unfinished(out, {**settings, "system": options.system.name}) as folder, progress() as report:
         made = folder / "policy.safetensors"
         setup.pretrain(made, options.seed, report)
@@ -41,7 +41,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _setup(options: argparse.Namespace) -> Setup:
-    system = the_system(options)
+    system = given_system(options)
     period = options.period or (0.1 if isinstance(system, Quadrotor) else 0.05)
     bare = World(system, (), period, substeps=math.ceil(period / LONGEST_STEP))
     world = bare.with_effects(given_effects(options, system))
@@ -53,7 +53,7 @@ def _setup(options: argparse.Namespace) -> Setup:
     if options.references and not isinstance(system, Quadrotor):
         raise InputError(f"--references is for a quadrotor, not for a {system.name}")
     references = read_reference(options.references, period) if options.references else None
-    with checked():
+    with as_input_error():
         setup = setup_to_train(world, options.iterations, renderer, references, options.with_history)
     if not options.seeing:
         return setup

@@ -77,7 +77,7 @@ def find_factory(name: str) -> Callable[[], Any]:
 
 
 @contextmanager
-def checked() -> Iterator[None]:
+def as_input_error() -> Iterator[None]:
     """Turn the ValueError or TypeError by which the library refuses an argument into an InputError.
 
     One that the user's own code raised names the line there.

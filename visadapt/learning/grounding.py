@@ -120,22 +120,22 @@ def ground(
     the one of the `ridges` that predicts held-out samples best. As long as `accept` returns False, it is fitted again
     with the next larger ridge; the largest is kept without a call of `accept`.
     """
-    target = gap(source, transitions) / residual.scale
+    wanted = gap(source, transitions) / residual.scale
     network = residual.network
     if not isinstance(network, ResidualNetwork):
         raise TypeError(f"grounding fits the head of a ResidualNetwork, not a {type(network).__name__}")
     with torch.no_grad():
         parts = torch.arange(len(transitions)).split(256)
         seen = torch.cat([network.embed(transitions.history(p).acting(transitions.action[p])) for p in parts])
-    informed = network.informed(seen)
-    if bool(informed.any()):
-        seen, target = seen[informed], target[informed]
+    complete = network.has_full_history(seen)
+    if bool(complete.any()):
+        seen, wanted = seen[complete], wanted[complete]
     train, held_out = split(len(seen), settings.held_out, generator)
     if not isinstance(network.head, nn.Linear):
-        return _descend(network.head, seen, target, train, held_out, settings, generator, progress)
+        return _descend(network.head, seen, wanted, train, held_out, settings, generator, progress)
     penalties = [ridge * network.penalties(seen) for ridge in settings.ridges]
-    for number in range(_best_penalty(seen, target, penalties), len(penalties)):
-        losses = _solve(network.head, seen, target, train, held_out, penalties[number])
+    for number in range(_best_penalty(seen, wanted, penalties), len(penalties)):
+        losses = _solve(network.head, seen, wanted, train, held_out, penalties[number])
         if number == len(penalties) - 1 or accept():
             break
     return losses
@@ -166,7 +166,7 @@ def _best_penalty(inputs: Tensor, targets: Tensor, penalties: Sequence[Tensor]) 
 
 @torch.no_grad()
 def _solve(
-    head: nn.Linear, seen: Tensor, target: Tensor, train: Tensor, held_out: Tensor, penalty: Tensor
+    head: nn.Linear, seen: Tensor, wanted: Tensor, train: Tensor, held_out: Tensor, penalty: Tensor
 ) -> list[GroundLoss]:
     """Fit a linear head to all samples, with the `penalty` (inputs,) on its squared weights.
 
@@ -174,12 +174,12 @@ def _solve(
     """
 
     def loss(step: int, weight: Tensor) -> GroundLoss:
-        error = (seen @ weight - target).square().mean(1)
+        error = (seen @ weight - wanted).square().mean(1)
         return GroundLoss(step, float(error[train].mean()), float(error[held_out].mean()))
 
-    none = seen.new_zeros(seen.shape[1], target.shape[1])
-    losses = [loss(0, none), loss(1, _ridge(seen[train], target[train], penalty))]
-    head.weight.copy_(_ridge(seen, target, penalty).T)
+    none = seen.new_zeros(seen.shape[1], wanted.shape[1])
+    losses = [loss(0, none), loss(1, _ridge(seen[train], wanted[train], penalty))]
+    head.weight.copy_(_ridge(seen, wanted, penalty).T)
     return losses
 
 
@@ -191,7 +191,7 @@ def _ridge(inputs: Tensor, targets: Tensor, penalty: Tensor) -> Tensor:
 def _descend(
     head: nn.Module,
     seen: Tensor,
-    target: Tensor,
+    wanted: Tensor,
     train: Tensor,
     held_out: Tensor,
     settings: GroundSettings,
@@ -207,7 +207,7 @@ def _descend(
     for step in range(settings.steps + 1):
         if step % settings.every == 0:
             with torch.no_grad():
-                score = float((head(seen[held_out]) - target[held_out]).square().mean())
+                score = float((head(seen[held_out]) - wanted[held_out]).square().mean())
             losses.append(GroundLoss(step, running / settings.every if step else score, score))
             running = 0.0
             if score < best:
@@ -220,7 +220,7 @@ def _descend(
             if ends:
                 break
         rows = train[torch.randint(len(train), (settings.batch,), generator=generator)]
-        loss = (head(seen[rows]) - target[rows]).square().mean()
+        loss = (head(seen[rows]) - wanted[rows]).square().mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

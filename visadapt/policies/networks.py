@@ -54,7 +54,7 @@ class ResidualNetwork(nn.Module):
         """The head's inputs (B, inputs)."""
         raise NotImplementedError
 
-    def informed(self, inputs: Tensor) -> Tensor:
+    def has_full_history(self, inputs: Tensor) -> Tensor:
         """(B,) whether the head's inputs (B, inputs) have a complete history; it is fitted to these rows alone."""
         return inputs.new_ones(len(inputs), dtype=torch.bool)
 
@@ -77,8 +77,8 @@ class ImageResidualNetwork(ResidualNetwork):
     hundred samples where along the track the target happened to push, and is wrong in the next episode.
 
     In the first rows of an episode the history repeats the first frame, so a cart that already moves seems to start
-    from rest there. Leaving these rows out of the fit, or filling them as `held_back` does, made no difference that 60
-    episodes could show.
+    from rest there. Leaving these rows out of the fit, or filling them as `fill_before_start` does, made no difference
+    that 60 episodes could show.
 
     Args:
         background, contrast: those of `FrameEncoder`.
@@ -167,7 +167,7 @@ class StateHistoryResidualNetwork(ResidualNetwork):
         unexplained = self.unexplained(states, actions) / ACCELERATION_UNIT
         return torch.cat((states.flatten(1), actions.flatten(1), unexplained.flatten(1)), 1)
 
-    def informed(self, inputs: Tensor) -> Tensor:
+    def has_full_history(self, inputs: Tensor) -> Tensor:
         """(B,) False in the first LENGTH - 1 rows of an episode, whose history is incomplete."""
         states = inputs[:, : LENGTH * self.n_state].unflatten(1, (LENGTH, self.n_state))
         return states.diff(dim=1).any(2).all(1)
@@ -187,13 +187,13 @@ class StateHistoryResidualNetwork(ResidualNetwork):
     def unexplained(self, states: Tensor, actions: Tensor) -> Tensor:
         """Mean accelerations minus the system's over the periods between states, (B, LENGTH - 1, J) of J joints.
 
-        The system's is the mean of those at both ends of a period, under the action held in between. `held_back` fills
-        the periods before an episode.
+        The system's is the mean of those at both ends of a period, under the action held in between.
+        `fill_before_start` fills the periods before an episode.
         """
         ends = [accelerations(self.system, part, actions[:, :-1]) for part in (states[:, :-1], states[:, 1:])]
         measured = states.diff(dim=1)[..., [velocity for _, velocity in self.system.coordinates]] / self.period
         left = measured - (ends[0] + ends[1]) / 2
-        return held_back(left, states.diff(dim=1).any(2, keepdim=True))
+        return fill_before_start(left, states.diff(dim=1).any(2, keepdim=True))
 
 
 def accelerations(system: System, states: Tensor, actions: Tensor) -> Tensor:
@@ -203,11 +203,11 @@ def accelerations(system: System, states: Tensor, actions: Tensor) -> Tensor:
     return system.accelerations(flat, actions.flatten(0, 1), loads).unflatten(0, states.shape[:2])
 
 
-def held_back(values: Tensor, known: Tensor) -> Tensor:
-    """The values (B, periods, n) with those of the episode's first period in the periods before it.
+def fill_before_start(values: Tensor, known: Tensor) -> Tensor:
+    """The values (B, periods, n); in the periods before an episode starts, those of its first period.
 
-    The latter are not `known` (B, periods, 1), since the first state is repeated in them. Where no period is known, all
-    values are 0.
+    `known` (B, periods, 1) says which periods are of the episode: before it, its first state is repeated. Where no
+    period is known, all values are 0.
     """
     past = [values[:, -1] * known[:, -1]]
     for k in range(values.shape[1] - 2, -1, -1):
@@ -245,10 +245,10 @@ class FlightResidualNetwork(ResidualNetwork):
             return own
         return torch.cat((own, self.unexplained(self.predict, states, history.actions)), 1)
 
-    def informed(self, inputs: Tensor) -> Tensor:
+    def has_full_history(self, inputs: Tensor) -> Tensor:
         """(B,) False in the first LENGTH - 1 rows of a flight, whose history is incomplete; True if none is read."""
         if self.predict is None:
-            return super().informed(inputs)
+            return super().has_full_history(inputs)
         past = inputs[:, -6 * (LENGTH - 1) :].unflatten(1, (LENGTH - 1, 6))
         return past.diff(dim=1).any(2).all(1)
 
@@ -269,7 +269,7 @@ class FlightResidualNetwork(ResidualNetwork):
     def unexplained(self, predict: Predict, states: Tensor, actions: Tensor) -> Tensor:
         """Changes of velocity and rates minus the source's over the periods between states, (B, 6 (LENGTH - 1)).
 
-        In units of HISTORY_ACCELERATION_UNIT times a period. `held_back` fills the periods before a flight.
+        In units of HISTORY_ACCELERATION_UNIT times a period. `fill_before_start` fills the periods before a flight.
         """
         predicted = predict(states[:, :-1], actions[:, :-1]).flatten(0, 1)
         before, after = states[:, :-1].flatten(0, 1), states[:, 1:].flatten(0, 1)
@@ -277,4 +277,4 @@ class FlightResidualNetwork(ResidualNetwork):
         moving = torch.cat((left[:, VELOCITY], left[:, RATES]), 1) / (HISTORY_ACCELERATION_UNIT * self.period)
         known = (after != before).any(1, keepdim=True)
         periods = (len(states), LENGTH - 1)
-        return held_back(moving.unflatten(0, periods), known.unflatten(0, periods)).flatten(1)
+        return fill_before_start(moving.unflatten(0, periods), known.unflatten(0, periods)).flatten(1)

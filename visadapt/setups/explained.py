@@ -55,13 +55,7 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
             found = diagnosed()
             write_json(path, found.to_json())
         content = read_json(path)
-        for warning in content["warnings"]:
-            name, inverted, _ = warning.partition(OPPOSITE)
-            if inverted:
-                raise TargetError(
-                    f"{path}: {name} of the target{OPPOSITE}, so that the policy would drive it the wrong way: negate "
-                    "it in the target, by scale = -1.0 in a map, and begin in another folder"
-                )
+        _refuse_opposite_signs(path, content["warnings"])
         verdict = content["verdict"]
         slight = frozenset(cause["effect"] for cause in content["causes"] if cause["slight"])
         effects = load_effects(path)[1] if verdict in (IDENTIFIED, AMBIGUOUS) else []
@@ -81,3 +75,14 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         return Explanation(verdict, effects, verdict != UNEXPLAINED, slight, settles)
 
     return explain
+
+
+def _refuse_opposite_signs(path: Path, warnings: Sequence[str]) -> None:
+    """Raises TargetError where a diagnosis, kept in `path`, warns that the target's sign of something is opposite."""
+    for warning in warnings:
+        name, opposite, _ = warning.partition(OPPOSITE)
+        if opposite:
+            raise TargetError(
+                f"{path}: {name} of the target{OPPOSITE}, so that the policy would drive it the wrong way: negate it "
+                "in the target, by scale = -1.0 in a map, and begin in another folder"
+            )

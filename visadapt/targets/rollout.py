@@ -91,7 +91,7 @@ def run(
     [(20, True), (20, True)]
     """
     see = see or SHOWN[policy.shown]
-    observation = checked(target, target.reset(batch, generator), batch)
+    observation = checked_copy(target, target.reset(batch, generator), batch)
     _check_finite(target, observation, torch.ones_like(observation.alive), "the first state")
     like = next(policy.parameters(), observation.state)
     history = History.start(see(observation).to(like), target.n_action)
@@ -107,7 +107,7 @@ def run(
         if added is not None:
             action = (action + added[len(rows)].to(action)).clamp(-1, 1)
         rows.append((observation if keep_frames else replace(observation, frame=None), action))
-        observation = checked(target, target.step(action), batch)
+        observation = checked_copy(target, target.step(action), batch)
         finite = observation.state.isfinite().all(1)
         if strict:
             _check_finite(target, observation, running, f"the state after step {len(rows)}")
@@ -129,7 +129,7 @@ def check_period(policy: Policy, target: Target) -> None:
         )
 
 
-def checked(target: Target, observation: Any, batch: int) -> Observation:
+def checked_copy(target: Target, observation: Any, batch: int) -> Observation:
     """A copy of what a target shows of `batch` episodes, since it may write the next instant over it.
 
     Raises:

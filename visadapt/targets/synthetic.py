@@ -112,7 +112,7 @@ class WorldTarget(Target):
         return self._observe()
 
     def _observe(self) -> Observation:
-        """What the sensors read, `alive` where the state is finite, and the force as all that the world loads."""
+        """What the sensors read, with `alive` where the state is finite, and as `force` the sum of all loads."""
         assert self._world is not None
         measured, self._at = self._world.measure(self._at, self._generator)
         return Observation(measured, self._at.state.isfinite().all(1), force=self._world.load(self._at))

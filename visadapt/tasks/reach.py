@@ -12,7 +12,7 @@ from visadapt.systems import FixedWing
 from visadapt.systems.rigid_body import POSITION, RATES, VELOCITY
 from visadapt.tasks.base import FlightTask
 
-WALDOCK = FixedWing()
+DEFAULT_WING = FixedWing()
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Reach(FlightTask):
     """
 
     period: float = 0.05  # s between commands
-    system: FixedWing = WALDOCK  # whose level flight at `speed` flights start in
+    system: FixedWing = DEFAULT_WING  # whose level flight at `speed` flights start in
     distance: float = 50.0  # m ahead
     sideways: float = 5.0  # m: half-width of the uniform distribution of the point to the sides and up and down
     speed: float = 11.5  # m/s at the start, along x
