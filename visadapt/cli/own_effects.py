@@ -11,7 +11,7 @@ from torch import Tensor
 
 from visadapt.effects.base import ActuationEffect, DynamicsEffect, Effect, Parameter, SensingEffect
 from visadapt.systems import System
-from visadapt.systems.contract import ROWS, inputs, said
+from visadapt.systems.contract import ROWS, error_line, inputs
 from visadapt.world import World
 
 STAGES = (ActuationEffect, DynamicsEffect, SensingEffect)
@@ -29,7 +29,7 @@ def complaints(effect: type[Effect], system: System) -> list[str]:
     try:
         return list(_tried(effect, system))
     except Exception as error:
-        return [f"raises {said(error)}"]
+        return [f"raises {error_line(error)}"]
 
 
 def _form(effect: type[Effect]) -> Iterator[str]:

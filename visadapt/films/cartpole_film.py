@@ -160,12 +160,12 @@ class CartPoleFilm(Film):
             for part in (move_scene, set_numbers, draw_speed):
                 part(row, ended)
             show_failure(failure, ended)
-            said = ""
+            ending = ""
             if panel.swings_up and row >= panel.up_from and not failure:
-                said = f"up since {time[panel.up_from]:.2f} s"
+                ending = f"up since {time[panel.up_from]:.2f} s"
             elif last and not panel.swings_up and not failure and panel.end < self.duration - 1e-6:
-                said = f"ends upright at t = {panel.end:.1f} s"
-            words.set_text(said)
+                ending = f"ends upright at t = {panel.end:.1f} s"
+            words.set_text(ending)
 
         return move
 

@@ -151,12 +151,12 @@ def trace(
     (thin,) = axes.plot([], [], color=INK, linewidth=1.2, animated=True)
     (dot,) = axes.plot([], [], "o", color=TEAL, markersize=8, animated=True)
     mark = axes.axvline(0, color=RED, linewidth=2, animated=True)
-    told = axes.set_title("", loc="right", fontsize=12, fontweight="bold", animated=True)
+    right_title = axes.set_title("", loc="right", fontsize=12, fontweight="bold", animated=True)
 
     def draw(row: int, failed: bool) -> None:
         line.set_data(time[: row + 1], values[: row + 1])
         thin.set_data(time[: row + 1], score[: row + 1])
-        told.set_text(words(float(score[row])))
+        right_title.set_text(words(float(score[row])))
         dot.set(data=([time[row]], [values[row]]), visible=not failed)
         mark.set(xdata=[time[row]] * 2, visible=failed)
 

@@ -20,7 +20,7 @@ from visadapt.recordings.csv import read_rows
 from visadapt.recordings.episode import Episode, Recording, RecordingError
 from visadapt.recordings.hdf5 import read_names, read_stretches
 from visadapt.recordings.logs import read_log
-from visadapt.recordings.physics import is_in_newtons, turns
+from visadapt.recordings.physics import is_in_newtons, same_after_a_turn
 from visadapt.recordings.sensors import check_sensors, without_outliers
 from visadapt.recordings.thinning import thinned
 from visadapt.recordings.topics import reader
@@ -99,7 +99,7 @@ def load_recording(
         for _, of_file in groupby(whole, lambda raw: raw.path):
             check_units(list(of_file), system)
         whole = check_sensors(whole, system, note)
-    turning = [state.name for state in system.states if state.unit == "rad" and turns(system, state.name)]
+    turning = [state.name for state in system.states if state.unit == "rad" and same_after_a_turn(system, state.name)]
     parts = [part for raw in whole for part in uninterrupted(_unwrapped(raw, turning), note)]
     parts, period = alike(_long_enough(parts, note), note)
     outliers = any(part.usable is not None for part in parts)

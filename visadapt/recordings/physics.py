@@ -26,16 +26,16 @@ LEAST_DURATION_S = 2.0
 """s that the episodes must last together for their units and order to be judged."""
 MOST_ROWS = 20_000
 """Rows of an episode that are used, for speed."""
-MOST_ERROR, CLEARLY = 0.75, 1.5
-"""Error of predicted accelerations, as a share of their mean square, below which an angle half a turn further explains
-them, and how many times as large the errors of its other readings must be."""
+EXPLAINED_ERROR, OTHERS_ERROR_RATIO = 0.75, 1.5
+"""Mean square error of predicted accelerations, as a share of the measured ones' mean square, below which an angle with
+another zero or sign explains these; and how many times as large the error of the angle as it is must be."""
 EXPLAINED_CORRELATION = 0.5
 """Correlation of measured and predicted accelerations above which the source explains them."""
 
 Columns = Mapping[str, NDArray[np.float64]]
 
 
-def turns(system: System, name: str) -> bool:
+def same_after_a_turn(system: System, name: str) -> bool:
     """Whether the source's physics are the same a whole turn further in an angle: not so for a drum on a spring."""
     generator = torch.Generator().manual_seed(0)
     low = torch.tensor([state.low for state in system.states]).double()
@@ -84,7 +84,9 @@ def is_half_a_turn_off(episodes: Sequence[RawEpisode], system: System) -> bool:
         return _error(*_fits(episodes, system, changed)[angle])
 
     there = error(further)
-    return there < MOST_ERROR and all(error(changed) > CLEARLY * there for changed in (_unchanged, negated))
+    return there < EXPLAINED_ERROR and all(
+        error(changed) > OTHERS_ERROR_RATIO * there for changed in (_unchanged, negated)
+    )
 
 
 def is_turned_round(episodes: Sequence[RawEpisode], system: System, name: str) -> bool:
@@ -94,7 +96,7 @@ def is_turned_round(episodes: Sequence[RawEpisode], system: System, name: str) -
         return False
     fit, slope = _fits(episodes, system)[name]
     there = _error(-fit, -slope)
-    return there < MOST_ERROR and _error(fit, slope) > CLEARLY * there
+    return there < EXPLAINED_ERROR and _error(fit, slope) > OTHERS_ERROR_RATIO * there
 
 
 def is_in_newtons(episodes: Sequence[RawEpisode], system: System, largest: float) -> bool:

@@ -34,13 +34,13 @@ def complaints(system: type[System]) -> list[str]:
     try:
         example = system()
     except Exception as error:
-        return [f"{system.__name__}() raises {said(error)}; every field needs a default that its check accepts"]
+        return [f"{system.__name__}() raises {error_line(error)}; every field needs a default that its check accepts"]
     try:
         if wrong := list(_shape(example)):
             return wrong
         return [*_gradients(example), *_loads(example), *_coordinates(example), *_batches(example)]
     except Exception as error:
-        return [f"derivative raises {said(error)}"]
+        return [f"derivative raises {error_line(error)}"]
 
 
 def _form(system: type[System]) -> Iterator[str]:
@@ -123,7 +123,7 @@ def _shape(system: System) -> Iterator[str]:
     try:
         rates = system.derivative(*given)
     except Exception as error:
-        yield f"derivative of {called} raises {said(error)}"
+        yield f"derivative of {called} raises {error_line(error)}"
         return
     right = (len(given[0]), len(system.states))
     if not isinstance(rates, Tensor) or rates.shape != right:
@@ -216,7 +216,7 @@ def _batches(system: System) -> Iterator[str]:
         try:
             together = replace(itself, **{name: values}).derivative(*given)
         except Exception as error:
-            yield f"{name} as a tensor, one value for each row ({ROWS},), raises {said(error)}"
+            yield f"{name} as a tensor, one value for each row ({ROWS},), raises {error_line(error)}"
             continue
         if together.shape != given[0].shape:
             yield (
@@ -237,7 +237,7 @@ def equal(one: Tensor, other: Tensor) -> bool:
     return torch.allclose(one, other, rtol=ROUNDING, atol=ROUNDING * float(other.abs().max()))
 
 
-def said(error: Exception) -> str:
+def error_line(error: Exception) -> str:
     """An exception in one line, with the line of the file that raised it."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if "/torch/" not in frame.filename and frame.filename != __file__]

@@ -83,10 +83,10 @@ def cost_to_go(source: World, state: tuple[float, ...], action: float) -> tuple[
     still = rest.new_zeros(1, bare.substeps, len(bare.system.actions))
     step = linearise_step(bare, bare.values.to(rest), rest[:, 0], rest, still, by_command=True)
     a, b, weights = step.by_state[0], step.by_command[0], torch.diag(rest.new_tensor(state))
-    price, to_go = action * torch.eye(b.shape[1]).to(b), torch.zeros_like(weights)
+    command_weight, to_go = action * torch.eye(b.shape[1]).to(b), torch.zeros_like(weights)
     for _ in range(RICCATI_STEPS):
         after = weights + to_go
-        to_go = a.T @ after @ (a - b @ torch.linalg.solve(price + b.T @ after @ b, b.T @ after @ a))
+        to_go = a.T @ after @ (a - b @ torch.linalg.solve(command_weight + b.T @ after @ b, b.T @ after @ a))
     return tuple(tuple(row) for row in to_go.tolist())
 
 

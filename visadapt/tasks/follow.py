@@ -60,8 +60,8 @@ class RecoverCost(FollowCost):
 
     A plan that ends on the reference but not with its velocity flies through it and out again, further each time: what
     counts is where the vehicle would be `beyond` s later. The root changes no best plan, but gives the many streams
-    near their references as much weight as the few that are far off. Turning costs little, since who is pushed has to
-    turn fast.
+    near their references as much weight as the few that are far off. Turning costs little, since a vehicle that is
+    pushed has to turn fast.
     """
 
     turning: float = 0.1
