@@ -1,5 +1,4 @@
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -7,7 +6,7 @@ from torch import nn
 from torch.func import functional_call
 
 from tests.own_systems import DoublePendulum, Pendulum
-from tests.worlds import Mass, columns, run, within
+from tests.worlds import Mass, columns, run
 from visadapt.effects import (
     EFFECTS,
     ActuatorBias,
@@ -348,7 +347,7 @@ def test_parameters_of_one_effect_may_be_one_for_all_rows_or_one_for_each():
 
 def test_time_does_not_drift_in_single_precision():
     world = World(Mass(), period=0.001)
-    at, action = replace(world.start(torch.zeros(1, 4)), time=torch.tensor([59.0])), torch.zeros(1, 1)
+    at, action = world.start(torch.zeros(1, 4), torch.tensor([59.0])), torch.zeros(1, 1)
     for _ in range(1000):
         at = world.step(at, action)
     assert float(at.time) == pytest.approx(60.0, abs=1e-5)
@@ -364,6 +363,11 @@ def test_a_batch_may_be_empty(effect):
 def test_the_states_have_the_precision_of_those_that_were_given():
     world = World(CartPole(cart_mass=torch.tensor([1.0, 2.0], dtype=torch.float64)))
     assert world.step(world.start(torch.zeros(2, 4)), torch.zeros(2, 1)).state.dtype == torch.float32
+
+
+def test_an_episode_cannot_start_from_states_without_the_commands_between_them():
+    with pytest.raises(ValueError, match="start with states needs the commands between them"):
+        World(CartPole()).start(torch.zeros(1, 4), torch.tensor([0.1]), states=torch.zeros(1, 3, 4))
 
 
 def test_an_effect_of_another_system_is_refused():
@@ -425,7 +429,7 @@ def test_an_episode_goes_on_from_any_of_its_rows_as_if_it_had_never_stopped(chos
     time = torch.tensor([went[k].time[b] for b, k in enumerate(begin)], dtype=torch.float64)
     there = torch.stack([went[k].state[b] for b, k in enumerate(begin)])
     states = torch.stack([each.state for each in went], 1)
-    measured, at = measure(within(world, there, time, actions.movedim(0, 1), states))
+    measured, at = measure(world.start(there, time, actions.movedim(0, 1), states))
     for ahead in range(3):
         rows = [k + ahead for k in begin]
         torch.testing.assert_close(at.state, torch.stack([went[k].state[b] for b, k in enumerate(rows)]))

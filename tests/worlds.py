@@ -6,7 +6,6 @@ from typing import ClassVar
 import torch
 
 from visadapt.systems import System, Variable
-from visadapt.world import WorldState
 
 
 @dataclass(frozen=True)
@@ -39,14 +38,6 @@ class Mass(System):
 def columns(*values, dtype=torch.float64):
     """A batch of one row."""
     return torch.tensor([values], dtype=dtype)
-
-
-def within(world, state, time, commands, states):
-    """The world within episodes: in `state` (B, n_state) at `time` (B,) s, after these commands (B, T, n_action) and
-    states (B, T, n_state) since the episodes began."""
-    rows = torch.arange(len(state)), (time / world.period).round().long()
-    memories = world.memories(states[:, 0], commands, states)
-    return WorldState(time, state, tuple(memory[rows] for memory in memories))
 
 
 def run(world, state, actions):

@@ -120,23 +120,35 @@ class World(nn.Module):
         made._arrange()
         return made
 
-    def start(self, state: Tensor) -> WorldState:
-        """The world in the state (B, n_state) at the start of an episode, before the sensors read it."""
-        return WorldState(torch.zeros_like(state[:, 0]), state, self._at_rest(state))
+    def start(
+        self, state: Tensor, time: Tensor | None = None, commands: Tensor | None = None, states: Tensor | None = None
+    ) -> WorldState:
+        """The world in the state (B, n_state), at the start of an episode or within one, before the sensors read it.
+
+        Args:
+            time: (B,) s since the episode began; 0 without it.
+            commands: (B, T, n_action) that were given since the episode began, at least to `time`: from these the
+                actuation effects fill their memory. What comes after `time` is not used.
+            states: (B, T, n_state) that the episode went through: from these the sensing effects fill theirs. Without
+                them these remember `state` alone.
+        """
+        clock = torch.zeros_like(state[:, 0]) if time is None else time
+        if commands is None:
+            if states is not None:
+                raise ValueError(
+                    "start with states needs the commands between them: World.start(..., commands, states)"
+                )
+            return WorldState(clock, state, self._at_rest(state))
+        rows = torch.arange(len(state), device=state.device), (clock / self.period).round().long()
+        return WorldState(clock, state, tuple(memory[rows] for memory in self.memories(state, commands, states)))
 
     def memories(
         self, state: Tensor, commands: Tensor, states: Tensor | None = None, held: Tensor | None = None
     ) -> tuple[Tensor, ...]:
         """What effects remember at every row of B episodes, before that row is read: (B, T + 1, any, any) each.
 
-        With them, a `WorldState` puts the world into any row of an episode.
-
-        Args:
-            state: (B, n_state) in which the episodes began; not used where `states` are given.
-            commands: (B, T, n_action) that were given since then: from these the actuation effects fill their memory.
-            states: (B, T, n_state) that the episodes went through: from these the sensing effects fill theirs. Without
-                them these remember `state` alone.
-            held: (B, T) s, how long each command was, where the clock is unsteady.
+        Args: as those of `start`, where `commands` and `states` begin where the episodes do; `held` (B, T) s is how
+        long each command was, where the clock is unsteady.
         """
         first = state if states is None else states[:, 0]
         shortest = self.period if held is None else float(held[held > 0].min())

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from tests.own_systems import Pendulum, furuta
-from tests.worlds import within
 from visadapt.effects.catalogue import catalogue
 from visadapt.estimation.effect_fit import fit_effects
 from visadapt.world import World
@@ -81,7 +80,7 @@ def test_an_episode_goes_on_from_any_of_its_rows(row):
     world = World(Pendulum(), [*effects], PERIOD, substeps=2)
     states, read = rows(world)
     time = torch.full((1,), row * PERIOD, dtype=torch.float64)
-    at = within(world, states[None, row], time, TORQUES[None, :, None], states[None])
+    at = world.start(states[None, row], time, TORQUES[None, :, None], states[None])
     torch.testing.assert_close(world.measure(at)[0], read[None, row])
 
 

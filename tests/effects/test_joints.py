@@ -34,8 +34,8 @@ LOADS = [
 def test_the_load_of_a_joint_acts_on_it_alone(name, values, unit, expected):
     effect = BY_NAME[name](**values)
     assert effect.table[0].unit == unit
-    world = World(FURUTA, [effect])
-    load = world.load(replace(world.start(STATE), time=torch.full((1,), 1.5, dtype=torch.float64)))[0]
+    at = World(FURUTA, [effect]).start(STATE, torch.full((1,), 1.5, dtype=torch.float64))
+    load = World(FURUTA, [effect]).load(at)[0]
     torch.testing.assert_close(load, torch.tensor(expected, dtype=torch.float64), rtol=1e-6, atol=1e-9)
 
 
