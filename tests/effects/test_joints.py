@@ -49,6 +49,16 @@ def test_cogging_returns_in_every_turn_of_a_joint_that_turns():
     assert "joint.cogging" not in {effect.name for effect in catalogue(Pendulum())}  # it swings
 
 
+def test_an_eccentric_sensor_reads_the_rate_of_its_error_too():
+    named = {effect.name: effect for effect in catalogue(Winch())}
+    world = World(Winch(), [named["drum.sensor_eccentricity"](amplitude=0.05, waves=1.0, phase=0.4)])
+    drum, step = torch.tensor([0.3, 2.0], dtype=torch.float64), 1e-6
+    readings = [world.measure(world.start(torch.stack((at, 3 + 0 * at), 1)))[0] for at in (drum, drum + 3 * step)]
+    torch.testing.assert_close(readings[0][:, 0], drum + 0.05 * (drum + 0.4).cos(), rtol=1e-6, atol=1e-8)
+    torch.testing.assert_close((readings[1][:, 0] - readings[0][:, 0]) / step, readings[0][:, 1], rtol=1e-5, atol=1e-6)
+    assert "angle.sensor_eccentricity" not in {effect.name for effect in catalogue(Pendulum())}  # it swings
+
+
 def test_added_inertia_is_that_of_a_heavier_arm():
     added = BY_NAME["arm_axis.added_inertia"](inertia=1e-4)
     command, load = columns(2.0), columns(1e-3, -1e-3)

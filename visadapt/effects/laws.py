@@ -103,7 +103,7 @@ class CoggingLaw(JointLoad):
     """
 
     abrupt = True  # a fast shaft passes several waves within a period
-    source = "Hendershot and Miller (2010), Design of Brushless Permanent-Magnet Machines, section 4.9"
+    source = "Hendershot and Miller (2010), Design of Brushless Permanent-Magnet Machines, on cogging"
 
     def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         angle = self.value("waves", state) * self.joint_position(state, system) + self.value("phase", state)

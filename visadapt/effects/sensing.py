@@ -78,6 +78,25 @@ class SensorGain(SensingEffect):
         return out, memory
 
 
+class SensorEccentricity(SensingEffect):
+    """An angle sensor whose error returns in every turn, as that of an encoder whose disc is not centred on its shaft.
+
+    A velocity that is read from it has the error's rate.
+    """
+
+    source = "Ellin and Dolsak (2008), The design and application of rotary encoders, Sensor Review 28(2)"
+    columns: ClassVar[list[int]]  # the angle that it reads, and its velocity where it reads that too
+
+    def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
+        waves, amplitude = self.value("waves", measured), self.value("amplitude", measured)
+        angle = waves * measured[:, self.columns[0]] + self.value("phase", measured)
+        out = measured.clone()
+        out[:, self.columns[0]] = out[:, self.columns[0]] + amplitude * angle.cos()
+        for velocity in self.columns[1:]:
+            out[:, velocity] = out[:, velocity] * (1 - amplitude * waves * angle.sin())
+        return out, memory
+
+
 class SensorOffset(SensingEffect):
     """An offset, () or (B,), on the reading of one state."""
 

@@ -10,13 +10,10 @@ from typing import Any
 from visadapt.effects import laws
 from visadapt.effects.base import Parameter, Role
 from visadapt.effects.own.added_inertia import AddedInertia, inertia_of
-from visadapt.effects.own.statement import Made
+from visadapt.effects.own.statement import Made, turns
 from visadapt.effects.parameters import ParameterScale
 from visadapt.systems import System, Variable
 from visadapt.systems.base import parameters
-
-MIN_RANGE = 4 * math.pi
-"""Range of a joint's angle, rad, above which what returns in every turn is told from loads at single angles."""
 
 
 def on_joints(system: type[System]) -> Iterator[Made]:
@@ -72,13 +69,13 @@ def _laws(load: Variable, position: Variable | None, velocity: Variable) -> _Law
                 Parameter("rest", position.unit, position.low, position.high, None),
             ),
         )
-    if position is not None and position.unit == "rad" and position.high - position.low > MIN_RANGE:
+    if position is not None and turns(position):
         by_position["cogging"] = (
             laws.CoggingLaw,
             f"Q = torque cos(waves {position.name} + phase)",
             (
                 linear("torque", 0.0),
-                Parameter("waves", "1", 1.0, 24.0, None, role=Role.WAVES),
+                Parameter("waves", "1", 0.5, 24.0, None, role=Role.WAVES),
                 Parameter("phase", "rad", -math.pi, math.pi, None, role=Role.PHASE),
             ),
         )

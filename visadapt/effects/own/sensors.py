@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import torch
 
 from visadapt.effects import late_sensors, sensing
-from visadapt.effects.base import Parameter
-from visadapt.effects.own.statement import ALL_SENSORS, Made, delay_of_all
+from visadapt.effects.base import Parameter, Role
+from visadapt.effects.own.statement import ALL_SENSORS, Made, delay_of_all, turns
 from visadapt.effects.transmission import TransmissionCompliance
 from visadapt.systems import System
 from visadapt.systems.contract import ROUNDING, inputs
@@ -54,6 +55,21 @@ def on_sensors(system: type[System]) -> Iterator[Made]:
                     "late": scaled,
                 },
             )
+        if column in rates and turns(state):
+            yield (
+                f"{name}.sensor_eccentricity",
+                sensing.SensorEccentricity,
+                {
+                    "equation": f"{name} measured = {name} + amplitude cos(waves {name} + phase)",
+                    "table": (
+                        Parameter("amplitude", "rad", 0.0, LARGEST_ECCENTRICITY, 0.0, linear=True),
+                        Parameter("waves", "1", 0.5, 4.0, None, role=Role.WAVES),
+                        Parameter("phase", "rad", -math.pi, math.pi, None, role=Role.PHASE),
+                    ),
+                    "columns": scaled,
+                    "order": sensing.SensorScale.order - 5,
+                },
+            )
         yield (
             f"{name}.sensor_scale",
             sensing.SensorGain,
@@ -65,6 +81,8 @@ def on_sensors(system: type[System]) -> Iterator[Made]:
             },
         )
 
+
+LARGEST_ECCENTRICITY = 0.1  # rad, of the error of an angle sensor within a turn
 
 LARGEST_TWIST = 0.02
 """Share of a joint's range that its transmission is searched to give under its largest load."""

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from visadapt.effects.base import Effect
-from visadapt.systems import System
+from visadapt.systems import System, Variable
 
 ALL_COMMANDS, ALL_SENSORS = "commands", "sensors"
 """What stands before the dot in the name of an effect on all commands, or on all readings."""
 
 Made = tuple[str, type[Effect], dict[str, Any]]
 """An effect's name, the class it derives from, and its attributes."""
+
+
+MIN_RANGE = 4 * math.pi
+"""Range of an angle, rad, above which what returns in every turn is told from what acts at single angles."""
+
+
+def turns(angle: Variable) -> bool:
+    """Whether a position is an angle of more than two turns."""
+    return angle.unit == "rad" and angle.high - angle.low > MIN_RANGE
 
 
 def delay_of_all(system: type[System]) -> str:

@@ -1,4 +1,4 @@
-"""Loads by a shaft's angle within a turn and between two joints: what is said of them, and that they are no pushes."""
+"""A motor that turns a disc: loads and errors of readings by the angle within a turn, and what acts between the two."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -72,9 +72,15 @@ def play(state):
     return torch.stack((lost, -lost), -1)
 
 
+def nothing(state):
+    """No loads, (B, 2)."""
+    return torch.zeros_like(state[:, :2])
+
+
 @cache
-def recorded(acting, push=0.0):
-    """Four runs of 4 s of a drive with loads `acting` by its states, and a push of the motor."""
+def recorded(acting, push=0.0, eccentric=0.0):
+    """Four runs of 4 s of a drive with loads `acting` by its states, a push of the motor, and a disc whose encoder is
+    `eccentric` rad off once in a turn."""
     generator = np.random.default_rng(3)
     time = PERIOD * np.arange(ROWS)
     speeds, phases = generator.uniform(2.5, 16.0, (4, 3)), generator.uniform(0, 6.3, (4, 3))
@@ -89,6 +95,7 @@ def recorded(acting, push=0.0):
             half = state + PERIOD / 40 * rate(state, command[:, row], acting, pushed)
             state = state + PERIOD / 20 * rate(half, command[:, row], acting, pushed)
     angles = torch.stack(states, 1)[..., :2].numpy()
+    angles[..., 1] += eccentric * np.cos(angles[..., 1] + 0.5)
     angles = np.round(angles / ENCODER) * ENCODER
     episodes = tuple(Episode(time, command[k, :, None], angles[k]) for k in range(4))
     return Recording(episodes, ("motor", "disc"), PERIOD, ("a", "b", "c", "d"))
@@ -146,3 +153,13 @@ def test_an_encoder_may_count_from_another_zero_in_every_run():
     assert found.causes[0].parameters["torque"].value == pytest.approx(0.012, rel=2e-3)
     assert found.where.pushes == ()
     assert any("its phase differs from episode to episode" in warning for warning in found.warnings)
+
+
+def test_an_eccentric_encoder_is_named():
+    wanted = ("disc.sensor_eccentricity", "motor.sensor_eccentricity", "disc_shaft.periodic_load", "stiffness.scale")
+    effects = [effect for effect in catalogue(Drive()) if effect.name in wanted]
+    found = va.diagnose(recorded(nothing, eccentric=0.012), va.World(Drive(), period=PERIOD), effects)
+    (cause,) = (cause for cause in found.causes if not cause.slight)
+    assert cause.effect == "disc.sensor_eccentricity"
+    for name, truth in {"amplitude": 0.012, "waves": 1.0, "phase": 0.5}.items():
+        assert cause.parameters[name].value == pytest.approx(truth, rel=0.02)
