@@ -73,6 +73,8 @@ class CandidateModel:
         if accuracy > COARSEST:
             own = type(system), parameters(system)
             smooth = min([self.profile.longest_step, *(stable_step(*own, effect) for effect in effects)])  # type: ignore[arg-type]  # hashable, as types
+        if accuracy == FINE:
+            smooth = min(smooth, self.profile.fine_step)
         resolving = smooth
         if any(effect.abrupt for effect in effects):
             resolving = min(smooth, self.profile.longest_abrupt_steps[accuracy])
