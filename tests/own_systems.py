@@ -74,6 +74,34 @@ class Winch(System):
 
 
 @dataclass(frozen=True)
+class Drive(System):
+    """A motor that turns a disc by a compliant coupling."""
+
+    inertia: float | torch.Tensor = 1e-4  # kg m2, of the motor
+    disc: float | torch.Tensor = 4e-4  # kg m2
+    stiffness: float | torch.Tensor = 0.15  # N m/rad
+    damping: float | torch.Tensor = 4e-4  # N m s/rad, of the coupling
+    friction: float | torch.Tensor = 1.3e-3  # N m s/rad, of the motor
+
+    name = "drive"
+    states: ClassVar[tuple[Variable, ...]] = (
+        Variable("motor", "rad", -40.0, 40.0),
+        Variable("disc", "rad", -40.0, 40.0),
+        Variable("motor_rate", "rad/s", -60.0, 60.0),
+        Variable("disc_rate", "rad/s", -60.0, 60.0),
+    )
+    actions: ClassVar[tuple[Variable, ...]] = (Variable("torque", "N m", -0.2, 0.2),)
+    loads = (Variable("motor_shaft", "N m", -0.05, 0.05), Variable("disc_shaft", "N m", -0.05, 0.05))
+    coordinates = ((0, 2), (1, 3))
+
+    def derivative(self, state, command, load):
+        motor, disc, motor_rate, disc_rate = state.unbind(-1)
+        shaft = self.stiffness * (motor - disc) + self.damping * (motor_rate - disc_rate)
+        first = (command[:, 0] - shaft - self.friction * motor_rate + load[:, 0]) / self.inertia
+        return torch.stack((motor_rate, disc_rate, first, (shaft + load[:, 1]) / self.disc), -1)
+
+
+@dataclass(frozen=True)
 class DoublePendulum(System):
     """Two uniform links on motors at shoulder and elbow; 0 hangs down, the second angle is relative to the first."""
 

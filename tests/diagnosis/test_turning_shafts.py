@@ -1,54 +1,24 @@
 """A motor that turns a disc: loads and errors of readings by the angle within a turn, and what acts between the two."""
 
-from dataclasses import dataclass
 from functools import cache
-from typing import ClassVar
 
 import numpy as np
 import pytest
 import torch
 
 import visadapt as va
+from tests.own_systems import Drive
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.verdict import left_by_source
 from visadapt.effects.catalogue import catalogue
 from visadapt.recordings import Episode, Recording
-from visadapt.systems import System, Variable
 
 PERIOD, ROWS = 0.01, 400
 ENCODER = 2 * np.pi / 8192  # rad, a step of the motor's angle
 PUSHED, PUSH = (1, 1.5, 0.08), 0.006
 """A push of the motor: the episode, its middle and its deviation in s; its peak in N m."""
-
-
-@dataclass(frozen=True)
-class Drive(System):
-    """A motor that turns a disc by a compliant coupling."""
-
-    inertia: float | torch.Tensor = 1e-4  # kg m2, of the motor
-    disc: float | torch.Tensor = 4e-4  # kg m2
-    stiffness: float | torch.Tensor = 0.15  # N m/rad
-    damping: float | torch.Tensor = 4e-4  # N m s/rad, of the coupling
-    friction: float | torch.Tensor = 1.3e-3  # N m s/rad, of the motor
-
-    name = "drive"
-    states: ClassVar[tuple[Variable, ...]] = (
-        Variable("motor", "rad", -40.0, 40.0),
-        Variable("disc", "rad", -40.0, 40.0),
-        Variable("motor_rate", "rad/s", -60.0, 60.0),
-        Variable("disc_rate", "rad/s", -60.0, 60.0),
-    )
-    actions: ClassVar[tuple[Variable, ...]] = (Variable("torque", "N m", -0.2, 0.2),)
-    loads = (Variable("motor_shaft", "N m", -0.05, 0.05), Variable("disc_shaft", "N m", -0.05, 0.05))
-    coordinates = ((0, 2), (1, 3))
-
-    def derivative(self, state, command, load):
-        motor, disc, motor_rate, disc_rate = state.unbind(-1)
-        shaft = self.stiffness * (motor - disc) + self.damping * (motor_rate - disc_rate)
-        first = (command[:, 0] - shaft - self.friction * motor_rate + load[:, 0]) / self.inertia
-        return torch.stack((motor_rate, disc_rate, first, (shaft + load[:, 1]) / self.disc), -1)
 
 
 def cogging(state):
