@@ -44,12 +44,13 @@ from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.searched_effects import searched, shown_by
+from visadapt.diagnosis.search.unexplained import SmoothFunction
 from visadapt.diagnosis.verdict import at_bounds, is_slow, left_by_source, left_unexplained, next_step, verdict_of
 from visadapt.diagnosis.words import listed, printable
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized
 from visadapt.estimation.effect_fit import remembers
-from visadapt.estimation.episode_phases import in_episode
+from visadapt.estimation.episode_phases import has_episode_phases, in_episode
 from visadapt.estimation.profiles import profile_of
 from visadapt.processes import one_thread
 from visadapt.progress import Report, staged
@@ -125,6 +126,7 @@ def diagnose(
     with_repeats = errors_with_repeats(explored.prepared, search) if repeats else None
     measured = measure(search, comparison, groups, with_repeats, jobs, staged(progress, "predictions"))
     verdict, found, partial = _judge(explored, measured)
+    source_leaves = [] if found else left_by_source(search)
     before, after = disturbances(search, comparison)
     regions = _regions(found, before if found else after, explored.effects, profile_of(system).region_variables, seed)
     found_in_motion = Diagnosis(
@@ -140,12 +142,14 @@ def diagnose(
             stage_shares(search, comparison, groups, _found_before(explored, film)),
             measured.errors.by_state(system, explored.prepared.rows.channels, bool(found)),
             regions,
-            _pushes(explored, world, bool(found)),
+            _pushes(explored, world, source_leaves),
         ),
         causes=found,
         ranking=ranking(comparison, explored.effects, system, measured.closed, repeats),
         gap=measured.gap,
-        next_experiment=next_step(search, comparison, verdict, groups, found, measured.gap, explored.prepared.coarse),
+        next_experiment=next_step(
+            search, comparison, verdict, groups, found, measured.gap, explored.prepared.coarse, source_leaves
+        ),
         warnings=(
             *used.warnings,
             *(f"{effect.name}: {NOT_SEARCHED}" for effect in effects if remembers(effect, system)),
@@ -178,7 +182,7 @@ def _check(recording: Recording, world: World, policy: policy_bound.StatesToActi
             f"the recording has {commands.pop()} commands in a row; a {system.name} has {len(system.actions)}: "
             f"{', '.join(action.name for action in system.actions)}"
         )
-    profile_of(system)
+    profile_of(system)  # raises where the system does not state its coordinates
     if policy is not None:
         policy_bound.check(policy, system)
 
@@ -250,15 +254,18 @@ def _found_before(explored: _Explored, film: Film | None) -> list[tuple[Stage, f
     return found
 
 
-def _pushes(explored: _Explored, world: World, explained: bool) -> tuple[Push, ...]:
-    """The pushes beyond the best set where it explains the recording, else beyond the source."""
+def _pushes(explored: _Explored, world: World, source_leaves: Sequence[SmoothFunction]) -> tuple[Push, ...]:
+    """The pushes beyond the best set where it explains the recording; beyond the source where it does not, which
+    leaves these functions."""
     whole, comparison = explored.prepared.whole, explored.comparison
     if whole is None:
         return ()
-    if explained:
-        explained_worlds = [_explained(world, comparison, episode) for episode in range(len(whole.episodes))]
-        return pushes(whole, explained_worlds, comparison.functions)
-    return pushes(whole, world, left_by_source(explored.search))
+    if source_leaves:
+        return pushes(whole, world, source_leaves)
+    if not any(has_episode_phases(effect) for effect in comparison.best.effects):
+        return pushes(whole, _explained(world, comparison, 0), comparison.functions)
+    worlds = [_explained(world, comparison, episode) for episode in range(len(whole.episodes))]
+    return pushes(whole, worlds, comparison.functions)
 
 
 def _explained(world: World, comparison: ModelComparison, episode: int) -> World:

@@ -80,8 +80,12 @@ def next_step(
     found: Sequence[Cause],
     gap: Gap,
     coarse: Sequence[CoarseSteps],
+    source_leaves: Sequence[SmoothFunction],
 ) -> str:
-    """The experiment to make next, in words; slight causes among those `found` need none."""
+    """The experiment to make next, in words; slight causes among those `found` need none.
+
+    `source_leaves` are the functions that the source leaves unexplained, where nothing was found.
+    """
     if is_slow(comparison, verdict):
         return next_experiment.LONGER
     if verdict == NO_GAP:
@@ -90,7 +94,7 @@ def next_step(
         return next_experiment.finer([position.state for position in coarse])
     if verdict == UNEXPLAINED:
         closed = gap.closed >= MIN_CLOSED_TO_EXPLAIN
-        return next_experiment.explain((comparison.functions if closed else left_by_source(search))[0])
+        return next_experiment.explain((comparison.functions if closed else source_leaves)[0])
     carrying = {cause.effect for cause in without_slight(found)}
     classes = [[one.effect for one in group] for group in groups]
     return next_experiment.separate([c for c in classes if carrying & {one.name for one in c}], search.system)

@@ -117,9 +117,7 @@ class _Fit:
     spread: list[Tensor]  # P times (N, J): deviation of the errors
     autoregression: Tensor  # (J, LAGS) of the errors over their deviation
     innovation: Tensor  # (J,) deviation of what the autoregression leaves
-    first: (
-        Tensor  # (J, LAGS, LAGS) Cholesky factors of the covariances of a part's first LAGS errors, which follow none
-    )
+    first: Tensor  # (J, LAGS, LAGS) Cholesky factors of the covariances of a part's first errors, which follow none
 
     def __init__(self, tracks: Sequence[LoadTrack]) -> None:
         self.tracks = tracks

@@ -17,6 +17,7 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
+from visadapt.effects.own.statement import MIN_RANGE
 from visadapt.estimation.candidate import FINE, CandidateModel, linearise, with_loads
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.sensitivity import Innovations
@@ -27,8 +28,6 @@ BUMPS = 10  # Gaussian bumps of a function
 PREVIOUS_PREFIX = "previous_"  # Prefix of the name of a command in the period before
 
 WAVES = 12  # Most waves within a turn
-
-MIN_TURNS = 2.0  # Turns that a shaft must have made for what repeats in every turn to be told from bumps
 
 TURN_SUFFIX = "_within_a_turn"  # Suffix of the name of an angle, for what repeats in every turn
 
@@ -120,8 +119,7 @@ def _of_turns(system: System, states: Tensor) -> Iterator[_Named]:
     for joint, (angle, _) in enumerate(system.coordinates):
         if angle is None or system.states[angle].unit != "rad":
             continue
-        turns = float(states[:, angle].max() - states[:, angle].min()) / (2 * math.pi)
-        if turns > MIN_TURNS:
+        if float(states[:, angle].max() - states[:, angle].min()) > MIN_RANGE:
             name = system.states[angle].name + TURN_SUFFIX
             on, of = _unit(len(system.loads), joint), _unit(len(system.states), angle)
             yield system.loads[joint].name, name, on, of
