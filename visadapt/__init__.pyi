@@ -31,6 +31,7 @@ from .systems.quadrotor import Quadrotor as Quadrotor
 from .targets.base import Observation as Observation, Target as Target
 from .targets.env_map import Entry as Entry, EnvMap as EnvMap
 from .targets.gymnasium import GymnasiumTarget as GymnasiumTarget
+from .targets.regulation import RegulationTarget as RegulationTarget
 from .targets.rollout import run as run
 from .targets.synthetic import (
     FlightTarget as FlightTarget,
@@ -40,5 +41,6 @@ from .targets.synthetic import (
 )
 from .tasks.base import Task as Task
 from .tasks.references import read_reference as read_reference
+from .tasks.regulate import Regulate as Regulate, read_task as read_task
 from .weights import shipped as shipped
 from .world import World as World

@@ -69,7 +69,7 @@ def test_frames(here, trained, capsys):
         (("rig:pushed",), "rig:pushed: returned a gymnasium environment, which needs --map MAP.toml"),
         (("rig:states", "--map", "map.toml"), "rig:states: returns a visadapt.Target, for which --map has no use"),
         (("rig:pushed", "--map", "none.toml"), "none.toml: cannot be read: No such file"),
-        (("rig:pushed", "--map", "torn.toml"), "torn.toml: cannot be read as TOML"),
+        (("rig:pushed", "--map", "torn.toml"), "torn.toml: not TOML"),
         (("rig:pushed", "--map", "typo.toml"), "typo.toml: unknown key 'hight'"),
         (("rig:pushed", "--map", "part.toml"), "rig:pushed: its tau says 0.02 s a step"),
         (("rig:pushed", "--map", "map.toml"), "rig:pushed has 0.02 s between actions"),

@@ -216,7 +216,7 @@ def test_a_map_can_be_a_toml_file(tmp_path):
         ("index = 3", "index = -3", "index must be a whole number from 0 on, got -3"),
         ("index = 3", "column = 3", "unexpected keyword argument 'column'"),
         ("crop = [0, 0", 'crop = ["left", 0', "crop must be left, top, right, bottom in whole px"),
-        ("[limits]", "[limits", "cannot be read as TOML"),
+        ("[limits]", "[limits", "not TOML"),
     ):
         path.write_text(TOML.replace(old, new))
         with pytest.raises(TargetError, match=r"rig\.toml: ") as error:

@@ -103,7 +103,9 @@ def train(parser: argparse.ArgumentParser) -> None:
         "where it was."
     )
     add = parser.add_argument
-    _add_system(parser, "or my_rig.py:Class, a system of your own that derives from one of these")
+    _add_system(parser, OWN_HELP)
+    task_help = "where a system of your own is to come to rest, and how exactly (docs/own_system.md)"
+    add("--task", metavar="TASK.toml", help=task_help)
     add("--out", required=True, metavar="P.safetensors", help="write the policy here")
     add("--period", metavar="S", type=_positive_number, help="s between commands (default: 0.05; quadrotor: 0.1)")
     add("--frames", action="store_true", help="the policy is shown a camera's frames, not states")
@@ -149,7 +151,8 @@ def score(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `visadapt score`."""
     parser.description = (
         "Runs episodes of a policy on a target. Cart-poles are scored by the cart's mean speed in m/s over the "
-        "episodes that stay up, flights by their mean error in m; failed episodes are counted apart."
+        "episodes that stay up, flights by their mean error in m, systems with a --task by their distances from its "
+        "goal; failed episodes are counted apart."
     )
     add = parser.add_argument
     _add_policy_and_target(parser)
@@ -165,7 +168,7 @@ def export(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `visadapt export`."""
     parser.description = (
         "Writes a policy, with the residual that it reads, as an ONNX file: the last five observations and actions to "
-        "the next ten actions in [-1, 1], of which the first is executed. Its actions are checked against the policy's."
+        "the next ten actions, of which the first is executed. Its actions are checked against the policy's."
     )
     parser.add_argument("policy", metavar="P.safetensors", help=POLICY_HELP)
     _add_policys_system(parser)

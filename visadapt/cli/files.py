@@ -14,7 +14,7 @@ from visadapt.cli.run_folders import check_run_folder
 from visadapt.storage.atomic_files import check_writable
 from visadapt.systems import SYSTEMS
 
-INPUTS = ("recording", "params", "effects", "policy", "renderer", "diagnosis", "references", "map")
+INPUTS = ("recording", "params", "effects", "policy", "renderer", "diagnosis", "references", "task", "map")
 OUTPUTS = ("out", "json", "report", "plan", "film")
 
 

@@ -19,6 +19,7 @@ from visadapt.setups.training import setup_to_train
 from visadapt.storage.atomic_files import replacing
 from visadapt.systems import CartPole, Quadrotor
 from visadapt.tasks.references import read_reference
+from visadapt.tasks.regulate import read_task
 from visadapt.weights import shipped
 from visadapt.world import World
 
@@ -31,7 +32,7 @@ def run(options: argparse.Namespace) -> None:
     import_effects(options)
     out = Path(options.out)
     setup = _setup(options)
-    settings = run_settings(options, "renderer", "references", "diagnosis", "params", "effects")
+    settings = run_settings(options, "renderer", "references", "task", "diagnosis", "params", "effects")
     with unfinished(out, {**settings, "system": options.system.name}) as folder, progress() as report:
         made = folder / "policy.safetensors"
         setup.pretrain(made, options.seed, report)
@@ -42,8 +43,11 @@ def run(options: argparse.Namespace) -> None:
 
 def _setup(options: argparse.Namespace) -> Setup:
     system = given_system(options)
+    task = read_task(options.task, system) if options.task else None
+    if task and not options.period:
+        raise InputError("--task: say how often the rig is commanded: --period, in s, is needed")
     period = options.period or (0.1 if isinstance(system, Quadrotor) else 0.05)
-    bare = World(system, (), period, substeps=math.ceil(period / LONGEST_STEP))
+    bare = World(system, (), period, substeps=None if task else math.ceil(period / LONGEST_STEP))
     world = bare.with_effects(given_effects(options, system))
     renderer = options.renderer or (shipped("renderer") if options.frames else None)
     if renderer and not isinstance(system, CartPole):
@@ -54,7 +58,7 @@ def _setup(options: argparse.Namespace) -> Setup:
         raise InputError(f"--references is for a quadrotor, not for a {system.name}")
     references = read_reference(options.references, period) if options.references else None
     with as_input_error():
-        setup = setup_to_train(world, options.iterations, renderer, references, options.with_history)
+        setup = setup_to_train(world, options.iterations, renderer, references, options.with_history, task)
     if not options.seeing:
         return setup
     perception = replace(setup.settings.perception or PerceptionSettings(), iterations=options.seeing)

@@ -10,7 +10,7 @@ from typing import overload
 import numpy as np
 import torch
 
-from visadapt.policies import Policy
+from visadapt.policies import Policy, RegulatorPolicy
 from visadapt.systems import CartPole, System
 from visadapt.targets import FlightTarget, Target
 from visadapt.targets.rollout import Run, check_period, run
@@ -59,6 +59,28 @@ class FlightScore:
         return f"{self.mean:.4f} +- {self.std:.4f} m, {self.flights - self.failed} of {self.flights} stayed near"
 
 
+@dataclass(frozen=True)
+class RegulationScore:
+    """How far a system stays from its goal. The errors are over the second halves of surviving episodes, in which it
+    should be at rest."""
+
+    episodes: int
+    survived: int
+    errors: dict[str, float] | None
+    """root mean square distances from the goal of the states that have a tolerance, by name and in the state's unit;
+    None where no episode survived"""
+    units: dict[str, str]
+    """by the names of these states"""
+
+    def __str__(self) -> str:
+        errors = [f"{name} {error:.3g} {self.units[name]}" for name, error in (self.errors or {}).items()]
+        return f"{', '.join(errors) or 'no errors'}, {self.survived} of {self.episodes} episodes survived"
+
+
+@overload
+def score(  # type: ignore[overload-overlap]
+    policy: RegulatorPolicy, target: Target, episodes: int = ..., seed: int = ..., steps: int | None = ...
+) -> RegulationScore: ...
 @overload
 def score(  # type: ignore[overload-overlap]
     policy: Policy, target: FlightTarget, episodes: int = ..., seed: int = ..., steps: int | None = ...
@@ -69,11 +91,12 @@ def score(
 ) -> CartPoleScore: ...
 def score(
     policy: Policy, target: Target, episodes: int = 100, seed: int = SCORE_SEED, steps: int | None = None
-) -> CartPoleScore | FlightScore:
+) -> CartPoleScore | FlightScore | RegulationScore:
     """Run `policy` for `episodes` episodes on `target`: how well it does, and how many episodes failed.
 
     Flights are scored by the errors in m that their task defines (`FlightTask.misses`), cart-poles by the cart's speed
-    in m/s. The steps are those of an evaluation: no ledger counts them.
+    in m/s, and systems with a `Regulate` task by their distances from its goal. The steps are those of an evaluation:
+    no ledger counts them.
 
     Args:
         seed: of the starts and of the hidden effects.
@@ -94,6 +117,9 @@ def score(
     check_period(policy, target)
     policy.eval()
     generator = torch.Generator().manual_seed(seed)
+    if isinstance(policy, RegulatorPolicy):
+        steps = steps or max(1, round(policy.task["seconds"] / target.period))
+        return _score_regulation(run(target, policy, episodes, steps, generator, keep_frames=False), policy)
     if isinstance(target, FlightTarget):
         if steps is not None and steps > target.task.steps:
             raise ValueError(f"a flight of this task has {target.task.steps} steps, got steps = {steps}")
@@ -123,6 +149,17 @@ def score_runs(runs: Sequence[Run]) -> CartPoleScore:
         std_speed=float(speeds.std()) if len(speeds) else None,
         mean_length=float(np.mean([r.episode.samples for r in runs])),
     )
+
+
+def _score_regulation(runs: Sequence[Run], policy: RegulatorPolicy) -> RegulationScore:
+    states = [run.episode.state for run in runs if run.survived and run.episode.state is not None]
+    units = {name: unit for name, unit in policy.states.items() if name in policy.task["tolerance"]}
+    errors = None
+    if states:
+        later = np.concatenate([each[len(each) // 2 :] for each in states])
+        apart = np.sqrt(np.square(later - policy.goal.numpy(force=True)).mean(0))
+        errors = {name: float(apart[k]) for k, name in enumerate(policy.states) if name in units}
+    return RegulationScore(len(runs), len(states), errors, units)
 
 
 def _score_flights(runs: Sequence[Run], target: FlightTarget) -> FlightScore:

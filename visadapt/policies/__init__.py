@@ -3,6 +3,7 @@
 from visadapt.policies.base import AutoregressivePolicy, Policy
 from visadapt.policies.cartpole import ImagePolicy, StatePolicy
 from visadapt.policies.flight import FlightPolicy, FollowPolicy, ReachPolicy
+from visadapt.policies.regulator import RegulatorPolicy, RegulatorResidualNetwork
 
 __all__ = [
     "AutoregressivePolicy",
@@ -11,5 +12,7 @@ __all__ = [
     "ImagePolicy",
     "Policy",
     "ReachPolicy",
+    "RegulatorPolicy",
+    "RegulatorResidualNetwork",
     "StatePolicy",
 ]

@@ -1,4 +1,4 @@
-"""Policies: from the last observations and actions to the next HORIZON actions, in [-1, 1], all at once.
+"""Policies: from the last observations and actions to the next HORIZON actions, all at once.
 
 A policy may read a residual: the correction that the residual predicts for a zero action is one of its inputs. It is a
 function of the same observations and actions, so it adds no privileged information, but the policy need not learn again
@@ -58,6 +58,12 @@ class Policy(nn.Module):
         nn.init.zeros_(self.feedforward.weight)
         self.residual: Residual | None = None
 
+    @property
+    def command_range(self) -> tuple[Tensor, Tensor]:
+        """Lowest and highest commands, (n_action,) each; -1 and 1, unless a subclass has others."""
+        most = self.feedforward.weight.new_ones(self.n_action)
+        return -most, most
+
     def embed(self, history: History) -> Tensor:
         """Inputs (B, inputs) of `plan` beside the correction: the features of frames, or the history itself."""
         raise NotImplementedError
@@ -67,7 +73,7 @@ class Policy(nn.Module):
         raise NotImplementedError
 
     def decide(self, inputs: Tensor, correction: Tensor) -> Tensor:
-        """Planned actions (B, HORIZON, n_action)."""
+        """Planned actions (B, HORIZON, n_action), in `command_range`."""
         out = (self.plan(inputs, correction) + self.feedforward(correction)).tanh()
         return out.unflatten(-1, (HORIZON, self.n_action))
 

@@ -90,12 +90,14 @@ class Setup:
                 f"{system.__name__} has the name of the class that it derives from, {system.name!r}, which a policy's "
                 "file would be read with: give it a name of its own"
             )
-        for action in self.source.system.actions:
-            if (action.low, action.high) != (-1.0, 1.0):
+        commands = torch.stack(_seeded(0, self.policy).command_range, 1)
+        for action, ours in zip(self.source.system.actions, commands, strict=True):
+            if not torch.allclose(ours, ours.new_tensor([action.low, action.high])):
+                low, high = ours.tolist()
                 raise ValueError(
                     f"{action.name} of a {self.source.system.name} ranges from {action.low:g} to {action.high:g} "
-                    f"{action.unit}, the commands of a policy from -1 to 1: give the action that range, and let the "
-                    "system's derivative multiply it by its largest value"
+                    f"{action.unit}, the commands of the policy from {low:g} to {high:g}: give the action that range, "
+                    "and let the system's derivative multiply it by its largest value"
                 )
 
     def pretrain(self, path: Path, seed: int, report: Report | None = None) -> Policy:

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from visadapt.world import World
 
 LARGEST_DIFFERENCE = 1e-4
-"""Largest difference of an action, in [-1, 1], between the file and the policy; float32 rounding makes 1e-6."""
+"""Largest difference of an action between the file and the policy, as a share of half a command's range; float32
+rounding makes 1e-6."""
 
 
 class ExportError(RuntimeError):
@@ -47,9 +48,9 @@ def export_policy(path: str | Path, policy: Policy, source: World | None = None)
 
     Its inputs are `observations`, states (5, n_state), with the goal appended where there is one, in float32, or frames
     (5, H, W) in uint8, and `actions` (5, n_action) in float32: the last five of each, oldest first. At the start of an
-    episode the first observation is repeated five times, and the actions are 0. Its output `plan` (10, n_action), in
-    [-1, 1], begins with the action to execute now. The file's metadata describe these and, of `source`, the states,
-    actions and period.
+    episode the first observation is repeated five times, and the actions are 0. Its output `plan` (10, n_action)
+    begins with the action to execute now. The file's metadata describe these and, of `source`, the states, actions and
+    period.
 
     Args:
         source: the world that the policy was trained in, for the metadata alone.
@@ -89,7 +90,8 @@ def export_policy(path: str | Path, policy: Policy, source: World | None = None)
         read = {each.name for each in session.get_inputs()}  # without inputs that the policy does not use
         for example, plan in zip(examples, plans, strict=True):
             found = session.run(None, {name: example[name].cpu().numpy() for name in read})[0]
-            if not (difference := abs(found - plan).max()) <= LARGEST_DIFFERENCE:
+            low, high = (bound.numpy(force=True) for bound in policy.command_range)
+            if not (difference := abs((found - plan) / (high - low) * 2).max()) <= LARGEST_DIFFERENCE:
                 raise ExportError(f"{path} was not written: its actions would differ by {difference:.2g} of 1")
 
 
@@ -109,9 +111,11 @@ def about(policy: Policy, source: World | None = None) -> dict[str, str]:
     """The metadata of the file, by name: what one needs to know to run it."""
     shape = " x ".join(map(str, (LENGTH, *policy.observation_shape)))
     kind = "uint8" if policy.shown == "frame" else "float32"
+    bounds = zip(*(bound.tolist() for bound in policy.command_range), strict=True)
+    ranges = "in " + ", ".join(dict.fromkeys(f"[{low:g}, {high:g}]" for low, high in bounds))
     known = {
         "observations": f"the last {LENGTH}, oldest first: {policy.shown}, {shape} {kind}",
-        "actions": f"the last {LENGTH}, oldest first, in [-1, 1]: {LENGTH} x {policy.n_action} float32",
+        "actions": f"the last {LENGTH}, oldest first, {ranges}: {LENGTH} x {policy.n_action} float32",
         "plan": f"the next {HORIZON}, of which the first is executed: {HORIZON} x {policy.n_action} float32",
     }
     if isinstance(policy, FlightPolicy):

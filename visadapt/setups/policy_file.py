@@ -17,7 +17,16 @@ from torch import Tensor
 from visadapt.effects import EFFECTS, Effect, Residual
 from visadapt.effects.own import is_own, own_effects
 from visadapt.learning.perception import PerceptionSettings, scale
-from visadapt.policies import FlightPolicy, FollowPolicy, ImagePolicy, Policy, ReachPolicy, StatePolicy
+from visadapt.policies import (
+    FlightPolicy,
+    FollowPolicy,
+    ImagePolicy,
+    Policy,
+    ReachPolicy,
+    RegulatorPolicy,
+    RegulatorResidualNetwork,
+    StatePolicy,
+)
 from visadapt.policies.networks import (
     FlightResidualNetwork,
     ImageResidualNetwork,
@@ -30,7 +39,9 @@ from visadapt.systems import SYSTEMS, RigidBody, System
 from visadapt.systems.base import NAMED, parameters
 from visadapt.world import World
 
-KINDS: dict[str, type[Policy]] = {kind.__name__: kind for kind in (ImagePolicy, StatePolicy, FollowPolicy, ReachPolicy)}
+KINDS: dict[str, type[Policy]] = {
+    kind.__name__: kind for kind in (ImagePolicy, StatePolicy, FollowPolicy, ReachPolicy, RegulatorPolicy)
+}
 
 
 def save_policy(path: str | Path, policy: Policy, about: Mapping[str, Any] | None = None) -> None:
@@ -204,6 +215,8 @@ def residual_for(
         unit = scale(perception or PerceptionSettings(), period)
         network = ImageResidualNetwork(eyes.background, float(eyes.contrast), system, period, unit)
         network.to(eyes.background).encoder.load_state_dict(eyes.state_dict())
+    elif isinstance(policy, RegulatorPolicy):
+        network = RegulatorResidualNetwork(system, period, policy)
     elif isinstance(policy, StatePolicy) and policy.with_history:
         network = StateHistoryResidualNetwork(system, period)
     elif isinstance(policy, StatePolicy):

@@ -13,17 +13,19 @@ import torch
 
 from renderers import LayeredRenderer
 from visadapt.learning.joint import Adapted
-from visadapt.policies import ImagePolicy, Policy, StatePolicy
+from visadapt.policies import ImagePolicy, Policy, RegulatorPolicy, StatePolicy
 from visadapt.progress import Report
 from visadapt.setups.base import Setup
 from visadapt.setups.cartpole import cartpole_frames, cartpole_states
 from visadapt.setups.flight import fixed_wing, quadrotor
 from visadapt.setups.policy_file import save_policy
-from visadapt.systems import SYSTEMS, CartPole, FixedWing, Quadrotor
+from visadapt.setups.regulator import regulator
+from visadapt.systems import CartPole, FixedWing, Quadrotor
 from visadapt.targets import FlightTarget, Target
 from visadapt.tasks.follow import Follow
 from visadapt.tasks.reach import Reach
 from visadapt.tasks.references import Reference
+from visadapt.tasks.regulate import Regulate
 from visadapt.world import World
 
 Renderer = LayeredRenderer | str | Path
@@ -35,6 +37,7 @@ def setup_for(
     renderer: Renderer | None = None,
     references: Reference | None = None,
     with_history: bool = False,
+    task: Regulate | None = None,
 ) -> Setup:
     """The setup of the world's system, for a given policy or a new one.
 
@@ -44,10 +47,11 @@ def setup_for(
         references: (N, T, 3) or (T, 3), what a quadrotor is to follow.
         with_history: whether a cart-pole's policy, or a vehicle's residual, also reads the last periods, which show a
             changing force.
+        task: where a system, of one's own say, is to come to rest; a policy that was trained for such a task keeps it.
 
     Raises:
-        ValueError: a policy of another system, a system without a setup, a quadrotor without references, or what the
-            system or the policy has no use for.
+        ValueError: a policy of another system, a system of one's own without a task, a quadrotor without references, or
+            what the system or the policy has no use for.
 
     >>> import visadapt as va
     >>> setup = va.setup_for(va.World(va.CartPole()))
@@ -55,6 +59,14 @@ def setup_for(
     3000
     """
     system = world.system
+    if isinstance(policy, RegulatorPolicy):
+        task = Regulate(system, **policy.task)
+    if task is not None:
+        if task.system.name != system.name:
+            raise ValueError(f"the task is of a {task.system.name}, the world of a {system.name}")
+        if renderer is not None or references is not None or with_history:
+            raise ValueError("a policy with a task of its own has no use for a renderer, references or a history")
+        return _checked(regulator(world, task), policy)
     if references is not None and not isinstance(system, Quadrotor):
         raise ValueError(f"references are for a quadrotor, not for a {system.name}: leave them out")
     if renderer is not None and not isinstance(system, CartPole):
@@ -77,12 +89,10 @@ def setup_for(
         setup = fixed_wing(world, with_history)
     else:
         raise ValueError(
-            f"policies are trained for {', '.join(SYSTEMS)}; for a {system.name}, make a visadapt.Setup with a task, a "
-            "policy and a residual"
+            f"what a {system.name} is to do is not known: give a task, by task= or --task, that says where it is to "
+            "come to rest"
         )
-    if policy is not None:
-        setup.check_policy(policy)
-    return setup
+    return _checked(setup, policy)
 
 
 def train(
@@ -93,6 +103,7 @@ def train(
     renderer: Renderer | None = None,
     references: Reference | None = None,
     with_history: bool = False,
+    task: Regulate | None = None,
     report: Report | None = None,
 ) -> Policy:
     """A policy trained in `world`, with the effects that it has, by backpropagation through it.
@@ -101,7 +112,8 @@ def train(
         path: file of the policy: an interrupted training goes on, a finished one is read. Without it, the policy is
             not written.
         iterations: instead of the setup's own.
-        renderer, references, with_history: as for `setup_for`; a vehicle has no residual yet that could read a history.
+        renderer, references, with_history, task: as for `setup_for`; a vehicle has no residual yet that could read a
+            history.
 
     Raises:
         ValueError: as `setup_for`.
@@ -111,7 +123,7 @@ def train(
     >>> policy.n_action
     1
     """
-    setup = setup_to_train(copy.deepcopy(world), iterations, renderer, references, with_history)
+    setup = setup_to_train(copy.deepcopy(world), iterations, renderer, references, with_history, task)
     with tempfile.TemporaryDirectory() as temporary:
         return setup.pretrain(Path(path or Path(temporary, "policy.safetensors")), seed, report)
 
@@ -222,16 +234,17 @@ def setup_to_train(
     renderer: Renderer | None,
     references: Reference | None,
     with_history: bool,
+    task: Regulate | None,
 ) -> Setup:
     """As `setup_for`, for a new policy, with `iterations` of its training instead of the setup's own.
 
     Raises:
         ValueError: as `setup_for`, or a history for a vehicle, whose policy reads none.
     """
-    if with_history and not isinstance(world.system, CartPole):
+    if with_history and task is None and not isinstance(world.system, CartPole):
         raise ValueError(f"a {world.system.name}'s policy reads no history; its residual may, where it is adapted")
     _check_iterations(iterations)
-    setup = setup_for(world, None, renderer, references, with_history)
+    setup = setup_for(world, None, renderer, references, with_history, task)
     return setup if iterations is None else replace(setup, settings=setup.settings.shortened(iterations))
 
 
@@ -258,6 +271,13 @@ def setup_to_adapt(
     setup = setup_for(source, policy, renderer, references, with_history)
     if isinstance(task, Reach) and isinstance(source.system, FixedWing):
         return fixed_wing(source, with_history, replace(task, system=source.system))
+    return setup
+
+
+def _checked(setup: Setup, policy: Policy | None) -> Setup:
+    """The setup, whose policy the given one must be."""
+    if policy is not None:
+        setup.check_policy(policy)
     return setup
 
 

@@ -11,12 +11,11 @@ from __future__ import annotations
 
 import inspect
 import os
-import tomllib
-from pathlib import Path
 from typing import TypeVar
 
 import torch
 
+from visadapt.storage.toml_file import read_toml
 from visadapt.systems import System
 
 LARGEST = float(torch.finfo(torch.float32).max)
@@ -42,12 +41,7 @@ def load_parameters(path: str | os.PathLike[str], system_class: type[SystemT]) -
     >>> va.load_parameters(rig, va.CartPole).cart_mass
     0.23
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise ParameterFileError(f"{path}: cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:  # of TOML, of its encoding, or of the Python that reads it
-        raise ParameterFileError(f"{path}: not TOML: {error}") from error
+    content = read_toml(path, ParameterFileError)
     names = list(inspect.signature(system_class).parameters)
     known = ", ".join(names)
     parameters = content.pop("parameters", None)

@@ -69,4 +69,4 @@ class Target(ABC):
 
     @abstractmethod
     def step(self, action: Tensor) -> Observation:
-        """Execute the action (B, n_action) in [-1, 1] for one period."""
+        """Execute the action (B, n_action), in the range of the policy's commands, for one period."""

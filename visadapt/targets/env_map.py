@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -13,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from visadapt.storage.toml_file import read_toml
 from visadapt.systems import System
 from visadapt.targets.base import TargetError
 
@@ -60,7 +60,7 @@ class EnvMap:
     states: Mapping[str, Entry]
     """by the name of our state: state = scale observation[index] + offset, in SI units"""
     actions: tuple[Entry, ...]
-    """for each of our commands in [-1, 1]: action[index] = scale command + offset; the other entries are 0"""
+    """for each of our commands: action[index] = scale command + offset; the other entries are 0"""
     period: float | None = None
     """s between actions; None: what the environment states, its `tau`, `dt` or `render_fps`"""
     crop: tuple[int, int, int, int] | None = None
@@ -125,12 +125,7 @@ class EnvMap:
         Raises:
             TargetError: the file is missing or no TOML, a key is unknown, missing or impossible; names file and key.
         """
-        try:
-            table = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-        except OSError as error:
-            raise TargetError(f"{path}: cannot be read: {error.strerror}") from error
-        except (ValueError, RecursionError) as error:  # of TOML, of its encoding, or of Python
-            raise TargetError(f"{path}: cannot be read as TOML: {error}") from error
+        table = read_toml(path, TargetError)
         known = [item.name for item in fields(cls)]
         for key in table:
             if key not in known:
@@ -170,13 +165,15 @@ class EnvMap:
             if entry.index >= count:
                 raise TargetError(f"{name}: the map {does} entry {entry.index}; there are {count}, counted from 0")
 
-    def check_range(self, name: str, low: NDArray[np.floating], high: NDArray[np.floating]) -> None:
-        """Raises TargetError where a command in [-1, 1] leaves the actions (n_action,) that the environment takes.
+    def check_range(
+        self, name: str, system: type[System], low: NDArray[np.floating], high: NDArray[np.floating]
+    ) -> None:
+        """Raises TargetError where a command of our system leaves the actions (n_action,) that the environment takes.
 
         It would clip them, and the machine would do less than what is recorded.
         """
-        for entry in self.actions:
-            least, most = entry.offset - abs(entry.scale), entry.offset + abs(entry.scale)
+        for entry, ours in zip(self.actions, system.actions, strict=True):
+            least, most = sorted(entry.offset + entry.scale * command for command in (ours.low, ours.high))
             rounding = 1e-6 * max(abs(least), abs(most))
             if least < low[entry.index] - rounding or most > high[entry.index] + rounding:
                 raise TargetError(
@@ -200,7 +197,7 @@ class EnvMap:
         return out
 
     def action(self, command: NDArray[np.floating], size: int) -> NDArray[np.floating]:
-        """The environment's action (size,) for our command (n_action,) in [-1, 1]."""
+        """The environment's action (size,) for our command (n_action,)."""
         out = np.zeros(size)
         for value, entry in zip(command, self.actions, strict=True):
             out[entry.index] = entry.scale * value + entry.offset

@@ -129,7 +129,7 @@ class GymnasiumTarget(Target):
         if not bool(action.isfinite().all()):
             raise TargetError(f"{self.name}: the action of step {self._steps} is not finite")
         self._steps += 1
-        commands = action.detach().clamp(-1, 1).double().cpu().numpy()
+        commands = self.system.within_range(action.detach()).double().cpu().numpy()
         for b, env in enumerate(self._envs[:batch]):
             if not self._shown[b].alive:
                 continue
@@ -231,7 +231,7 @@ class GymnasiumTarget(Target):
             )
         n_action = int(env.action_space.shape[0])
         self.mapping.check(self.name, self.system, int(env.observation_space.shape[0]), n_action)
-        self.mapping.check_range(self.name, env.action_space.low, env.action_space.high)
+        self.mapping.check_range(self.name, self.system, env.action_space.low, env.action_space.high)
         return n_action
 
     def _period(self, env: Any, own: tuple[str, float] | None) -> tuple[float, str]:

@@ -75,7 +75,8 @@ def run(
     """Run `batch` episodes of at most `steps` steps each; one that ends earlier is cut there, and not `survived`.
 
     Args:
-        exploration: standard deviation of white noise on the commands, so that the data show their effect.
+        exploration: standard deviation of white noise on the commands, as a share of half their range, so that the data
+            show their effect.
         added: (steps, n_action) or more of them, added to the policy's commands, such as those of a `Plan`.
         strict: whether a state that is not finite is an error; if not, its episode ends before it.
         see: what the policy is shown, where that is not what `policy.shown` names.
@@ -98,14 +99,16 @@ def run(
     rows: list[tuple[Observation, Tensor]] = []
     length = torch.zeros(batch, dtype=torch.long)
     running = observation.alive.clone()
+    low, high = (bound.to(observation.state) for bound in policy.command_range)
     for _ in range(steps):
         if not bool(running.any()):
             break
         action = policy.act(history).to(observation.state)
         if exploration > 0:
-            action = (action + exploration * torch.randn(action.shape, generator=generator).to(action)).clamp(-1, 1)
+            noise = exploration * torch.randn(action.shape, generator=generator).to(action)
+            action = (action + (high - low) / 2 * noise).clamp(low, high)
         if added is not None:
-            action = (action + added[len(rows)].to(action)).clamp(-1, 1)
+            action = (action + added[len(rows)].to(action)).clamp(low, high)
         rows.append((observation if keep_frames else replace(observation, frame=None), action))
         observation = checked_copy(target, target.step(action), batch)
         finite = observation.state.isfinite().all(1)

@@ -13,14 +13,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from visadapt.estimation.linearise import linearise_step
 from visadapt.tasks.base import Task, curriculum
+from visadapt.tasks.linear_quadratic import linear_quadratic
 from visadapt.world import World
 
 EPISODE_STEPS = 250
 """Steps of a cart-pole's episode, in training and in scores."""
-
-RICCATI_STEPS = 1000  # 50 s at 0.05 s: later steps add next to nothing
 
 
 @dataclass(frozen=True)
@@ -75,18 +73,10 @@ class RegulatorCost(Cost):
 def cost_to_go(source: World, state: tuple[float, ...], action: float) -> tuple[tuple[float, ...], ...]:
     """V of `RegulatorCost` with these weights, for the source without effects, linearised at rest.
 
-    s' V s is the least sum of the costs of all states and commands that follow a state s, by the discrete algebraic
-    Riccati equation, iterated from V = 0.
+    s' V s is the least sum of the costs of all states and commands that follow a state s.
     """
-    bare = source.with_effects(())
-    rest = torch.zeros(1, len(state), dtype=torch.float64)
-    still = rest.new_zeros(1, bare.substeps, len(bare.system.actions))
-    step = linearise_step(bare, bare.values.to(rest), rest[:, 0], rest, still, by_command=True)
-    a, b, weights = step.by_state[0], step.by_command[0], torch.diag(rest.new_tensor(state))
-    command_weight, to_go = action * torch.eye(b.shape[1]).to(b), torch.zeros_like(weights)
-    for _ in range(RICCATI_STEPS):
-        after = weights + to_go
-        to_go = a.T @ after @ (a - b @ torch.linalg.solve(command_weight + b.T @ after @ b, b.T @ after @ a))
+    weights = torch.tensor(state, dtype=torch.float64)
+    to_go = linear_quadratic(source, weights, weights.new_full((len(source.system.actions),), action)).to_go
     return tuple(tuple(row) for row in to_go.tolist())
 
 

@@ -1,0 +1,118 @@
+"""Policies of systems of one's own: the regulator that they begin as, and what adapting them is worth."""
+
+from dataclasses import replace
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from hypothesis import given, settings, strategies
+
+import visadapt as va
+from tests.own_systems import Drive, Pendulum
+from visadapt.evaluation import RegulationScore
+from visadapt.history import HORIZON, History
+from visadapt.policies import RegulatorPolicy, StatePolicy
+from visadapt.setups.regulator import regulator
+
+PERIOD = 0.02
+TASK = va.Regulate(
+    Pendulum(), goal={"angle": 0.5}, tolerance={"angle": 0.1, "rate": 1.0}, limits={"angle": 1.5}, seconds=2.0
+)
+OWN = {effect.name: effect for effect in va.catalogue(Pendulum())}
+
+
+def weak(batch, generator):
+    return [OWN["torque.actuator_gain"](scale=0.7)]
+
+
+def policy_of(task=TASK):
+    return regulator(va.World(task.system, period=PERIOD), task).policy()
+
+
+def error(policy, draw) -> float:
+    found = va.score(policy, va.RegulationTarget(TASK, PERIOD, draw), episodes=5)
+    assert isinstance(found, RegulationScore)
+    assert found.survived == 5
+    assert found.errors is not None
+    return found.errors["angle"]
+
+
+def test_the_plan_of_a_new_policy_is_what_its_feedback_goes_on_to_do():
+    world, policy = va.World(Pendulum(), period=PERIOD), policy_of()
+    history = History.start(torch.tensor([[0.5005, 0.001]]), 1)
+    at = world.start(history.observations[:, -1])
+    with torch.no_grad():
+        plan = policy(history)[0, :, 0]
+        for k in range(HORIZON):
+            command = policy.act(history)
+            # The law is linear in small distances from the goal, the pendulum nearly so.
+            assert float(plan[k] - command) == pytest.approx(0.0, abs=1e-4)
+            at = world.step(at, command)
+            history = history.acting(command).observing(at.state)
+
+
+DRIVE = policy_of(va.Regulate(Drive(), tolerance={"disc": 0.05}))
+
+
+@given(strategies.lists(strategies.floats(-50, 50), min_size=4, max_size=4))
+@settings(max_examples=25, deadline=None)
+def test_no_command_leaves_the_range_of_its_action(state):
+    with torch.no_grad():
+        plan = DRIVE(History.start(torch.tensor([state]), 1))
+    assert float(plan.abs().max()) <= 0.2 + 1e-6
+
+
+@pytest.fixture(scope="module")
+def trained() -> RegulatorPolicy:
+    policy = va.train(va.World(Pendulum(), period=PERIOD), iterations=20, task=TASK)
+    assert isinstance(policy, RegulatorPolicy)
+    return policy
+
+
+def test_a_policy_tuned_with_the_effect_brings_the_machine_to_its_goal(trained):
+    assert error(trained, lambda *_: ()) < 0.002
+    before = error(trained, weak)
+    world = va.World(Pendulum(), weak(1, None), PERIOD)
+    assert error(va.adapt(trained, world, iterations=100), weak) < 0.3 * before
+
+
+@pytest.mark.parametrize("diagnose", [False, True])
+def test_a_few_hundred_samples_of_the_machine_do_the_same(trained, diagnose):
+    source, target = va.World(Pendulum(), period=PERIOD), va.RegulationTarget(TASK, PERIOD, weak)
+    found = va.adapt(trained, source, target, samples=200, round_samples=200, iterations=100, diagnose=diagnose)
+    assert found.ledger.used == 200
+    assert error(found.policy, weak) < 0.4 * error(trained, weak)
+    if diagnose:
+        explanation = found.rounds[-1].explanation
+        assert [effect.name for effect in explanation.effects] == ["torque.actuator_gain"]
+
+
+def test_a_file_keeps_task_residual_and_actions(trained, tmp_path):
+    source, target = va.World(Pendulum(), period=PERIOD), va.RegulationTarget(TASK, PERIOD, weak)
+    adapted = va.adapt(trained, source, target, samples=40, round_samples=40, iterations=2).policy
+    va.save_policy(tmp_path / "policy.safetensors", adapted)
+    loaded = va.load_policy(tmp_path / "policy.safetensors")
+    assert isinstance(loaded, RegulatorPolicy)
+    assert loaded.residual is not None
+    assert va.Regulate(Pendulum(), **loaded.task) == TASK
+    generator = torch.Generator().manual_seed(0)
+    history = History(torch.rand(3, 5, 2, generator=generator), torch.rand(3, 5, 1, generator=generator))
+    assert torch.equal(loaded(history), adapted(history))
+    va.export_policy(tmp_path / "policy.onnx", loaded, source)
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
+    named = {"observations": history.observations[0].numpy(), "actions": history.actions[0].numpy()}
+    assert np.abs(session.run(None, named)[0] - loaded(history)[0].numpy(force=True)).max() < 1e-4
+    assert "in [-2, 2]" in session.get_modelmeta().custom_metadata_map["actions"]
+
+
+def test_what_a_task_does_not_go_with_is_refused(trained):
+    world = va.World(Pendulum(), period=PERIOD)
+    with pytest.raises(ValueError, match="what a pendulum is to do is not known: give a task"):
+        va.train(world)
+    with pytest.raises(ValueError, match="the task is of a drive, the world of a pendulum"):
+        va.train(world, task=va.Regulate(Drive(), tolerance={"disc": 0.05}))
+    with pytest.raises(ValueError, match="has no use for a renderer, references or a history"):
+        va.train(world, task=TASK, with_history=True)
+    with pytest.raises(ValueError, match=r"torque of a pendulum ranges from -2 to 2 N m, the commands of the policy"):
+        replace(regulator(world, TASK), policy=lambda: StatePolicy(2))

@@ -1,0 +1,103 @@
+import math
+from dataclasses import replace
+
+import pytest
+import scipy.linalg
+import torch
+
+import visadapt as va
+from tests.own_systems import Drive, Pendulum
+from visadapt.estimation.linearise import linearise_step
+from visadapt.tasks.linear_quadratic import linear_quadratic
+from visadapt.tasks.regulate import TaskFileError
+
+TILTED = va.Regulate(
+    Pendulum(), goal={"angle": 0.5}, tolerance={"angle": 0.1, "rate": 1.0}, limits={"angle": 1.0}, seconds=2.0
+)
+
+
+def test_the_goal_is_held_by_the_command_that_balances_the_weight():
+    weight = Pendulum().moment * 9.81 * math.sin(0.5)
+    assert TILTED.held.tolist() == pytest.approx([weight], rel=1e-9)
+
+
+def test_a_speed_is_a_goal_where_no_tolerance_asks_for_a_position():
+    speeds = {"motor_rate": 20.0, "disc_rate": 20.0}
+    task = va.Regulate(Drive(), goal=speeds, tolerance={"motor_rate": 1.0, "disc_rate": 1.0})
+    assert task.held.tolist() == pytest.approx([Drive().friction * 20.0], rel=1e-6)
+    with pytest.raises(ValueError, match="goal: no command within its range holds it: there disc changes by 20 rad/s"):
+        replace(task, tolerance={**task.tolerance, "disc": 0.1})
+
+
+def test_the_regulator_is_that_of_the_discrete_algebraic_riccati_equation():
+    world = va.World(Pendulum(), period=0.02)
+    solved = linear_quadratic(world, TILTED.weights, TILTED.command_weights, TILTED.at_goal, TILTED.held)
+    at, still = TILTED.at_goal[None], TILTED.held.expand(1, world.substeps, 1)
+    step = linearise_step(world, torch.zeros(0).double(), torch.zeros(1).double(), at, still, by_command=True)
+    a, b = step.by_state[0].numpy(), step.by_command[0].numpy()
+    weights, command = TILTED.weights.diag().numpy(), TILTED.command_weights.diag().numpy()
+    after = scipy.linalg.solve_discrete_are(a, b, weights, command)
+    # s' V s leaves out the cost of s itself, which nothing can change.
+    assert solved.to_go.numpy() == pytest.approx(after - weights, rel=1e-6)
+
+
+def test_the_cost_of_a_plan_is_what_the_equation_says():
+    task = replace(TILTED, to_go=((2.0, 0.0), (0.0, 3.0)), effort=0.5)
+    states = torch.tensor([[[0.6, 0.0], [0.5, 1.0]]]).double()
+    plan = task.held + torch.tensor([[[1.0], [0.0]]]).double()
+    cost = task.cost(states, plan, states[:, 0], states[:, 0, :0])
+    assert float(cost) == pytest.approx(1.0 + 1.0 + (1.0 / (0.5 * 2.0)) ** 2 + 3.0, rel=1e-6)
+
+
+def test_an_episode_ends_beyond_a_limit_and_starts_within_its_spread():
+    states = torch.tensor([[1.4, 50.0], [1.6, 0.0], [math.nan, 0.0]])
+    assert TILTED.within_limits(states).tolist() == [True, False, False]
+    drawn = replace(TILTED, start={"rate": 0.2}).first_state(500, torch.Generator().manual_seed(0))
+    away = (drawn - torch.tensor([0.5, 0.0])).abs().amax(0)
+    assert 0.09 < float(away[0]) <= 0.1
+    assert 0.18 < float(away[1]) <= 0.2
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"goal": {"speed": 1.0}}, "goal: a pendulum has no state 'speed': angle, rate"),
+        ({"tolerance": {"angle": 0.0}}, "tolerance: angle must be a positive number, got 0.0"),
+        ({"limits": {"angle": "1"}}, "limits: angle must be a positive number, got '1'"),
+        ({"goal": {"angle": math.inf}}, "goal: angle must be a finite number, got inf"),
+        ({"effort": 0.0}, "effort must be a positive number, got 0.0"),
+        ({"tolerance": {}}, "tolerance: name the states that are to be at the goal, of angle, rate"),
+        ({"goal": {"rate": 1.0}}, "goal: no command within its range holds it: there angle changes by 1 rad/s"),
+    ],
+)
+def test_what_is_no_task_is_refused(change, line):
+    with pytest.raises(ValueError, match=f"^{line}"):
+        replace(TILTED, **change)
+
+
+def test_a_file_says_the_same_task(tmp_path):
+    path = tmp_path / "task.toml"
+    path.write_text("seconds = 2\n[goal]\nangle = 0.5\n[tolerance]\nangle = 0.1\nrate = 1\n[limits]\nangle = 1.0\n")
+    assert va.read_task(path, Pendulum()) == TILTED
+    assert va.Regulate(Pendulum(), **TILTED.settings()) == TILTED
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        (
+            "[weights]\nangle = 1.0\n",
+            "unknown key 'weights'; there are goal, tolerance, start, limits, ",
+        ),
+        ("tolerance = 0.1\n", r"tolerance must be a table, \[tolerance\]"),
+        ("[effort]\nx = 1\n", "effort must be a number, effort = 1.0"),
+        ("effort = true\n[tolerance]\nangle = 1\n", "effort must be a positive number, got True"),
+        ("[tolerance]\nangel = 1.0\n", "tolerance: a pendulum has no state 'angel': angle, rate"),
+        ("[tolerance\n", "not TOML"),
+    ],
+)
+def test_a_file_that_says_no_task_is_refused(text, line, tmp_path):
+    path = tmp_path / "task.toml"
+    path.write_text(text)
+    with pytest.raises(TaskFileError, match=f"task.toml: {line}"):
+        va.read_task(path, Pendulum())

@@ -1,0 +1,85 @@
+"""A system of one's own, shown its states: brought to rest at a goal."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from visadapt.history import HORIZON
+from visadapt.learning.setup_settings import SetupSettings
+from visadapt.learning.tuning import TuneSettings
+from visadapt.policies import RegulatorPolicy
+from visadapt.setups.base import Setup
+from visadapt.setups.policy_file import residual_for
+from visadapt.tasks.linear_quadratic import Regulator, linear_quadratic
+from visadapt.tasks.regulate import Regulate
+from visadapt.world import World
+
+NEARLY = 0.999  # Largest share of a command's range that the policy holds at the goal before it is trained
+
+
+def regulator(source: World, task: Regulate) -> Setup:
+    """A system that is brought to rest at the goal of its task.
+
+    The policy begins as the linear-quadratic regulator of the bare system, and is trained in the source with its
+    effects; the regulator's cost-to-go ends the cost of each plan.
+
+    >>> import visadapt as va
+    >>> source = va.World(va.CartPole())
+    >>> setup = regulator(source, va.Regulate(source.system, tolerance={"x": 0.5, "theta": 0.05}))
+    >>> setup.policy().n_action
+    1
+    """
+    solved = linear_quadratic(source, task.weights, task.command_weights, task.at_goal, task.held)
+    task = replace(task, to_go=tuple(tuple(row) for row in solved.to_go.tolist()))
+    steps = task.steps(source.period)
+    tuning = TuneSettings(
+        task,
+        iterations=400,
+        longest=min(100, steps),
+        closed_loop=True,
+        curriculum=False,
+        observation_noise=0.0,
+    )
+    return Setup(
+        source=source,
+        policy=partial(_policy, task, solved),
+        residual=residual_for,
+        settings=SetupSettings(
+            source=tuning,
+            tuning=replace(tuning, iterations=200, recorded=0.8),
+            named=tuning,
+            later=200,
+            longest_episode=steps,
+            feedforward=False,
+        ),
+    )
+
+
+def _policy(task: Regulate, solved: Regulator) -> RegulatorPolicy:
+    """A policy whose plan is the regulator's, as long as its commands are small."""
+    low, high = task.command_range
+    states = {state.name: state.unit for state in task.system.states}
+    half_ranges = torch.tensor([(state.high - state.low) / 2 for state in task.system.states]).double()
+    unit = task.spread.where(task.spread > 0, half_ranges)
+    goal, ranges = task.at_goal.tolist(), (low.tolist(), high.tolist())
+    policy = RegulatorPolicy(states, goal, unit.tolist(), *ranges, task.settings())
+    half, middle = (high - low) / 2, (high + low) / 2
+    held = ((task.held - middle) / half).clamp(-NEARLY, NEARLY)
+    slope = half * (1 - held.square())  # of the command by what the policy's last tanh takes
+    with torch.no_grad():
+        policy.law.weight.copy_((_plan(solved) * unit / slope[:, None]).flatten(0, 1))
+        policy.law.bias.copy_(held.atanh().repeat(HORIZON))
+    return policy
+
+
+def _plan(solved: Regulator) -> Tensor:
+    """(HORIZON, n_action, n_state) a state to the next commands of the regulator."""
+    ahead, plan = torch.eye(len(solved.closed)).to(solved.closed), []
+    for _ in range(HORIZON):
+        plan.append(-solved.gain @ ahead)
+        ahead = solved.closed @ ahead
+    return torch.stack(plan)

@@ -1,0 +1,52 @@
+"""The linear-quadratic regulator of a source about a state of rest."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from visadapt.estimation.linearise import linearise_step
+from visadapt.world import World
+
+LASTING = 50.0  # s over which costs are summed; what comes later adds next to nothing
+
+
+class Regulator(NamedTuple):
+    """A regulator a = -gain s of distances s from a state of rest, and what it costs."""
+
+    closed: Tensor
+    """(n_state, n_state) states to those one period later, under the regulator"""
+    gain: Tensor
+    """(n_action, n_state)"""
+    to_go: Tensor
+    """(n_state, n_state) V: s' V s is the least sum of the costs of all states and commands that follow s"""
+
+
+def linear_quadratic(
+    source: World, weights: Tensor, command_weights: Tensor, rest: Tensor | None = None, held: Tensor | None = None
+) -> Regulator:
+    """The regulator with the least sum of weighted squared distances and commands, in float64.
+
+    The source, without its effects, is linearised at rest; the discrete algebraic Riccati equation is iterated from
+    V = 0 over LASTING.
+
+    Args:
+        weights: (n_state,) of the squared distances. command_weights: (n_action,) of the squared commands.
+        rest: (n_state,) the state of rest; the origin without it.
+        held: (n_action,) the commands that hold it; 0 without them.
+    """
+    bare = source.with_effects(())
+    weights, command_weights = weights.double().diag(), command_weights.double().diag()
+    at = torch.zeros(1, len(weights)).to(weights) if rest is None else rest.to(weights)[None]
+    acting = at.new_zeros(len(command_weights)) if held is None else held.to(at)
+    still = acting.expand(1, bare.substeps, -1)
+    step = linearise_step(bare, bare.values.to(at), at.new_zeros(1), at, still, by_command=True)
+    a, b = step.by_state[0], step.by_command[0]
+    to_go = torch.zeros_like(weights)
+    for _ in range(round(LASTING / source.period)):
+        after = weights + to_go
+        gain = torch.linalg.solve(command_weights + b.T @ after @ b, b.T @ after @ a)
+        to_go = a.T @ after @ (a - b @ gain)
+    return Regulator(a - b @ gain, gain, to_go)
