@@ -168,6 +168,7 @@ COMMANDS = (
         40,
         work="--work",
     ),
+    Command("own_system", "own_system.csv", ("benchmarks.own_system",), 30, work="--work"),
     Command(
         "planned_experiments",
         "planned_experiments.csv",

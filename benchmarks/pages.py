@@ -71,6 +71,7 @@ TABLES = {
     "named": Table(adaptation.named, ("named_effects",)),
     "named control": Table(adaptation.named_control, ("named_control",)),
     "named control, frames": Table(adaptation.named_control, ("named_control_frames",)),
+    "own system": Table(adaptation.own_system, ("own_system",)),
     "rotorpy": Table(adaptation.rotorpy, ("rotorpy",)),
     "loops": Table(adaptation.loops, ("power_loop",)),
     "swing": Table(adaptation.swing, ("swing_up",)),

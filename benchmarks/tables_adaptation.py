@@ -185,6 +185,22 @@ def named_control(rows: Rows) -> Lines:
     return lines
 
 
+def own_system(rows: Rows) -> Lines:
+    """A rotary pendulum held upright under hidden effects, in mrad."""
+    samples = {row["method"]: int(row["samples"]) for row in rows}
+    heads = [f"{method}, {count:,} samples" if count else method for method, count in samples.items()]
+    lines = [["error of arm and pendulum in mrad (episodes upright)", *heads]]
+    for experiment in dict.fromkeys(row["experiment"] for row in rows):
+        line = [experiment.split(", ", 1)[1]]
+        for method in samples:
+            arm, pendulum = (row for row in rows if (row["experiment"], row["method"]) == (experiment, method))
+            up = f"({int(arm['episodes']) - int(arm['failed'])} of {arm['episodes']})"
+            errors = [f"{1000 * float(row['mean']):.2g}" for row in (arm, pendulum)]
+            line.append(up if "nan" in errors else f"{errors[0]}, {errors[1]} {up}")
+        lines.append(line)
+    return lines
+
+
 def rotorpy(rows: Rows) -> Lines:
     """rotorpy's multirotor, in m."""
     lines = [["rotorpy's Crazyflie, mean tracking error in m", "counted samples", "here", "within 1 m", "seeds"]]

@@ -1,12 +1,9 @@
-"""Systems of one's own: a driven pendulum, and the one of docs/own_system.md."""
+"""Systems of one's own: a pendulum, a winch, a drive and others; and the code of docs/own_system.md."""
 
 import re
-import sys
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from types import ModuleType
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 
@@ -39,17 +36,10 @@ class Pendulum(System):
         return torch.stack((rate, (command[:, 0] + push - weight) / self.inertia), -1)
 
 
-def page_code() -> list[str]:
-    """The page's code: the class, the script that records, that which diagnoses, and the class of a real machine."""
-    return re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-
-
-@cache
-def furuta() -> Any:
-    """The page's class."""
-    module = sys.modules["furuta_of_the_page"] = ModuleType("furuta_of_the_page")
-    exec(compile(page_code()[0], "furuta.py", "exec"), vars(module))
-    return module.Furuta
+def page_code(language: str = "python") -> list[str]:
+    """The page's code: the class, a script that records, one that diagnoses, a target, a script that adapts to it, and
+    the class of a real machine; in TOML, a task."""
+    return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), re.DOTALL)
 
 
 @dataclass(frozen=True)

@@ -177,13 +177,17 @@ def test_the_effect_of_ones_own_works():
 @pytest.mark.parametrize("line", [line for page in PAGES for line in COMMAND_LINES.findall(page.read_text())])
 def test_the_commands_that_pages_show_are_ones_that_the_command_line_takes(line, tmp_path, monkeypatch):
     (tmp_path / "furuta.py").write_text(page_code()[0])  # the files that must be there
-    (tmp_path / "my_rig.py").write_text(page_code()[3])
+    (tmp_path / "my_rig.py").write_text(page_code()[-1])
     monkeypatch.chdir(tmp_path)
     parser = argparse.ArgumentParser(exit_on_error=False)
     commands = parser.add_subparsers(required=True)
     for command in main.COMMANDS:
         command(commands.add_parser(command.__name__))
     parser.parse_args(shlex.split(line))
+
+
+def test_the_rotary_pendulum_of_the_benchmarks_is_that_of_the_page():
+    assert (ROOT / "experiments" / "furuta.py").read_text().partition("\n\n")[2] == page_code()[0]
 
 
 def test_the_target_of_the_page_is_made():

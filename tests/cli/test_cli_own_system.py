@@ -1,5 +1,6 @@
 """A system of one's own on the command line: named by file and class, checked, and refused in one line."""
 
+import json
 import os
 import runpy
 import subprocess
@@ -163,6 +164,38 @@ def test_a_policy_for_it_is_read_where_system_names_its_class(rig):
     assert done.stderr.endswith("a policy of a cartpole; --system is a belt_cart\n")
 
 
-def test_no_policy_is_trained_on_it(rig, capsys):
-    line = refused(capsys, "train", "--system", "furuta.py:Furuta", "--out", "policy.safetensors")
-    assert "furuta" in line
+def test_a_policy_brings_it_to_the_goal_of_a_task(rig, capsys):
+    (rig / "upright.toml").write_text(page_code("toml")[0])
+    (rig / "late.py").write_text(page_code()[3])
+    own, late = ("--system", "furuta.py:Furuta"), ("--effect", "voltage.actuator_delay:delay=0.02")
+    train = ("train", *own, "--task", "upright.toml", "--period", "0.02", "--iterations")
+    done = command(*train, "2", *late, "--out", "with_effect.safetensors")
+    assert done.returncode == 0, done.stderr
+    assert cli.main((*train, "10", "--out", "source.safetensors")) == 0
+    score = ("score", *own, "--target", "late:make", "--episodes", "5", "--policy")
+    assert cli.main((*score, "source.safetensors")) == 0
+    assert "0 of 5 episodes survived" in capsys.readouterr().out
+    run = ("--target", "late:make", "--samples", "40", "--iterations", "1", "--out", "run")
+    assert cli.main(("adapt", *own, "--policy", "source.safetensors", *run, *late)) == 0
+    assert cli.main((*score, "run/policy.safetensors", "--json", "score.json")) == 0
+    assert json.loads((rig / "score.json").read_text())["units"]["arm_rate"] == "rad/s"
+    code = page_code()[4].replace("task=task", "task=task, iterations=1").replace("500", "30, iterations=1")
+    (rig / "adapt.py").write_text(code)
+    assert runpy.run_path("adapt.py")["adapted"].ledger.used == 30
+
+
+@pytest.mark.parametrize(
+    ("arguments", "right"),
+    [
+        ((), "what a furuta is to do is not known: give a task, by task= or --task"),
+        (("--task", "upright.toml"), "--task: say how often the rig is commanded: --period, in s, is needed"),
+        (("--task", "none.toml", "--period", "0.02"), "none.toml: cannot be read: No such file"),
+        (("--task", "wrong.toml", "--period", "0.02"), "wrong.toml: tolerance: a furuta has no state 'leg': arm, pend"),
+        (("--task", "upright.toml", "--period", "0.02", "--frames"), "a furuta has no renderer"),
+    ],
+)
+def test_what_no_policy_is_trained_for_is_said(rig, capsys, arguments, right):
+    (rig / "upright.toml").write_text(page_code("toml")[0])
+    (rig / "wrong.toml").write_text("[tolerance]\nleg = 0.1\n")
+    line = refused(capsys, "train", "--system", "furuta.py:Furuta", "--out", "policy.safetensors", *arguments)
+    assert right in line

@@ -10,7 +10,8 @@ import torch
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from tests.own_systems import Rover, furuta
+from experiments.furuta import Furuta
+from tests.own_systems import Rover
 from visadapt.diagnosis import diagnose
 from visadapt.effects.catalogue import catalogue
 from visadapt.recordings import Episode, Recording, load_recording
@@ -136,7 +137,7 @@ def test_a_larger_mass_and_added_inertia_are_told_apart_by_a_balance(recorded):
     [("hinge.viscous_friction", {"coefficient": 1e-4}), ("arm_axis.coulomb_friction", {"torque": 2e-3})],
 )
 def test_a_friction_is_found_by_the_arm_s_sensor_alone(name, values):
-    rotary = furuta()()
+    rotary = Furuta()
     named = {effect.name: effect for effect in catalogue(rotary)}
     machine = World(rotary, [named[name](**values)], 0.02, substeps=10)
     machine.double().requires_grad_(False)

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from tests.own_systems import Pendulum, furuta
+from experiments.furuta import Furuta
+from tests.own_systems import Pendulum
 from visadapt.effects.catalogue import catalogue
 from visadapt.estimation.effect_fit import fit_effects
 from visadapt.world import World
@@ -62,7 +63,7 @@ def test_late_sensors_read_the_motor_late():
 
 
 def test_a_motor_that_is_commanded_a_voltage_twists_by_its_torque():
-    arm = furuta()()
+    arm = Furuta()
     (transmission,) = (each for each in catalogue(arm) if each.name.endswith("transmission_compliance"))
     assert transmission.table[0].unit == "rad/(N m)"
     assert transmission.name == "arm_axis.transmission_compliance", "no motor moves the hinge"

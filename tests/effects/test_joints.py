@@ -6,14 +6,15 @@ from typing import Any
 import pytest
 import torch
 
-from tests.own_systems import Pendulum, Rover, Winch, furuta
+from experiments.furuta import Furuta
+from tests.own_systems import Pendulum, Rover, Winch
 from tests.worlds import columns
 from visadapt.effects import EFFECTS
 from visadapt.effects.catalogue import catalogue, catalogue_text, twins
 from visadapt.systems import CartPole, System, Variable
 from visadapt.world import World
 
-FURUTA = furuta()()
+FURUTA = Furuta()
 BY_NAME = {effect.name: effect for effect in catalogue(FURUTA)}
 STATE = columns(0.3, 1.2, 2.0, -3.0)
 LOADS = [

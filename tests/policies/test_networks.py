@@ -3,7 +3,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from tests.own_systems import DoublePendulum, furuta
+from experiments.furuta import Furuta
+from tests.own_systems import DoublePendulum
 from tests.scenes import (
     CONTRAST,
     HEIGHT,
@@ -194,7 +195,7 @@ def test_on_states_a_force_is_left_and_without_one_nothing():
         torch.testing.assert_close(left.mean((0, 1)), torch.tensor([cart, -0.75 * cart / 0.5]), rtol=0.02, atol=0.02)
 
 
-@pytest.mark.parametrize(("system", "load"), [(DoublePendulum, "shoulder"), (furuta(), "hinge")])
+@pytest.mark.parametrize(("system", "load"), [(DoublePendulum, "shoulder"), (Furuta, "hinge")])
 def test_on_states_of_ones_own_system_a_load_is_left_as_the_accelerations_it_gives(system, load):
     constant = {effect.name: effect for effect in catalogue(system())}[f"{load}.constant_load"]
     machine = World(system(), [constant(torque=0.02)], 0.002).requires_grad_(False)

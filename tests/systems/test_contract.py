@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from tests.own_systems import Pendulum, Rover, furuta
+from experiments.furuta import Furuta
+from tests.own_systems import Pendulum, Rover
 from visadapt.systems import SYSTEMS, System, Variable
 from visadapt.systems.contract import complaints
 
 
-@pytest.mark.parametrize("system", [*SYSTEMS.values(), Pendulum, Rover, furuta()], ids=lambda system: system.name)
+@pytest.mark.parametrize("system", [*SYSTEMS.values(), Pendulum, Rover, Furuta], ids=lambda system: system.name)
 def test_the_systems_keep_it(system):
     assert complaints(system) == []
 

@@ -43,6 +43,7 @@ def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
             system.
         DiagnosisFileError: a diagnosis that named nothing.
     """
+    catalogue(system)  # makes the effects of a system of one's own known, by which they are named
     effects: list[Effect] = []
     if options.diagnosis:
         diagnosed, effects = load_effects(options.diagnosis)
