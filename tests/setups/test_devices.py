@@ -14,6 +14,7 @@ import visadapt as va
 from renderers import DrawnCartPole
 from tests.coarse import coarse_targets
 from tests.flying import small_quadrotor
+from tests.own_systems import Pendulum
 from tests.second_device import DEVICE, GPU, second_device
 from visadapt.diagnosis.policy_bound import actions
 from visadapt.history import History
@@ -21,6 +22,7 @@ from visadapt.learning import training_state
 from visadapt.learning.perception import PerceptionSettings
 from visadapt.setups.cartpole import cartpole_frames, cartpole_states, from_frames
 from visadapt.setups.flight import fixed_wing
+from visadapt.setups.regulator import regulator
 
 CPU = torch.device("cpu")
 
@@ -36,11 +38,13 @@ def frames():
     return cartpole_frames(settings=few)
 
 
+REST = va.Regulate(Pendulum(), goal={"angle": 0.5}, tolerance={"angle": 0.1, "rate": 1.0})
 SETUPS = {
     "cartpole_states": cartpole_states,
     "cartpole_frames": frames,
     "quadrotor": lambda: small_quadrotor(with_history=True),
     "fixed_wing": lambda: fixed_wing(with_history=True),
+    "own system": lambda: regulator(va.World(Pendulum(), period=0.05), REST),
 }
 
 
@@ -66,14 +70,17 @@ def short(name):
 
 
 def target(setup):
+    if isinstance(setup.settings.source.task, va.Regulate):
+        return va.RegulationTarget(REST, setup.source.period)
     if setup.test is not None:
         return va.FlightTarget(setup.test, setup.source.system)
     return va.SyntheticTarget(va.constant_force(2.0), DrawnCartPole() if setup.renderer else None)
 
 
 def shipped(setup, name, like):
-    """The policy that the library ships for the setup, with the device and dtype of `like`."""
-    return setup.load(va.shipped(name)).to(like)
+    """The policy that the library ships for the setup, or a new one, with the device and dtype of `like`."""
+    torch.manual_seed(0)
+    return (setup.policy() if name == "own system" else setup.load(va.shipped(name))).to(like)
 
 
 def weights(policy):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.own_systems import Pendulum
 from visadapt.systems import CartPole, Quadrotor
 from visadapt.targets.base import TargetError
 from visadapt.targets.env_map import Entry, EnvMap
@@ -157,6 +158,16 @@ def test_an_environment_that_raises_or_returns_something_else_is_one_line(wrong,
 def test_a_map_that_does_not_fit_the_environment(change, says):
     with pytest.raises(TargetError, match=says):
         target(dataclasses.replace(MAP, **change))
+
+
+def test_commands_of_a_system_of_ones_own_keep_their_units_and_range():
+    states = {"angle": Entry(0), "rate": Entry(1)}
+    pendulum = GymnasiumTarget(Toy, EnvMap(states, (Entry(1),)), Pendulum, frames=False, name="toy")
+    start = pendulum.reset(2, generator())
+    after = pendulum.step(torch.tensor([[1.5], [-5.0]]))
+    assert (after.state - start.state)[:, 0].tolist() == [1.5, -2.0]  # N m, of at most 2
+    with pytest.raises(TargetError, match="sets action entry 1 from -4 to 4, the environment takes -2 to 2"):
+        GymnasiumTarget(Toy, EnvMap(states, (Entry(1, scale=2.0),)), Pendulum, frames=False, name="toy")
 
 
 def test_two_commands_cannot_set_the_same_entry():

@@ -157,7 +157,7 @@ def _score_regulation(runs: Sequence[Run], policy: RegulatorPolicy) -> Regulatio
     errors = None
     if states:
         later = np.concatenate([each[len(each) // 2 :] for each in states])
-        apart = np.sqrt(np.square(later - policy.goal.numpy(force=True)).mean(0))
+        apart = np.sqrt(np.square(later - policy.goal.cpu().numpy()).mean(0))
         errors = {name: float(apart[k]) for k, name in enumerate(policy.states) if name in units}
     return RegulationScore(len(runs), len(states), errors, units)
 

@@ -90,7 +90,7 @@ def export_policy(path: str | Path, policy: Policy, source: World | None = None)
         read = {each.name for each in session.get_inputs()}  # without inputs that the policy does not use
         for example, plan in zip(examples, plans, strict=True):
             found = session.run(None, {name: example[name].cpu().numpy() for name in read})[0]
-            low, high = (bound.numpy(force=True) for bound in policy.command_range)
+            low, high = (bound.cpu().numpy() for bound in policy.command_range)
             if not (difference := abs((found - plan) / (high - low) * 2).max()) <= LARGEST_DIFFERENCE:
                 raise ExportError(f"{path} was not written: its actions would differ by {difference:.2g} of 1")
 

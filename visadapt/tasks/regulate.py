@@ -198,7 +198,7 @@ def read_task(path: str | os.PathLike[str], system: System) -> Regulate:
 
     >>> import pathlib, tempfile, visadapt as va
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "task.toml"
-    >>> _ = path.write_text("seconds = 8\n[tolerance]\nx = 0.5\ntheta = 0.05\n")
+    >>> _ = path.write_text("seconds = 8\\n[tolerance]\\nx = 0.5\\ntheta = 0.05\\n")
     >>> va.read_task(path, va.CartPole()).seconds
     8.0
     """
