@@ -174,7 +174,10 @@ def test_a_policy_brings_it_to_the_goal_of_a_task(rig, capsys):
     assert cli.main((*train, "10", "--out", "source.safetensors")) == 0
     score = ("score", *own, "--target", "late:make", "--episodes", "5", "--policy")
     assert cli.main((*score, "source.safetensors")) == 0
-    assert "0 of 5 episodes survived" in capsys.readouterr().out
+    assert capsys.readouterr().out == "0 of 5 episodes survived\n"
+    assert "a film is that of a cart-pole or of a vehicle" in refused(
+        capsys, *score, "source.safetensors", "--film", "f.mp4"
+    )
     run = ("--target", "late:make", "--samples", "40", "--iterations", "1", "--out", "run")
     assert cli.main(("adapt", *own, "--policy", "source.safetensors", *run, *late)) == 0
     assert cli.main((*score, "run/policy.safetensors", "--json", "score.json")) == 0

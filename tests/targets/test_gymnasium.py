@@ -162,7 +162,7 @@ def test_a_map_that_does_not_fit_the_environment(change, says):
 
 def test_commands_of_a_system_of_ones_own_keep_their_units_and_range():
     states = {"angle": Entry(0), "rate": Entry(1)}
-    pendulum = GymnasiumTarget(Toy, EnvMap(states, (Entry(1),)), Pendulum, frames=False, name="toy")
+    pendulum = GymnasiumTarget(Toy, EnvMap(states, (Entry(1),), period=0.05), Pendulum, frames=False, name="toy")
     start = pendulum.reset(2, generator())
     after = pendulum.step(torch.tensor([[1.5], [-5.0]]))
     assert (after.state - start.state)[:, 0].tolist() == [1.5, -2.0]  # N m, of at most 2

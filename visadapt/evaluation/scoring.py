@@ -74,7 +74,7 @@ class RegulationScore:
 
     def __str__(self) -> str:
         errors = [f"{name} {error:.3g} {self.units[name]}" for name, error in (self.errors or {}).items()]
-        return f"{', '.join(errors) or 'no errors'}, {self.survived} of {self.episodes} episodes survived"
+        return ", ".join((*errors, f"{self.survived} of {self.episodes} episodes survived"))
 
 
 @overload

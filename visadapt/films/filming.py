@@ -14,7 +14,7 @@ from visadapt.films.flight_film import FlightFilm
 from visadapt.films.flight_panel import FlightPanel
 from visadapt.policies import Policy
 from visadapt.progress import Progress
-from visadapt.systems import CartPole
+from visadapt.systems import CartPole, RigidBody, System
 from visadapt.targets import FlightTarget, SyntheticTarget, Target
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.targets.rollout import Run, See, check_period, run, see_within_a_turn
@@ -51,8 +51,8 @@ def film(
         progress: called after each frame.
 
     Raises:
-        ValueError: states of neither a cart-pole nor a vehicle, a run that does not fit the target, or a policy that
-            was trained for another period.
+        ValueError: a system that is neither a cart-pole nor a vehicle, or states of neither, a run that does not fit
+            the target, or a policy that was trained for another period.
         TargetError: the target shows no frames to a policy that sees frames.
         DiskFullError: the disk is full; a file that was at `path` before is unchanged.
         FilmError: ffmpeg failed for another reason; a file that was at `path` before is unchanged.
@@ -63,6 +63,9 @@ def film(
     >>> path.exists()
     True
     """
+    kind = type(target.system) if isinstance(target.system, System) else target.system
+    if kind is not None and not issubclass(kind, CartPole | RigidBody):
+        raise ValueError(f"a film is that of a cart-pole or of a vehicle; {target.name} is a {kind.name}")
     titled = shown if isinstance(shown, Mapping) else {target.name: shown}
     runs = {
         title: each if isinstance(each, Run) else _run(each, target, seconds, seed, see)
