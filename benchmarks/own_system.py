@@ -171,15 +171,23 @@ def _adapted(
 
 
 def _rows(kind: str, method: str, samples: int, scores: list[RegulationScore]) -> list[Row]:
-    """The errors of arm and pendulum: mean and spread over the seeds in which an episode survived."""
+    """The errors of the arm's angle and rate: mean and spread over the seeds in which an episode survived."""
     episodes = sum(one.episodes for one in scores)
     failed = episodes - sum(one.survived for one in scores)
     domain = "target" if method in (REGULATOR, SOURCE) else "adapted"
     rows = []
-    for state in ("arm", "pendulum"):
+    for state in ("arm", "arm_rate"):
         errors = np.array([one.errors[state] for one in scores if one.errors is not None])
         mean, std = (float(errors.mean()), float(errors.std())) if len(errors) else (math.nan, math.nan)
-        about = (f"rotary pendulum, {kind}", "furuta", method, domain, samples, f"{state} error", "rad")
+        about = (
+            f"rotary pendulum, {kind}",
+            "furuta",
+            method,
+            domain,
+            samples,
+            f"{state} error",
+            scores[0].units[state],
+        )
         rows.append(Row(*about, round(mean, 6), round(std, 6), episodes, failed, len(scores)))
     return rows
 

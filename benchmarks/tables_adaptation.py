@@ -186,17 +186,17 @@ def named_control(rows: Rows) -> Lines:
 
 
 def own_system(rows: Rows) -> Lines:
-    """A rotary pendulum held upright under hidden effects, in mrad."""
+    """A rotary pendulum held upright under hidden effects: errors of its arm in mrad and rad/s."""
     samples = {row["method"]: int(row["samples"]) for row in rows}
     heads = [f"{method}, {count:,} samples" if count else method for method, count in samples.items()]
-    lines = [["error of arm and pendulum in mrad (episodes upright)", *heads]]
+    lines = [["error of the arm in mrad, of its rate in rad/s (episodes upright)", *heads]]
     for experiment in dict.fromkeys(row["experiment"] for row in rows):
         line = [experiment.split(", ", 1)[1]]
         for method in samples:
-            arm, pendulum = (row for row in rows if (row["experiment"], row["method"]) == (experiment, method))
-            up = f"({int(arm['episodes']) - int(arm['failed'])} of {arm['episodes']})"
-            errors = [f"{1000 * float(row['mean']):.2g}" for row in (arm, pendulum)]
-            line.append(up if "nan" in errors else f"{errors[0]}, {errors[1]} {up}")
+            angle, rate = (row for row in rows if (row["experiment"], row["method"]) == (experiment, method))
+            up = int(angle["episodes"]) - int(angle["failed"])
+            errors = f"{1000 * float(angle['mean']):.2f}, {float(rate['mean']):.4f} " if up else ""
+            line.append(f"{errors}({up} of {angle['episodes']})")
         lines.append(line)
     return lines
 
