@@ -41,6 +41,18 @@ def test_the_regulator_is_that_of_the_discrete_algebraic_riccati_equation():
     assert solved.to_go.numpy() == pytest.approx(after - weights, rel=1e-6)
 
 
+def test_a_goal_at_which_no_command_keeps_the_system_is_refused():
+    class Loose(Pendulum):
+        name = "loose_pendulum"
+
+        def derivative(self, state, command, load):
+            return super().derivative(state, 0 * command, load)
+
+    task = va.Regulate(Loose(), goal={"angle": math.pi}, tolerance={"angle": 0.1})
+    with pytest.raises(ValueError, match=r"^no commands keep a loose_pendulum at rest there"):
+        va.train(va.World(Loose(), period=0.02), task=task)
+
+
 def test_the_cost_of_a_plan_is_what_the_equation_says():
     task = replace(TILTED, to_go=((2.0, 0.0), (0.0, 3.0)), effort=0.5)
     states = torch.tensor([[[0.6, 0.0], [0.5, 1.0]]]).double()
@@ -66,6 +78,7 @@ def test_an_episode_ends_beyond_a_limit_and_starts_within_its_spread():
         ({"limits": {"angle": "1"}}, "limits: angle must be a positive number, got '1'"),
         ({"goal": {"angle": math.inf}}, "goal: angle must be a finite number, got inf"),
         ({"effort": 0.0}, "effort must be a positive number, got 0.0"),
+        ({"start": {"angle": 1.0}}, "limits: angle starts up to 1 from the goal, and fails at 1"),
         ({"tolerance": {}}, "tolerance: name the states that are to be at the goal, of angle, rate"),
         ({"goal": {"rate": 1.0}}, "goal: no command within its range holds it: there angle changes by 1 rad/s"),
     ],

@@ -15,8 +15,8 @@ from visadapt.systems import System
 
 WIDTH = 64  # of the MLP's layers
 LARGEST = 4.0
-"""Largest correction in units of the residual's scale, the root mean square of the gap; a linear map has no bound of
-its own where a trajectory leaves the recorded states."""
+"""Largest correction in units of the residual's scale, the root mean square of the gap. A linear map has no bound of
+its own where a trajectory leaves the recorded states: without this one, tuning ended in NaN under a delay and a lag."""
 UNIT_PERIODS = 10  # Periods in which the unit of acceleration changes a velocity by its unit
 
 

@@ -27,6 +27,9 @@ def regulator(source: World, task: Regulate) -> Setup:
     The policy begins as the linear-quadratic regulator of the bare system, and is trained in the source with its
     effects; the regulator's cost-to-go ends the cost of each plan.
 
+    Raises:
+        ValueError: as `linear_quadratic`.
+
     >>> import visadapt as va
     >>> source = va.World(va.CartPole())
     >>> setup = regulator(source, va.Regulate(source.system, tolerance={"x": 0.5, "theta": 0.05}))

@@ -11,6 +11,9 @@ from visadapt.estimation.linearise import linearise_step
 from visadapt.world import World
 
 LASTING = 50.0  # s over which costs are summed; what comes later adds next to nothing
+STEADY = 1e-4
+"""Growth in a period, under the regulator, up to which a motion is steady: a position that costs nothing stays where it
+is, by an eigenvalue of 1."""
 
 
 class Regulator(NamedTuple):
@@ -36,6 +39,9 @@ def linear_quadratic(
         weights: (n_state,) of the squared distances. command_weights: (n_action,) of the squared commands.
         rest: (n_state,) the state of rest; the origin without it.
         held: (n_action,) the commands that hold it; 0 without them.
+
+    Raises:
+        ValueError: no regulator keeps the system at rest: what moves away from it there is not moved by the commands.
     """
     bare = source.with_effects(())
     weights, command_weights = weights.double().diag(), command_weights.double().diag()
@@ -47,6 +53,9 @@ def linear_quadratic(
     to_go = torch.zeros_like(weights)
     for _ in range(round(LASTING / source.period)):
         after = weights + to_go
-        gain = torch.linalg.solve(command_weights + b.T @ after @ b, b.T @ after @ a)
+        gain = torch.linalg.solve_ex(command_weights + b.T @ after @ b, b.T @ after @ a).result
         to_go = a.T @ after @ (a - b @ gain)
-    return Regulator(a - b @ gain, gain, to_go)
+    closed = a - b @ gain
+    if not bool(to_go.isfinite().all()) or float(torch.linalg.eigvals(closed).abs().max()) > 1 + STEADY:
+        raise ValueError(f"no commands keep a {source.system.name} at rest there: what moves away is not moved by them")
+    return Regulator(closed, gain, to_go)

@@ -39,7 +39,7 @@ class Regulate(Task):
 
     Raises:
         ValueError: a state that the system does not have, a number that is not finite or not positive, no tolerance,
-            or a goal that no command holds.
+            starts beyond a limit, or a goal that no command holds.
 
     >>> import torch, visadapt as va
     >>> task = va.Regulate(va.CartPole(), tolerance={"x": 0.5, "theta": 0.05}, limits={"theta": 0.3})
@@ -83,6 +83,9 @@ class Regulate(Task):
                 f"tolerance: name the states that are to be at the goal, of {', '.join(names)}, with deviations that "
                 "are equally bad"
             )
+        for state, spread, limit in zip(names, self.spread.tolist(), self.limit.tolist(), strict=True):
+            if spread >= limit:
+                raise ValueError(f"limits: {state} starts up to {spread:g} from the goal, and fails at {limit:g}")
         self._check_holds()
 
     def _check_holds(self) -> None:
