@@ -3,7 +3,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from renderers import DrawnCartPole
 from visadapt.effects import AngleOffset, Dropout
@@ -31,10 +30,8 @@ def seeded(seed=0):
 class Scripted(Policy):
     """A policy that a test writes out: `command` gives (B, 1)."""
 
-    n_action = 1
-
     def __init__(self):
-        nn.Module.__init__(self)
+        super().__init__(4, 1)
 
     def command(self, history):
         """Does nothing, whatever it sees."""
