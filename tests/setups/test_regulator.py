@@ -55,6 +55,15 @@ def test_the_plan_of_a_new_policy_is_what_its_feedback_goes_on_to_do():
 DRIVE = policy_of(va.Regulate(Drive(), tolerance={"disc": 0.05}))
 
 
+def test_a_target_measures_with_the_noise_that_it_is_given():
+    target = va.RegulationTarget(TASK, PERIOD, noise={"rate": 0.1})
+    exact = va.RegulationTarget(TASK, PERIOD)
+    away = [one.reset(1000, torch.Generator().manual_seed(0)).state for one in (target, exact)]
+    angle, rate = (away[0] - away[1]).std(0).tolist()
+    assert angle == 0
+    assert rate == pytest.approx(0.1, rel=0.1)
+
+
 @given(strategies.lists(strategies.floats(-50, 50), min_size=4, max_size=4))
 @settings(max_examples=25, deadline=None)
 def test_no_command_leaves_the_range_of_its_action(state):

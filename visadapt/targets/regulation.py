@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
@@ -20,6 +21,11 @@ class RegulationTarget(WorldTarget):
         task: where episodes start and end; its system is the physics.
         period: s between actions.
         draw_effects: draws the hidden effects of a batch of episodes.
+        noise: standard deviations of white noise on what is measured, by the names of the states and in their units; 0
+            for those that are not named.
+
+    Raises:
+        KeyError: noise on a state that the system does not have.
 
     >>> import torch, visadapt as va
     >>> task = va.Regulate(va.CartPole(), tolerance={"x": 0.5, "theta": 0.05}, limits={"theta": 0.3})
@@ -28,10 +34,19 @@ class RegulationTarget(WorldTarget):
     torch.Size([2, 4])
     """
 
-    def __init__(self, task: Regulate, period: float, draw_effects: DrawEffects = no_effects) -> None:
+    def __init__(
+        self,
+        task: Regulate,
+        period: float,
+        draw_effects: DrawEffects = no_effects,
+        noise: Mapping[str, float] | None = None,
+    ) -> None:
         super().__init__(task.system, period, draw_effects)
         self.name = f"synthetic {task.system.name}"
         self.task = task
+        self.noise = torch.zeros(len(task.system.states))
+        for state, deviation in (noise or {}).items():
+            self.noise[task.system.index(state)] = deviation
 
     def reset(self, batch: int, generator: torch.Generator) -> Observation:
         effects = self.draw_effects(batch, generator)
@@ -39,4 +54,5 @@ class RegulationTarget(WorldTarget):
 
     def _observe(self) -> Observation:
         seen = super()._observe()
-        return replace(seen, alive=seen.alive & self.task.within_limits(self._at.state), force=None)
+        measured = seen.state + self.noise * torch.randn(seen.state.shape, generator=self._generator)
+        return replace(seen, state=measured, alive=seen.alive & self.task.within_limits(self._at.state), force=None)
