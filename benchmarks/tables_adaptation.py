@@ -195,7 +195,7 @@ def own_system(rows: Rows) -> Lines:
         for method in samples:
             angle, rate = (row for row in rows if (row["experiment"], row["method"]) == (experiment, method))
             up = int(angle["episodes"]) - int(angle["failed"])
-            errors = f"{1000 * float(angle['mean']):.2f}, {float(rate['mean']):.4f} " if up else ""
+            errors = f"{1000 * float(angle['mean']):.1f}, {float(rate['mean']):.3f} " if up else ""
             line.append(f"{errors}({up} of {angle['episodes']})")
         lines.append(line)
     return lines
