@@ -107,7 +107,12 @@ def train(parser: argparse.ArgumentParser) -> None:
     task_help = "where a system of your own is to come to rest, and how exactly (docs/own_system.md)"
     add("--task", metavar="TASK.toml", help=task_help)
     add("--out", required=True, metavar="P.safetensors", help="write the policy here")
-    add("--period", metavar="S", type=_positive_number, help="s between commands (default: 0.05; quadrotor: 0.1)")
+    add(
+        "--period",
+        metavar="S",
+        type=_positive_number,
+        help="s between commands (default: 0.05; quadrotor: 0.1; with --task: needed)",
+    )
     add("--frames", action="store_true", help="the policy is shown a camera's frames, not states")
     add(
         "--renderer",
@@ -151,7 +156,7 @@ def score(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `visadapt score`."""
     parser.description = (
         "Runs episodes of a policy on a target. Cart-poles are scored by the cart's mean speed in m/s over the "
-        "episodes that stay up, flights by their mean error in m, systems with a --task by their distances from its "
+        "episodes that stay up, flights by their mean error in m, systems with a task by their distances from its "
         "goal; failed episodes are counted apart."
     )
     add = parser.add_argument
