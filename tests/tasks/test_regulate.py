@@ -1,5 +1,5 @@
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 import scipy.linalg
@@ -27,6 +27,32 @@ def test_a_speed_is_a_goal_where_no_tolerance_asks_for_a_position():
     assert task.held.tolist() == pytest.approx([Drive().friction * 20.0], rel=1e-6)
     with pytest.raises(ValueError, match="goal: no command within its range holds it: there disc changes by 20 rad/s"):
         replace(task, tolerance={**task.tolerance, "disc": 0.1})
+
+
+@dataclass(frozen=True)
+class Tanks(va.System):
+    """A pump fills the upper tank, which drains into the lower one, which drains away."""
+
+    drain: float = 0.1  # 1/s
+
+    name = "tanks"
+    states = (va.Variable("upper", "m", 0.0, 0.5), va.Variable("lower", "m", 0.0, 0.5))
+    actions = (va.Variable("pump", "V", 0.0, 12.0),)
+    loads = (va.Variable("inlet", "m/s", -0.01, 0.01),)
+    coordinates = ((None, 0),)
+
+    def derivative(self, state, command, load):
+        upper, lower = (self.drain * state).unbind(-1)
+        return torch.stack((0.002 * command[:, 0] + load[:, 0] - upper, upper - lower), -1)
+
+
+def test_a_level_is_held_by_the_one_before_it():
+    held = va.Regulate(Tanks(), goal={"upper": 0.2, "lower": 0.2}, tolerance={"lower": 0.01}).held
+    assert held.tolist() == pytest.approx([10.0], rel=1e-4)
+    with pytest.raises(
+        ValueError, match=r"^goal: no command within its range holds it: there lower changes by -0"
+    ):
+        va.Regulate(Tanks(), goal={"upper": 0.3, "lower": 0.3}, tolerance={"lower": 0.01})
 
 
 def test_the_regulator_is_that_of_the_discrete_algebraic_riccati_equation():

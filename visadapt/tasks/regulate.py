@@ -19,7 +19,10 @@ from visadapt.tasks.base import Task
 TABLES = ("goal", "tolerance", "start", "limits")  # Fields with a number for each state that they name
 ATTEMPTS = 20  # of Newton's method for the commands that hold a goal
 HOLDS = 1e-3
-"""Largest rate of a state at the goal, as a share of the state's tolerance in a second."""
+"""Largest rate of a state at the goal, as a share of the state's tolerance in a second, and largest change of that rate
+in a second as other states drift."""
+DRIFT = 1e-3  # s, by which states without a tolerance drift in this test
+SLIGHT = 1e-3  # Weight of their rates, as a share of their range in a second, in finding the commands that hold a goal
 
 
 class TaskFileError(ValueError):
@@ -90,12 +93,14 @@ class Regulate(Task):
 
     def _check_holds(self) -> None:
         rates = self._rates(self.held[None])[0]
-        for state, rate, weight in zip(self.system.states, rates.tolist(), self.weights.tolist(), strict=True):
-            if weight and abs(rate) * math.sqrt(weight) > HOLDS:
-                raise ValueError(
-                    f"goal: no command within its range holds it: there {state.name} changes by {rate:.3g} "
-                    f"{state.unit}/s"
-                )
+        changes = (self._rates(self.held[None], DRIFT * rates)[0] - rates) / DRIFT
+        for found, unit in ((rates, "s"), (changes, "s2")):
+            for state, rate, weight in zip(self.system.states, found.tolist(), self.weights.tolist(), strict=True):
+                if weight and abs(rate) * math.sqrt(weight) > HOLDS:
+                    raise ValueError(
+                        f"goal: no command within its range holds it: there {state.name} changes by {rate:.3g} "
+                        f"{state.unit}/{unit}"
+                    )
 
     def settings(self) -> dict[str, Any]:
         """What a user gives beside the system, as plain values: `Regulate(system, **settings)` is the same task."""
@@ -145,7 +150,8 @@ class Regulate(Task):
         """(n_action,) the commands within their range that hold the goal best, by Newton's method."""
         low, high = self.command_range
         held = ((low + high) / 2).where((low > 0) | (high < 0), torch.zeros_like(low))
-        scale = self.weights.sqrt()
+        ranges = torch.tensor([state.high - state.low for state in self.system.states], dtype=torch.float64)
+        scale = self.weights.sqrt().where(self.weights > 0, SLIGHT / ranges)
         for _ in range(ATTEMPTS):
             rates = self._rates(held[None])[0]
             step = 1e-6 * (high - low)
@@ -153,10 +159,10 @@ class Regulate(Task):
             held = torch.clamp(held - torch.linalg.pinv(scale[:, None] * by_command) @ (scale * rates), low, high)
         return held
 
-    def _rates(self, commands: Tensor) -> Tensor:
-        """Rates (N, n_state) of the states at the goal, under commands (N, n_action)."""
-        goal, none = self.at_goal.expand(len(commands), -1), commands.new_zeros(len(commands), len(self.system.loads))
-        return self.system.derivative(goal, commands, none)
+    def _rates(self, commands: Tensor, off: Tensor | float = 0.0) -> Tensor:
+        """Rates (N, n_state) of the states at the goal, or `off` (n_state,) it, under commands (N, n_action)."""
+        state = (self.at_goal + off).expand(len(commands), -1)
+        return self.system.derivative(state, commands, commands.new_zeros(len(commands), len(self.system.loads)))
 
     def steps(self, period: float) -> int:
         """Periods in an episode."""
