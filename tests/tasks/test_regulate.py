@@ -49,9 +49,7 @@ class Tanks(va.System):
 def test_a_level_is_held_by_the_one_before_it():
     held = va.Regulate(Tanks(), goal={"upper": 0.2, "lower": 0.2}, tolerance={"lower": 0.01}).held
     assert held.tolist() == pytest.approx([10.0], rel=1e-4)
-    with pytest.raises(
-        ValueError, match=r"^goal: no command within its range holds it: there lower changes by -0"
-    ):
+    with pytest.raises(ValueError, match=r"^goal: no command within its range holds it: there lower changes by -0"):
         va.Regulate(Tanks(), goal={"upper": 0.3, "lower": 0.3}, tolerance={"lower": 0.01})
 
 
