@@ -25,11 +25,13 @@ from visadapt.diagnosis.saved import load_effects
 from visadapt.learning.training_state import TrainingState
 from visadapt.recordings import Episode, load_recording, write_recording
 from visadapt.setups.policy_file import describe, load_policy, load_source, residual_for, save_policy
+from visadapt.setups.regulator import regulator
 from visadapt.storage.run_folder import open_run
 from visadapt.systems import CartPole
 from visadapt.systems.parameter_file import load_parameters
 from visadapt.targets.env_map import EnvMap
 from visadapt.tasks.references import read_reference
+from visadapt.tasks.regulate import Regulate, read_task
 from visadapt.world import World
 
 Damage = Callable[[bytes, bytes, Random], bytes]
@@ -120,7 +122,9 @@ def _policies(folder: Path) -> list[Path]:
         if path is paths[1]:
             policy.residual, policy.grounded_in = residual_for(policy, world), describe(world)
         save_policy(path, policy, {"source": describe(world)})
-    return paths
+    task = Regulate(world.system, tolerance={"x": 0.5, "theta": 0.05})
+    save_policy(folder / "with task", regulator(world, task).policy(), {"source": describe(world)})
+    return [*paths, folder / "with task"]
 
 
 def _training_state(path: Path) -> TrainingState:
@@ -181,6 +185,7 @@ x = 0.2
 [options]
 width = 240
 """
+TASK = "effort = 0.5\nseconds = 4\n[goal]\nx = 0.1\n[tolerance]\nx = 0.5\ntheta = 0.05\n[limits]\ntheta = 0.3\n"
 PARAMETERS = "[parameters]\ncart_mass = 0.23 # kg\npole_mass = 0.087\npole_half_length = 0.1975\nmax_force = 1.77\n"
 LINE = "time,x,y,z\n" + "".join(f"{0.5 * row},{0.2 * row},0,1\n" for row in range(12))
 DIAGNOSIS = {
@@ -215,6 +220,7 @@ READERS = {
     "parameters": Reader(
         "rig.toml", _text(PARAMETERS), (damage.damaged_text,), lambda path: load_parameters(path, CartPole)
     ),
+    "task": Reader("task.toml", _text(TASK), (damage.damaged_text,), lambda path: read_task(path, CartPole())),
     "map": Reader("map.toml", _text(MAP), (damage.damaged_text,), EnvMap.load),
     "policy": Reader("policy.safetensors", _policies, (damage.odd_tensors,), _read_policy),
     "training": Reader("state.safetensors", _training, (damage.odd_tensors,), _read_training),

@@ -53,6 +53,17 @@ def test_a_level_is_held_by_the_one_before_it():
         va.Regulate(Tanks(), goal={"upper": 0.3, "lower": 0.3}, tolerance={"lower": 0.01})
 
 
+def test_a_goal_at_which_the_derivative_is_not_finite_is_refused():
+    class Orifice(Tanks):
+        name = "orifice_tanks"
+
+        def derivative(self, state, command, load):
+            return super().derivative(state.sqrt(), command, load)
+
+    with pytest.raises(ValueError, match=r"^goal: the derivative of a orifice_tanks is not finite there"):
+        va.Regulate(Orifice(), goal={"upper": -0.1}, tolerance={"lower": 0.01})
+
+
 def test_the_regulator_is_that_of_the_discrete_algebraic_riccati_equation():
     world = va.World(Pendulum(), period=0.02)
     solved = linear_quadratic(world, TILTED.weights, TILTED.command_weights, TILTED.at_goal, TILTED.held)
@@ -131,6 +142,7 @@ def test_a_file_says_the_same_task(tmp_path):
         ("effort = true\n[tolerance]\nangle = 1\n", "effort must be a positive number, got True"),
         ("[tolerance]\nangel = 1.0\n", "tolerance: a pendulum has no state 'angel': angle, rate"),
         ("[tolerance\n", "not TOML"),
+        (f"[tolerance]\nangle = 1{'0' * 400}\n", "tolerance: angle must be a positive number, got 1000"),
     ],
 )
 def test_a_file_that_says_no_task_is_refused(text, line, tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -12,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from visadapt.storage.toml_file import read_toml
+from visadapt.storage.toml_file import is_number, read_toml
 from visadapt.systems import System
 from visadapt.targets.base import TargetError
 
@@ -38,7 +37,7 @@ class Entry:
         if not isinstance(self.index, int) or isinstance(self.index, bool) or self.index < 0:
             raise TargetError(f"index must be a whole number from 0 on, got {self.index!r}")
         for name, value in (("scale", self.scale), ("offset", self.offset)):
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            if not is_number(value):
                 raise TargetError(f"{name} must be a finite number, got {value!r}")
         if self.scale == 0:
             raise TargetError("scale must not be 0")
@@ -232,4 +231,4 @@ class EnvMap:
 
 def _is_positive(value: Any) -> bool:
     """Whether it is a finite number above 0."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf
+    return is_number(value) and value > 0

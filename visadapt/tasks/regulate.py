@@ -12,11 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from visadapt.storage.toml_file import read_toml
+from visadapt.storage.toml_file import is_number, read_toml
 from visadapt.systems import System
 from visadapt.tasks.base import Task
 
 TABLES = ("goal", "tolerance", "start", "limits")  # Fields with a number for each state that they name
+LEAST = torch.finfo(torch.float32).tiny  # of a positive number
 ATTEMPTS = 20  # of Newton's method for the commands that hold a goal
 HOLDS = 1e-3
 """Largest rate of a state at the goal, as a share of the state's tolerance in a second, and largest change of that rate
@@ -74,12 +75,12 @@ class Regulate(Task):
             for name, value in getattr(self, table).items():
                 if name not in names:
                     raise ValueError(f"{table}: a {self.system.name} has no state {name!r}: {', '.join(names)}")
-                if not _is_number(value) or (table != "goal" and value <= 0):
+                if not is_number(value) or (table != "goal" and value < LEAST):
                     right = "finite" if table == "goal" else "positive"
                     raise ValueError(f"{table}: {name} must be a {right} number, got {value!r}")
         for name in ("effort", "seconds"):
             value = getattr(self, name)
-            if not _is_number(value) or value <= 0:
+            if not is_number(value) or value < LEAST:
                 raise ValueError(f"{name} must be a positive number, got {value!r}")
         if not self.tolerance:
             raise ValueError(
@@ -156,7 +157,10 @@ class Regulate(Task):
             rates = self._rates(held[None])[0]
             step = 1e-6 * (high - low)
             by_command = (self._rates(held + step.diag()) - rates).T / step
-            held = torch.clamp(held - torch.linalg.pinv(scale[:, None] * by_command) @ (scale * rates), low, high)
+            off, slopes = scale * rates, scale[:, None] * by_command
+            if not bool(off.isfinite().all() and slopes.isfinite().all()):
+                raise ValueError(f"goal: the derivative of a {self.system.name} is not finite there")
+            held = torch.clamp(held - torch.linalg.pinv(slopes) @ off, low, high)
         return held
 
     def _rates(self, commands: Tensor, off: Tensor | float = 0.0) -> Tensor:
@@ -166,7 +170,7 @@ class Regulate(Task):
 
     def steps(self, period: float) -> int:
         """Periods in an episode."""
-        return max(1, round(self.seconds / period))
+        return steps_in(self.seconds, period)
 
     def deviation(self, state: Tensor) -> Tensor:
         """(..., n_state) how far states are from the goal."""
@@ -199,6 +203,11 @@ class Regulate(Task):
         return ~(near & self.within_limits(state))  # also where a state is not a number
 
 
+def steps_in(seconds: float, period: float) -> int:
+    """Periods in an episode, at least one."""
+    return max(1, round(seconds / period))
+
+
 def read_task(path: str | os.PathLike[str], system: System) -> Regulate:
     """The task in a TOML file, whose tables and numbers have the names of the fields of `Regulate`.
 
@@ -224,7 +233,3 @@ def read_task(path: str | os.PathLike[str], system: System) -> Regulate:
     except ValueError as error:
         raise TaskFileError(f"{path}: {error}") from error
     return replace(task, effort=float(task.effort), seconds=float(task.seconds))
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
