@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import copy
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,26 +26,26 @@ import torch
 import tyro
 
 from experiments.furuta import Furuta
+from experiments.kept_scores import kept_score
 from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import Row, write_rows
 from visadapt.effects import Effect
 from visadapt.effects.catalogue import catalogue
-from visadapt.evaluation import RegulationScore, score
+from visadapt.evaluation import RegulationScore
 from visadapt.policies import RegulatorPolicy
 from visadapt.setups.regulator import regulator
 from visadapt.setups.training import adapt
-from visadapt.storage.run_folder import once, open_run
+from visadapt.storage.run_folder import open_run
 from visadapt.targets.regulation import RegulationTarget
 from visadapt.tasks.regulate import Regulate
 from visadapt.world import World
 
 PERIOD = 0.02  # s
-RATES = {"arm_rate": 0.5, "pendulum_rate": 0.5}
 TASK = Regulate(
     Furuta(),
     goal={"pendulum": math.pi},
     tolerance={"arm": 0.2, "pendulum": 0.1, "arm_rate": 2.0, "pendulum_rate": 2.0},
-    start={"arm": 0.3, "pendulum": 0.1, **RATES},
+    start={"arm": 0.3, "pendulum": 0.1, "arm_rate": 0.5, "pendulum_rate": 0.5},
     limits={"arm": 1.9, "pendulum": 0.6},
 )
 NOISE = {"arm": 1e-3, "pendulum": 1e-3, "arm_rate": 2e-2, "pendulum_rate": 2e-2}
@@ -127,12 +127,9 @@ def _scores(settings: Settings, kind: str, seed: int) -> dict[str, RegulationSco
     scores = {}
     for method in METHODS:
         work = folder / method.replace(" ", "-")
-
-        def scored(method: str = method, work: Path = work) -> dict[str, object]:
-            policy = _adapted(source, hidden, target, method, work, settings, seed)
-            return asdict(score(policy, target, settings.episodes))
-
-        scores[method] = RegulationScore(**once(work.with_suffix(".json"), scored))
+        path = work.with_suffix(".json")
+        policy = source if path.exists() else _adapted(source, hidden, target, method, work, settings, seed)
+        scores[method] = kept_score(path, policy, target, settings.episodes)
     return scores
 
 

@@ -7,14 +7,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
-from visadapt.evaluation import SCORE_SEED, CartPoleScore, FlightScore, score
-from visadapt.policies import Policy
+from visadapt.evaluation import SCORE_SEED, CartPoleScore, FlightScore, RegulationScore, score
+from visadapt.policies import Policy, RegulatorPolicy
 from visadapt.storage.run_folder import once, read_json
 from visadapt.targets import FlightTarget, Target
 
-Kind = TypeVar("Kind", CartPoleScore, FlightScore)
+Kind = TypeVar("Kind", CartPoleScore, FlightScore, RegulationScore)
 
 
+@overload
+def kept_score(  # type: ignore[overload-overlap]
+    path: Path, policy: RegulatorPolicy, target: Target, episodes: int, steps: int | None = ..., seed: int = ...
+) -> RegulationScore: ...
 @overload
 def kept_score(  # type: ignore[overload-overlap]
     path: Path, policy: Policy, target: FlightTarget, episodes: int, steps: int | None = ..., seed: int = ...
@@ -25,9 +29,11 @@ def kept_score(
 ) -> CartPoleScore: ...
 def kept_score(
     path: Path, policy: Policy, target: Target, episodes: int, steps: int | None = None, seed: int = SCORE_SEED
-) -> CartPoleScore | FlightScore:
+) -> CartPoleScore | FlightScore | RegulationScore:
     """`score`, run only where it is not kept in the JSON file `path` yet."""
     once(path, lambda: asdict(score(policy, target, episodes, seed, steps)))
+    if isinstance(policy, RegulatorPolicy):
+        return read_score(path, RegulationScore)
     return read_score(path, FlightScore) if isinstance(target, FlightTarget) else read_score(path, CartPoleScore)
 
 

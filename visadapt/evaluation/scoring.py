@@ -11,10 +11,11 @@ import numpy as np
 import torch
 
 from visadapt.policies import Policy, RegulatorPolicy
-from visadapt.systems import CartPole, System
+from visadapt.systems import CartPole
 from visadapt.targets import FlightTarget, Target
 from visadapt.targets.rollout import Run, check_period, run
 from visadapt.tasks.balance import EPISODE_STEPS
+from visadapt.tasks.regulate import steps_in
 
 SCORE_SEED = 2026
 """Seed of the starts and hidden effects that policies are scored on; seeds of trainings count from 0."""
@@ -118,7 +119,7 @@ def score(
     policy.eval()
     generator = torch.Generator().manual_seed(seed)
     if isinstance(policy, RegulatorPolicy):
-        steps = steps or max(1, round(policy.task["seconds"] / target.period))
+        steps = steps or steps_in(policy.task["seconds"], target.period)
         return _score_regulation(run(target, policy, episodes, steps, generator, keep_frames=False), policy)
     if isinstance(target, FlightTarget):
         if steps is not None and steps > target.task.steps:
@@ -127,7 +128,7 @@ def score(
         return _score_flights(runs, target)
     if policy.shown == "state and goal":
         raise ValueError(f"{target.name}: flights are scored by their task: derive the target from FlightTarget")
-    kind = type(target.system) if isinstance(target.system, System) else target.system
+    kind = target.system_class
     if kind is not None and not issubclass(kind, CartPole):
         raise ValueError(f"a score is that of a cart's speed or of a flight; {target.name} is a {kind.name}: use run")
     runs = run(target, policy, episodes, steps or EPISODE_STEPS, generator, keep_frames=False)

@@ -14,7 +14,7 @@ from visadapt.films.flight_film import FlightFilm
 from visadapt.films.flight_panel import FlightPanel
 from visadapt.policies import Policy
 from visadapt.progress import Progress
-from visadapt.systems import CartPole, RigidBody, System
+from visadapt.systems import CartPole, RigidBody
 from visadapt.targets import FlightTarget, SyntheticTarget, Target
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.targets.rollout import Run, See, check_period, run, see_within_a_turn
@@ -63,7 +63,7 @@ def film(
     >>> path.exists()
     True
     """
-    kind = type(target.system) if isinstance(target.system, System) else target.system
+    kind = target.system_class
     if kind is not None and not issubclass(kind, CartPole | RigidBody):
         raise ValueError(f"a film is that of a cart-pole or of a vehicle; {target.name} is a {kind.name}")
     titled = shown if isinstance(shown, Mapping) else {target.name: shown}

@@ -63,6 +63,11 @@ class Target(ABC):
     system: System | type[System] | None = None
     """the machine's system, or its class where its parameters are not known; None where not even that is known"""
 
+    @property
+    def system_class(self) -> type[System] | None:
+        """The class of the machine's system; None where it is not known."""
+        return type(self.system) if isinstance(self.system, System) else self.system
+
     @abstractmethod
     def reset(self, batch: int, generator: torch.Generator) -> Observation:
         """Start `batch` new episodes."""
