@@ -13,8 +13,8 @@ from visadapt.systems.dry_friction import Limits, sliding, stopped
 from visadapt.systems.integrators import INTEGRATORS, Duration
 from visadapt.systems.stiffness import longest_step
 
-EDGE_STEP = 0.0125
-"""s, integration step that resolves the edges of abrupt loads (`PulseLaw`, `FrictionPatch`)."""
+EDGE_STEP = 0.025
+"""Integration step that resolves the edges of abrupt loads (`PulseLaw`, `FrictionPatch`), in prediction times."""
 
 
 class Dynamics:
@@ -51,7 +51,7 @@ class Dynamics:
             return self._load(time, state, self.varied(system, time, state))
 
         follows = longest_step(system, load if self._loading or self._varying else None)
-        return min(EDGE_STEP, follows) if edges else follows
+        return min(EDGE_STEP * system.prediction_time, follows) if edges else follows
 
     def varied(self, system: System, time: Tensor, state: Tensor) -> System:
         """The system with the parameters that effects give it at the time (B,) in the state (B, n_state)."""

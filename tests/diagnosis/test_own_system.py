@@ -12,7 +12,8 @@ from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.report.html import as_html
 from visadapt.diagnosis.words import plain
 from visadapt.effects.catalogue import catalogue
-from visadapt.recordings import Episode, Recording
+from visadapt.recordings import Episode, Recording, RecordingError, load_recording, write_recording
+from visadapt.systems import Variable
 from visadapt.world import World
 
 PERIOD = 0.02
@@ -95,3 +96,48 @@ def test_a_system_that_does_not_say_what_its_loads_act_on_is_refused(catalogue):
         ValueError, match=r"^bare_pendulum cannot be diagnosed: its coordinates are \(\); a pair .* right$"
     ):
         diagnose(recording(), World(Bare(), period=PERIOD), catalogue)
+
+
+SLOWER = 32.0
+
+
+@dataclass(frozen=True)
+class SlowPendulum(Pendulum):
+    """The pendulum with so much inertia that it moves SLOWER times as slowly."""
+
+    inertia: float | torch.Tensor = SLOWER**2 * Pendulum.inertia
+
+    name = "slow_pendulum"
+    prediction_time = SLOWER * Pendulum.prediction_time
+    states = (Pendulum.states[0], Variable("rate", "rad/s", -12.0 / SLOWER, 12.0 / SLOWER))
+
+
+def slowed(recorded):
+    """The same motion, SLOWER times as slow."""
+    by_column = np.array([1.0, SLOWER])
+    episodes = [Episode(SLOWER * e.time, e.action, e.state / by_column) for e in recorded.episodes]
+    return Recording(tuple(episodes), recorded.measured, SLOWER * recorded.period, recorded.sources)
+
+
+def test_rows_of_a_slow_machine_may_be_far_apart(tmp_path):
+    path = tmp_path / "run.h5"
+    write_recording(path, slowed(recording()).episodes, ["angle", "rate"], ["torque"])
+    assert load_recording(path, SlowPendulum()).period == pytest.approx(SLOWER * PERIOD)
+    right = r"rows are 0\.64 s apart; 0\.0001 to 0\.1667 s are right \(.* milliseconds\?\), since predictions reach"
+    with pytest.raises(RecordingError, match=right + r" 0\.5 s ahead \(prediction_time of the class Pendulum\)$"):
+        load_recording(path, Pendulum())
+
+
+def test_a_machine_that_moves_slowly_is_diagnosed_as_a_fast_one():
+    slow = {effect.name: effect for effect in catalogue(SlowPendulum())}
+    assert slow["joint.push"].table[1].high == SLOWER * BY_NAME["joint.push"].table[1].high
+    fast = recording(BY_NAME["torque.actuator_delay"](delay=0.03))
+    found = diagnose(
+        slowed(fast), World(SlowPendulum(), period=SLOWER * PERIOD), [slow[effect.name] for effect in IMITATING]
+    )
+    assert found.verdict == "ambiguous"
+    assert found.causes[0].effect == "torque.actuator_delay"
+    assert found.causes[0].parameters["delay"].value == pytest.approx(SLOWER * 0.03, rel=0.05)
+    expected = diagnose(fast, World(Pendulum(), period=PERIOD), IMITATING)
+    assert found.gap.before == pytest.approx(expected.gap.before, rel=0.02)
+    assert found.gap.closed == pytest.approx(expected.gap.closed, abs=0.01)

@@ -5,7 +5,7 @@ import torch
 
 from visadapt.estimation.colour import colour_of, whitened, whitened_adjoint
 
-WINDOWS, ROWS, PERIOD = 8, 300, 0.01
+WINDOWS, ROWS, LONGEST = 8, 300, 15
 MIXING = torch.tensor([[1.0, 0.0], [0.5, 0.8]], dtype=torch.float64)
 RESONANCE = [0.9 * torch.tensor([[1.2, 0.3], [0.0, 0.9]]).double(), torch.tensor([[-0.8, 0.0], [0.1, -0.3]]).double()]
 
@@ -25,7 +25,7 @@ def drawn(coefficients):
 
 def colour(innovations, inside=None):
     inside = torch.ones(innovations.shape[:2]) if inside is None else inside
-    return colour_of(innovations, inside, PERIOD, torch.zeros(1), torch.zeros(2))
+    return colour_of(innovations, inside, LONGEST, torch.zeros(1), torch.zeros(2))
 
 
 def test_white_innovations_have_no_colour():

@@ -302,8 +302,8 @@ def _warnings(
     if is_slow(comparison, verdict):
         better = listed([effect.name for effect in comparison.best.effects])
         yield (
-            f"half a second ahead the simulator errs by no more than the noise, but {better} explains whole "
-            f"episodes far better (the unchanged simulator has a probability of {bare:.3f}): it acts slowly"
+            f"over a prediction the simulator errs by no more than the noise, but {better} explains whole episodes far "
+            f"better (the unchanged simulator has a probability of {bare:.3f}): it acts slowly"
         )
     if found:
         yield from phases_of_episodes(comparison.best)

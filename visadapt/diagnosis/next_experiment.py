@@ -40,10 +40,10 @@ ALONG = (
 MIN_LOG_ODDS = 0.0  # Log odds above which the variable of an unexplained disturbance is named: likelier than not
 
 LONGER = (
-    "Half a second ahead nothing departs from the source beyond the noise. What acts more slowly shows in long runs "
-    "under commands that stay the same for longer than the machine takes to settle."
+    "As far as predictions reach, nothing departs from the source beyond the noise. What acts more slowly shows in "
+    "long runs under commands that stay the same for longer than the machine takes to settle."
 )
-"""For a gap that half a second does not show."""
+"""For a gap that shows only beyond the time of a prediction."""
 
 
 def separate(classes: Sequence[Collection[type[Effect]]], system: System) -> str:

@@ -38,12 +38,12 @@ from visadapt.storage.atomic_files import replacing
 from visadapt.systems import System
 from visadapt.world import World
 
-FREQUENCIES = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # Hz
+CYCLES = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # In a prediction time, of square waves and sines
 BIT_ROWS = (1, 2, 4, 8)  # Rows of a bit of a pseudo-random binary sequence
 SIZES = (0.05, 0.1, 0.14, 0.2, 0.28, 0.4, 0.57, 0.8)
 """Amplitudes that are tried, and the standard deviation of white noise, as shares of half the command's range."""
 MARGIN = 0.9  # Share of the states' ranges that an experiment may reach
-SUBSTEP = 0.0125  # s, the longest integration step of a simulation
+SUBSTEP = 0.025  # Longest integration step of a simulation, in prediction times
 WORTH = 3.0  # Log odds up to which an experiment is said to settle nothing
 CERTAIN = 100.0  # Log odds above which more make no difference
 
@@ -256,7 +256,8 @@ def _excitations(system: System, period: float, samples: int, generator: torch.G
     names, shapes = [], []
     for k, action in enumerate(system.actions):
         where = f" on {action.name}" if len(system.actions) > 1 else ""
-        phases = {f: 2 * math.pi * f * time for f in FREQUENCIES if f * period < 0.25}
+        frequencies = [cycles / system.prediction_time for cycles in CYCLES]
+        phases = {f: 2 * math.pi * f * time for f in frequencies if f * period < 0.25}
         signals = {
             f"a square wave of {f:g} Hz{where}": torch.where(phase.sin() >= 0, 1.0, -1.0) for f, phase in phases.items()
         }
@@ -286,7 +287,8 @@ def _simulate(
 ) -> tuple[tuple[Tensor, Tensor], Tensor]:
     """Readings without noise (N, T + 1, n) and commands (N, T + 1, n_action) under each of N excitations, and (N,)
     whether all states stay within their ranges; the policy sees readings with noise."""
-    world = World(system, effects, recording.period, substeps=math.ceil(recording.period / SUBSTEP)).double()
+    substeps = math.ceil(recording.period / (SUBSTEP * system.prediction_time))
+    world = World(system, effects, recording.period, substeps=substeps).double()
     ranges = torch.tensor([variable.largest for variable in system.states], dtype=torch.float64)
 
     def read(at: Tensor) -> Tensor:

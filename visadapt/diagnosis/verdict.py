@@ -22,7 +22,7 @@ MIN_GAP_CLOSED = 0.95
 predictions with them are not within the noise."""
 
 LEAST_UNCHANGED = 0.01
-"""Probability of the unchanged simulator below which a recording without a gap half a second ahead has one in the long
+"""Probability of the unchanged simulator below which a recording without a gap within a prediction has one in the long
 run."""
 CLEAR_OF_NOISE = 3.0
 """Ratio of prediction error to measurement noise above which there is a gap. Where the ratio with the causes is still
@@ -107,7 +107,7 @@ def left_by_source(search: Search) -> list[SmoothFunction]:
 
 
 def is_slow(comparison: ModelComparison, verdict: str) -> bool:
-    """Whether there is no gap half a second ahead, and one in the long run."""
+    """Whether there is no gap within a prediction, and one in the long run."""
     return verdict == NO_GAP and comparison.unchanged < LEAST_UNCHANGED
 
 

@@ -58,8 +58,8 @@ class ActuatorDelay(ActuationEffect):
             "the cart alone moves late, the actuator is"
         ),
         "actuator_lag": (
-            "record steps of the command, large and held for half a second, at the highest rate that the sensors have: "
-            "after a delay the acceleration jumps, after a lag it creeps up"
+            "record steps of the command, large and held for several times the delay, at the highest rate that the "
+            "sensors have: after a delay the acceleration jumps, after a lag it creeps up"
         ),
     }
 

@@ -70,7 +70,7 @@ def twins(effect: type[Effect], effects: Iterable[type[Effect]], system: System)
 
 def catalogue_text(system: System | None = None) -> str:
     """The catalogue for a terminal: a paragraph per effect, in the order of the chain."""
-    return "\n\n".join("\n".join(_lines(effect)) for effect in _sorted(system))
+    return "\n\n".join("\n".join(_lines(effect, system)) for effect in _sorted(system))
 
 
 def catalogue_markdown() -> str:
@@ -97,14 +97,17 @@ def _sorted(system: System | None) -> list[type[Effect]]:
     return sorted(catalogue(system), key=lambda effect: (stages.index(effect.stage), effect.order, effect.name))
 
 
-def _lines(effect: type[Effect]) -> list[str]:
+def _lines(effect: type[Effect], system: System | None) -> list[str]:
     lines = [f"{effect.name} ({effect.stage})", f"  {_summary(effect)}", f"  {effect.equation}"]
     for parameter in effect.table:
         low, high, neutral = _numbers(parameter)
         off = f", no effect at {neutral}" if neutral else ""
         unit = "" if parameter.unit == "1" else f" {parameter.unit}"
         lines.append(f"  {parameter.name}: {low} to {high}{unit}{off}")
-    return [*lines, *(f"  {name}: {value}" for name, value in _facts(effect).items())]
+    facts = _facts(effect)
+    if system is not None and is_own(type(system)):
+        del facts["systems"]  # which the library's effects on every system do not name
+    return [*lines, *(f"  {name}: {value}" for name, value in facts.items())]
 
 
 def _summary(effect: type[Effect]) -> str:

@@ -21,8 +21,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-LONGEST = 0.15  # s that the autoregression reaches back at most
-
 ORDERS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # that are tried, in rows
 
 READINGS_PER_COEFFICIENT = 10  # At least
@@ -93,15 +91,16 @@ def whitened(innovations: Tensor, colour: Colour | None) -> Tensor:
 
 
 def colour_of(
-    innovations: Tensor, inside: Tensor, period: float, log_process: Tensor, log_noise: Tensor
+    innovations: Tensor, inside: Tensor, longest: float, log_process: Tensor, log_noise: Tensor
 ) -> Colour | None:
     """The colour of a filter's whitened innovations (N, T, m), `inside` (N, T) its windows; None where they are white.
 
-    The order is the one with the largest log likelihood less the number of coefficients (Akaike 1974, IEEE Transactions
-    on Automatic Control 19(6)). `log_process` (G,) and `log_noise` (m,) are the noise of the filter.
+    The order, `longest` at most, is the one with the largest log likelihood less the number of coefficients (Akaike
+    1974, IEEE Transactions on Automatic Control 19(6)). `log_process` (G,) and `log_noise` (m,) are the noise of the
+    filter.
     """
     channels = innovations.shape[2]
-    orders = [p for p in ORDERS if p <= LONGEST / period and p < innovations.shape[1] // 2]
+    orders = [p for p in ORDERS if p <= longest and p < innovations.shape[1] // 2]
     if not orders:
         return None
     first = orders[-1]

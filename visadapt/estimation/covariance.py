@@ -17,9 +17,6 @@ from visadapt.estimation.fit_states import Effects, posterior
 from visadapt.estimation.kalman import forward
 from visadapt.estimation.likelihood import FitState, linear_problem, variances
 
-CORRELATION_TIME = 0.5  # s; scores further apart are taken as independent
-
-
 VAGUE = 1e-4
 """Share of the prior's precision that is added to the information, so that it can be inverted where data show nothing.
 The whole of it would be right for a maximum a posteriori estimate; those used here are of maximum likelihood."""
@@ -34,7 +31,8 @@ def inverse_information(effects: Effects, fits: FitState) -> Tensor:
 def deviations(model: CandidateModel, fits: FitState) -> Tensor:
     """Standard deviations (K,) of the parameters of a fit (C = 1): the larger of both covariances' for each.
 
-    The long-run covariance is estimated from the recording, and too small where that is short.
+    The long-run covariance is estimated from the recording, and too small where that is short. Scores further apart
+    than a prediction reaches are taken as independent.
     """
     rows = model.rows
     covariance = inverse_information(model.effects, fits)
@@ -43,7 +41,7 @@ def deviations(model: CandidateModel, fits: FitState) -> Tensor:
     white = whitened(filtered.white, rows.colour)
     score = (white[..., :1] * white[..., 1:]).sum(2)
     length = score.shape[1]
-    last = min(length - 1, round(CORRELATION_TIME / rows.period))
+    last = min(length - 1, round(model.system.prediction_time / rows.period))
     scores = torch.einsum("wtk,wtl->kl", score, score)
     for lag in range(1, last + 1):
         product = torch.einsum("wtk,wtl->kl", score[:, lag:], score[:, : length - lag])

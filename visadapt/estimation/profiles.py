@@ -190,6 +190,7 @@ def _own_profile(system: type[System]) -> SystemProfile:
     positions, velocities = system.velocity_of(), [velocity for _, velocity in system.coordinates]
     places = {units[p]: names[p] for p in positions if sum(units[p] == units[q] for q in positions) == 1}
     along = system.coordinates[0][0]
+    slower = system.prediction_time / System.prediction_time
     return SystemProfile(
         driven=tuple((velocity,) for velocity in velocities),
         position_of={velocity: position for position, velocity in positions.items()},
@@ -208,6 +209,8 @@ def _own_profile(system: type[System]) -> SystemProfile:
             load.name: (None, names[velocity]) for load, velocity in zip(system.loads, velocities, strict=True)
         },
         sign_conventions=tuple(_own_conventions(system)),
+        longest_step=slower * SystemProfile.longest_step,
+        longest_abrupt_steps=tuple(slower * step for step in SystemProfile.longest_abrupt_steps),
     )
 
 

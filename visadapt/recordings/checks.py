@@ -16,12 +16,12 @@ from visadapt.recordings.clock import GAP_PERIODS, UNITS_S, Note, RawEpisode
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.physics import (
     DEGREE,
-    DIFFERENCE_S,
     are_degrees,
     correlation,
     exchanged,
     is_half_a_turn_off,
     is_turned_round,
+    rows_apart,
 )
 from visadapt.recordings.sensors import TURN, differences
 from visadapt.systems import CartPole, RigidBody, System, Variable
@@ -99,7 +99,7 @@ def check_units(episodes: Sequence[RawEpisode], system: System) -> None:
     for raw in judged:
         for name in columns:
             if (rate := system.rate_of(name)) is not None:
-                _check_rate(raw, variables[name], variables[rate])
+                _check_rate(raw, variables[name], variables[rate], rows_apart(raw, system))
         check_attitude(raw, system)
     _check_answers(judged, system, angles, [name for name in columns if variables[name].unit == "m"])
 
@@ -169,15 +169,15 @@ def _check_clock(raw: RawEpisode, system: System) -> None:
             )
 
 
-def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable) -> None:
-    """Compares a variable's change with its measured rate, and both with the range that the system states."""
+def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable, stride: int) -> None:
+    """Compares a variable's change with its measured rate; and both, the change over `stride` rows, with the range
+    that the system states."""
     values, measured = raw.states[variable.name], raw.states.get(rate.name)
     angle = variable.unit == "rad"
     right = "metres are right (these look like centimetres or millimetres)"
     if angle:
         right = "radians are right (these look like degrees)"
     change = _rates(raw.time, values, angle)
-    stride = max(1, round(DIFFERENCE_S / float(np.median(np.diff(raw.time)))))
     coarse = np.convolve(change, np.ones(stride) / stride, "valid")
     fast = float(np.quantile(np.abs(coarse), 0.9))
     limit = MOST_RATE_RANGES * rate.largest

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visadapt.recordings.episode import RecordingError
+from visadapt.systems import System
 
 Note = Callable[[str, str], None]
 """Called with (what was changed or left out, where in the recording)."""
@@ -27,8 +28,9 @@ LONGEST_STEP_PERIODS = 3.0
 """Longest step, in periods, of an irregular clock; at longer ones the episode is split."""
 HARMLESS_GAP_S = 0.01
 """Step up to which an episode is never split: a loop of a few ms that stalls for so long holds its command."""
-SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-4, 0.1667
-"""Least and largest period in s; at the largest, the shortest episode, of 0.5 s, has three steps."""
+SHORTEST_PERIOD_S = 1e-4
+LEAST_STEPS = 3
+"""Steps in the time of a prediction, at least."""
 LEAST_STEP_PERIODS = 1e-3
 """Step between two rows, in periods, below which the stamps are not those of the readings."""
 UNITS_S = {"nanoseconds": 1e-9, "microseconds": 1e-6, "milliseconds": 1e-3, "minutes": 60, "hours": 3600, "days": 86400}
@@ -106,22 +108,25 @@ def check_forward(raw: RawEpisode) -> None:
         )
 
 
-def check_steps(episodes: Sequence[RawEpisode]) -> None:
+def check_steps(episodes: Sequence[RawEpisode], system: System) -> None:
     """Check that the stamps of a file's episodes are in s.
 
     Raises:
-        RecordingError: the period is not one of a controller, or a step is less than `LEAST_STEP_PERIODS`.
+        RecordingError: the period is too short, or too long for predictions of the system, or a step is less than
+            `LEAST_STEP_PERIODS`.
     """
     steps = [np.diff(raw.time) for raw in episodes]
     every = np.concatenate(steps)
     if not len(every):
         return
     raw, period = episodes[0], float(np.median(every))
-    if not SHORTEST_PERIOD_S <= period <= LONGEST_PERIOD_S:
-        units = [name for name, unit in UNITS_S.items() if SHORTEST_PERIOD_S <= unit * period <= LONGEST_PERIOD_S]
+    longest = system.prediction_time / LEAST_STEPS * (1 + 1e-4)
+    if not SHORTEST_PERIOD_S <= period <= longest:
+        units = [name for name, unit in UNITS_S.items() if SHORTEST_PERIOD_S <= unit * period <= longest]
         raise RecordingError(
-            f"{raw.source}: column 'time': rows are {period:.4g} s apart; {SHORTEST_PERIOD_S:g} to "
-            f"{LONGEST_PERIOD_S:g} s are right" + (f" (is the clock in {' or '.join(units)}?)" if units else "")
+            f"{raw.source}: column 'time': rows are {period:.4g} s apart; {SHORTEST_PERIOD_S:g} to {longest:.4g} s are "
+            f"right" + (f" (is the clock in {' or '.join(units)}?)" if units else "") + ", since predictions reach "
+            f"{system.prediction_time:g} s ahead (prediction_time of the class {type(system).__name__})"
         )
     for raw, own in zip(episodes, steps, strict=True):
         if len(own) and own.min() < LEAST_STEP_PERIODS * period:

@@ -26,8 +26,6 @@ from visadapt.recordings.thinning import thinned
 from visadapt.recordings.topics import reader
 from visadapt.systems import System
 
-SHORTEST_EPISODE_S = 0.5
-"""s; shorter episodes hold too few predictions several steps ahead and are left out."""
 MOST_BYTES = 2**28
 """Most bytes of the values of all files: 4.8 million rows of a cart-pole. The checks make a few copies of them."""
 SUFFIXES = (".csv", ".h5", ".hdf5", ".bag", ".mcap", ".db3", ".ulg")
@@ -91,7 +89,7 @@ def load_recording(
         for raw in episodes:
             check_finite(raw, system.actions)
             check_forward(raw)
-        check_steps(episodes)
+        check_steps(episodes, system)
         whole += [without_outliers(raw, system, note) for raw in episodes]
     whole = _commands(_shared(whole, system, note), system, note)
     check_commands(whole, system, note)
@@ -101,7 +99,7 @@ def load_recording(
         whole = check_sensors(whole, system, note)
     turning = [state.name for state in system.states if state.unit == "rad" and same_after_a_turn(system, state.name)]
     parts = [part for raw in whole for part in uninterrupted(_unwrapped(raw, turning), note)]
-    parts, period = alike(_long_enough(parts, note), note)
+    parts, period = alike(_long_enough(parts, system.prediction_time, note), note)
     outliers = any(part.usable is not None for part in parts)
     return Recording(
         episodes=tuple(Episode(part.time, part.action, None if frames else part.state, part.frame) for part in parts),
@@ -267,17 +265,17 @@ def _unwrapped(raw: RawEpisode, turning: Sequence[str]) -> RawEpisode:
     return replace(raw, state=state)
 
 
-def _long_enough(parts: Sequence[RawEpisode], note: Note) -> list[RawEpisode]:
-    """The parts of at least SHORTEST_EPISODE_S; notes the others."""
-    least = SHORTEST_EPISODE_S * (1 - 1e-6)
+def _long_enough(parts: Sequence[RawEpisode], shortest: float, note: Note) -> list[RawEpisode]:
+    """The parts of at least `shortest` s, the time of a prediction; notes the others."""
+    least = shortest * (1 - 1e-6)
     durations = [part.time[-1] - part.time[0] for part in parts]
     longest = parts[int(np.argmax(durations))]
     if max(durations) < least:
         raise RecordingError(
             f"{longest.source}: too short: {len(longest.time)} rows, {max(durations):.3g} s; "
-            f"an uninterrupted run of at least {SHORTEST_EPISODE_S:g} s, with a clock in seconds, is right"
+            f"an uninterrupted run of at least {shortest:g} s, with a clock in seconds, is right"
         )
     for part, duration in zip(parts, durations, strict=True):
         if duration < least:
-            note(f"shorter than {SHORTEST_EPISODE_S:g} s, so it is left out", f"{part.source}, from {part.place(0)} on")
+            note(f"shorter than {shortest:g} s, so it is left out", f"{part.source}, from {part.place(0)} on")
     return [part for part, duration in zip(parts, durations, strict=True) if duration >= least]

@@ -18,12 +18,12 @@ from visadapt.recordings.clock import RawEpisode
 from visadapt.systems import System
 
 DEGREE = math.pi / 180
-DIFFERENCE_S = 0.05
-"""s between rows whose difference is taken: over less, noise would outweigh motion."""
-LONGEST_DELAY_S = 0.25
-"""Longest delay of the command, s, that is tried before columns are called exchanged."""
-LEAST_DURATION_S = 2.0
-"""s that the episodes must last together for their units and order to be judged."""
+DIFFERENCE = 0.1
+"""Prediction times between rows whose difference is taken: over less, noise would outweigh motion."""
+LONGEST_DELAY = 0.5
+"""Longest delay of the command, in prediction times, that is tried before columns are called exchanged."""
+LEAST_DURATION = 4.0
+"""Prediction times that the episodes must last together for their units and order to be judged."""
 MOST_ROWS = 20_000
 """Rows of an episode that are used, for speed."""
 EXPLAINED_ERROR, OTHERS_ERROR_RATIO = 0.75, 1.5
@@ -112,7 +112,7 @@ def is_in_newtons(episodes: Sequence[RawEpisode], system: System, largest: float
 def exchanged(episodes: Sequence[RawEpisode], system: System, one: str, other: str) -> bool:
     """Whether the source explains both accelerations with two columns (and their rates) exchanged, and not as they are.
 
-    A delayed command could look like that, so every delay up to `LONGEST_DELAY_S` is tried for the columns as
+    A delayed command could look like that, so every delay up to `LONGEST_DELAY` is tried for the columns as
     they are. False where that cannot be decided.
     """
     if not _can_decide(episodes, system, (one, other)):
@@ -127,7 +127,8 @@ def exchanged(episodes: Sequence[RawEpisode], system: System, one: str, other: s
     if not all(1 / 4 < fits[name][1] < 4 for name in (one, other)):
         return False
     period = min(_period(raw) for raw in episodes)
-    unchanged = [_fits(episodes, system, delay=k * period) for k in range(round(LONGEST_DELAY_S / period) + 1)]
+    latest = round(LONGEST_DELAY * system.prediction_time / period)
+    unchanged = [_fits(episodes, system, delay=k * period) for k in range(latest + 1)]
     best = max(min(fits[one][0], fits[other][0]) for fits in unchanged)
     explained = min(fits[one][0], fits[other][0])
     opposite = max(unchanged[0][one][0], unchanged[0][other][0]) < 0
@@ -142,30 +143,31 @@ def _only_angle(episodes: Sequence[RawEpisode], system: System) -> str | None:
 
 
 def _can_decide(episodes: Sequence[RawEpisode], system: System, names: Sequence[str]) -> bool:
-    judged = _judged(episodes)
+    judged = _judged(episodes, system)
     duration = sum(float(raw.time[:MOST_ROWS][-1] - raw.time[0]) for raw in judged)
     measured = episodes[0].measured
     known = {*measured, *(system.rate_of(name) for name in measured)}
     return (
         all(system.rate_of(name) for name in names)
         and known >= {state.name for state in system.states}
-        and duration > LEAST_DURATION_S
+        and duration > LEAST_DURATION * system.prediction_time
         and float(np.ptp(np.vstack([raw.action[:MOST_ROWS] for raw in judged]), axis=0).max()) > 0
     )
 
 
-def _judged(episodes: Sequence[RawEpisode]) -> list[RawEpisode]:
+def _judged(episodes: Sequence[RawEpisode], system: System) -> list[RawEpisode]:
     """The episodes that are long enough for second differences after the longest delay."""
-    return [raw for raw in episodes if len(raw.time) > 2 * _stride(raw) + 1 + round(LONGEST_DELAY_S / _period(raw))]
+    latest = LONGEST_DELAY * system.prediction_time
+    return [raw for raw in episodes if len(raw.time) > 2 * rows_apart(raw, system) + 1 + round(latest / _period(raw))]
 
 
 def _period(raw: RawEpisode) -> float:
     return float(np.median(np.diff(raw.time[:MOST_ROWS])))
 
 
-def _stride(raw: RawEpisode) -> int:
+def rows_apart(raw: RawEpisode, system: System) -> int:
     """Rows between those whose difference is taken."""
-    return max(1, round(DIFFERENCE_S / _period(raw)))
+    return max(1, round(DIFFERENCE * system.prediction_time / _period(raw)))
 
 
 def _unchanged(columns: Columns) -> Columns:
@@ -184,7 +186,7 @@ def _fits(
     act late.
     """
     each = []
-    for raw in _judged(episodes):
+    for raw in _judged(episodes, system):
         columns = changed({name: values[:MOST_ROWS] for name, values in raw.states.items()})
         each.append(_accelerations(raw, columns, system, delay))
     return {name: _fit(*(np.concatenate([one[name][k] for one in each]) for k in (0, 1))) for name in each[0]}
@@ -198,7 +200,7 @@ def _accelerations(
     angles = [variable.name for variable in system.states if variable.unit == "rad"]
     columns = {name: np.unwrap(values) if name in angles else values for name, values in columns.items()}
     action = raw.action[:MOST_ROWS]
-    stride = _stride(raw)
+    stride = rows_apart(raw, system)
     span = 2 * stride * _period(raw)
     # The mean of three points has noise that is uncorrelated with that of their second difference.
     middle = {

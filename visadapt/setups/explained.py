@@ -19,7 +19,6 @@ from visadapt.learning.explanation import Explain, Explanation
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
 from visadapt.recordings import Episode, Recording
-from visadapt.recordings.loading import SHORTEST_EPISODE_S
 from visadapt.storage.run_folder import read_json, write_json
 from visadapt.targets.base import TargetError
 from visadapt.world import World
@@ -28,7 +27,7 @@ from visadapt.world import World
 def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, report: Report | None = None) -> Explain:
     """Diagnoses episodes from all their states or, given the renderer of their scene, from their frames alone.
 
-    Each diagnosis is written as by `visadapt diagnose --json`. Episodes shorter than `SHORTEST_EPISODE_S` are left out.
+    Each diagnosis is written as by `visadapt diagnose --json`. Episodes shorter than a prediction are left out.
     Where the episodes cannot tell causes apart, the likeliest is taken and, unless they are frames, an experiment is
     designed for the next round. Where the gap stays unexplained, all of it is left to a residual.
 
@@ -42,10 +41,12 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
     catalogue(source.system)  # makes the effects of a system of one's own known, by which a file names them
     measured = () if renderer else tuple(state.name for state in source.system.states)
 
+    shortest = source.system.prediction_time
+
     def explain(episodes: Sequence[Episode], path: Path) -> Explanation:
-        long = tuple(e for e in episodes if e.time[-1] - e.time[0] >= SHORTEST_EPISODE_S)
+        long = tuple(e for e in episodes if e.time[-1] - e.time[0] >= shortest)
         if not long:
-            none = f"all {len(episodes)} episodes are shorter than {SHORTEST_EPISODE_S:g} s, not diagnosed"
+            none = f"all {len(episodes)} episodes are shorter than {shortest:g} s, not diagnosed"
             return Explanation(none, [], complete=False)
         sources = tuple(f"episode {number}" for number in range(len(long)))
         recording = Recording(long, measured, source.period, sources)

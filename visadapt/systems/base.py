@@ -63,6 +63,10 @@ class System(ABC):
     coordinates: ClassVar[tuple[tuple[int | None, int], ...]] = ()
     """For each load the columns of the position and the velocity that it acts on; dry friction needs them. A velocity
     that is the rate of no state, as the forward speed of a robot on wheels, has None for its position."""
+    prediction_time: ClassVar[float] = 0.5
+    """s ahead that predictions are compared with a recording. The other times of a diagnosis follow from it: rows are
+    at most a third of it apart, delays are searched up to 0.4 of it. Longer for a machine that moves slowly: 10 for a
+    boat."""
     longest_step: ClassVar[float | None] = None
     """s, the longest Runge-Kutta step that follows the dynamics with the default parameters; None: found from the
     derivative"""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import traceback
 from collections.abc import Iterator
 from dataclasses import fields, replace
-from math import isfinite
+from math import inf, isfinite
 from typing import Any
 
 import torch
@@ -55,7 +55,7 @@ def _form(system: type[System]) -> Iterator[str]:
         if not hasattr(system, name):
             yield f"{system.__name__} has no {name}: {_EXAMPLES[name]} would be right"
     for field in fields(itself):
-        if field.name in ("name", "states", "actions", "loads", "coordinates"):
+        if field.name in ("name", "states", "actions", "loads", "coordinates", "prediction_time"):
             yield f"{field.name} is a field, which is a parameter: write it without an annotation, or as a ClassVar"
 
 
@@ -70,11 +70,14 @@ _EXAMPLES = {
 def _variables(system: type[System]) -> Iterator[str]:
     if not isinstance(system.name, str) or not system.name.isidentifier():
         yield f"name is {system.name!r}; a word such as {_EXAMPLES['name']} would be right"
+    seconds = system.prediction_time
+    if not isinstance(seconds, int | float) or not 0 < seconds < inf:
+        yield f"prediction_time is {seconds!r}; a positive number of s, such as prediction_time = 0.5, would be right"
     names: dict[str, list[Any]] = {}
     for kind in ("states", "actions", "loads"):
         every = getattr(system, kind)
         if not isinstance(every, tuple) or not every:
-            yield f"{kind} is {every!r}; a tuple, {_EXAMPLES[kind]}, would be right"
+            yield f"{kind} is {every!r}; a tuple of at least one, {_EXAMPLES[kind]}, would be right"
             continue
         for variable in every:
             if not isinstance(variable, Variable):

@@ -25,6 +25,8 @@ from visadapt.progress import Progress
 
 START_FROM = 4  # Best sets of a search from which the next one begins
 
+REACH = 0.3  # Prediction times that the autoregression of coloured noise reaches back at most
+
 
 def with_coloured_noise(
     search: Search, comparison: ModelComparison, searched: Tensor, progress: Progress | None = None
@@ -69,6 +71,5 @@ def colour_left_by(search: Search, best: ScoredModel) -> Colour | None:
     model = CandidateModel(search.system, best.effects, search.rows)
     problem = linear_problem([model], best.fits).data()
     innovations = forward(problem, *variances(model, best.fits, problem)).white[..., 0]
-    return colour_of(
-        innovations, search.rows.inside, search.rows.period, best.fits.log_process[0], best.fits.log_noise[0]
-    )
+    longest = REACH * search.system.prediction_time / search.rows.period
+    return colour_of(innovations, search.rows.inside, longest, best.fits.log_process[0], best.fits.log_noise[0])

@@ -32,10 +32,9 @@ from visadapt.estimation.segments import Segments
 from visadapt.processes import shared_out
 from visadapt.systems import System
 
-PREDICTION_TIME = 0.5  # s; the horizon at which the gap is measured
-
-START_TIME = 0.02
-"""s between the starts of predictions, where rows follow each other faster; they then hardly differ."""
+START_SPACING = 0.04
+"""Share of the prediction time between the starts of predictions, where rows follow each other faster; they then hardly
+differ."""
 
 BLACK_BOX_ROWS = 1600  # Rows to which a black box is fitted: windows spread evenly over the recording
 
@@ -177,7 +176,7 @@ def _of_folds(
         return model, one.on(windows)
 
     # Episodes may be shorter than the time of a prediction.
-    horizon = max(1, min(round(PREDICTION_TIME / rows.period), int(rows.inside.sum(1).max()) - 1))
+    horizon = max(1, min(round(system.prediction_time / rows.period), int(rows.inside.sum(1).max()) - 1))
     parts = []
     for k in indices:
         box = None
@@ -196,7 +195,7 @@ def rollout_errors(
     """Errors of one fitted set up to `horizon` rows ahead, perhaps with a black box, whose loads follow the states."""
     rows = model.rows
     length = rows.shape[1]
-    stride = max(1, int(START_TIME / rows.period + 1e-9))
+    stride = max(1, int(START_SPACING * model.system.prediction_time / rows.period + 1e-9))
     if black_box is not None:
         fits = replace(fits, log_process=black_box.fits.log_process)
     problem = linear_problem([model], fits).data()

@@ -22,7 +22,8 @@ from visadapt.world import World, WorldState
 
 GAUSSIAN_REACH = 4  # Deviations at which a smoothing Gaussian is cut off
 
-SMOOTHING = 0.065  # s, deviation of the Gaussian that smooths the load, or one period if that is longer
+SMOOTHING = 0.13
+"""Deviation of the Gaussian that smooths the load, as a share of the prediction time; one period if that is longer."""
 
 SHORTEST = 25  # Length over the smoothing's deviation below which an episode tells nothing of pushes
 
@@ -99,7 +100,7 @@ def motion_of(episode: Episode, world: World, measured: Sequence[int], period: f
     stamps, readings, given = (
         torch.as_tensor(values, dtype=torch.float64) for values in (episode.time, episode.state, episode.action)
     )
-    smoothing = max(SMOOTHING, period)
+    smoothing = max(SMOOTHING * world.system.prediction_time, period)
     stamps = stamps.contiguous()
     time = torch.arange(float(stamps[0]), float(stamps[-1]), period, dtype=torch.float64)
     if len(time) * period < SHORTEST * smoothing:

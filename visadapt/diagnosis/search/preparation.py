@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from visadapt.diagnosis.search import angle_defect, sensor_checks, sign_conventions
-from visadapt.diagnosis.search.heldout import PREDICTION_TIME
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.words import OPPOSITE
 from visadapt.effects import Effect
@@ -51,8 +50,8 @@ spaced stamps decide whether the readings share the jitter."""
 MOST_FILLED = 2
 """Rows in a row whose readings are filled in by cubics: the acceleration in more of them would be made up."""
 
-MEMORY_TIME = 1.0
-"""s before a stretch of rows whose commands are used too: what is late, or lags, remembers them."""
+MEMORY = 2.0
+"""Prediction times before a stretch of rows whose commands are used too: what is late, or lags, remembers them."""
 
 MOST_SEARCHES, STRETCH_WINDOWS = 24, 4
 """Most rows of a recording that are used, as a multiple of `SystemProfile.search_rows`: so many give narrow intervals
@@ -62,8 +61,13 @@ already, and the time grows with the rows. Of a longer recording, stretches of S
 def limited(recording: Recording, system: System) -> Recording:
     """The recording; where it has more rows than a diagnosis uses, stretches that are spread evenly over it."""
     profile = profile_of(system)
-    stretch = STRETCH_WINDOWS * max(profile.window_rows, round(PREDICTION_TIME / recording.period))
-    return spread(recording, MOST_SEARCHES * profile.search_rows, stretch, round(MEMORY_TIME / recording.period))
+    stretch = STRETCH_WINDOWS * max(profile.window_rows, round(system.prediction_time / recording.period))
+    return spread(
+        recording,
+        MOST_SEARCHES * profile.search_rows,
+        stretch,
+        round(MEMORY * system.prediction_time / recording.period),
+    )
 
 
 def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effect]] = ()) -> PreparedRecording:
@@ -96,7 +100,7 @@ class _Readings:
         if stretches is None:
             stretches = [(k, first, len(self.states[k])) for k, first in enumerate(self.first_usable)]
         # A window holds predictions from half of its rows, however fast these follow each other.
-        least = round(2 * PREDICTION_TIME / period)
+        least = round(2 * self.system.prediction_time / period)
         longest = max(profile_of(self.system).window_rows, least)
         if len(self.states) == 1:  # of which a part is held out
             longest = min(longest, max(least, -(-len(self.states[0]) // 2)))

@@ -27,7 +27,7 @@ from visadapt.diagnosis.search.unexplained_load import LoadTrack, load_tracks
 from visadapt.recordings import Recording
 from visadapt.world import World
 
-WIDTHS = (0.06, 0.085, 0.12, 0.17)  # s, deviations of the Gaussian bumps that are tried
+WIDTHS = (0.12, 0.17, 0.24, 0.34)  # Deviations of the Gaussian bumps that are tried, in prediction times
 
 SPACING = 0.3  # Distance between the bumps of a width that are tried, over that width
 
@@ -83,10 +83,11 @@ def pushes(
         tracks = load_tracks(recording, worlds, next(functions, None))
         if not tracks:
             return ()
-        found = _Fit(tracks).pushes()
+        widths = [width * worlds[0].system.prediction_time for width in WIDTHS]
+        found = _Fit(tracks, widths).pushes()
     except torch.linalg.LinAlgError:  # type: ignore[attr-defined]
         return ()  # errors too small, or too large, for any push to stand out
-    middles = sum(float(track.time[-1] - track.time[0]) / (SPACING * width) for track in tracks for width in WIDTHS)
+    middles = sum(float(track.time[-1] - track.time[0]) / (SPACING * width) for track in tracks for width in widths)
     tries = round(middles) * tracks[0].load.shape[1]
     named = [summed(bumps, deviation, tracks, worlds[0].system.loads, tries) for bumps, deviation in found]
     sure = [push for push in named if push.p_value <= MAX_P_VALUE and push.ci90[0] * push.ci90[1] > 0]
@@ -109,6 +110,7 @@ class _Fit:
     """Columns, errors and bumps, fitted to all parts of a recording together."""
 
     tracks: Sequence[LoadTrack]  # P parts, of N instants each (N differs), with J joints and K columns
+    widths: Sequence[float]  # s, of the bumps that are tried
     bumps: list[Bump]  # B on a part
     residual: list[Tensor]  # P times (N, J): the load less all that is fitted
     weights: list[Tensor]  # P times (M,): of the columns, the loads held by dry friction, and the bumps
@@ -119,8 +121,8 @@ class _Fit:
     innovation: Tensor  # (J,) deviation of what the autoregression leaves
     first: Tensor  # (J, LAGS, LAGS) Cholesky factors of the covariances of a part's first errors, which follow none
 
-    def __init__(self, tracks: Sequence[LoadTrack]) -> None:
-        self.tracks = tracks
+    def __init__(self, tracks: Sequence[LoadTrack], widths: Sequence[float]) -> None:
+        self.tracks, self.widths = tracks, widths
         self.bumps = []
         joints = tracks[0].load.shape[1]
         # At first all of the load, so that `_design` takes the columns along the world's motion: along the measured
@@ -306,7 +308,7 @@ class _Fit:
                 first, last = max(first, near.middle - 2 * near.width), min(last, near.middle + 2 * near.width)
             return torch.arange(first, last, SPACING * width, dtype=torch.float64)
 
-        tried = (best(joint, middles(width), width) for width in WIDTHS for joint in on)
+        tried = (best(joint, middles(width), width) for width in self.widths for joint in on)
         return max(tried, key=lambda one: one.score)
 
     def _impulse_deviation(self, group: Sequence[Bump]) -> float:

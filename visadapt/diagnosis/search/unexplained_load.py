@@ -27,7 +27,8 @@ EDGE = GAUSSIAN_REACH + 0.2
 """Deviations of the smoothing that are left out at either end, where it reaches beyond the recording; positions are
 smoothed too."""
 
-STEP = 0.04  # s between the instants at which the load is given, or one period if that is longer
+STEP = 0.08
+"""Share of the prediction time between the instants at which the load is given; one period if that is longer."""
 
 LONGEST = 300  # Instants in a part: what drifts is fitted part by part, and the work grows with its square
 
@@ -143,7 +144,7 @@ def _track(
     fastest = torch.tensor([world.system.states[v].largest for v in motion.velocities], dtype=torch.float64)
     velocity = motion.state[:, motion.velocities]
     at_rest = motion.smooth((-(_slowest(velocity) / (SLOW * fastest)).square()).exp())
-    edge, stride = round(EDGE * motion.smoothing / period), max(1, round(STEP / period))
+    edge, stride = round(EDGE * motion.smoothing / period), max(1, round(STEP * world.system.prediction_time / period))
     inner = slice(edge, len(motion.time) - edge, stride)
     both = torch.cat((found.load[:, None], found.columns), 1)
     smooth = smoothed(both.flatten(1), motion.smoothing / period, edge, stride).unflatten(1, both.shape[1:])

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from visadapt.effects.base import EFFECTS, Effect
+from visadapt.effects.base import EFFECTS, Effect, Parameter
 from visadapt.effects.own.added_inertia import inertia_of
 from visadapt.effects.own.commands import on_commands
 from visadapt.effects.own.drift import on_states
@@ -118,6 +118,13 @@ def _scaled(system: System, field: str, factor: float) -> System | None:
     return scaled
 
 
+def _in_time(parameter: Parameter, system: type[System]) -> Parameter:
+    """A parameter whose range, if it is a time or a frequency, is that for the prediction time of a system."""
+    slower = system.prediction_time / System.prediction_time
+    factor = {"s": slower, "Hz": 1 / slower}.get(parameter.unit, 1.0)
+    return replace(parameter, low=factor * parameter.low, high=factor * parameter.high)
+
+
 def _named(
     system: type[System],
     name: str,
@@ -128,6 +135,7 @@ def _named(
 ) -> type[Effect]:
     # Where effects of two systems have the same name, the later ones replace the earlier in `EFFECTS`.
     own = {"__module__": system.__module__, "__qualname__": name, "name": name, "systems": (system,)}
+    attributes = {**attributes, "table": tuple(_in_time(p, system) for p in attributes.get("table", base.table))}
     settled = {other: _MOTOR_OFF for other in alike if other.endswith(".constant_load")}
     settled |= {other: _COMMANDS_OFF for other in alike if other.endswith(".drift")}
     settled |= {other: _measured(other, "an actuator's gain") for other in alike if other.endswith(".scale")}
