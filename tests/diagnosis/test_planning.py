@@ -18,7 +18,7 @@ SOURCE = va.World(va.CartPole())
 @pytest.fixture(autouse=True)
 def few_excitations(monkeypatch):
     """One frequency of six and one binary sequence of four, for the time it takes."""
-    monkeypatch.setattr(planning, "FREQUENCIES", (0.8,))
+    monkeypatch.setattr(planning, "CYCLES", (0.4,))
     monkeypatch.setattr(planning, "BIT_ROWS", (4,))
 
 
