@@ -107,7 +107,6 @@ PARTS = {
     ),
     "careful fits": Part(Search, "_polish", _nothing),
     "starts without process noise": Part(Search, "_fit_from_quiet", _fit_with_noise),
-    "widening": Part(Search, "_widen", _nothing),
     "late sensors": Part(Search, "_fit_late", _nothing, lambda _, self, bases: bool(bases)),
     "phases of episodes": Part(Search, "_phases_of_episodes", _nothing),
     "jumps": Part(DIAGNOSE, "with_jumps", _nothing, lambda out, _: out is not None),
@@ -131,7 +130,6 @@ TOGETHER = (
     "every effect alone",
     "exchanges",
     "starts without process noise",
-    "widening",
     "phases of episodes",
 )
 ALL_OF_THEM = "all but growth, removal and careful fits"

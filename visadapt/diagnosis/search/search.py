@@ -31,7 +31,7 @@ MAX_CANDIDATES, MAX_EXCHANGES = 8, 3
 
 TWO_FOR_ONE_UP_TO = 4
 """Effects at most in a set of which two are exchanged for one. Larger sets describe something that no effect explains;
-their many pairs would take most of the search. Instead, sets of one and of two effects then get a further effect."""
+their many pairs would take most of the search."""
 
 LEADERS = 4  # Sets that are fitted before the others, where some fall far behind
 
@@ -40,10 +40,6 @@ FIT_ALL_ABOVE = 100.0  # Log likelihood that the best effect promises, above whi
 EXCHANGE_LOG_PROCESS = math.log(0.003**2)
 """Least log variance of the velocities' process noise, (m/s)^2 and (rad/s)^2, with which a fit starts after an
 exchange: room for what the new effect does not yet explain, and little to shed where it explains all."""
-
-WIDEN_MODELS = 6
-"""Where the best set leaves something unexplained, the search is widened: the WIDEN_MODELS best sets of one and of two
-effects get a further effect."""
 
 LATE_SHARE, LATE_BASES = 0.3, 3
 """Late sensors are fitted even where the screening proposes none: added to the source, to the best set and to the
@@ -76,7 +72,9 @@ class Search(FittedModels):
             beam = self._worth_extending(ranked)
         self._settle(exchanged)
         if not self.explains_all(self.best):
-            self._widen(exchanged)
+            self.try_late_sensors()
+            self._settle(exchanged)
+            self._phases_of_episodes()
         self._report(progress, MAX_EFFECTS)
 
     def fit_singles(self) -> list[ScoredModel]:
@@ -160,16 +158,6 @@ class Search(FittedModels):
         """Fit sets without process noise and, from there, with it."""
         quiet = self.fit(starts, effort, process_noise=False)
         self.fit([(each.effects, each.fits) for each in quiet], effort)
-
-    def _widen(self, exchanged: Exchanges) -> None:
-        """Search further where the best set leaves something unexplained."""
-        # Perhaps two effects explain it that only together beat single effects which fit fairly.
-        for size in (1, 2):
-            bases = [f for f in self.ranked if len(f.effects) == size and f.log_odds > -math.inf]
-            self.extend(bases[:WIDEN_MODELS])
-        self.try_late_sensors()
-        self._settle(exchanged)
-        self._phases_of_episodes()
 
     def try_late_sensors(self) -> None:
         """The source, the best set and the best single effects with each late sensor in addition.
