@@ -79,29 +79,29 @@ class Seeing(Policy):
     def __init__(self, policy: Policy) -> None:
         super().__init__(policy.n_state, policy.n_action)
         self.policy = policy
-        self.places = torch.zeros(0, 0, 2, dtype=torch.float64)  # (B, frames seen, 2), five at most
+        self.poses = torch.zeros(0, 0, 2, dtype=torch.float64)  # (B, frames seen, 2), five at most
 
     @torch.no_grad()
     def act(self, history: History) -> Tensor:
         found = tracker().poses((255 * history.observations[:, -1]).round().to(torch.uint8))
-        place = found.place
+        pose = found.pose
         if bool(history.begins.all()):
-            self.places = place[:, None]
+            self.poses = pose[:, None]
         else:
             # Where a frame shows no cart-pole, the last pose is kept.
-            place = torch.where(found.explained[:, None], place, self.places[:, -1])
-            self.places = torch.cat((self.places[:, 1 - LENGTH :], place[:, None]), 1)
-        states = path_through(self.places, history.actions[:, history.actions.shape[1] + 1 - self.places.shape[1] :])
+            pose = torch.where(found.explained[:, None], pose, self.poses[:, -1])
+            self.poses = torch.cat((self.poses[:, 1 - LENGTH :], pose[:, None]), 1)
+        states = path_through(self.poses, history.actions[:, history.actions.shape[1] + 1 - self.poses.shape[1] :])
         before = states[:, :1].expand(-1, LENGTH - states.shape[1], -1)
         return self.policy.act(History(torch.cat((before, states), 1).to(history.actions), history.actions))
 
 
-def path_through(places: Tensor, actions: Tensor) -> Tensor:
+def path_through(poses: Tensor, actions: Tensor) -> Tensor:
     """States (B, n, 4) of the source on its way through poses (B, n, 2) under commands (B, n - 1, 1) and a force.
 
     Five numbers of each episode are unknown: its first state, and the force.
     """
-    batch, actions = len(places), actions.double()
+    batch, actions = len(poses), actions.double()
 
     def path(unknown: Tensor) -> Tensor:
         """(B, n, 4) from the first state and the force (B, 5)."""
@@ -114,11 +114,11 @@ def path_through(places: Tensor, actions: Tensor) -> Tensor:
 
     def errors(unknown: Tensor) -> Tensor:
         """(B, 2 n + 3) in standard deviations."""
-        away = path(unknown)[..., [0, 2]] - places.repeat(len(unknown) // batch, 1, 1)
+        away = path(unknown)[..., [0, 2]] - poses.repeat(len(unknown) // batch, 1, 1)
         return torch.cat((away.flatten(1) / POSE, unknown[:, [1, 3]] / RATE, unknown[:, 4:] / PUSH), 1)
 
     found = torch.zeros(batch, 5, dtype=torch.float64)
-    found[:, 0], found[:, 2] = places[:, 0].unbind(-1)
+    found[:, 0], found[:, 2] = poses[:, 0].unbind(-1)
     step = DIFFERENCE * torch.eye(5, dtype=torch.float64)
     for _ in range(STEPS):
         here, *moved = errors(torch.cat([found, *(found + each for each in step)])).split(batch)

@@ -28,31 +28,31 @@ def problem():
 
 
 PROCESS = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64).expand(N, -1)
-SOURCES = torch.randn(N, T - 1, STATES, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+DIRECTIONS = torch.randn(N, T - 1, STATES, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 MEASUREMENT = torch.tensor([0.5, 0.2], dtype=torch.float64).expand(N, -1)
 
 
 def process_of(variances):
-    """Covariances of noises with variances (N, 3), which enter the states by SOURCES."""
-    return (SOURCES * variances[:, None, None]) @ SOURCES.mT
+    """Covariances of noises with variances (N, 3), which enter the states by DIRECTIONS."""
+    return (DIRECTIONS * variances[:, None, None]) @ DIRECTIONS.mT
 
 
 def dense(problem, n, column):
     """Mean and covariance of all states, and the matrix, of system n, as one Gaussian."""
     mean = [problem.start[n, :, column]]
     maps = [torch.eye(STATES, dtype=torch.float64)]
-    sources = [torch.diag(problem.initial_variance[n])]
+    blocks = [torch.diag(problem.initial_variance[n])]
     rows = [[maps[0]]]
     for t in range(T - 1):
         a = problem.transition[n, t]
         mean.append(a @ mean[-1] + problem.drive[n, t, :, column])
         rows.append([a @ m for m in rows[-1]] + [torch.eye(STATES, dtype=torch.float64)])
-        sources.append(process_of(PROCESS)[n, t])
+        blocks.append(process_of(PROCESS)[n, t])
     whole = torch.zeros(T * STATES, T * STATES, dtype=torch.float64)
     for i, row in enumerate(rows):
         for j, m in enumerate(row):
             whole[i * STATES : (i + 1) * STATES, j * STATES : (j + 1) * STATES] = m
-    covariance = whole @ torch.block_diag(*sources) @ whole.T
+    covariance = whole @ torch.block_diag(*blocks) @ whole.T
     return torch.cat(mean), covariance
 
 
@@ -112,7 +112,7 @@ def test_noise_scores_are_the_derivatives_of_the_likelihood(problem):
     log_likelihood(filtered, torch.ones(N, T, CHANNELS)).sum().backward()
     _, adjoint = backward(filtered)
     weight = weights(filtered, filtered.white, adjoint)
-    by_process, by_noise = noise_scores(filtered, adjoint[..., 0], weight[..., 0], SOURCES, PROCESS, MEASUREMENT)
+    by_process, by_noise = noise_scores(filtered, adjoint[..., 0], weight[..., 0], DIRECTIONS, PROCESS, MEASUREMENT)
     torch.testing.assert_close(by_process.sum(1), process.grad)
     torch.testing.assert_close(by_noise.sum(1), noise.grad)
 

@@ -94,31 +94,31 @@ class TestPoses:
         theta = np.where(np.abs(x) > 1.2, -np.sign(x) * np.abs(theta), theta)
         poses = tracker.poses(torch.from_numpy(DrawnCartPole()(x, theta)))
         assert poses.explained.all()
-        error = poses.place.numpy() - np.stack([x, theta], 1)
+        error = poses.pose.numpy() - np.stack([x, theta], 1)
         assert (rms(error) < [1e-3, 3e-3]).all()
         assert (np.abs(error).max(0) < [3e-3, 1e-2]).all()
 
     def test_found_as_far_as_a_renderer_shows_the_cart(self):
         renderer = small_renderer(width=80)  # 8 px a metre
-        places = torch.tensor([[-4.6, 0.1], [-2.1, -0.1], [3.3, 0.0], [4.6, 0.1]])
-        frames = (255 * renderer(*places.T)).round().to(torch.uint8)
-        assert Tracker(renderer, WORLD).poses(frames).place.numpy() == pytest.approx(places.numpy(), abs=0.02)
+        poses = torch.tensor([[-4.6, 0.1], [-2.1, -0.1], [3.3, 0.0], [4.6, 0.1]])
+        frames = (255 * renderer(*poses.T)).round().to(torch.uint8)
+        assert Tracker(renderer, WORLD).poses(frames).pose.numpy() == pytest.approx(poses.numpy(), abs=0.02)
 
     def test_the_renderers_own_frames_are_explained_to_rounding(self, tracker):
-        place = torch.tensor([[0.313, -0.121], [-0.878, 0.333]])
+        pose = torch.tensor([[0.313, -0.121], [-0.878, 0.333]])
         with torch.no_grad():
-            frames = (255 * tracker.poses.renderer(*place.T)).round().to(torch.uint8)
+            frames = (255 * tracker.poses.renderer(*pose.T)).round().to(torch.uint8)
         poses = tracker.poses(frames)
         assert poses.misfit.max() < 0.5 / 255
-        np.testing.assert_allclose(poses.place, place, atol=1e-4)
+        np.testing.assert_allclose(poses.pose, pose, atol=1e-4)
 
     def test_the_covariance_is_that_of_white_errors(self, tracker):
-        place = torch.tensor([0.2, -0.1]).expand(100, 2)
+        pose = torch.tensor([0.2, -0.1]).expand(100, 2)
         noise = torch.randn(100, 100, 120, generator=torch.Generator().manual_seed(0))
         with torch.no_grad():
-            frames = (255 * tracker.poses.renderer(*place.T) + 5 * noise).round().clamp(0, 255).to(torch.uint8)
+            frames = (255 * tracker.poses.renderer(*pose.T) + 5 * noise).round().clamp(0, 255).to(torch.uint8)
         poses = tracker.poses(frames)
-        error = poses.place - place
+        error = poses.pose - pose
         whitened = torch.linalg.solve(torch.linalg.cholesky(poses.covariance), error[..., None])
         # Noise above white is cut off, and not all pixels count.
         assert 0.7 < float(whitened.square().mean().sqrt()) < 1.3
@@ -138,8 +138,8 @@ class TestPoses:
         drawn = DrawnCartPole(camera, pole_width=0.1)
         x, theta = np.array([-1.2, 0.3, 1.0]), np.array([0.1, -0.3, 0.02])
         poses = PoseFinder(Sketch(drawn), 1.5)(torch.from_numpy(drawn(x, theta)))
-        np.testing.assert_allclose(poses.place[:, 0], x, atol=3e-3)
-        np.testing.assert_allclose(poses.place[:, 1], theta, atol=1e-2)
+        np.testing.assert_allclose(poses.pose[:, 0], x, atol=3e-3)
+        np.testing.assert_allclose(poses.pose[:, 1], theta, atol=1e-2)
 
 
 class TestTracks:

@@ -34,7 +34,7 @@ def scene(panels, t, due=DUE):
 
 def seen(film, point):
     """Column and row in the scene of a point in m, to the right and up from the hinge at x = 0."""
-    zoom = PANEL_WIDTH / (2 * film.reach)
+    zoom = PANEL_WIDTH / (2 * film.half_width)
     return np.floor(np.array([PANEL_WIDTH, SCENE_HEIGHT]) / 2 + zoom * point * (1, -1)).astype(int)
 
 

@@ -135,7 +135,7 @@ def diagnose(
             len(recording.episodes),
             recording.samples,
             float(f"{recording.period:.9g}"),
-            tuple(printable(source) for source in used.sources),
+            tuple(printable(origin) for origin in used.sources),
         ),
         verdict=verdict,
         where=Where(
@@ -289,13 +289,13 @@ def _judge(explored: _Explored, measured: MeasuredGap) -> tuple[str, tuple[Cause
 
 
 def _warnings(
-    explored: _Explored, measured: MeasuredGap, verdict: str, found: Sequence[Cause], source: str
+    explored: _Explored, measured: MeasuredGap, verdict: str, found: Sequence[Cause], origin: str
 ) -> Iterator[str]:
-    """What a reader of the diagnosis must know of the recording `source`, the comparison and the causes found."""
+    """What a reader of the diagnosis must know of the recording from `origin`, the comparison and the causes found."""
     comparison = explored.comparison
     yield from explored.prepared.warnings
     if not measured.errors.held_out:
-        yield f"{source}: {TOO_SHORT}"
+        yield f"{origin}: {TOO_SHORT}"
     yield from left_unexplained(comparison, verdict, comparison.unexplained(measured.improvable))
     yield from at_bounds(comparison, found, explored.effects)
     bare = comparison.unchanged

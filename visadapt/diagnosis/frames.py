@@ -111,9 +111,9 @@ def watch(recording: Recording, system: System, renderer: nn.Module, report: Rep
         finder = PoseFinder(seen, reach)
     known = within_frame(effects, every[0].float()).to(torch.uint8)
     poses = found_in(recording, finder, known, staged(report, "poses"))
-    left = left_over(seen, effects, every, torch.cat([each.place for each in poses]))
+    left = left_over(seen, effects, every, torch.cat([each.pose for each in poses]))
     found, frames = positions(recording, poses)
-    pixels = judged(left, usual(renderer, effects, camera.best.place))
+    pixels = judged(left, usual(renderer, effects, camera.best.pose))
     return Film(found, frames, camera, seen, pixels, left)
 
 
@@ -183,8 +183,8 @@ def _without_gap(motion: Diagnosis, seen_by_a_faulty_camera: bool, system: Syste
 def _unexplained_in_pixels(motion: Diagnosis, camera: Sequence[Cause]) -> Diagnosis:
     """The diagnosis where frames show what neither renderer nor camera explains: its causes become warnings."""
     found = [
-        f"found in the {place}, to be trusted less: {_values(causes)}"
-        for place, causes in (("pixels", camera), ("motion", motion.causes))
+        f"found in the {shown}, to be trusted less: {_values(causes)}"
+        for shown, causes in (("pixels", camera), ("motion", motion.causes))
         if causes
     ]
     return replace(
@@ -215,14 +215,14 @@ def _values(causes: Sequence[Cause]) -> str:
 
 def check_frames(recording: Recording, size: tuple[int, ...]) -> None:
     """Raises FramesError where frames are not of the renderer's (height, width), or none differs from another."""
-    for episode, source in zip(recording.episodes, recording.sources, strict=True):
+    for episode, origin in zip(recording.episodes, recording.sources, strict=True):
         assert episode.frame is not None
         if episode.frame.shape[1:] != size:
             shown = " x ".join(str(side) for side in episode.frame.shape[1:])
             drawn = " x ".join(str(side) for side in size)
-            raise FramesError(f"{source}: frames of {shown} px (height x width); the renderer draws {drawn} px")
+            raise FramesError(f"{origin}: frames of {shown} px (height x width); the renderer draws {drawn} px")
         if len(episode.frame) > 1 and (episode.frame == episode.frame[0]).all():
-            raise FramesError(f"{source}: all {len(episode.frame)} frames are the same; a film that moves is right")
+            raise FramesError(f"{origin}: all {len(episode.frame)} frames are the same; a film that moves is right")
 
 
 def found_in(recording: Recording, finder: PoseFinder, known: Tensor, progress: Progress | None = None) -> list[Poses]:
@@ -250,12 +250,12 @@ def positions(recording: Recording, found: Sequence[Poses]) -> tuple[Recording, 
     parts = list(_parts(recording, seen, clear))
     if not parts:
         raise FramesError(f"{recording.sources[0]}: no {FEWEST_POSES} frames close to each other are explained")
-    episodes, usable, sources, frames = zip(*parts, strict=True)
+    episodes, usable, origins, frames = zip(*parts, strict=True)
     shown_in = replace(
         recording,
         episodes=episodes,
         measured=POSE,
-        sources=sources,
+        sources=origins,
         warnings=(*recording.warnings, *_misses(recording, clear)),
         usable=usable,
         resolution=RESOLUTION,
@@ -267,7 +267,7 @@ def positions(recording: Recording, found: Sequence[Poses]) -> tuple[Recording, 
 class _Seen:
     """The poses that the frames of an episode show, row by row."""
 
-    place: NDArray[np.floating]  # (T, 2)
+    pose: NDArray[np.floating]  # (T, 2)
     explained: NDArray[np.bool_]  # (T,) whether the renderer explains the frame
     deviation: NDArray[np.floating]  # (T, 2) standard deviation of the pose
     usual: NDArray[np.bool_]  # (T,) False in the copies of its first frame with which a late camera begins
@@ -284,8 +284,8 @@ def _seen(episode: Episode, poses: Poses) -> _Seen:
     if len(new) > 1:
         usual[1 : 1 + int(new[1:].argmax())] = False
     deviation = poses.covariance.diagonal(dim1=1, dim2=2).sqrt().nan_to_num(torch.inf).numpy()
-    place, explained = poses.place.nan_to_num().numpy(), poses.explained.numpy()
-    return _Seen(place[original], explained[original], deviation[original], usual)
+    pose, explained = poses.pose.nan_to_num().numpy(), poses.explained.numpy()
+    return _Seen(pose[original], explained[original], deviation[original], usual)
 
 
 def _clear(seen: Sequence[_Seen]) -> list[NDArray[np.bool_]]:
@@ -310,14 +310,14 @@ def _check_scene(recording: Recording, clear: Sequence[NDArray[np.bool_]], found
 def _parts(
     recording: Recording, seen: Sequence[_Seen], clear: Sequence[NDArray[np.bool_]]
 ) -> Iterator[tuple[Episode, NDArray[np.bool_], str, NDArray[np.uint8]]]:
-    """The stretches of the episodes without long misses: poses, which rows are usable, source, and frames."""
-    for episode, poses, used, source in zip(recording.episodes, seen, clear, recording.sources, strict=True):
+    """The stretches of the episodes without long misses: poses, which rows are usable, origin, and frames."""
+    for episode, poses, used, origin in zip(recording.episodes, seen, clear, recording.sources, strict=True):
         assert episode.frame is not None
         for first, last in _stretches(used, recording.period):
             rows = slice(first, last)
             time, action = episode.time[rows], episode.action[rows]
-            part = replace(episode, time=time, action=action, state=poses.place[rows], frame=None)
-            yield part, (used & poses.usual)[rows], source, episode.frame[rows]
+            part = replace(episode, time=time, action=action, state=poses.pose[rows], frame=None)
+            yield part, (used & poses.usual)[rows], origin, episode.frame[rows]
 
 
 def _misses(recording: Recording, clear: Sequence[NDArray[np.bool_]]) -> Iterator[str]:

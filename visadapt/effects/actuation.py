@@ -71,10 +71,10 @@ class ActuatorDelay(ActuationEffect):
             return commands.new_zeros(0, 1, commands.shape[-1] + 2)
         if not bool((delay >= 0).all()):
             raise ValueError(f"actuator_delay: delay must not be negative, got {float(delay.min()):g} s")
-        reach = 2 * math.ceil(float(delay.max()) / substep) + 1
+        remembered = 2 * math.ceil(float(delay.max()) / substep) + 1
         held = torch.full_like(commands[:, :1, :1], substep)
         count = torch.full_like(held, commands.shape[1])
-        return torch.cat((torch.zeros_like(commands[:, :1]), held, count), -1).expand(-1, reach, -1)
+        return torch.cat((torch.zeros_like(commands[:, :1]), held, count), -1).expand(-1, remembered, -1)
 
     def apply_to(self, commands: Tensor, memory: Tensor, substep: Duration) -> tuple[Tensor, Tensor]:
         batch, count, width = commands.shape

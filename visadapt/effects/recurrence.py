@@ -22,9 +22,9 @@ def linear_recurrence(
         compose: the product of two of `kept`, by default element by element.
         apply: one of `kept` applied to a value.
     """
-    reach = 1
-    while reach < added.shape[1]:
-        added = torch.cat((added[:, :reach], added[:, reach:] + apply(kept[:, reach:], added[:, :-reach])), 1)
-        kept = torch.cat((kept[:, :reach], compose(kept[:, reach:], kept[:, :-reach])), 1)
-        reach *= 2
+    spacing = 1
+    while spacing < added.shape[1]:
+        added = torch.cat((added[:, :spacing], added[:, spacing:] + apply(kept[:, spacing:], added[:, :-spacing])), 1)
+        kept = torch.cat((kept[:, :spacing], compose(kept[:, spacing:], kept[:, :-spacing])), 1)
+        spacing *= 2
     return added, kept

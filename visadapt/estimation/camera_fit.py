@@ -90,7 +90,7 @@ class CameraFit:
 
     camera: Camera
     values: Tensor  # (P,) float64, in the order of the effects and of their tables
-    place: Tensor  # (N, 2) x in m and theta in rad of the frames
+    pose: Tensor  # (N, 2) x in m and theta in rad of the frames
     mean_square: float  # of frame less what is drawn, grey levels of [0, 1]
     covariance: Tensor  # (P, P) of the values
     residual: Tensor  # (N, H, W), 0 where the renderer draws nothing of what is seen
@@ -116,7 +116,7 @@ def made(camera: Camera, values: Tensor) -> list[CameraEffect]:
 
 
 class _Comparison:
-    """Frames (N, H, W) less what renderer and camera draw at places (N, 2) with parameters (P,), and its derivatives.
+    """Frames (N, H, W) less what renderer and camera draw at poses (N, 2) with parameters (P,), and its derivatives.
 
     Args:
         fixed: names of the parameters that stay as they are, whose derivatives are 0.
@@ -133,33 +133,33 @@ class _Comparison:
         self.free = torch.tensor([p.name not in fixed for p in table], dtype=torch.float64)
         self.step = (DIFFERENCE_SHARE * (self.high - self.low)).clamp_max(LONGEST_DIFFERENCE)
 
-    def left(self, place: Tensor, values: Tensor) -> Tensor:
+    def left(self, pose: Tensor, values: Tensor) -> Tensor:
         """What is left of the frames, also where the renderer draws nothing of what they show."""
-        return self.frames - self._shown(self._scene(place), values)
+        return self.frames - self._shown(self._scene(pose), values)
 
-    def compared(self, place: Tensor, values: Tensor, smooth: bool) -> tuple[Tensor, float]:
+    def compared(self, pose: Tensor, values: Tensor, smooth: bool) -> tuple[Tensor, float]:
         """What is left of the frames, and its mean square where the renderer draws what they show."""
-        left = self._counted(self.left(place, values), values, smooth)
+        left = self._counted(self.left(pose, values), values, smooth)
         return left, float(left.square().mean() / within_frame(made(self.camera, values), self.frames).mean())
 
-    def slopes(self, place: Tensor, values: Tensor, smooth: bool) -> tuple[Tensor, Tensor]:
-        """Derivatives (N, 2, H W) by place and (N, P, H W) by the parameters, as central differences."""
-        by_place = [
-            self._shown(self._scene(place + h), values) - self._shown(self._scene(place - h), values)
-            for h in DIFFERENCE * torch.eye(2).to(place)
+    def slopes(self, pose: Tensor, values: Tensor, smooth: bool) -> tuple[Tensor, Tensor]:
+        """Derivatives (N, 2, H W) by pose and (N, P, H W) by the parameters, as central differences."""
+        by_pose = [
+            self._shown(self._scene(pose + h), values) - self._shown(self._scene(pose - h), values)
+            for h in DIFFERENCE * torch.eye(2).to(pose)
         ]
-        scene = self._scene(place)
+        scene = self._scene(pose)
         by_value = [
             self.free[k] * (self._shown(scene, values + h) - self._shown(scene, values - h)) / (2 * self.step[k])
             for k, h in enumerate(torch.diag(self.step))
         ]
-        pictures = torch.stack([each.to(self.frames) for each in (*by_place, *by_value)], 1)
+        pictures = torch.stack([each.to(self.frames) for each in (*by_pose, *by_value)], 1)
         counted = self._counted(pictures.flatten(0, 1), values, smooth)
         derivatives = counted.unflatten(0, pictures.shape[:2]).flatten(2)
         return derivatives[:, :2] / (2 * DIFFERENCE), derivatives[:, 2:]
 
-    def _scene(self, place: Tensor) -> Tensor:
-        out: Tensor = self.renderer(place[:, 0].to(self.frames), place[:, 1].to(self.frames))
+    def _scene(self, pose: Tensor) -> Tensor:
+        out: Tensor = self.renderer(pose[:, 0].to(self.frames), pose[:, 1].to(self.frames))
         return out
 
     def _shown(self, scene: Tensor, values: Tensor) -> Tensor:
@@ -177,71 +177,71 @@ def fit_camera(
     frames: Tensor,
     camera: Camera,
     values: Tensor,
-    place: Tensor,
+    pose: Tensor,
     fixed: frozenset[str],
     smooth: bool = False,
 ) -> CameraFit:
-    """Fit camera effects to frames (N, H, W) in [0, 1], from values (P,) and places (N, 2); `fixed` are the names of
+    """Fit camera effects to frames (N, H, W) in [0, 1], from values (P,) and poses (N, 2); `fixed` are the names of
     parameters that stay as they are; with `smooth`, to `smoothed` frames."""
     pictures = _Comparison(renderer, frames, camera, fixed)
     low, high = pictures.low, pictures.high
-    values, place = values.double().clone(), place.double().clone()
-    (error, loss), damping, parts = pictures.compared(place, values, smooth), 1e-3, None
+    values, pose = values.double().clone(), pose.double().clone()
+    (error, loss), damping, parts = pictures.compared(pose, values, smooth), 1e-3, None
     for _ in range(STEPS):
         if parts is None:
-            parts = _normal(*pictures.slopes(place, values, smooth), error)
+            parts = _normal(*pictures.slopes(pose, values, smooth), error)
         change, moves = _solved(*parts, damping)
         tried = torch.minimum(torch.maximum(values + change, low), high)
-        there = place + moves.clamp(-SPACING, SPACING)
+        there = pose + moves.clamp(-SPACING, SPACING)
         error_there, loss_there = pictures.compared(there, tried, smooth)
         if loss_there < loss:
             gained = 1 - loss_there / loss
-            values, place, error, loss, damping, parts = tried, there, error_there, loss_there, damping / 10, None
+            values, pose, error, loss, damping, parts = tried, there, error_there, loss_there, damping / 10, None
             if gained < SMALL_GAIN:
                 break
         else:
             damping *= 10
             if damping > 1e3:
                 break
-    noise = white_noise(pictures.left(place, values))
-    covariance = _covariance(*pictures.slopes(place, values, smooth), error, noise, (high - low).square() / 12)
+    noise = white_noise(pictures.left(pose, values))
+    covariance = _covariance(*pictures.slopes(pose, values, smooth), error, noise, (high - low).square() / 12)
     if smooth:  # what is left of sharp frames is compared with that of other cameras
-        error, loss = pictures.compared(place, values, smooth=False)
-    return CameraFit(camera, values, place, loss, covariance, error)
+        error, loss = pictures.compared(pose, values, smooth=False)
+    return CameraFit(camera, values, pose, loss, covariance, error)
 
 
-def _normal(by_place: Tensor, by_value: Tensor, error: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Blocks of the normal equations: places (N, 2, 2), both (N, P, 2), values (P, P), and their right sides."""
+def _normal(by_pose: Tensor, by_value: Tensor, error: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Blocks of the normal equations: poses (N, 2, 2), both (N, P, 2), values (P, P), and their right sides."""
     flat = error.flatten(1)[..., None]
     return (
-        (by_place @ by_place.mT).double(),
-        (by_value @ by_place.mT).double(),
+        (by_pose @ by_pose.mT).double(),
+        (by_value @ by_pose.mT).double(),
         (by_value @ by_value.mT).double().sum(0),
-        (by_place @ flat)[..., 0].double(),
+        (by_pose @ flat)[..., 0].double(),
         (by_value @ flat)[..., 0].double().sum(0),
     )
 
 
-def _solved(places: Tensor, both: Tensor, whole: Tensor, g: Tensor, b: Tensor, damping: float) -> tuple[Tensor, Tensor]:
-    """Steps (P,) of the values and (N, 2) of the places, from the blocks and right sides that `_normal` gives."""
-    places = places + torch.diag_embed(places.diagonal(dim1=1, dim2=2) * damping + 1e-9)
+def _solved(poses: Tensor, both: Tensor, whole: Tensor, g: Tensor, b: Tensor, damping: float) -> tuple[Tensor, Tensor]:
+    """Steps (P,) of the values and (N, 2) of the poses, from the blocks and right sides that `_normal` gives."""
+    poses = poses + torch.diag_embed(poses.diagonal(dim1=1, dim2=2) * damping + 1e-9)
     whole = whole + torch.diag(whole.diagonal() * damping + 1e-9)
-    gain = torch.linalg.solve(places, both.mT).mT  # (N, P, 2)
+    gain = torch.linalg.solve(poses, both.mT).mT  # (N, P, 2)
     reduced = whole - (gain @ both.mT).sum(0)
     change = torch.linalg.solve(reduced, b - (gain @ g[..., None])[..., 0].sum(0))
-    moves = torch.linalg.solve(places, (g - (change @ both))[..., None])[..., 0]
+    moves = torch.linalg.solve(poses, (g - (change @ both))[..., None])[..., 0]
     return change, moves
 
 
-def _covariance(by_place: Tensor, by_value: Tensor, error: Tensor, noise: float, wide: Tensor) -> Tensor:
+def _covariance(by_pose: Tensor, by_value: Tensor, error: Tensor, noise: float, wide: Tensor) -> Tensor:
     """Covariance (P, P) of the parameters, with prior variances `wide` (P,): from white noise of the pixels, and from
     the rest of the residual, which is alike in many pixels and frames and so counts as few errors."""
     if not len(wide):
         return wide.new_zeros(0, 0)
-    places = (by_place @ by_place.mT).double()
-    places = places + 1e-9 * torch.eye(2).to(places)
-    gain = torch.linalg.solve(places, (by_place @ by_value.mT).double()).mT  # (N, P, 2)
-    clear = by_value - gain.to(by_place) @ by_place  # less what the places take up
+    poses = (by_pose @ by_pose.mT).double()
+    poses = poses + 1e-9 * torch.eye(2).to(poses)
+    gain = torch.linalg.solve(poses, (by_pose @ by_value.mT).double()).mT  # (N, P, 2)
+    clear = by_value - gain.to(by_pose) @ by_pose  # less what the poses take up
     white = max(noise**2, 1e-12)
     left = white_noise(error) ** 2  # of the noise, where frames are smoothed
     structured = max(0.0, float(error.square().mean()) - left) * len(error) * CORRELATED_PIXELS

@@ -123,12 +123,12 @@ def remembers(effect: type[Effect], system: System) -> bool:
 def check_fittable(kinds: Sequence[type[Effect]], system: System) -> None:
     """Raise ValueError, which names it, for an effect that cannot be fitted, is given twice, or that passive data of
     the system cannot tell from another."""
-    for place, kind in enumerate(kinds):
+    for index, kind in enumerate(kinds):
         if remembers(kind, system):
             raise ValueError(f"{kind.name} cannot be fitted: what it measures depends on earlier rows")
         if kind.stage is Stage.CAMERA:
             raise ValueError(f"{kind.name} cannot be fitted to states: only frames show it")
-        others = [*kinds[:place], *kinds[place + 1 :]]
+        others = [*kinds[:index], *kinds[index + 1 :]]
         if kind in others:
             raise ValueError(f"{kind.name} is given more than once: leave all but one out")
         for twin in twins(kind, others, system):

@@ -124,10 +124,10 @@ def backward(filtered: Filtered) -> tuple[Tensor, Tensor]:
 
 def adjoints(filtered: Filtered, white: Tensor) -> Tensor:
     """Adjoints (N, T, n, M) of readings with these white innovations (N, T, m, M)."""
-    sources = (-filtered.sensing.mT @ white).unbind(1)
-    out = [sources[-1]]
-    for loop, source in zip(reversed(filtered.closed_loop.unbind(1)), reversed(sources[:-1]), strict=True):
-        out.append(torch.baddbmm(source, loop.mT, out[-1]))
+    inputs = (-filtered.sensing.mT @ white).unbind(1)
+    out = [inputs[-1]]
+    for loop, each in zip(reversed(filtered.closed_loop.unbind(1)), reversed(inputs[:-1]), strict=True):
+        out.append(torch.baddbmm(each, loop.mT, out[-1]))
     return torch.stack(out[::-1], 1)
 
 
@@ -139,7 +139,7 @@ def weights(filtered: Filtered, white: Tensor, adjoint: Tensor) -> Tensor:
 
 
 def noise_scores(
-    filtered: Filtered, adjoint: Tensor, weight: Tensor, sources: Tensor, process: Tensor, noise: Tensor
+    filtered: Filtered, adjoint: Tensor, weight: Tensor, directions: Tensor, process: Tensor, noise: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Derivatives of the log likelihood by the logs of the noises' variances.
 
@@ -148,7 +148,7 @@ def noise_scores(
 
     Args:
         filtered: a filter run with the variances `process` (N, L) of uncorrelated process noises, which enter the
-            states by `sources` (N, T - 1, n, L), and `noise` (N, m) of the measurements.
+            states by `directions` (N, T - 1, n, L), and `noise` (N, m) of the measurements.
         adjoint, weight: (N, T, n) and (N, T, m) of the data.
 
     Returns:
@@ -160,7 +160,8 @@ def noise_scores(
     for loop, each in zip(reversed(filtered.closed_loop.unbind(1)), reversed(own[1:-1]), strict=False):
         covariances.append(torch.baddbmm(each, torch.bmm(loop.mT, covariances[-1]), loop))
     covariance = torch.stack(covariances[::-1], 1)
-    by_process = (sources * adjoint[:, 1:, :, None]).sum(-2).square() - (sources * (covariance @ sources)).sum(-2)
+    by_process = (directions * adjoint[:, 1:, :, None]).sum(-2).square()
+    by_process = by_process - (directions * (covariance @ directions)).sum(-2)
     # The variance of the weights: of the row's own innovation, and of the rows after.
     injected = filtered.injection @ filtered.whitening[:, :-1]
     variance = filtered.whitening.square().sum(-2)

@@ -130,17 +130,17 @@ def variances(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[T
 class LoadNoise(Batch):
     """The process noise of N systems: loads held for a period, each in the velocity that it gives to its coordinate."""
 
-    sources: Tensor  # (N, T - 1, n, L) change of the states per unit of each load
+    directions: Tensor  # (N, T - 1, n, L) change of the states per unit of each load
     variance: Tensor  # (N, L)
 
     def covariance(self) -> Tensor:
         """(N, T - 1, n, n) of the states, of which each has LEAST_PROCESS_NOISE of its own."""
-        least = torch.full_like(self.sources[..., 0], LEAST_PROCESS_NOISE**2)
-        return (self.sources * self.variance[:, None, None]) @ self.sources.mT + torch.diag_embed(least)
+        least = torch.full_like(self.directions[..., 0], LEAST_PROCESS_NOISE**2)
+        return (self.directions * self.variance[:, None, None]) @ self.directions.mT + torch.diag_embed(least)
 
     def smoothed(self, adjoint: Tensor) -> Tensor:
         """Smoothed loads (N, T - 1, L, M), with the other sign, from the smoother's adjoints (N, T, n, M)."""
-        return self.variance[:, None, :, None] * (self.sources.mT @ adjoint[:, 1:])
+        return self.variance[:, None, :, None] * (self.directions.mT @ adjoint[:, 1:])
 
 
 def _noises(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[LoadNoise, Tensor]:
@@ -150,10 +150,10 @@ def _noises(model: CandidateModel, fits: FitState, problem: Linear) -> tuple[Loa
     """
     windows = model.rows.shape[0]
     per_reading = problem.initial_variance / problem.initial_variance.new_tensor(model.profile.initial_variance)
-    sources = model.noise_directions.repeat(len(fits.theta), 1, 1, 1)
+    directions = model.noise_directions.repeat(len(fits.theta), 1, 1, 1)
     group = [k for k, columns in enumerate(model.profile.driven) for _ in columns]
     variance, noise = fits.log_process[:, group].exp(), fits.log_noise.exp()
-    loads = LoadNoise(sources * per_reading.sqrt()[:, None, :, None], variance.repeat_interleave(windows, 0))
+    loads = LoadNoise(directions * per_reading.sqrt()[:, None, :, None], variance.repeat_interleave(windows, 0))
     return loads, noise.repeat_interleave(windows, 0)
 
 
@@ -282,11 +282,11 @@ def _by_noise(
     of_both = adjoint[..., both]
     weight = weights(here, white[..., both], of_both)
     driven, measured = members
-    by_process, by_noise = noise_scores(here, of_both[..., 0], weight[..., 0], loads.sources, loads.variance, noise)
+    by_process, by_noise = noise_scores(here, of_both[..., 0], weight[..., 0], loads.directions, loads.variance, noise)
     score = by_process.sum(1) @ driven.T + (by_noise * used).sum(1) @ measured.T
     # What inputs add to the states is subtracted from the readings.
     by_group = loads.smoothed(of_both).mT[..., None] * driven.T
-    drive = (loads.sources[:, :, None] @ by_group).movedim(2, 3)
+    drive = (loads.directions[:, :, None] @ by_group).movedim(2, 3)
     reading = (noise[:, None, :, None] * weight)[..., None] * measured.T[:, None]
     working = respond(here, drive.flatten(-2), reading.flatten(-2)).flatten(1, 2)
     working = working.unflatten(-1, (2, len(driven))).flatten(1, 2)

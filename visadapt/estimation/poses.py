@@ -40,9 +40,9 @@ HIDDEN = 0.5  # `Poses.contrast` above which a frame does not show cart and pole
 class Poses:
     """What was found in T frames; tensors are on the CPU."""
 
-    place: Tensor  # (T, 2) float64: x in m, theta in rad
+    pose: Tensor  # (T, 2) float64: x in m, theta in rad
     covariance: Tensor
-    """(T, 2, 2) float64, misfit^2 (J'J)^-1: what white pixel errors of the size of the misfit would do to `place`"""
+    """(T, 2, 2) float64, misfit^2 (J'J)^-1: what white pixel errors of the size of the misfit would do to `pose`"""
     misfit: Tensor  # (T,) root mean square of frame less rendered frame, in grey levels of [0, 1]
     contrast: Tensor
     """(T,) misfit where cart and pole are drawn, over how much these differ from the mean picture there: small where
@@ -86,10 +86,10 @@ class PoseFinder:
     def __call__(self, frames: Tensor) -> Poses:
         """Poses in frames (T, H, W) uint8."""
         parts = [self._find(part.to(self._like) / 255) for part in frames.split(CHUNK)]
-        place, covariance, misfit, contrast = (torch.cat(tensors).cpu() for tensors in zip(*parts, strict=True))
+        pose, covariance, misfit, contrast = (torch.cat(tensors).cpu() for tensors in zip(*parts, strict=True))
         # Where the picture does not depend on the pose (a cart out of sight) there is nothing to be found either.
         sound = covariance.flatten(1).isfinite().all(1)
-        return Poses(place, covariance, misfit, contrast, sound & (contrast <= HIDDEN))
+        return Poses(pose, covariance, misfit, contrast, sound & (contrast <= HIDDEN))
 
     @torch.no_grad()
     def nearest(self, frames: Tensor, change: Callable[[Tensor], Tensor] | None = None) -> tuple[Tensor, Tensor]:
@@ -108,28 +108,28 @@ class PoseFinder:
         return self._grid[index], (least + small.square().sum(1)) / small.shape[1]
 
     @torch.no_grad()
-    def _render(self, place: Tensor) -> Tensor:
-        out: Tensor = self.renderer(place[:, 0], place[:, 1])
+    def _render(self, pose: Tensor) -> Tensor:
+        out: Tensor = self.renderer(pose[:, 0], pose[:, 1])
         return out
 
     def _find(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        place, _ = self.nearest(frames)
-        error = frames - self._render(place)
+        pose, _ = self.nearest(frames)
+        error = frames - self._render(pose)
         loss = error.square().mean((1, 2))
         damping = torch.full_like(loss, 1e-2)
         for step in range(STEPS):
             if step < FRESH:
-                slope = self._slope(place)
+                slope = self._slope(pose)
             normal = slope @ slope.transpose(1, 2)
             scale = normal.diagonal(dim1=1, dim2=2)
             damped = normal + torch.diag_embed(scale * damping[:, None] + 1e-9)
             move = torch.linalg.solve(damped, slope @ error.flatten(1)[..., None])[..., 0]
             # No step is longer than the spacing of the grid: the nearest pose of the grid is not further.
-            tried = place + move.clamp(-SPACING, SPACING)
+            tried = pose + move.clamp(-SPACING, SPACING)
             error_there = frames - self._render(tried)
             loss_there = error_there.square().mean((1, 2))
             better = loss_there < loss
-            place = torch.where(better[:, None], tried, place)
+            pose = torch.where(better[:, None], tried, pose)
             error = torch.where(better[:, None, None], error_there, error)
             loss = torch.where(better, loss_there, loss)
             damping = torch.where(better, damping / 10, damping * 10)
@@ -137,12 +137,12 @@ class PoseFinder:
         covariance = loss.double()[:, None, None] * torch.linalg.inv_ex(normal).inverse
         drawn = (frames - error - self._mean).square()
         contrast = ((drawn * error.square()).sum((1, 2)) / drawn.square().sum((1, 2))).sqrt()
-        return place.double(), covariance, loss.sqrt(), contrast
+        return pose.double(), covariance, loss.sqrt(), contrast
 
-    def _slope(self, place: Tensor) -> Tensor:
+    def _slope(self, pose: Tensor) -> Tensor:
         """Derivatives (B, 2, H W) of the rendered frames by x and by theta."""
-        steps = torch.eye(2).to(place) * DIFFERENCE
-        rise = torch.stack([self._render(place + h) - self._render(place - h) for h in steps], 1)
+        steps = torch.eye(2).to(pose) * DIFFERENCE
+        rise = torch.stack([self._render(pose + h) - self._render(pose - h) for h in steps], 1)
         return rise.flatten(2) / (2 * DIFFERENCE)
 
 

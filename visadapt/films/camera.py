@@ -18,7 +18,7 @@ NEAREST_M, FARTHEST_PX = 0.2, 1e5
 class ChaseCamera:
     """A pinhole camera that moves with something, without turning."""
 
-    place: tuple[float, float, float]
+    position: tuple[float, float, float]
     """m, from what it moves with"""
     looks_at: tuple[float, float, float]
     """m, the point in the middle of the picture, from what it moves with"""
@@ -30,7 +30,7 @@ class ChaseCamera:
 
         Both are nan where a point is nearer than NEAREST_M. What the camera moves with is at `moving` (3,).
         """
-        seen = (points - moving - np.array(self.place)) @ axes_towards(np.subtract(self.looks_at, self.place)).T
+        seen = (points - moving - np.array(self.position)) @ axes_towards(np.subtract(self.looks_at, self.position)).T
         depth = np.where(seen[..., 2] < NEAREST_M, np.nan, seen[..., 2])
         return (self.focal * seen[..., :2] / depth[..., None]).clip(-FARTHEST_PX, FARTHEST_PX), depth
 

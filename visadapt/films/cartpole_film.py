@@ -99,8 +99,8 @@ class CartPolePanel:
         time = self.run.episode.time
         if not self.run.survived and row == len(time) - 1:
             x, _, theta, _ = abs(self.state[-1])
-            reach = self.drawn.camera.reach if self.position_limit is None else self.position_limit
-            how = "FELL" if theta > self.angle_limit else "LEFT THE FRAME" if x > reach else "ENDED"
+            limit = self.drawn.camera.reach if self.position_limit is None else self.position_limit
+            how = "FELL" if theta > self.angle_limit else "LEFT THE FRAME" if x > limit else "ENDED"
             return f"{how} at t = {self.end:.2f} s"
         late = self.swings_up and time[row] >= due and self.up_from > widgets.last_row(time, due)
         return f"not up at {due:g} s" if late else ""
@@ -133,7 +133,7 @@ class CartPoleFilm(Film):
         x, _, theta, _ = np.concatenate([panel.state for panel in panels]).T
         length = panels[0].drawn.pole_length
         wide = float(np.abs([x, x + length * np.sin(theta)]).max()) + 0.4
-        self.reach = max(wide, 1.15 * length * PANEL_WIDTH / SCENE_HEIGHT)
+        self.half_width = max(wide, 1.15 * length * PANEL_WIDTH / SCENE_HEIGHT)
         """m to either side of the middle, such that neither carts nor poles that swing up leave the scene"""
         self.roams = any(bool((np.abs(panel.state[:-1, 0]) > panel.drawn.camera.reach).any()) for panel in panels)
         """whether a cart went on beyond what `drawn` shows, so that the track is shown as far as the carts go"""
@@ -172,7 +172,7 @@ class CartPoleFilm(Film):
     def _states(self, scene: Axes, panel: CartPolePanel) -> Callable[[int, bool], None]:
         """The track with its metres, cart and pole, and the disturbance as an arrow; or the cone and earlier poses."""
         sizes, camera = panel.drawn, panel.drawn.camera
-        left, bottom, wide = -self.reach, -self.reach * SCENE_HEIGHT / PANEL_WIDTH, 2 * self.reach
+        left, bottom, wide = -self.half_width, -self.half_width * SCENE_HEIGHT / PANEL_WIDTH, 2 * self.half_width
         if not panel.swings_up and not self.roams:
             left, bottom = (-0.5 - camera.column) / camera.scale, (camera.row - camera.height + 0.5) / camera.scale
             wide = camera.width / camera.scale

@@ -138,8 +138,8 @@ class Film(ABC):
             for index, panel in enumerate(self.panels):
                 left, top = self._corner(index)
                 bottom = height - top - self.panel_height
-                place = np.array([left, bottom, self.panel_width, self.panel_height]) / (width, height, width, height)
-                page = figure.add_axes(tuple(place), xlim=(0, self.panel_width), ylim=(self.panel_height, 0))
+                box = np.array([left, bottom, self.panel_width, self.panel_height]) / (width, height, width, height)
+                page = figure.add_axes(tuple(box), xlim=(0, self.panel_width), ylim=(self.panel_height, 0))
                 page.set_axis_off()
                 moves.append(self.draw_panel(page, panel))
             canvas.draw()

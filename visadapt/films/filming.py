@@ -90,16 +90,16 @@ def _film(runs: Mapping[str, Run], target: Target, due: float) -> Film:
     if isinstance(target, FlightTarget):
         return FlightFilm([_flight_panel(title, each, target) for title, each in runs.items()])
     drawn = _drawn(target)
-    limit, reach = target.angle_limit if isinstance(target, SyntheticTarget) else 0.3, None
+    limit, position_limit = target.angle_limit if isinstance(target, SyntheticTarget) else 0.3, None
     if isinstance(target, GymnasiumTarget):
-        limit, reach = target.mapping.limits.get("theta", limit), target.mapping.limits.get("x")
+        limit, position_limit = target.mapping.limits.get("theta", limit), target.mapping.limits.get("x")
     panels = []
     for title, each in runs.items():
         state = each.episode.state
         if state is None or state.shape[1] != len(CartPole.states):
             raise ValueError(f"panel {title!r}: a cart-pole's states (rows, 4) are needed to film {target.name}")
         pictures = None if isinstance(target, SyntheticTarget) else each.episode.frame
-        farthest = math.inf if reach is None and each.episode.frame is None else reach
+        farthest = math.inf if position_limit is None and each.episode.frame is None else position_limit
         panels.append(CartPolePanel(title, each, pictures, drawn, limit, farthest))
     return CartPoleFilm(panels, target.period, due)
 

@@ -84,18 +84,18 @@ def _grid(scene: Axes, half: Floats, scales: FlightScales) -> Callable[[Seen, Fl
 
 def _lines(scene: Axes, panel: FlightPanel, scales: FlightScales) -> list[tuple[Line2D, Callable[[int], Floats]]]:
     """The course, the goal and their shadows: lines, and the points (n, 3) of each at an instant."""
-    place, goal = panel.position, panel.goal
+    position, goal = panel.position, panel.goal
     lines: list[tuple[Line2D, Callable[[int], Floats]]] = [
         (moving_line(scene, HAIRLINE, 1), lambda i: scales.dropped(panel.reference)),
-        (moving_line(scene, MUTED, 1, alpha=0.5), lambda i: scales.dropped(place[: i + 1])),
-        (moving_line(scene, MUTED, 1, linestyle="--"), lambda i: scales.plumb(place[i])),
+        (moving_line(scene, MUTED, 1, alpha=0.5), lambda i: scales.dropped(position[: i + 1])),
+        (moving_line(scene, MUTED, 1, linestyle="--"), lambda i: scales.plumb(position[i])),
         (moving_line(scene, MUTED, 1, linestyle="-" if scales.follows else "--"), lambda i: panel.reference),
     ]
     if scales.follows:
         return [
             *lines,
             (moving_line(scene, INK, 2), lambda i: panel.reference[i : i + SECOND + 1]),
-            (moving_line(scene, RED, 2, zorder=4), lambda i: np.stack([place[i], goal[i]])),
+            (moving_line(scene, RED, 2, zorder=4), lambda i: np.stack([position[i], goal[i]])),
             (moving_line(scene, INK, 0, marker="o", markersize=8, mec=PAPER, zorder=4), lambda i: goal[i : i + 1]),
         ]
     ring = np.column_stack([np.zeros(len(ROUND)), ROUND])
@@ -114,11 +114,11 @@ def _forces(scene: Axes, panel: FlightPanel, scales: FlightScales) -> Callable[[
     longest = 0.45 if scales.follows else 1.2  # m, of the largest hidden force
 
     def draw(seen: Seen, i: int) -> None:
-        place = panel.position[i]
+        position = panel.position[i]
         newtons, way = _thrust(panel, i)
-        show_thrust(seen(place + np.outer([0, newtons], way)), f"thrust {newtons:.1f} N")
+        show_thrust(seen(position + np.outer([0, newtons], way)), f"thrust {newtons:.1f} N")
         way = longest / scales.most_force * panel.force[i]
-        show_force(seen(place + np.outer([0, 1], way)), f"{np.linalg.norm(panel.force[i]):.2f} N")
+        show_force(seen(position + np.outer([0, 1], way)), f"{np.linalg.norm(panel.force[i]):.2f} N")
 
     return draw
 
@@ -141,7 +141,7 @@ def _words(scene: Axes, panel: FlightPanel, scales: FlightScales) -> Callable[[i
 def _draw_sky(scene: Axes, camera: ChaseCamera, half: Floats) -> None:
     """The ground, which fades into the sky over the 150 px below the horizon; `half` (2,) px is half the scene's
     size."""
-    ahead = np.subtract(camera.looks_at, camera.place)
+    ahead = np.subtract(camera.looks_at, camera.position)
     horizon = camera.project(1e6 * ahead * (1, 1, 0), np.zeros(3))[0][1]
     rows = ((horizon - np.linspace(half[1], -half[1], SCENE_HEIGHT)) / 150).clip(0, 1)[:, None]
     shades = LinearSegmentedColormap.from_list("ground", [SKY, GROUND])

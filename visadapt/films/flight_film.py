@@ -67,7 +67,7 @@ class FlightFilm(Film):
 
     def _overview(self, page: Axes, panel: FlightPanel) -> Callable[[int], None]:
         """The whole course from afar, above its shadow on the ground."""
-        course, place, size = panel.reference, panel.position, np.array([PANEL_WIDTH - BOX_SIDE - 12, BOX_SIDE])
+        course, position, size = panel.reference, panel.position, np.array([PANEL_WIDTH - BOX_SIDE - 12, BOX_SIDE])
         across = axes_towards(OVERVIEW_DIRECTION)[:2].T
         view = widgets.framed(page, 0, BOX_TOP, *size, facecolor=GROUND)
         both = np.concatenate([course, self.scales.dropped(course)]) @ across
@@ -90,8 +90,8 @@ class FlightFilm(Film):
 
         def move(i: int) -> None:
             draw_path(lambda points: points @ across, i)
-            plumb.set_data(*(self.scales.plumb(place[i]) @ across).T)
-            dot.set_data(*(place[i : i + 1] @ across).T)
+            plumb.set_data(*(self.scales.plumb(position[i]) @ across).T)
+            dot.set_data(*(position[i : i + 1] @ across).T)
 
         return move
 
@@ -128,8 +128,8 @@ class FlightFilm(Film):
     def _numbers(self, page: Axes, panel: FlightPanel) -> Callable[[int], None]:
         """Speed, distance, score and hidden force; the commands."""
         names = ("off the reference", "mean so far") if self.follows else ("to the target", "nearest so far")
-        places = ((0, "speed"), (106, names[0]), (240, names[1]), (362, "hidden force"))
-        readings = [widgets.reading(page, left, READINGS_TOP, name) for left, name in places]
+        headings = ((0, "speed"), (106, names[0]), (240, names[1]), (362, "hidden force"))
+        readings = [widgets.reading(page, left, READINGS_TOP, name) for left, name in headings]
         readings[3].set_color(VIOLET)
         half = PANEL_WIDTH / 2
         bars = []

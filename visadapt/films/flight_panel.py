@@ -80,8 +80,8 @@ class FlightPanel:
         self.rows = np.minimum((self.times / task.period + 1e-6).astype(int), len(states) - 1)
         self.position = self._smooth(states[:, POSITION], states[:, VELOCITY], self.times)
         self.speed = self._between(np.linalg.norm(states[:, VELOCITY], axis=1))
-        turns = continuous_quaternion(torch.from_numpy(states[:, ATTITUDE])).numpy()
-        self.attitude: Floats = rotation(torch.from_numpy(self._between(turns))).numpy()
+        quaternions = continuous_quaternion(torch.from_numpy(states[:, ATTITUDE])).numpy()
+        self.attitude: Floats = rotation(torch.from_numpy(self._between(quaternions))).numpy()
         force = np.zeros((len(states), 3)) if run.force is None else run.force[: len(states)]
         self.force = self._between(force.clip(-LARGEST_DRAWN, LARGEST_DRAWN))
         lost = None if run.survived else self.end
@@ -92,12 +92,12 @@ class FlightPanel:
 
     def _along(self, course: Reference, which: int, start: int, lost: float | None) -> None:
         """What is shown of a flight along one of the references, from its row `start` on."""
-        places, slopes = (part[which, start:].double().numpy() for part in (course.positions, course.velocities))
-        count = round((len(places) - 1) * course.period / INSTANT_PERIOD_S) + 1
-        self.reference = self._smooth(places, slopes, np.arange(count) * INSTANT_PERIOD_S)
+        positions, slopes = (part[which, start:].double().numpy() for part in (course.positions, course.velocities))
+        count = round((len(positions) - 1) * course.period / INSTANT_PERIOD_S) + 1
+        self.reference = self._smooth(positions, slopes, np.arange(count) * INSTANT_PERIOD_S)
         self.goal = self.reference[: len(self.times)]
         self.away: Floats = np.linalg.norm(self.position - self.goal, axis=1)
-        at_rows = np.linalg.norm(self.states[:, POSITION] - places[: len(self.states)], axis=1)
+        at_rows = np.linalg.norm(self.states[:, POSITION] - positions[: len(self.states)], axis=1)
         self.score: Floats = np.concatenate([at_rows[:1], running_mean(at_rows[1:])])[self.rows]
         self.worst, self.passed = float(self.away.max()), self.end
         far = np.flatnonzero(self.away > FAR)

@@ -76,13 +76,13 @@ def hull(points: Floats) -> Floats:
 
 
 def drawn_parts(
-    parts: list[Part], place: Floats, attitude: Floats, project: Callable[[Floats], tuple[Floats, Floats]]
+    parts: list[Part], position: Floats, attitude: Floats, project: Callable[[Floats], tuple[Floats, Floats]]
 ) -> tuple[Floats, dict[str, Any]]:
-    """Corners (n, 3) of a vehicle at `place` (3,) turned by `attitude` (3, 3), and what a PolyCollection is to show.
+    """Corners (n, 3) of a vehicle at `position` (3,) turned by `attitude` (3, 3), and what a PolyCollection is to show.
 
     `project` gives where points (n, 3) are seen (n, 2) and how deep (n,), nan where they are not.
     """
-    corners, drawn = [place + part.corners @ attitude.T for part in parts], []
+    corners, drawn = [position + part.corners @ attitude.T for part in parts], []
     for part, points in zip(parts, corners, strict=True):
         seen, depth = project(points)
         if np.isfinite(depth).all():

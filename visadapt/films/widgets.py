@@ -56,8 +56,8 @@ CHART_HEIGHT = 128
 def inset(page: Axes, left: float, top: float, width: float, height: float, **properties: Any) -> Axes:
     """Axes on a part of a page, in px."""
     whole = page.bbox
-    place = np.array([left, whole.height - top - height, width, height]) / np.tile(whole.size, 2)
-    return page.inset_axes(tuple(place), **properties)
+    box = np.array([left, whole.height - top - height, width, height]) / np.tile(whole.size, 2)
+    return page.inset_axes(tuple(box), **properties)
 
 
 def framed(page: Axes, left: float, top: float, width: float, height: float, **properties: Any) -> Axes:

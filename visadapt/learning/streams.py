@@ -48,13 +48,13 @@ class Streams:
     transitions: Transitions | None  # recorded starts, each at its time, with the memory that effects have there
     count: int
     longest: int  # steps after which a stream starts anew
-    recorded: float  # share of the starts that are transitions, with their histories
+    recorded_share: float  # share of the starts that are transitions, with their histories
     like: Tensor  # whose device and dtype the streams have
 
     def __post_init__(self) -> None:
         self.now: StreamState
         self.age: Tensor
-        self._recorded: WorldState | None = None
+        self._recorded_starts: WorldState | None = None
         self.task = self.task.to(self.like)
         if self.transitions is not None:
             self.transitions = self.transitions.to(self.like)
@@ -65,7 +65,9 @@ class Streams:
                 times, state = self.transitions.time, self.transitions.state[:1]
                 # Without the progress of its task, where a flight is to go from a recorded state is not known.
                 known = not isinstance(self.task, FlightTask) or self.transitions.task_states.shape[-1] > 0
-                self._recorded = self.transitions.start(self.world) if self.recorded > 0 and known else None
+                self._recorded_starts = (
+                    self.transitions.start(self.world) if self.recorded_share > 0 and known else None
+                )
             self._times = times if depends_on_time(self.world, times.unique(), state) else None
 
     @torch.no_grad()
@@ -117,20 +119,20 @@ class Streams:
         seen, at = look(self.world, self.observe, at, generator)
         history = History.start(self.task.show(seen, task_state), len(self.world.system.actions))
         fresh = StreamState(at, history, task_state)
-        if transitions is None or self._recorded is None:
+        if transitions is None or self._recorded_starts is None:
             return fresh
         task_states = transitions.task_states[transitions.rows].to(task_state)
         # Recorded falls are left out: a stream that starts beyond delta_div ends at once, at a cost above all others.
         near = (~self.task.diverged(transitions.state, task_states[:, -1], progress)).nonzero()[:, 0]
         if not len(near):
             return fresh
-        from_record = torch.rand(count, generator=generator).to(state)[ended] < self.recorded
+        from_record = torch.rand(count, generator=generator).to(state)[ended] < self.recorded_share
         rows = near[torch.randint(len(near), (count,), generator=generator)][ended]
         past = transitions.history(rows)
         seen, now, where = self.task.augment(past.observations, transitions.state[rows], task_states[rows], generator)
         shown = self.task.show(seen.flatten(0, 1), where.flatten(0, 1)).unflatten(0, seen.shape[:2])
         # The history ends with the recorded reading of this row, so the sensors have read it.
-        _, at = look(self.world, self.observe, replace(self._recorded[rows], state=now), generator)
+        _, at = look(self.world, self.observe, replace(self._recorded_starts[rows], state=now), generator)
         return StreamState(at, History(shown, past.actions), where[:, -1]).where(from_record, fresh)
 
 

@@ -104,9 +104,9 @@ class Tracker:
         commands = [torch.as_tensor(episode.action[:-1], dtype=torch.float64) for episode in episodes]
         paths = [self._first_guess(poses) for poses in found]
         noise: Noise | None = None
-        for turn in range(SMOOTHINGS):
+        for pass_number in range(SMOOTHINGS):
             problems = [self._problem(*parts) for parts in zip(found, commands, paths, strict=True)]
-            if turn < 2:
+            if pass_number < 2:
                 noise = most_probable_noise(problems, noise)
             assert noise is not None
             paths = [backward(each.filtered(noise))[0][0, ..., 0] for each in problems]
@@ -151,9 +151,9 @@ class Tracker:
 
     def _first_guess(self, poses: Poses) -> Tensor:
         """States and loads (T, n_state + n_load): poses as seen, velocities by differences, no load."""
-        system, rows = self.world.system, np.arange(len(poses.place))
+        system, rows = self.world.system, np.arange(len(poses.pose))
         used = poses.explained.numpy()
-        seen = np.stack([np.interp(rows, rows[used], column[used]) for column in poses.place.numpy().T], 1)
+        seen = np.stack([np.interp(rows, rows[used], column[used]) for column in poses.pose.numpy().T], 1)
         guess = torch.zeros(len(rows), len(system.states) + len(system.loads), dtype=torch.float64)
         guess[:, self._seen] = torch.from_numpy(seen)
         if len(rows) > 1:
@@ -176,13 +176,13 @@ class Tracker:
         wide = torch.tensor([(v.high - v.low) / 2 for v in self.world.system.states], dtype=path.dtype)
         used = poses.explained[:, None].to(path)
         seen = used[..., None] * torch.eye(n, dtype=path.dtype)[self._seen]
-        place = used * poses.place.nan_to_num()
+        pose = used * poses.pose.nan_to_num()
         root = torch.linalg.cholesky(torch.where(used[..., None] > 0, poses.covariance, torch.eye(2).to(path)))
         system = Linear(
             transition=transition[None],
             drive=offset[None, ..., None],
             sensing=torch.linalg.solve_triangular(root, seen, upper=False)[None],
-            reading=torch.linalg.solve_triangular(root, place[..., None], upper=False)[None],
+            reading=torch.linalg.solve_triangular(root, pose[..., None], upper=False)[None],
             start=path.new_zeros(1, n, 1),
             initial_variance=torch.cat((wide, ACCELERATION * unit)).square()[None],
         )

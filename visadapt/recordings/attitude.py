@@ -39,15 +39,15 @@ def check_attitude(raw: RawEpisode, system: System) -> None:
     fit, slope = _turning(raw, attitude, rates)
     if fit > TURNS_CORRELATION and 0.5 < slope * DEGREE < 2:
         right = "rad/s are right (these look like degrees per second)"
-        raise RecordingError(f"{raw.source}: the body rates are {slope:.0f} times what the attitude says; {right}")
+        raise RecordingError(f"{raw.origin}: the body rates are {slope:.0f} times what the attitude says; {right}")
     if fit < -TURNS_CORRELATION:
         raise RecordingError(
-            f"{raw.source}: the attitude turns against the body rates; a quaternion that rotates body into world axes "
+            f"{raw.origin}: the attitude turns against the body rates; a quaternion that rotates body into world axes "
             "is right"
         )
     if fit < OTHER_CORRELATION and _turning(raw, np.roll(attitude, 1, axis=1), rates)[0] > TURNS_CORRELATION:
         raise RecordingError(
-            f"{raw.source}: the attitude's numbers are in the order x, y, z, w; {first}, the scalar, first is right"
+            f"{raw.origin}: the attitude's numbers are in the order x, y, z, w; {first}, the scalar, first is right"
         )
 
 

@@ -124,24 +124,24 @@ def _check_answers(judged: Sequence[RawEpisode], system: System, angles: Sequenc
     whole = judged[0]
     if isinstance(system, RigidBody) and is_turned_round(judged, system, "z"):
         raise RecordingError(
-            f"{whole.source}: {whole.column('z')} accelerates against the thrust, as if it pointed down; up is right"
+            f"{whole.origin}: {whole.column('z')} accelerates against the thrust, as if it pointed down; up is right"
         )
     if is_half_a_turn_off(judged, system):
         zero = "0 upright" if isinstance(system, CartPole) else "the source's zero"
         raise RecordingError(
-            f"{whole.source}: {whole.column(angles[0])} answers the command as it should half a turn further; "
+            f"{whole.origin}: {whole.column(angles[0])} answers the command as it should half a turn further; "
             f"{zero} is right"
         )
     if are_degrees(judged, system):
         name, values = angles[0], np.concatenate([raw.states[angles[0]] for raw in judged])
         raise RecordingError(
-            f"{whole.source}: {whole.column(name)} goes from {values.min():.3g} to {values.max():.3g} and answers the "
+            f"{whole.origin}: {whole.column(name)} goes from {values.min():.3g} to {values.max():.3g} and answers the "
             f"command as if in degrees; radians are right"
         )
     for name, other in product(lengths, angles):
         if exchanged(judged, system, name, other):
             raise RecordingError(
-                f"{whole.source}: {whole.column(name)} answers the command as {other} should, and "
+                f"{whole.origin}: {whole.column(name)} answers the command as {other} should, and "
                 f"{whole.column(other)} as {name}: they are exchanged "
                 f"(or the command's sign is wrong: positive pushes towards +x)"
             )
@@ -164,7 +164,7 @@ def _check_clock(raw: RawEpisode, system: System) -> None:
         # With one ratio alone, the position may be in another unit instead.
         if len(ratios) > 1 and all(0.8 < ratio / seconds < 1.25 for ratio in ratios.values()):
             raise RecordingError(
-                f"{raw.source}: column 'time': by it {', '.join(ratios)} change {seconds:g} times as fast as their "
+                f"{raw.origin}: column 'time': by it {', '.join(ratios)} change {seconds:g} times as fast as their "
                 f"rates say: the clock is in {unit}; seconds are right"
             )
 
@@ -196,7 +196,7 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable, stride: int
     between = 0.5 * (measured[1:] + measured[:-1])
     if _is_opposite(change, between):
         raise RecordingError(
-            f"{raw.source}: {raw.column(rate.name)} has the opposite sign of the change of {variable.name}"
+            f"{raw.origin}: {raw.column(rate.name)} has the opposite sign of the change of {variable.name}"
         )
     if correlation(change, between) < IS_RATE_CORRELATION:
         return
@@ -205,7 +205,7 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable, stride: int
         for wrong, (large, small) in ((variable, sizes), (rate, sizes[::-1])):
             if 0.5 * times * small < large < 2 * times * small:
                 raise RecordingError(
-                    f"{raw.source}: {raw.column(wrong.name)} is {times:.0f} times what the other says "
+                    f"{raw.origin}: {raw.column(wrong.name)} is {times:.0f} times what the other says "
                     f"({variable.name} changes by {change.std():.3g} {rate.unit}, {rate.name} is {between.std():.3g} "
                     f"{rate.unit}, root mean square); {right}"
                 )
@@ -235,7 +235,7 @@ def _check_exchanged(
         own = correlation(change[name], rate)
         if crossed > IS_RATE_CORRELATION and own < NOT_RATE_CORRELATION and not _is_opposite(change[name], rate):
             raise RecordingError(
-                f"{raw.source}: {raw.column(name)} and {raw.column(rates[name])} are evidently exchanged: "
+                f"{raw.origin}: {raw.column(name)} and {raw.column(rates[name])} are evidently exchanged: "
                 "the first is the second's rate of change"
             )
     for name, other in combinations(measured, 2):
@@ -243,7 +243,7 @@ def _check_exchanged(
         own = max(correlation(change[one], measured[one]) for one in (name, other))
         if crossed > IS_RATE_CORRELATION and own < NOT_RATE_CORRELATION:
             raise RecordingError(
-                f"{raw.source}: {raw.column(name)} and {raw.column(other)} are evidently exchanged: "
+                f"{raw.origin}: {raw.column(name)} and {raw.column(other)} are evidently exchanged: "
                 f"{name} changes as {rates[other]} says, and {other} as {rates[name]} says"
             )
     for raw, name in product(episodes, rates):

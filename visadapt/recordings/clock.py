@@ -67,7 +67,7 @@ class RawEpisode:
     """(T,) which rows are measurements; without it, all are"""
 
     @property
-    def source(self) -> str:
+    def origin(self) -> str:
         """The file, and the episode if the file has several, for messages."""
         return str(self.path) if self.number is None else f"{self.path}, episode {self.number:.15g}"
 
@@ -83,7 +83,7 @@ class RawEpisode:
 
     def cell(self, row: int, name: str) -> str:
         """Where in the file a value stands, for messages."""
-        return f"{self.source}: {self.place(row)}, {self.column(name)}"
+        return f"{self.origin}: {self.place(row)}, {self.column(name)}"
 
     def part(self, start: int, end: int) -> RawEpisode:
         """The rows from `start` up to, but not including, `end`."""
@@ -124,7 +124,7 @@ def check_steps(episodes: Sequence[RawEpisode], system: System) -> None:
     if not SHORTEST_PERIOD_S <= period <= longest:
         units = [name for name, unit in UNITS_S.items() if SHORTEST_PERIOD_S <= unit * period <= longest]
         raise RecordingError(
-            f"{raw.source}: column 'time': rows are {period:.4g} s apart; {SHORTEST_PERIOD_S:g} to {longest:.4g} s are "
+            f"{raw.origin}: column 'time': rows are {period:.4g} s apart; {SHORTEST_PERIOD_S:g} to {longest:.4g} s are "
             f"right" + (f" (is the clock in {' or '.join(units)}?)" if units else "") + ", since predictions reach "
             f"{system.prediction_time:g} s ahead (prediction_time of the class {type(system).__name__})"
         )
@@ -149,7 +149,7 @@ def uninterrupted(raw: RawEpisode, note: Note) -> list[RawEpisode]:
     longest = max(HARMLESS_GAP_S, (LONGEST_STEP_PERIODS if irregular else GAP_PERIODS) * period)
     cuts = (np.flatnonzero(steps > longest * (1 + 1e-6)) + 1).tolist()
     for cut in cuts:
-        note("rows are missing here; the episode was split", f"{raw.source}, {raw.place(cut)}")
+        note("rows are missing here; the episode was split", f"{raw.origin}, {raw.place(cut)}")
     return [_clocked(raw.part(start, end), note) for start, end in pairwise([0, *cuts, len(raw.time)])]
 
 
@@ -167,7 +167,7 @@ def _clocked(part: RawEpisode, note: Note) -> RawEpisode:
         return replace(part, time=part.time[0] + period * index)
     steps = np.diff(part.time)
     if np.ptp(steps) > UNSTEADY_PERIODS * period:
-        note(f"an unsteady clock: its steps last {steps.min():.3g} to {steps.max():.3g} s", part.source)
+        note(f"an unsteady clock: its steps last {steps.min():.3g} to {steps.max():.3g} s", part.origin)
     return part
 
 
@@ -196,9 +196,9 @@ def alike(parts: list[RawEpisode], note: Note) -> tuple[list[RawEpisode], float]
     for part, own, fit in zip(parts, periods, fits, strict=True):
         if part.path not in usual:
             raise RecordingError(
-                f"{part.source}: column 'time': rows are {own:.4g} s apart, those of {kept[0].path} {period:.4g} s; "
+                f"{part.origin}: column 'time': rows are {own:.4g} s apart, those of {kept[0].path} {period:.4g} s; "
                 "recordings with one period, in seconds, are right"
             )
         if not fit:
-            note(f"left out, since its rows are not {period:.4g} s apart as most are", part.source)
+            note(f"left out, since its rows are not {period:.4g} s apart as most are", part.origin)
     return kept, period

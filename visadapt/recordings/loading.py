@@ -72,10 +72,10 @@ def load_recording(
     >>> run.samples, round(run.period, 6)
     (60, 0.05)
     """
-    places: dict[str, list[str]] = {}
+    notes: dict[str, list[str]] = {}
 
     def note(text: str, where: str) -> None:
-        places.setdefault(text, []).append(where)
+        notes.setdefault(text, []).append(where)
 
     columns = columns or {}
     if unmeasured := [name for name, theirs in columns.items() if not theirs]:
@@ -105,18 +105,18 @@ def load_recording(
         episodes=tuple(Episode(part.time, part.action, None if frames else part.state, part.frame) for part in parts),
         measured=whole[0].measured,
         period=period,
-        sources=tuple(part.source for part in parts),
+        sources=tuple(part.origin for part in parts),
         usable=tuple(np.ones(len(p.time), bool) if p.usable is None else p.usable for p in parts) if outliers else (),
         warnings=tuple(
             f"{where[0]}{f' and {len(where) - 1} more' if len(where) > 1 else ''}: {text}"
-            for text, where in places.items()
+            for text, where in notes.items()
         ),
     )
 
 
 def _files(paths: Sequence[str | os.PathLike[str]], note: Note) -> list[Path]:
     """The files that are given, each once; of a folder, the recordings that are not hidden."""
-    files: dict[Path, Path] = {}  # by where they are
+    files: dict[Path, Path] = {}  # by their resolved paths
     of_size: dict[int, list[Path]] = {}
     for path in map(Path, paths):
         found = [path]
@@ -134,11 +134,11 @@ def _files(paths: Sequence[str | os.PathLike[str]], note: Note) -> list[Path]:
         elif not path.is_file() and not path.is_dir():
             raise RecordingError(f"{path}: no regular file; a CSV or HDF5 file is right")
         for file in found:
-            place, as_large = file.resolve(), of_size.setdefault(file.stat().st_size, [])
-            if twin := _the_same(file, place, files) or next((o for o in as_large if _same_content(file, o)), None):
+            resolved, as_large = file.resolve(), of_size.setdefault(file.stat().st_size, [])
+            if twin := _the_same(file, resolved, files) or next((o for o in as_large if _same_content(file, o)), None):
                 note(f"holds the same as {twin}, so it is not used twice", str(file))
             else:
-                files[place] = file
+                files[resolved] = file
                 as_large.append(file)
     if not files:
         raise RecordingError("no recording was given")
@@ -150,10 +150,10 @@ def _is_recording(path: Path) -> bool:
     return reader(path) is not None if path.is_dir() else path.is_file() and path.suffix.lower() in SUFFIXES
 
 
-def _the_same(file: Path, place: Path, files: Mapping[Path, Path]) -> Path | None:
-    """Of `files`, by where they are, the one that is at `place`, or a bag that holds it or that it holds."""
-    around = [files[each] for each in (place, *place.parents) if each in files]
-    inside = [other for each, other in files.items() if place in each.parents] if file.is_dir() else []
+def _the_same(file: Path, resolved: Path, files: Mapping[Path, Path]) -> Path | None:
+    """Of `files`, by their resolved paths, the one that is at `resolved`, or a bag that holds it or that it holds."""
+    around = [files[each] for each in (resolved, *resolved.parents) if each in files]
+    inside = [other for each, other in files.items() if resolved in each.parents] if file.is_dir() else []
     return next(iter((*around, *inside)), None)
 
 
@@ -272,10 +272,10 @@ def _long_enough(parts: Sequence[RawEpisode], shortest: float, note: Note) -> li
     longest = parts[int(np.argmax(durations))]
     if max(durations) < least:
         raise RecordingError(
-            f"{longest.source}: too short: {len(longest.time)} rows, {max(durations):.3g} s; "
+            f"{longest.origin}: too short: {len(longest.time)} rows, {max(durations):.3g} s; "
             f"an uninterrupted run of at least {shortest:g} s, with a clock in seconds, is right"
         )
     for part, duration in zip(parts, durations, strict=True):
         if duration < least:
-            note(f"shorter than {shortest:g} s, so it is left out", f"{part.source}, from {part.place(0)} on")
+            note(f"shorter than {shortest:g} s, so it is left out", f"{part.origin}, from {part.place(0)} on")
     return [part for part, duration in zip(parts, durations, strict=True) if duration >= least]

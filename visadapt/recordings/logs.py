@@ -41,11 +41,11 @@ def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], n
             f"{path}: say where {', '.join(missing)} are: --columns {missing[0]}=TOPIC.FIELD,... "
             f"(`ros2 bag info` and `ulog_info` list topics){if_unmeasured(system, missing[0])}"
         )
-    places = {name: _place(path, given[name]) for name in ours if given.get(name)}
+    columns = {name: _topic_and_field(path, given[name]) for name in ours if given.get(name)}
     wanted: dict[str, set[str]] = {}
-    for topic, field in places.values():
+    for topic, field in columns.values():
         wanted.setdefault(topic, set()).add(field)
-    log = _Log(path, system, places, _topics(path, read, wanted))
+    log = _Log(path, system, columns, _topics(path, read, wanted))
     log.check_stamps()
     rows = log.rows(note)
     time = log.topics[log.slowest].time[rows]
@@ -61,7 +61,7 @@ def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], n
     def message(row: int) -> str:
         return f"message {rows[row] + 1} of {log.slowest}"
 
-    names = {name: ".".join(place) for name, place in places.items()}
+    names = {name: ".".join(column) for name, column in columns.items()}
     return RawEpisode(path, time - time[0], action[kept], states[kept], log.measured, message, names)
 
 
@@ -82,24 +82,24 @@ class _Log:
 
     path: Path
     system: System
-    places: Mapping[str, tuple[str, str]]
+    columns: Mapping[str, tuple[str, str]]
     """topic and field of each measured state and each action"""
     topics: Mapping[str, Topic]
 
     @cached_property
     def measured(self) -> tuple[str, ...]:
         """The states that were measured."""
-        return tuple(state.name for state in self.system.states if state.name in self.places)
+        return tuple(state.name for state in self.system.states if state.name in self.columns)
 
     @cached_property
     def of_states(self) -> list[str]:
         """The topics of these, each once."""
-        return list(dict.fromkeys(self.places[name][0] for name in self.measured))
+        return list(dict.fromkeys(self.columns[name][0] for name in self.measured))
 
     @cached_property
     def of_actions(self) -> list[str]:
         """The topics of the actions, each once."""
-        return list(dict.fromkeys(self.places[action.name][0] for action in self.system.actions))
+        return list(dict.fromkeys(self.columns[action.name][0] for action in self.system.actions))
 
     @cached_property
     def slowest(self) -> str:
@@ -108,7 +108,7 @@ class _Log:
 
     def check_stamps(self) -> None:
         """Raises RecordingError where a topic has too few messages, or a clock that runs backwards."""
-        for name in {topic for topic, _ in self.places.values()}:
+        for name in {topic for topic, _ in self.columns.values()}:
             stamps = self.topics[name].time
             if not len(stamps):
                 raise RecordingError(f"{self.path}: {name} has no messages")
@@ -141,15 +141,15 @@ class _Log:
 
     def state(self, name: str, rows: NDArray[np.intp]) -> NDArray[np.float64]:
         """A measured state in these rows (T,): as read there, or interpolated to the rows' stamps."""
-        topic, field = self.places[name]
+        topic, field = self.columns[name]
         stamps, values = self.topics[topic].time, self.topics[topic].values[field]
         if topic == self.slowest:
             return values[rows]
         attitude = self.system.states[ATTITUDE] if isinstance(self.system, RigidBody) else ()
         quaternion = [state.name for state in attitude]
         if name in quaternion:
-            places = [self.places[each] for each in quaternion if each in self.places]
-            fields = [other for where, other in places if where == topic]
+            columns = [self.columns[each] for each in quaternion if each in self.columns]
+            fields = [other for its_topic, other in columns if its_topic == topic]
             whole = np.column_stack([self.topics[topic].values[each] for each in fields])
             values = continuous_quaternion(torch.from_numpy(whole)).numpy()[:, fields.index(field)]
         if self.system.states[self.system.index(name)].unit == "rad":
@@ -158,7 +158,7 @@ class _Log:
 
     def command(self, name: str, time: NDArray[np.float64]) -> NDArray[np.float64]:
         """The command of an action in rows with these stamps (T,)."""
-        topic, field = self.places[name]
+        topic, field = self.columns[name]
         return _held(time, self.topics[topic].time, self.topics[topic].values[field])
 
 
@@ -198,7 +198,7 @@ def _held(time: NDArray[np.float64], stamps: NDArray[np.float64], commands: NDAr
     return np.where(missing > 1e-9, np.nan, mean(np.nan_to_num(commands)))
 
 
-def _place(path: Path, column: str) -> tuple[str, str]:
+def _topic_and_field(path: Path, column: str) -> tuple[str, str]:
     topic, dot, field = column.partition(".")
     if not (topic and dot and field):
         raise RecordingError(f"{path}: the column {column!r} is not of the form TOPIC.FIELD, say /cart/state.position")

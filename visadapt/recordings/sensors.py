@@ -66,10 +66,10 @@ def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
         if variable.unit == "1":  # as a quaternion's, whose sign may change
             continue
         rate = system.rate_of(name)
-        reach = variable.largest
+        allowed = variable.largest
         if rate is not None:
-            reach = min(reach, 2 * period * system.states[system.index(rate)].largest)
-        outliers = _outliers(differences(values, variable.unit == "rad"), values, reach)
+            allowed = min(allowed, 2 * period * system.states[system.index(rate)].largest)
+        outliers = _outliers(differences(values, variable.unit == "rad"), values, allowed)
         if outliers.mean() > MOST_OUTLIERS:
             row = int(outliers.argmax())
             raise RecordingError(
@@ -98,11 +98,11 @@ def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
     return replace(raw, state=state, usable=~bad)
 
 
-def _outliers(steps: NDArray[np.float64], values: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
-    """Which rows (T,) follow a jump that is larger than `reach` and than usual, and undone in `OUTLIER_ROWS` rows."""
+def _outliers(steps: NDArray[np.float64], values: NDArray[np.float64], allowed: float) -> NDArray[np.bool_]:
+    """Which rows (T,) follow a jump that is larger than `allowed` and than usual, and undone in `OUTLIER_ROWS` rows."""
     apart = np.diff(np.unique(values))
     usual = 1.4826 * float(np.median(np.abs(np.diff(steps)))) / 2
-    least = max(reach, OUTLIER_SCALES * max(usual, float(apart.min()) if len(apart) else 0.0))
+    least = max(allowed, OUTLIER_SCALES * max(usual, float(apart.min()) if len(apart) else 0.0))
     bad = np.zeros(len(values), bool)
     for jump in np.flatnonzero(np.abs(steps) > least):
         away = np.abs(np.cumsum(steps[jump : jump + OUTLIER_ROWS + 1]))
@@ -134,7 +134,7 @@ def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) ->
     measured = episodes[0].measured
     if all(_is_still(raw.states[name], system, name) for raw in episodes for name in measured):
         raise RecordingError(
-            f"{episodes[0].source}: no state ever changes; a recording of something that moves is right"
+            f"{episodes[0].origin}: no state ever changes; a recording of something that moves is right"
         )
     rates = {system.rate_of(name) for name in measured}
     dead: set[str] = set()
@@ -210,5 +210,5 @@ def _note_noise(raw: RawEpisode, system: System, note: Note) -> None:
             note(
                 f"{name} jumps about from row to row and does not move, although what is commanded and measured moves "
                 "it: does its sensor follow the motion, or does the machine stick?",
-                raw.source,
+                raw.origin,
             )

@@ -116,10 +116,10 @@ def _is_running(process: int) -> bool:
 
 def _is_device(path: str | os.PathLike[str]) -> bool:
     """Whether `path` exists, is no folder, and is either no regular file or lies in /dev, as `/dev/stdout` does."""
-    place = Path(path)
+    path = Path(path)
     with suppress(OSError):
-        exists = place.exists() and not place.is_dir()
-        return exists and (not place.is_file() or Path("/dev") in place.absolute().parents)
+        exists = path.exists() and not path.is_dir()
+        return exists and (not path.is_file() or Path("/dev") in path.absolute().parents)
     return False
 
 

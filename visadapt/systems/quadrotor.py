@@ -115,8 +115,8 @@ class Quadrotor(RigidBody):
 
     def _delivered(self, thrust: Tensor, torque: Tensor) -> tuple[Tensor, Tensor]:
         """Thrust (B,) and torque (B, 3) where each rotor delivers a share of the thrust that is commanded of it."""
-        reach = self.arm_length / math.sqrt(2)
-        levers = stack_parameters((1.0, reach, reach, self.torque_to_thrust), torque)
+        lever = self.arm_length / math.sqrt(2)
+        levers = stack_parameters((1.0, lever, lever, self.torque_to_thrust), torque)
         mixer = torque.new_tensor(_MIXER)
         shares = stack_parameters((self.rotor_1, self.rotor_2, self.rotor_3, self.rotor_4), torque)
         # The mixer's rows are orthogonal and of length 2: its transpose is 4 times its inverse.

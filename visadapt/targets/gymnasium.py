@@ -74,7 +74,7 @@ class GymnasiumTarget(Target):
                 "leave them out"
             )
         mujoco_frames.choose_backend()
-        self._source = env
+        self._given_env = env
         self.mapping = mapping
         self.system: type[System] = system
         self.frames = frames
@@ -110,7 +110,7 @@ class GymnasiumTarget(Target):
         for b, env in enumerate(self._envs[:batch]):
             seen, _ = self._call(env, "reset", seed=seeds[b])
             if starts is not None:
-                seen = self._place(env, seen, starts[b])
+                seen = self._put_into(env, seen, starts[b])
             self._shown.append(self._see(seen, b))
         return self._observe()
 
@@ -165,17 +165,17 @@ class GymnasiumTarget(Target):
         seen, _ = self._call(self._envs[0], "reset", seed=0)
         pictures = []
         for state in states:
-            seen = self._place(self._envs[0], seen, state)
+            seen = self._put_into(self._envs[0], seen, state)
             pictures.append(self._draw(self._envs[0]))
         return np.stack(pictures)
 
     def _make(self) -> Any:
-        if not isinstance(self._source, str):
-            return self._source()
+        if not isinstance(self._given_env, str):
+            return self._given_env()
         try:
             # No time limit: episodes end where the mapping's limits or the environment say.
             return gymnasium.make(
-                self._source,
+                self._given_env,
                 render_mode="rgb_array" if self.frames else None,
                 max_episode_steps=-1,
                 disable_env_checker=True,
@@ -255,7 +255,7 @@ class GymnasiumTarget(Target):
         warnings.warn(f"{self.name}: the period, {1 / rate:g} s, is taken from {origin}", stacklevel=3)
         return 1 / float(rate), origin
 
-    def _place(self, env: Any, seen: NDArray[np.floating], state: NDArray[np.floating]) -> NDArray[np.floating]:
+    def _put_into(self, env: Any, seen: NDArray[np.floating], state: NDArray[np.floating]) -> NDArray[np.floating]:
         """Put an environment that observes `seen` and has not been stepped into our state; its observation there."""
         wanted = self.mapping.observation(state, self.system, seen)
         body = env.unwrapped

@@ -3,9 +3,9 @@
 A quadrotor without drag is differentially flat in position and yaw: Mellinger and Kumar (2011), Minimum snap
 trajectory generation and control for quadrotors, ICRA. Thrust points along a + g z and the jerk turns it:
 
-    thrust = |a + g z|        z_body = (a + g z) / thrust        turn = (j - (z_body . j) z_body) / thrust
+    thrust = |a + g z|        z_body = (a + g z) / thrust        z_rate = (j - (z_body . j) z_body) / thrust
     y_body = z_body x e_x, normalised        x_body = y_body x z_body        (yaw is zero)
-    omega_x = -turn . y_body        omega_y = turn . x_body        omega_z = omega_x (z_body . e_x) / (x_body . e_x)
+    omega_x = -z_rate . y_body        omega_y = z_rate . x_body        omega_z = omega_x (z_body . e_x) / (x_body . e_x)
 
 omega_z keeps y_body at right angles to e_x (Faessler, Franchi and Scaramuzza 2018, RA-L 3(2), without drag); it is
 not zero, though yaw stands still. Vectors a (acceleration) and j (jerk) are in world axes, z up.
@@ -48,8 +48,8 @@ def demanded(acceleration: Tensor, jerk: Tensor, gravity: float = 9.81) -> Deman
     left = torch.linalg.cross(up, ahead)
     left = left / left.norm(dim=-1, keepdim=True)
     forward = torch.linalg.cross(left, up)
-    turn = (jerk - up * (up * jerk).sum(-1, keepdim=True)) / thrust
-    roll, pitch = -(turn * left).sum(-1), (turn * forward).sum(-1)
+    up_rate = (jerk - up * (up * jerk).sum(-1, keepdim=True)) / thrust
+    roll, pitch = -(up_rate * left).sum(-1), (up_rate * forward).sum(-1)
     rates = torch.stack((roll, pitch, roll * up[..., 0] / forward[..., 0]), -1)
     return Demand(thrust[..., 0], _attitude(torch.stack((forward, left, up), -1)), rates)
 

@@ -122,7 +122,7 @@ def _read(path: Path) -> tuple[NDArray[np.float64], bool]:
 
 
 def _motion(
-    stamps: NDArray[np.float64], places: NDArray[np.float64], speeds: NDArray[np.float64] | None, period: float
+    stamps: NDArray[np.float64], positions: NDArray[np.float64], speeds: NDArray[np.float64] | None, period: float
 ) -> list[NDArray[np.float64]]:
     """Positions, velocities, accelerations and jerks, each (T, 3), a period apart, of positions and, if known,
     velocities (N, 3) at rising times (N,) in s."""
@@ -136,9 +136,9 @@ def _motion(
         return np.gradient(values, stamps, axis=0, edge_order=2)
 
     if speeds is None:
-        motion = [at_periods(places, slopes_of(places))]
+        motion = [at_periods(positions, slopes_of(positions))]
     else:
-        motion = [at_periods(places, speeds), at_periods(speeds, slopes_of(speeds))]
+        motion = [at_periods(positions, speeds), at_periods(speeds, slopes_of(speeds))]
     while len(motion) < 4:
         motion.append(np.gradient(motion[-1], period, axis=0, edge_order=2))
     return motion

@@ -85,8 +85,8 @@ def summed(
     """
     track, load = tracks[bumps[0].part], loads[bumps[0].joint]
     unit = float(track.unit[bumps[0].joint])
-    reach = [(one.middle - EDGE * one.width, one.middle + EDGE * one.width) for one in bumps]
-    time = np.linspace(min(a for a, _ in reach), max(b for _, b in reach), SHAPE_POINTS)
+    extents = [(one.middle - EDGE * one.width, one.middle + EDGE * one.width) for one in bumps]
+    time = np.linspace(min(a for a, _ in extents), max(b for _, b in extents), SHAPE_POINTS)
     heights, middles, widths = np.array([(one.height, one.middle, one.width) for one in bumps]).T
     shape = unit * np.exp(-0.5 * ((time[:, None] - middles) / widths) ** 2) @ heights
     peak = shape[np.abs(shape).argmax()]

@@ -96,10 +96,10 @@ class CameraFindings:
         """The parameters of one effect of a fit."""
         first = sum(len(other.table) for other in fit.camera[: fit.camera.index(kind)])
         table = kind.table_in(*fit.residual.shape[1:])
-        reaches = Z_90 * fit.covariance.diagonal()[first:].sqrt()
+        half_widths = Z_90 * fit.covariance.diagonal()[first:].sqrt()
         out = {}
-        for p, value, reach in zip(table, fit.values[first:].tolist(), reaches.tolist(), strict=False):
-            low, high = max(p.low, value - reach), min(p.high, value + reach)
+        for p, value, half_width in zip(table, fit.values[first:].tolist(), half_widths.tolist(), strict=False):
+            low, high = max(p.low, value - half_width), min(p.high, value + half_width)
             if kind is not Occlusion:  # what a box covers beyond the frame does not matter
                 low = math.nan if is_at_end(p, value, p.low) else low
                 high = math.nan if is_at_end(p, value, p.high) else high
@@ -134,12 +134,12 @@ class _CameraSearch:
         self._done = 0
         self._shown = frames.float() / 255  # (N, H, W)
         self.fixed: frozenset[str] = frozenset()
-        self.unchanged = self._fit((), torch.zeros(0), finder(frames).place)
+        self.unchanged = self._fit((), torch.zeros(0), finder(frames).pose)
         square = self.unchanged.residual.square().mean((1, 2))
         usual = square <= MAX_FRAME_RATIO * square.median()
         if not usual.all():
             self._shown = self._shown[usual]
-            self.unchanged = self._fit((), torch.zeros(0), self.unchanged.place[usual])
+            self.unchanged = self._fit((), torch.zeros(0), self.unchanged.pose[usual])
         if _track_is_featureless(finder, self.unchanged):
             self.fixed = frozenset({"dx"})
 
@@ -177,10 +177,10 @@ class _CameraSearch:
         """
         if not best.camera:
             return best, without
-        best = self._fit(best.camera, best.values, best.place, smooth=True)
+        best = self._fit(best.camera, best.values, best.pose, smooth=True)
         still = may_do_nothing(best, self.fixed)
         if 0 < len(still) < len(best.camera):
-            best = self._fit(*_without(best, still), best.place, smooth=True)
+            best = self._fit(*_without(best, still), best.pose, smooth=True)
             without = self._without_each(best)
         return best, without
 
@@ -195,7 +195,7 @@ class _CameraSearch:
                 if other in best.camera:
                     continue
                 start = torch.cat((values, fit.values[-len(other.table) :]))
-                again = self._fit((*rest, other), start, best.place, smooth=True)
+                again = self._fit((*rest, other), start, best.pose, smooth=True)
                 if _as_good(again, best):
                     out[kind][other] = again
         return out
@@ -206,24 +206,24 @@ class _CameraSearch:
         for kind in SEARCHED:
             start = None if kind in best.camera else _start(kind, self._finder, self._shown, best, self.fixed)
             if start is not None:
-                values, place = start
-                tried[kind] = self._fit_all((*best.camera, kind), torch.cat((best.values, values)), place)
+                values, pose = start
+                tried[kind] = self._fit_all((*best.camera, kind), torch.cat((best.values, values)), pose)
         return tried
 
     def _without_each(self, best: CameraFit) -> Fits:
         """The camera with one effect less."""
         rests = {kind: _without(best, {kind}) for kind in best.camera}
-        return {kind: self._fit_all(*rest, best.place) if rest[0] else self.unchanged for kind, rest in rests.items()}
+        return {kind: self._fit_all(*rest, best.pose) if rest[0] else self.unchanged for kind, rest in rests.items()}
 
-    def _fit_all(self, camera: Camera, values: Tensor, place: Tensor) -> CameraFit:
+    def _fit_all(self, camera: Camera, values: Tensor, pose: Tensor) -> CameraFit:
         """A fit to all frames: poses that are wrong are looked for again, through the camera that explains the
         others."""
-        fit = self._fit(camera, values, place)
+        fit = self._fit(camera, values, pose)
         square = fit.residual.square().mean((1, 2))
         astray = square > ASTRAY * square.median()
         if astray.any():
-            nearest = _nearest(self._finder, fit.effects, self._shown)[0].to(fit.place)
-            again = self._fit(camera, fit.values, torch.where(astray[:, None], nearest, fit.place))
+            nearest = _nearest(self._finder, fit.effects, self._shown)[0].to(fit.pose)
+            again = self._fit(camera, fit.values, torch.where(astray[:, None], nearest, fit.pose))
             fit = min(fit, again, key=lambda one: one.misfit)
         if self._progress is not None:
             self._done += 1
@@ -231,8 +231,8 @@ class _CameraSearch:
             self._progress(min(self._done, least), least, fit.mean_square)
         return fit
 
-    def _fit(self, camera: Camera, values: Tensor, place: Tensor, smooth: bool = False) -> CameraFit:
-        return fit_camera(self._renderer, self._shown, camera, values, place, self.fixed, smooth)
+    def _fit(self, camera: Camera, values: Tensor, pose: Tensor, smooth: bool = False) -> CameraFit:
+        return fit_camera(self._renderer, self._shown, camera, values, pose, self.fixed, smooth)
 
 
 def _as_good(fit: CameraFit, best: CameraFit) -> bool:
@@ -266,13 +266,13 @@ def may_do_nothing(fit: CameraFit, fixed: frozenset[str]) -> set[type[CameraEffe
 def _start(
     kind: type[CameraEffect], finder: PoseFinder, shown: Tensor, best: CameraFit, fixed: frozenset[str]
 ) -> tuple[Tensor, Tensor] | None:
-    """First values (P,) of an effect and places (N, 2), beside what the best camera has; None where there are none."""
+    """First values (P,) of an effect and poses (N, 2), beside what the best camera has; None where there are none."""
     neutral = torch.tensor([math.nan if p.neutral is None else p.neutral for p in kind.table], dtype=torch.float64)
     if kind is Occlusion:
         box = _covered(best.residual, shown)
         return None if box is None else (box, _nearest(finder, [*best.effects, *made((kind,), box)], shown)[0])
     if kind is Blur:
-        return neutral + 0.7, best.place  # its slope at 0 is 0
+        return neutral + 0.7, best.pose  # its slope at 0 is 0
     few = shown[evenly_spaced(len(shown), FRAMES_AT_FIRST)]
     if kind is Brightness:
         gains = torch.logspace(math.log2(0.35), math.log2(1.9), 11, base=2)
@@ -285,7 +285,7 @@ def _start(
     points = torch.cat((neutral[None], points.double()))
     cameras = [[*best.effects, *made((kind,), point)] for point in points]
     first = int(torch.stack([_nearest(finder, camera, few)[1].mean() for camera in cameras]).argmin())
-    return points[first], _nearest(finder, cameras[first], shown)[0] if first else best.place
+    return points[first], _nearest(finder, cameras[first], shown)[0] if first else best.pose
 
 
 def _nearest(finder: PoseFinder, camera: Sequence[CameraEffect], frames: Tensor) -> tuple[Tensor, Tensor]:
@@ -320,7 +320,7 @@ def _covered(residual: Tensor, shown: Tensor) -> Tensor | None:
 
 def _track_is_featureless(finder: PoseFinder, unchanged: CameraFit) -> bool:
     """Whether a camera moved along the track shows the same as a cart at another place."""
-    drawn = finder.renderer(*unchanged.place.to(unchanged.residual).T)
+    drawn = finder.renderer(*unchanged.pose.to(unchanged.residual).T)
     shown = through(drawn, [CameraShift(dx=PROBE, dy=0.0)])
     again = finder((255 * shown).round().clamp(0, 255).to(torch.uint8))
     # Another fault of the camera may raise the frames' misfit far above what any feature of the track makes.

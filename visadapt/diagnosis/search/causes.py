@@ -219,8 +219,8 @@ def _estimate(
     parameter: Parameter, value: float, low: float, high: float, covered: Mapping[str, tuple[float, float]]
 ) -> Estimate:
     if parameter.role is Role.PHASE:
-        turn = 2 * math.pi * round(value / (2 * math.pi))
-        return Estimate(value - turn, parameter.unit, (low - turn, high - turn))
+        whole_turns = 2 * math.pi * round(value / (2 * math.pi))
+        return Estimate(value - whole_turns, parameter.unit, (low - whole_turns, high - whole_turns))
     if parameter.is_edge:
         # Where an edge lies outside the data is unknown.
         first, last = covered.get(parameter.unit, (parameter.low, parameter.high))

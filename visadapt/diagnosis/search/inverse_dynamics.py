@@ -138,10 +138,10 @@ def smoothed(values: Tensor, deviation: float, edge: int = 0, stride: int = 1) -
 
     Every `stride`-th row is given, without the first and the last `edge` rows.
     """
-    reach = math.ceil(GAUSSIAN_REACH * deviation)
-    lags = torch.arange(-reach, reach + 1, dtype=values.dtype)
+    half_width = math.ceil(GAUSSIAN_REACH * deviation)
+    lags = torch.arange(-half_width, half_width + 1, dtype=values.dtype)
     kernel = torch.exp(-0.5 * (lags / max(deviation, 1e-6)).square())
     first, last = values[:1], values[-1:]
-    before, beyond = 2 * first - values[1 : reach + 1].flip(0), 2 * last - values[-reach - 1 : -1].flip(0)
-    padded = torch.cat((before, values, beyond))[edge : len(values) + 2 * reach - edge].T[:, None]
+    before, beyond = 2 * first - values[1 : half_width + 1].flip(0), 2 * last - values[-half_width - 1 : -1].flip(0)
+    padded = torch.cat((before, values, beyond))[edge : len(values) + 2 * half_width - edge].T[:, None]
     return conv1d(padded, (kernel / kernel.sum())[None, None], stride=stride)[:, 0].T

@@ -29,14 +29,14 @@ STANDS_OUT = 4.0  # Structure of a pixel over the mean, above which it belongs t
 MOST_BOXES, LEAST_SHARE = 5, 0.05  # Boxes at most, and the least share of a film's structure that one holds
 
 
-def left_over(seen: nn.Module, camera: Sequence[CameraEffect], frames: Tensor, place: Tensor) -> Tensor:
+def left_over(seen: nn.Module, camera: Sequence[CameraEffect], frames: Tensor, pose: Tensor) -> Tensor:
     """`structure` (H, W) of frames (T, H, W) uint8 less what is drawn of their poses (T, 2); 0 where nothing is drawn.
 
     `seen` is the renderer through `camera`. A few frames that are far worse than most, such as flashes, are left out.
     """
     rows = evenly_spaced(len(frames), FRAMES)
-    rows = rows[place[rows].isfinite().all(1)]
-    x, theta = place[rows].float().T
+    rows = rows[pose[rows].isfinite().all(1)]
+    x, theta = pose[rows].float().T
     drawn = seen(x, theta)
     residual = (frames[rows].float() / 255 - drawn) * within_frame(camera, drawn)
     power = residual.square().mean((1, 2))
@@ -44,12 +44,12 @@ def left_over(seen: nn.Module, camera: Sequence[CameraEffect], frames: Tensor, p
     return structure(residual[power <= most])
 
 
-def usual(renderer: nn.Module, camera: Sequence[CameraEffect], place: Tensor) -> float:
+def usual(renderer: nn.Module, camera: Sequence[CameraEffect], pose: Tensor) -> float:
     """What is left where nothing is unexplained, root mean square, where white is 1: the renderer's own errors and,
-    where the camera is moved, what frames drawn at places (N, 2) lose when they are moved half a pixel and back."""
+    where the camera is moved, what frames drawn at poses (N, 2) lose when they are moved half a pixel and back."""
     known = getattr(renderer, "error", None)
     error = USUAL if known is None else float(known)
-    drawn = renderer(*place.float().T)
+    drawn = renderer(*pose.float().T)
     if all(effect.motion(drawn) is None for effect in camera):
         return error
     half = CameraShift(dx=0.5, dy=0.5).motion(drawn)

@@ -183,5 +183,5 @@ def _activity(motion: Motion, fastest: Tensor) -> Tensor:
 def _slowest(velocity: Tensor) -> Tensor:
     """The least speeds (T, J) of each joint from the row before to the row after; 0 where it turns round."""
     three = pad(velocity.T[None], (1, 1), mode="replicate")[0].T.unfold(0, 3, 1)
-    turns = three.amin(-1) * three.amax(-1) <= 0
-    return three.abs().amin(-1).masked_fill(turns, 0.0)
+    reverses = three.amin(-1) * three.amax(-1) <= 0
+    return three.abs().amin(-1).masked_fill(reverses, 0.0)

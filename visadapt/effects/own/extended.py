@@ -41,8 +41,8 @@ class Extended(System):
 
     def _values(self, prefix: str, count: int) -> dict[int, Any]:
         """The fields of one kind, but for those that are 0, by their number."""
-        values = {place: getattr(self, f"{prefix}{place}") for place in range(count)}
-        return {place: value for place, value in values.items() if isinstance(value, Tensor) or value}
+        values = {index: getattr(self, f"{prefix}{index}") for index in range(count)}
+        return {index: value for index, value in values.items() if isinstance(value, Tensor) or value}
 
 
 def _added(system: type[System]) -> list[str]:
