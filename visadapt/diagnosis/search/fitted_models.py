@@ -138,7 +138,7 @@ class FittedModels:
 
     def single(self, effect: type[Effect]) -> ScoredModel:
         """The set of one effect alone."""
-        key = frozenset({effect.name})
+        key = key_of((effect,))
         if key not in self.fitted:
             self.fit([((effect,), self._start(self.source, effect))], QUICK)
         return self.fitted[key]
