@@ -39,7 +39,6 @@ quick fits, and for reported results."""
 SHORT_PERIOD = 0.005
 """s: up to it the midpoint rule is accurate enough for what is not reported, and takes half as long."""
 
-
 STABLE = 2.0
 """Ratio, to the longest step that is accurate, of one in which Runge-Kutta is stable."""
 
@@ -89,12 +88,14 @@ class CandidateModel:
         self.table = self._world.table
         self.low, self.high = search_range(self.table)
         acting = [effect for effect in effects if issubclass(effect, ActuationEffect)]
-        alone = all(effect.acting_on is ActuationEffect.acting_on for effect in acting)
-        named = [effect for effect in effects for _ in effect.table]
-        self.acting_parameters = [k for k, effect in enumerate(named) if acting and (effect in acting or not alone)]
+        from_commands_alone = all(effect.acting_on is ActuationEffect.acting_on for effect in acting)
+        owners = [effect for effect in effects for _ in effect.table]
+        self.acting_parameters = [
+            k for k, effect in enumerate(owners) if acting and (effect in acting or not from_commands_alone)
+        ]
         """columns of the parameters that change what acts of the commands"""
         self.reads_commands = self._world.reads_commands
-        self._late = [(k, effect.late) for k, effect in enumerate(named) if issubclass(effect, LateSensors)]
+        self._late = [(k, effect.late) for k, effect in enumerate(owners) if issubclass(effect, LateSensors)]
         rubs = any(issubclass(effect, DynamicsEffect) and effect.rubs() for effect in effects)
         self.feels_unmodelled_loads = rows.colour is not None and rubs
         """whether what is missing from the model decides which way friction acts"""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -31,6 +32,7 @@ from visadapt.estimation.fit_states import (
     neutral,
     single_fit,
     stacked,
+    widths,
     with_effect,
 )
 from visadapt.estimation.fitting import fit
@@ -78,17 +80,15 @@ def fit_effects(
     kinds = [with_episode_phases(sized(type(effect), system), len(measured)) for effect in effects]
     check_fittable(kinds, system)
     fitted = tuple(kind for kind in kinds if not kind.repeats_readings)
-    columns, first = {}, 0
-    for kind in fitted:
-        columns[kind] = slice(first, first + len(kind.table))
-        first += len(kind.table)
+    ends = accumulate(len(kind.table) for kind in fitted)
+    columns = {kind: slice(end - len(kind.table), end) for kind, end in zip(fitted, ends, strict=True)}
     measured = [values.double() for values in measured]
     commands = [values.double() for values in commands]
     profile = profile_of(system)
     channels = tuple(range(len(system.states)))
-    holds = find_repeats(measured, channels, profile.angle_sensor)
+    repeats = find_repeats(measured, channels, profile.angle_sensor)
     stamps = [period * torch.arange(len(values)).double() for values in measured]
-    rows = cut(measured, holds.used, commands, stamps, channels, period, profile.window_rows)
+    rows = cut(measured, repeats.used, commands, stamps, channels, period, profile.window_rows)
     present = [
         value
         for effect, kind in zip(effects, kinds, strict=True)
@@ -105,9 +105,9 @@ def fit_effects(
         values[plain] = _within_a_turn(plain, found.theta[0, stated])
         spreads[plain] = covariance[stated, stated]
     if Dropout in kinds:
-        values[Dropout], spreads[Dropout] = _lost(holds)
+        values[Dropout], spreads[Dropout] = _lost(repeats)
     if FrozenZone in kinds:
-        values[FrozenZone], spreads[FrozenZone] = _frozen(holds, states, found, profile.angle_sensor[0])
+        values[FrozenZone], spreads[FrozenZone] = _frozen(repeats, states, found, profile.angle_sensor[0])
     return EffectFit(values, spreads, states, _shifts(fitted, columns, found.theta[0], len(measured)))
 
 
@@ -204,21 +204,21 @@ def _by_episode(rows: Segments, state: Tensor, measured: Sequence[Tensor]) -> li
     return out
 
 
-def _lost(holds: RepeatedReadings) -> tuple[Tensor, Tensor]:
+def _lost(repeats: RepeatedReadings) -> tuple[Tensor, Tensor]:
     """The rate at which rows are lost, (1,), and its posterior variance, (1, 1), under a uniform prior."""
-    lost, rows = sum(int(x.sum()) for x in holds.lost), sum(len(x) - 1 for x in holds.lost)
+    lost, rows = sum(int(x.sum()) for x in repeats.lost), sum(len(x) - 1 for x in repeats.lost)
     variance = (lost + 1) * (rows - lost + 1) / ((rows + 2) ** 2 * (rows + 3))
     return torch.tensor([lost / max(1, rows)]).double(), torch.tensor([[variance]]).double()
 
 
-def _frozen(holds: RepeatedReadings, states: Sequence[Tensor], found: FitState, angle: int) -> tuple[Tensor, Tensor]:
+def _frozen(repeats: RepeatedReadings, states: Sequence[Tensor], found: FitState, angle: int) -> tuple[Tensor, Tensor]:
     """Start and end (2,) of the angles at which the sensor stands still, and their covariance (2, 2)."""
     # A first reading has none before it to repeat.
-    seen = torch.cat([~silent[1:] for silent in holds.silent])
-    held = torch.cat([frozen[1:] for frozen in holds.frozen])[seen]
+    seen = torch.cat([~silent[1:] for silent in repeats.silent])
+    held = torch.cat([frozen[1:] for frozen in repeats.frozen])[seen]
     if not bool(held.any()):
-        width = torch.tensor([p.high - p.low for p in FrozenZone.table], dtype=torch.float64)
-        return torch.tensor(neutral(FrozenZone), dtype=torch.float64), torch.diag(width.square() / 12)
+        variance = widths((FrozenZone,)).square() / 12  # of a uniform distribution
+        return torch.tensor(neutral(FrozenZone), dtype=torch.float64), torch.diag(variance)
     noise = SMOOTHING_RATIO * float((found.log_noise[0, angle] / 2).exp())
     edges, deviations = zone(held, torch.cat([state[1:, angle] for state in states])[seen], noise)
     return edges, torch.diag(deviations.square())

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from visadapt.effects import ActuationEffect, DynamicsEffect, Effect, Role
-from visadapt.estimation.grids import neutral_point, strengths, values_of
+from visadapt.estimation.grids import column_of, neutral_point, strengths, values_of
 from visadapt.estimation.sensitivity import Sensitivity
 
 BIN = 0.02
@@ -48,7 +48,7 @@ def likeliest(whole: Sensitivity, some: Sensitivity, effect: type[Effect]) -> Te
         whole: on all windows, from which g_t is computed.
         some: on fewer windows, from which E is computed: too small by one factor for all f, so the best f are the same.
     """
-    column, strength = _column(effect, Role.FREQUENCY), strengths(effect)[0]
+    column, strength = column_of(effect, Role.FREQUENCY), strengths(effect)[0]
     low, high = effect.table[column].low, effect.table[column].high
     coarse = values_of(effect.table[column])
     pull = whole.pull(effect, neutral_point(effect), strength)
@@ -79,13 +79,9 @@ def likeliest(whole: Sensitivity, some: Sensitivity, effect: type[Effect]) -> Te
 
 def _energy(some: Sensitivity, effect: type[Effect], frequencies: Tensor) -> Tensor:
     """(F,) E at frequencies (F,): the mean of that of a cosine and of a sine."""
-    column, phase = _column(effect, Role.FREQUENCY), _column(effect, Role.PHASE)
+    column, phase = column_of(effect, Role.FREQUENCY), column_of(effect, Role.PHASE)
     points = neutral_point(effect).repeat(2 * len(frequencies), 1)
     points[:, column] = frequencies.repeat(2)
     points[len(frequencies) :, phase] = math.pi / 2
     response = some.by_unit(effect, points, strengths(effect)[:1])[..., 0]
     return response.square().sum(0).view(2, -1).mean(0)
-
-
-def _column(effect: type[Effect], role: Role) -> int:
-    return next(k for k, parameter in enumerate(effect.table) if parameter.role is role)

@@ -36,6 +36,11 @@ def strengths(effect: type[Effect]) -> list[int]:
     return [k for k, parameter in enumerate(effect.table) if parameter.is_strength]
 
 
+def column_of(effect: type[Effect], role: Role) -> int:
+    """Column of the effect's first parameter with this role."""
+    return next(k for k, parameter in enumerate(effect.table) if parameter.role is role)
+
+
 def is_proportional(effect: type[Effect]) -> bool:
     """Whether the effect has strengths, and is proportional to all of them."""
     columns = strengths(effect)

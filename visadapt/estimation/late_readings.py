@@ -50,11 +50,12 @@ def reading(
     seen, shown = state.clone(), dict[tuple[int, ...], Tensor]()
     for column in range(state.shape[1]):
         of = tuple(k for k, sensor in enumerate(sensors) if column in sensor.late)
-        if of and of not in shown:
+        if not of:
+            continue
+        if of not in shown:
             delay = sum(sensors[k].value("delay", state) for k in of)
             shown[of] = _later(world, every, state, following, following.read[:, column] - delay)
-        if of:
-            seen[:, column] = shown[of][:, column]
+        seen[:, column] = shown[of][:, column]
     return here.reading(seen, applied)
 
 

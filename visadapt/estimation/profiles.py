@@ -188,7 +188,7 @@ def _own_profile(system: type[System]) -> SystemProfile:
         )
     names, units = [state.name for state in system.states], [state.unit for state in system.states]
     positions, velocities = system.velocity_of(), [velocity for _, velocity in system.coordinates]
-    places = {units[p]: names[p] for p in positions if sum(units[p] == units[q] for q in positions) == 1}
+    by_unit = {units[p]: names[p] for p in positions if sum(units[p] == units[q] for q in positions) == 1}
     along = system.coordinates[0][0]
     slower = system.prediction_time / System.prediction_time
     return SystemProfile(
@@ -197,7 +197,7 @@ def _own_profile(system: type[System]) -> SystemProfile:
         sensors=tuple((column,) for column in range(len(names))),
         quaternion=(),
         initial_variance=tuple((FIRST_STATE_SHARE * s.largest) ** 2 for s in system.states),
-        region_variables={"s": "time", **places},
+        region_variables={"s": "time", **by_unit},
         plotted_variables=(
             names[velocities[0]],
             *([] if along is None else [names[along]]),

@@ -58,7 +58,7 @@ def find_repeats(
     changes = torch.cat([values.diff(dim=0) for values in measured])
     steps = [smallest_step(torch.cat([values[:, k] for values in measured])) for k in range(len(channels))]
     by_chance = [_equal_by_chance(changes[:, k], step) for k, step in enumerate(steps)]
-    pole = torch.tensor([c in angle_sensor for c in channels], dtype=torch.bool)
+    of_angle = torch.tensor([c in angle_sensor for c in channels], dtype=torch.bool)
     angle = channels.index(angle_sensor[0]) if angle_sensor and angle_sensor[0] in channels else None
     same = [torch.stack([_repeats(values[:, k], steps[k]) for k in range(len(channels))], 1) for values in measured]
     resting = [_resting(values) for values in measured]
@@ -74,7 +74,7 @@ def find_repeats(
     used = []
     doubtful = frozen if angle is None else _between_held([values[:, angle] for values in measured], frozen)
     for whole, still in zip(lost, doubtful, strict=True):
-        partial = pole & still[:, None]
+        partial = of_angle & still[:, None]
         # The first reading after a standstill may still be mixed with the repeated value.
         waking = torch.zeros_like(partial)
         waking[1:] = partial[:-1] & ~partial[1:]

@@ -22,6 +22,7 @@ from visadapt.estimation.grids import (
     FREQUENCY_POINTS,
     SMALL_SHARE,
     clamped_to_range,
+    column_of,
     grid,
     is_proportional,
     size,
@@ -98,9 +99,9 @@ def screen(
         if not proportional:
             promising = _promising(some, effect, points, columns)
             if len(columns) == 1:
-                return _best_of(sensitivity(1), effect, promising)
+                return _best_of_points(sensitivity(1), effect, promising)
             return _descend(sensitivity(1), effect, promising[0])
-        found = _best(effect, points, columns, some.innovations.error, some.by_unit(effect, points, columns))
+        found = _best_on_grid(effect, points, columns, some.innovations.error, some.by_unit(effect, points, columns))
         return None if found is None else replace(found, gain=stride * found.gain)
 
     found = shared_out(lambda indices: [best(candidates[k]) for k in indices], len(candidates), jobs)
@@ -123,7 +124,7 @@ def _with_episode_phases(sensitivity: Sensitivity, effect: type[Effect]) -> Cand
 def _best_phases(sensitivity: Sensitivity, effect: type[Effect], values: Sequence[float]) -> Candidate:
     """An effect with a phase for each episode: of parameters (P,) with one phase, the phase that suits each best."""
     plain, rows = with_common_phase(effect), sensitivity.rows
-    column = next(k for k, p in enumerate(plain.table) if p.role is Role.PHASE)
+    column = column_of(plain, Role.PHASE)
     phases = values_of(plain.table[column])
     points = torch.tensor(list(values), dtype=torch.float64).repeat(len(phases), 1)
     points[:, column] = phases
@@ -165,7 +166,7 @@ def _promising(sensitivity: Sensitivity, effect: type[Effect], points: Tensor, c
     return clamped_to_range(effect, torch.cat((stepped[chosen], points[best][None])))
 
 
-def _best_of(sensitivity: Sensitivity, effect: type[Effect], points: Tensor) -> Candidate | None:
+def _best_of_points(sensitivity: Sensitivity, effect: type[Effect], points: Tensor) -> Candidate | None:
     """The candidate with the largest gain of points (G, P), or of much smaller ones that gain nearly as much: large
     ones the linear response may misjudge. None without a gain."""
     change, _ = sensitivity.around(effect, points, [])
@@ -209,7 +210,9 @@ def _descend(sensitivity: Sensitivity, effect: type[Effect], point: Tensor) -> C
     return Candidate(effect, tuple(found.tolist()), best) if best > 0 else None
 
 
-def _best(effect: type[Effect], shapes: Tensor, linear: list[int], error: Tensor, response: Tensor) -> Candidate | None:
+def _best_on_grid(
+    effect: type[Effect], shapes: Tensor, linear: list[int], error: Tensor, response: Tensor
+) -> Candidate | None:
     """The point of a grid (G, P) that reduces the squares of `error` (N,) most, with the best sizes of the parameters
     `linear`; `response` (N, G, L) is the change per unit of these. None where no point reduces them.
     """

@@ -196,22 +196,23 @@ def cut(
         period: s between rows, the median of all.
         stretches: the parts to use, as (episode index, first row, row past the last); whole episodes by default.
     """
-    pieces = []
     if stretches is None:
         stretches = [(k, 0, len(values)) for k, values in enumerate(measured)]
+    pieces = []
     for index, begin, end in stretches:
         count = -(-(end - begin) // longest)
         edges = torch.linspace(begin, end, count + 1).round().long().tolist()
         pieces += [(index, a, b) for a, b in pairwise(edges)]
     rows = max(b - a for _, a, b in pieces)
-    shape = (len(pieces), rows)
-    out = torch.zeros(*shape, len(channels), dtype=torch.float64)
-    inside = torch.zeros(shape, dtype=torch.float64)
+    inside = torch.zeros(len(pieces), rows, dtype=torch.float64)
+    time, out = torch.zeros_like(inside), inside.new_zeros(*inside.shape, len(channels))
     used = torch.zeros_like(out)
     for w, (index, a, b) in enumerate(pieces):
         out[w, : b - a] = measured[index][a:b]
         used[w, : b - a] = valid[index][a:b]
         inside[w, : b - a] = 1
+        time[w] = stamps[index][a] + period * torch.arange(rows)
+        time[w, : b - a] = stamps[index][a:b]
     command = torch.zeros(
         len(commands), max(len(c) for c in commands) + rows, commands[0].shape[1], dtype=torch.float64
     )
@@ -220,10 +221,6 @@ def cut(
         command[index, : len(values)] = values
         held[index, : len(values) - 1] = stamp.diff()
     first = torch.tensor([a for _, a, _ in pieces])
-    time = torch.zeros(shape, dtype=torch.float64)
-    for w, (index, a, b) in enumerate(pieces):
-        time[w] = stamps[index][a] + period * torch.arange(rows)
-        time[w, : b - a] = stamps[index][a:b]
     episode = torch.tensor([index for index, _, _ in pieces])
     resolution = tuple(smallest_step(torch.cat([values[:, k] for values in measured])) for k in range(len(channels)))
     return Segments(out, used, inside, time, command, held, first, episode, channels, period, resolution)

@@ -160,13 +160,17 @@ def _averaged(
     having = [c for c in comparison.models if one.canonical in c.model.effects and c.model.names in fitted]
     known = [fitted[compared.model.names][one.canonical] for compared in having]
     values, spreads = (torch.stack(each) for each in zip(*known, strict=True))
-    phases = torch.tensor([2 * math.pi * p.is_phase for p in one.canonical.table], dtype=values.dtype)
-    values = values - phases * ((values - likeliest) / (2 * math.pi)).round()
+    turns = torch.tensor([2 * math.pi * p.is_phase for p in one.canonical.table], dtype=values.dtype)
+
+    def near(values: Tensor) -> Tensor:
+        """The same values (..., P), with each phase at most half a turn from the likeliest."""
+        return values - turns * ((values - likeliest) / (2 * math.pi)).round()
+
+    values = near(values)
     weights = torch.tensor([compared.probability for compared in having], dtype=values.dtype)
     low, high = (_quantile(values, spreads, weights, level) for level in (0.05, 0.95))
     if one.canonical in without_slight:
-        alone = without_slight[one.canonical][0]
-        alone = alone - phases * ((alone - likeliest) / (2 * math.pi)).round()
+        alone = near(without_slight[one.canonical][0])
         low, high = torch.minimum(low, alone), torch.maximum(high, alone)
     return _estimates(search, one.compared.model, one.canonical, likeliest, low, high)
 
