@@ -136,14 +136,14 @@ def _check_answers(judged: Sequence[RawEpisode], system: System, angles: Sequenc
         name, values = angles[0], np.concatenate([raw.states[angles[0]] for raw in judged])
         raise RecordingError(
             f"{whole.origin}: {whole.column(name)} goes from {values.min():.3g} to {values.max():.3g} and answers the "
-            f"command as if in degrees; radians are right"
+            "command as if in degrees; radians are right"
         )
     for name, other in product(lengths, angles):
         if exchanged(judged, system, name, other):
             raise RecordingError(
                 f"{whole.origin}: {whole.column(name)} answers the command as {other} should, and "
                 f"{whole.column(other)} as {name}: they are exchanged "
-                f"(or the command's sign is wrong: positive pushes towards +x)"
+                "(or the command's sign is wrong: positive pushes towards +x)"
             )
 
 
@@ -174,9 +174,8 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable, stride: int
     that the system states."""
     values, measured = raw.states[variable.name], raw.states.get(rate.name)
     angle = variable.unit == "rad"
-    right = "metres are right (these look like centimetres or millimetres)"
-    if angle:
-        right = "radians are right (these look like degrees)"
+    unit, mistaken = ("radians", "degrees") if angle else ("metres", "centimetres or millimetres")
+    right = f"{unit} are right (these look like {mistaken})"
     change = _rates(raw.time, values, angle)
     coarse = np.convolve(change, np.ones(stride) / stride, "valid")
     fast = float(np.quantile(np.abs(coarse), 0.9))

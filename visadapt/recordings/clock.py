@@ -180,7 +180,7 @@ def _rounding(time: NDArray[np.float64]) -> float:
     return float(10**-MOST_DECIMALS)
 
 
-def alike(parts: list[RawEpisode], note: Note) -> tuple[list[RawEpisode], float]:
+def with_common_period(parts: list[RawEpisode], note: Note) -> tuple[list[RawEpisode], float]:
     """The parts with about the period of most rows, and the median step in s; every part needs at least two rows.
 
     Raises:

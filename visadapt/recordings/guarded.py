@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from visadapt.recordings.episode import RecordingError
 
-Read = TypeVar("Read")
+Result = TypeVar("Result")
 
 READING_S, READING_BYTES_PER_S = 5, 50e6
 """CPU time in s that opening any file may take, and bytes of its values, unpacked, for each second more."""
@@ -20,7 +20,7 @@ MEMORY = Path("/proc/self/statm")
 """Pages of memory of this process, on Linux; the sixth number is that of its data."""
 
 
-def tried(path: str | os.PathLike[str], read: Callable[[Callable[[int], None]], Read]) -> Read:
+def tried(path: str | os.PathLike[str], read: Callable[[Callable[[int], None]], Result]) -> Result:
     """The result of `read`, tried first in a process of its own: a damaged file can make HDF5 hang, or end the process.
 
     `read` is given a function that it calls with the bytes that it is going to unpack: they take time and memory.

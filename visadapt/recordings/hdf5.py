@@ -238,7 +238,7 @@ def _datasets(path: Path, file: h5py.File, number: int, frames: bool) -> dict[st
                 if dataset.is_virtual or dataset.external:
                     raise RecordingError(f"{where}: the values of {name!r} are in another file; its own are right")
                 if dataset.nbytes > COMPRESSION * dataset.id.get_storage_size() or dataset.dtype.hasobject:
-                    raise TypeError
+                    raise TypeError  # `_undamaged` says it in words
     return found
 
 
@@ -252,7 +252,7 @@ def _read_dataset(dataset: h5py.Dataset, name: str, where: str, rows: NDArray[np
             found.update(part.tobytes())
             used.append(own)
         if file.attrs["version"] > 1 and dataset.attrs.get("sha256") != found.hexdigest():
-            raise TypeError
+            raise TypeError  # `_undamaged` says it in words
     return used[0] if len(used) == 1 else np.concatenate(used)
 
 

@@ -14,14 +14,14 @@ import numpy as np
 
 from visadapt.progress import Report, staged
 from visadapt.recordings.checks import check_commands, check_finite, check_units
-from visadapt.recordings.clock import Note, RawEpisode, alike, check_forward, check_steps, uninterrupted
+from visadapt.recordings.clock import Note, RawEpisode, check_forward, check_steps, uninterrupted, with_common_period
 from visadapt.recordings.columns import match
 from visadapt.recordings.csv import read_rows
 from visadapt.recordings.episode import Episode, Recording, RecordingError
 from visadapt.recordings.hdf5 import read_names, read_stretches
 from visadapt.recordings.logs import read_log
 from visadapt.recordings.physics import is_in_newtons, same_after_a_turn
-from visadapt.recordings.sensors import check_sensors, without_outliers
+from visadapt.recordings.sensors import TURN, check_sensors, without_outliers
 from visadapt.recordings.thinning import thinned
 from visadapt.recordings.topics import reader
 from visadapt.systems import System
@@ -99,7 +99,7 @@ def load_recording(
         whole = check_sensors(whole, system, note)
     turning = [state.name for state in system.states if state.unit == "rad" and same_after_a_turn(system, state.name)]
     parts = [part for raw in whole for part in uninterrupted(_unwrapped(raw, turning), note)]
-    parts, period = alike(_long_enough(parts, system.prediction_time, note), note)
+    parts, period = with_common_period(_long_enough(parts, system.prediction_time, note), note)
     outliers = any(part.usable is not None for part in parts)
     return Recording(
         episodes=tuple(Episode(part.time, part.action, None if frames else part.state, part.frame) for part in parts),
@@ -259,9 +259,9 @@ def _unwrapped(raw: RawEpisode, turning: Sequence[str]) -> RawEpisode:
     for column, name in enumerate(raw.measured):
         if name in turning:
             angle = np.unwrap(state[:, column])
-            turn = np.round(angle / (2 * np.pi))
-            upright = np.abs(angle - 2 * np.pi * turn) < UPRIGHT_RAD
-            state[:, column] = angle - 2 * np.pi * np.round(np.median(turn[upright] if upright.any() else turn))
+            turn = np.round(angle / TURN)
+            upright = np.abs(angle - TURN * turn) < UPRIGHT_RAD
+            state[:, column] = angle - TURN * np.round(np.median(turn[upright] if upright.any() else turn))
     return replace(raw, state=state)
 
 

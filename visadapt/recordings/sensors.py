@@ -62,13 +62,13 @@ def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
     bad = np.zeros(len(raw.time), bool)
     period = float(np.median(np.diff(raw.time)))
     for name, values in raw.states.items():
-        variable = system.states[system.index(name)]
+        variable = _variable(system, name)
         if variable.unit == "1":  # as a quaternion's, whose sign may change
             continue
         rate = system.rate_of(name)
         allowed = variable.largest
         if rate is not None:
-            allowed = min(allowed, 2 * period * system.states[system.index(rate)].largest)
+            allowed = min(allowed, 2 * period * _variable(system, rate).largest)
         outliers = _outliers(differences(values, variable.unit == "rad"), values, allowed)
         if outliers.mean() > MOST_OUTLIERS:
             row = int(outliers.argmax())
@@ -92,7 +92,7 @@ def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
     for column, name in enumerate(raw.measured):
         values = raw.state[:, column]
         step = values[after] - values[before]
-        if system.states[system.index(name)].unit == "rad":
+        if _variable(system, name).unit == "rad":
             step -= TURN * np.round(step / TURN)
         state[rows, column] = values[before] + share * step
     return replace(raw, state=state, usable=~bad)
@@ -120,7 +120,7 @@ def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) ->
     """
     for raw in episodes:
         for name, values in raw.states.items():
-            variable, row = system.states[system.index(name)], int(np.abs(values).argmax())
+            variable, row = _variable(system, name), int(np.abs(values).argmax())
             limit = ABSURD_RANGES * variable.largest
             if abs(values[row]) > (ABSURD_TURNS * TURN if variable.unit == "rad" else limit):
                 raise RecordingError(
@@ -157,13 +157,14 @@ def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) ->
 
 
 def _is_still(values: NDArray[np.float64], system: System, name: str) -> bool:
-    return float(np.ptp(values)) <= STILL_RANGES * system.states[system.index(name)].largest
+    return float(np.ptp(values)) <= STILL_RANGES * _variable(system, name).largest
 
 
 def _must_move(raw: RawEpisode, system: System, name: str) -> bool:
     """Whether the source says that a state that is measured does not stand still."""
     columns = {
-        name: np.unwrap(values) if _unit(system, name) == "rad" else values for name, values in raw.states.items()
+        name: np.unwrap(values) if _variable(system, name).unit == "rad" else values
+        for name, values in raw.states.items()
     }
     for position in raw.measured:
         if (rate := system.rate_of(position)) and len(raw.time) > 1:
@@ -172,18 +173,19 @@ def _must_move(raw: RawEpisode, system: System, name: str) -> bool:
     load = torch.zeros(len(state), len(system.loads), dtype=torch.float64)
     change = system.derivative(torch.from_numpy(state), torch.from_numpy(raw.action), load).numpy()
     moved = system.rate_of(name) or name
-    largest = system.states[system.index(moved)].largest
+    largest = _variable(system, moved).largest
     return float(np.abs(change[:, system.index(moved)]).max()) > MOVING_RANGES * largest
 
 
-def _unit(system: System, name: str) -> str:
-    return system.states[system.index(name)].unit
+def _variable(system: System, name: str) -> Variable:
+    """The state of this name."""
+    return system.states[system.index(name)]
 
 
 def _check_not_frozen(raw: RawEpisode, system: System) -> None:
     """Raises RecordingError where a position stands still while its rate, which is measured, says that it moves."""
     for name, values in raw.states.items():
-        variable: Variable = system.states[system.index(name)]
+        variable = _variable(system, name)
         rate = raw.states.get(system.rate_of(name) or "")
         # An angle that stands still in places is an effect of the catalogue.
         if rate is None or variable.unit == "rad":
@@ -205,7 +207,7 @@ def _note_noise(raw: RawEpisode, system: System, note: Note) -> None:
     for name, values in raw.states.items():
         if system.rate_of(name) is None or len(values) < FEWEST_NOISY or not np.ptp(values):
             continue
-        values = np.unwrap(values) if _unit(system, name) == "rad" else values
+        values = np.unwrap(values) if _variable(system, name).unit == "rad" else values
         if np.diff(values).var() > NOISE_RATIO * values.var() and _must_move(raw, system, name):
             note(
                 f"{name} jumps about from row to row and does not move, although what is commanded and measured moves "

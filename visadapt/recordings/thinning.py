@@ -43,7 +43,7 @@ def spread(recording: Recording, most: int, length: int, before: int) -> Recordi
         stretches += [(number, slice(*pair)) for pair in pairwise(edges)]
     count = max(1, most * len(stretches) // sum(rows))
     chosen = [stretches[k] for k in np.linspace(0, len(stretches) - 1, count).round().astype(int)]
-    every = recording.usable or [np.ones(count, bool) for count in rows]
+    every = recording.usable or [np.ones(own, bool) for own in rows]
     episodes, sources, usable = [], [], []
     for number, own in chosen:
         episode, led = recording.episodes[number], slice(max(0, own.start - before), own.stop)
