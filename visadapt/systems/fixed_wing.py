@@ -32,7 +32,7 @@ from torch import Tensor
 from visadapt.systems.base import Variable, holds
 from visadapt.systems.rigid_body import POSITION, VELOCITY, RigidBody, from_angles, matvec, stack_parameters
 
-_EFFECTS = ("drag", "side", "lift", "roll", "pitch", "yaw")
+_FORCES = ("drag", "side", "lift", "roll", "pitch", "yaw")  # The last three are moments
 _CAUSES = ("zero", "sideslip", "attack", "elevator", "aileron", "rudder", "roll_rate", "pitch_rate", "yaw_rate")
 _DEGREE = math.pi / 180
 _LEAST_AIRSPEED = 1e-6
@@ -114,7 +114,7 @@ class FixedWing(RigidBody):
     )
 
     def __post_init__(self) -> None:
-        signed = ("inertia_xz", *(f.name for f in fields(self) if f.name.startswith((*_EFFECTS, "wind"))))
+        signed = ("inertia_xz", *(f.name for f in fields(self) if f.name.startswith((*_FORCES, "wind"))))
         self.check_parameters(either_sign=signed)
         if not holds(self.inertia_xz**2 < self.inertia_x * self.inertia_z):
             raise ValueError(
@@ -150,12 +150,12 @@ class FixedWing(RigidBody):
         angles = torch.atan2(velocity[:, 1:], torch.cat((in_plane, ahead), -1)).clamp(-limit, limit)
         # The causes times V. Forces are V times their sum: rates enter as c q / (2 V), and no division by V is left.
         causes = torch.cat((speed, speed * torch.cat((angles, command[:, 1:]), -1), rates), -1)
-        effects = speed * matvec(table, causes)
-        drag, side, lift = effects[:, :3].unbind(-1)
+        aerodynamic = speed * matvec(table, causes)
+        drag, side, lift = aerodynamic[:, :3].unbind(-1)
         forward, upward = (plane / in_plane).unbind(-1)
         thrust = self.max_thrust * (command[:, 0] + 1) / 2
         force = torch.stack((thrust - drag * forward - lift * upward, side, lift * forward - drag * upward), -1)
-        return force, effects[:, 3:]
+        return force, aerodynamic[:, 3:]
 
     def trim(self, speed: Tensor) -> tuple[Tensor, Tensor]:
         """States (B, 13) and commands (B, 4) of steady level flight, with the nose along +x, at airspeeds (B,) in m/s.
@@ -197,22 +197,22 @@ class FixedWing(RigidBody):
         return state.to(like), command.to(like)
 
     def coefficients(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        """What one unit of each cause adds to each effect, in the body's axes, and the limit of the angles.
+        """What one unit of each cause adds to each force or moment, in the body's axes, and the limit of the angles.
 
         (6, 9) and (1,), or (B, 6, 9) and (B, 1) where a parameter is (B,). Entries become N and N m when they are
         multiplied by the airspeed and by the cause, which is the airspeed times an angle, or a rate.
         """
         unit = self.air_density * self.wing_area / 2
-        effects = (unit, -unit, unit, unit * self.span, -unit * self.chord, -unit * self.span)
+        forces = (unit, -unit, unit, unit * self.span, -unit * self.chord, -unit * self.span)
         surfaces = (self.max_elevator, self.max_aileron, self.max_rudder)
         causes = (1.0, -1.0, -1.0, *surfaces, self.span / 2, -self.chord / 2, -self.span / 2)
         values = [
-            getattr(self, name) * effects[row] * causes[column] if name else 0.0
+            getattr(self, name) * forces[row] * causes[column] if name else 0.0
             for row, names in enumerate(_TABLE)
             for column, name in enumerate(names)
         ]
         gathered = stack_parameters([*values, self.linear_range], like)
-        return gathered[..., :-1].unflatten(-1, (len(_EFFECTS), len(_CAUSES))), gathered[..., -1:]
+        return gathered[..., :-1].unflatten(-1, (len(_FORCES), len(_CAUSES))), gathered[..., -1:]
 
 
 @lru_cache(64)
@@ -222,7 +222,7 @@ def _constant_table(wing: FixedWing, dtype: torch.dtype, device: torch.device) -
 
 
 _TABLE = tuple(
-    tuple(name if (name := f"{effect}_{cause}") in FixedWing.__dataclass_fields__ else "" for cause in _CAUSES)
-    for effect in _EFFECTS
+    tuple(name if (name := f"{force}_{cause}") in FixedWing.__dataclass_fields__ else "" for cause in _CAUSES)
+    for force in _FORCES
 )
-"""Names of the coefficients, a row for each effect; empty where a cause has no such effect."""
+"""Names of the coefficients, a row for each force or moment; empty where a cause does not change it."""

@@ -82,9 +82,8 @@ class Quadrotor(RigidBody):
         Flightmare's plate with rotors: m l^2 / 12 times (4.5, 4.5, 7) about x, y and z.
         """
         size = stack_parameters(((self.mass - self.payload) * self.arm_length**2 / 12,), like)
-        return size[..., None] * constant((4.5, 0.0, 0.0, 0.0, 4.5, 0.0, 0.0, 0.0, 7.0), like.dtype, like.device).view(
-            3, 3
-        )
+        shape = constant((4.5, 0.0, 0.0, 0.0, 4.5, 0.0, 0.0, 0.0, 7.0), like.dtype, like.device).view(3, 3)
+        return size[..., None] * shape
 
     def thrust(self, command: Tensor) -> Tensor:
         """Mass-normalised thrust (B,) in m/s2 at commands (B, 4)."""
