@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -33,6 +34,24 @@ EXPLAINED_CORRELATION = 0.5
 """Correlation of measured and predicted accelerations above which the source explains them."""
 
 Columns = Mapping[str, NDArray[np.float64]]
+
+
+class Agreement(NamedTuple):
+    """How measured accelerations follow those that the source predicts."""
+
+    correlation: float
+    slope: float  # of the measured over the predicted; 0 where either never changes
+
+    @property
+    def opposite(self) -> Agreement:
+        """That of a variable with the other sign."""
+        return Agreement(-self.correlation, -self.slope)
+
+    @property
+    def error(self) -> float:
+        """Mean square of what the prediction misses, over that of the measured values."""
+        size = self.correlation / self.slope if self.slope else 0.0  # of the predicted over the measured values
+        return 1 - 2 * self.correlation * size + size**2
 
 
 def same_after_a_turn(system: System, name: str) -> bool:
@@ -62,9 +81,9 @@ def are_degrees(episodes: Sequence[RawEpisode], system: System) -> bool:
     def scaled(columns: Columns) -> Columns:
         return {name: values * (DEGREE if name in angular else 1) for name, values in columns.items()}
 
-    radians, radian_slope = _fits(episodes, system)[angle]
-    degrees, slope = _fits(episodes, system, scaled)[angle]
-    return degrees > EXPLAINED_CORRELATION and 1 / 3 < slope < 3 and (degrees > radians + 0.2 or radian_slope > 10)
+    radians, degrees = _agreements(episodes, system)[angle], _agreements(episodes, system, scaled)[angle]
+    explained = degrees.correlation > EXPLAINED_CORRELATION and 1 / 3 < degrees.slope < 3
+    return explained and (degrees.correlation > radians.correlation + 0.2 or radians.slope > 10)
 
 
 def is_half_a_turn_off(episodes: Sequence[RawEpisode], system: System) -> bool:
@@ -81,7 +100,7 @@ def is_half_a_turn_off(episodes: Sequence[RawEpisode], system: System) -> bool:
         return {name: -values if name in (angle, rate) else values for name, values in columns.items()}
 
     def error(changed: Callable[[Columns], Columns]) -> float:
-        return _error(*_fits(episodes, system, changed)[angle])
+        return _agreements(episodes, system, changed)[angle].error
 
     there = error(further)
     return there < EXPLAINED_ERROR and all(
@@ -94,9 +113,9 @@ def is_turned_round(episodes: Sequence[RawEpisode], system: System, name: str) -
     cannot be decided, as in `are_degrees`."""
     if not _can_decide(episodes, system, [name]):
         return False
-    fit, slope = _fits(episodes, system)[name]
-    there = _error(-fit, -slope)
-    return there < EXPLAINED_ERROR and _error(fit, slope) > OTHERS_ERROR_RATIO * there
+    found = _agreements(episodes, system)[name]
+    there = found.opposite.error
+    return there < EXPLAINED_ERROR and found.error > OTHERS_ERROR_RATIO * there
 
 
 def is_in_newtons(episodes: Sequence[RawEpisode], system: System, largest: float) -> bool:
@@ -105,7 +124,8 @@ def is_in_newtons(episodes: Sequence[RawEpisode], system: System, largest: float
     names = [variable.name for variable in system.states if system.rate_of(variable.name)]
     if not _can_decide(episodes, system, names):
         return False
-    slopes = [slope for fit, slope in _fits(episodes, system).values() if fit > EXPLAINED_CORRELATION]
+    found = _agreements(episodes, system).values()
+    slopes = [one.slope for one in found if one.correlation > EXPLAINED_CORRELATION]
     return bool(slopes) and all(1 / 3 < slope * largest < 3 for slope in slopes)
 
 
@@ -123,16 +143,17 @@ def exchanged(episodes: Sequence[RawEpisode], system: System, one: str, other: s
     def swapped(columns: Columns) -> Columns:
         return {to.get(name, name): values for name, values in columns.items()}
 
-    fits = _fits(episodes, system, swapped)
-    if not all(1 / 4 < fits[name][1] < 4 for name in (one, other)):
+    def correlations(found: Mapping[str, Agreement]) -> tuple[float, float]:
+        return found[one].correlation, found[other].correlation
+
+    crossed = _agreements(episodes, system, swapped)
+    if not all(1 / 4 < crossed[name].slope < 4 for name in (one, other)):
         return False
     period = min(_period(raw) for raw in episodes)
     latest = round(LONGEST_DELAY * system.prediction_time / period)
-    unchanged = [_fits(episodes, system, delay=k * period) for k in range(latest + 1)]
-    best = max(min(fits[one][0], fits[other][0]) for fits in unchanged)
-    explained = min(fits[one][0], fits[other][0])
-    opposite = max(unchanged[0][one][0], unchanged[0][other][0]) < 0
-    return explained > EXPLAINED_CORRELATION and best < 0.7 * explained and opposite
+    unchanged = [correlations(_agreements(episodes, system, delay=k * period)) for k in range(latest + 1)]
+    explained = min(correlations(crossed))
+    return explained > EXPLAINED_CORRELATION and max(map(min, unchanged)) < 0.7 * explained and max(unchanged[0]) < 0
 
 
 def _only_angle(episodes: Sequence[RawEpisode], system: System) -> str | None:
@@ -174,13 +195,13 @@ def _unchanged(columns: Columns) -> Columns:
     return columns
 
 
-def _fits(
+def _agreements(
     episodes: Sequence[RawEpisode],
     system: System,
     changed: Callable[[Columns], Columns] = _unchanged,
     delay: float = 0.0,
-) -> dict[str, tuple[float, float]]:
-    """For each variable with a rate: correlation of its acceleration with the source's, and slope over the source's.
+) -> dict[str, Agreement]:
+    """For each variable with a rate: how its acceleration follows the source's.
 
     `changed` gives the measured states the units and names to be tried; `delay` is by how many s the commands
     act late.
@@ -189,7 +210,7 @@ def _fits(
     for raw in _judged(episodes, system):
         columns = changed({name: values[:MOST_ROWS] for name, values in raw.states.items()})
         each.append(_accelerations(raw, columns, system, delay))
-    return {name: _fit(*(np.concatenate([one[name][k] for one in each]) for k in (0, 1))) for name in each[0]}
+    return {name: _agreement(*(np.concatenate([one[name][k] for one in each]) for k in (0, 1))) for name in each[0]}
 
 
 def _accelerations(
@@ -226,16 +247,9 @@ def _accelerations(
     return found
 
 
-def _fit(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> tuple[float, float]:
-    """Correlation and slope of measured over predicted values."""
+def _agreement(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> Agreement:
     found = correlation(measured, predicted)
-    return found, found * float(measured.std() / predicted.std()) if found else 0.0
-
-
-def _error(fit: float, slope: float) -> float:
-    """Mean square of what the prediction misses, over that of the measured values, from the `_fit` of both."""
-    size = fit / slope if slope else 0.0  # of the predicted over the measured values
-    return 1 - 2 * fit * size + size**2
+    return Agreement(found, found * float(measured.std() / predicted.std()) if found else 0.0)
 
 
 def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
