@@ -30,7 +30,7 @@ from visadapt.diagnosis.result import (
     without_slight,
 )
 from visadapt.diagnosis.search.camera import CameraFindings, find_camera
-from visadapt.diagnosis.search.pixels import judged, left_over, usual
+from visadapt.diagnosis.search.pixels import expected_size, judged, left_over
 from visadapt.diagnosis.verdict import CLOSES_BUT, at_bound
 from visadapt.diagnosis.words import MISFIT, estimate
 from visadapt.effects import (
@@ -113,7 +113,7 @@ def watch(recording: Recording, system: System, renderer: nn.Module, report: Rep
     poses = found_in(recording, finder, known, staged(report, "poses"))
     left = left_over(seen, effects, every, torch.cat([each.pose for each in poses]))
     found, frames = positions(recording, poses)
-    pixels = judged(left, usual(renderer, effects, camera.best.pose))
+    pixels = judged(left, expected_size(renderer, effects, camera.best.pose))
     return Film(found, frames, camera, seen, pixels, left)
 
 

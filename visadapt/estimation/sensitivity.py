@@ -177,34 +177,30 @@ class Sensitivity:
 
     def _after(self, model: CandidateModel, theta: Tensor) -> Tensor:
         """(M, W, T - 1, n) the states a period after each row with parameters (M, P)."""
-        rows, state, count = self.rows, self.fits.state[0], len(theta)
-        windows, length = rows.shape
+        (time, duration), count, (windows, length) = self.rows.clock, len(theta), self.rows.shape
         acted = self._acted(model, theta)
-
-        def spread(x: Tensor) -> Tensor:
-            return x[None].expand(count, *x.shape).reshape(-1, *x.shape[2:])
-
-        return integrate(
+        after = integrate(
             model.at(theta[0]),
             model.by_row(theta, length - 1),
-            spread(rows.time[:, :-1]),
-            spread(state[:, :-1]),
+            time.repeat(count),
+            self.fits.state[0, :, :-1].flatten(0, 1).repeat(count, 1),
             acted.expand(count, *acted.shape[1:]).flatten(0, 2),
-            spread(rows.duration[:, :-1]),
-        ).reshape(count, windows, length - 1, -1)
+            duration.repeat(count),
+        )
+        return after.unflatten(0, (count, windows, length - 1))
 
     @cached_property
     def _slopes(self) -> tuple[Tensor, Tensor]:
         """Change of the state after a period per unit of a command that acts over it, (W, T - 1, n, n_action), and per
         unit of a load, (W, T - 1, n, n_load)."""
-        bare = CandidateModel(self.system, self.effects, self.rows, COARSEST)
-        model, count, state = with_loads(bare, COARSEST), len(self.system.loads), self.fits.state[0]
+        model, count = with_loads(self.innovations.model, COARSEST), len(self.system.loads)
         theta = torch.cat((self.fits.theta[0], torch.zeros(count, dtype=torch.float64)))
         acted = self._acted(model, theta[None])[0].flatten(0, 1)
-        time, duration = (x[:, :-1].flatten() for x in (self.rows.time, self.rows.duration))
-        values = model.by_row(theta, self.rows.shape[1] - 1)
-        args = (model.at(theta), values, time, state[:, :-1].flatten(0, 1), acted)
-        step = linearise_step(*args, by_state=False, by_command=True, duration=duration)
+        time, duration = self.rows.clock
+        values, state = model.by_row(theta, self.rows.shape[1] - 1), self.fits.state[0, :, :-1].flatten(0, 1)
+        step = linearise_step(
+            model.at(theta), values, time, state, acted, by_state=False, by_command=True, duration=duration
+        )
         shape = (self.rows.shape[0], -1)
         return step.by_command.unflatten(0, shape), step.by_parameter[..., -count:].unflatten(0, shape)
 

@@ -20,7 +20,7 @@ MAX_LEFT_OUT = 0.1  # Share of the frames that may be left out because their res
 
 FRAMES = 96  # Frames, spread over the film, whose pixels are looked at
 
-USUAL = 1 / 255
+USUAL_ERROR = 1 / 255
 """Error of a renderer whose file states none: root mean square of the structure of its residual, where white is 1."""
 
 FACTOR = 1.7  # Ratio of a film's structure to the usual one, above which frames are unexplained
@@ -44,11 +44,11 @@ def left_over(seen: nn.Module, camera: Sequence[CameraEffect], frames: Tensor, p
     return structure(residual[power <= most])
 
 
-def usual(renderer: nn.Module, camera: Sequence[CameraEffect], pose: Tensor) -> float:
+def expected_size(renderer: nn.Module, camera: Sequence[CameraEffect], pose: Tensor) -> float:
     """What is left where nothing is unexplained, root mean square, where white is 1: the renderer's own errors and,
     where the camera is moved, what frames drawn at poses (N, 2) lose when they are moved half a pixel and back."""
     known = getattr(renderer, "error", None)
-    error = USUAL if known is None else float(known)
+    error = USUAL_ERROR if known is None else float(known)
     drawn = renderer(*pose.float().T)
     if all(effect.motion(drawn) is None for effect in camera):
         return error
@@ -60,7 +60,7 @@ def usual(renderer: nn.Module, camera: Sequence[CameraEffect], pose: Tensor) -> 
 
 
 def judged(left: Tensor, expected: float) -> Pixels:
-    """What is left (H, W) beside what is `usual`, with the boxes in which it stands out."""
+    """What is left (H, W) beside the `expected_size`, with the boxes in which it stands out."""
     whole = size_of(left)
     unexplained = whole > FACTOR * expected
     return Pixels(255 * whole, 255 * expected, unexplained, tuple(_boxes(left)) if unexplained else ())
