@@ -68,21 +68,21 @@ class CandidateModel:
         self.effects = tuple(effects)
         self.rows = rows
         self.accuracy = accuracy
-        smooth = self.profile.coarsest_step
+        smooth_step = self.profile.coarsest_step
         if accuracy > COARSEST:
             own = type(system), parameters(system)
-            smooth = min([self.profile.longest_step, *(stable_step(*own, effect) for effect in effects)])  # type: ignore[arg-type]  # hashable, as types
+            smooth_step = min([self.profile.longest_step, *(stable_step(*own, effect) for effect in effects)])  # type: ignore[arg-type]  # hashable, as types
         if accuracy == FINE:
-            smooth = min(smooth, self.profile.fine_step)
-        resolving = smooth
+            smooth_step = min(smooth_step, self.profile.fine_step)
+        step = smooth_step
         if any(effect.abrupt for effect in effects):
-            resolving = min(smooth, self.profile.longest_abrupt_steps[accuracy])
+            step = min(smooth_step, self.profile.longest_abrupt_steps[accuracy])
         longest = float(rows.held.max())
         integrator = "midpoint" if accuracy < FINE and rows.period <= SHORT_PERIOD else "rk4"
         placeholders = [effect(**{parameter.name: 0.0 for parameter in effect.table}) for effect in effects]
-        self._world, self._smooth = (
-            World(system, placeholders, rows.period, integrator, steps_within(longest, step))
-            for step in (resolving, smooth)
+        self._world, self._smooth_world = (
+            World(system, placeholders, rows.period, integrator, steps_within(longest, each))
+            for each in (step, smooth_step)
         )
         self._only_commands_jump = not any(e.abrupt and not issubclass(e, ActuationEffect) for e in effects)
         self.table = self._world.table
@@ -155,7 +155,7 @@ class CandidateModel:
         or a limit does, the substeps of smooth physics are enough.
         """
         if self._only_commands_jump and bool((acting == acting[..., :1, :]).all()):
-            return self._smooth.with_values(theta), acting[..., : self._smooth.substeps, :]
+            return self._smooth_world.with_values(theta), acting[..., : self._smooth_world.substeps, :]
         return self.at(theta), acting
 
     def started(self, theta: Tensor, state: Tensor) -> WorldState:
@@ -258,11 +258,11 @@ def linearise(model: CandidateModel, theta: Tensor, state: Tensor) -> Linearised
     # What acts changes with the parameters of actuation effects alone: for the others it is computed once.
     variants = [0, *(1 + k for k in model.acting_parameters)]
     variant = [variants.index(k) if k in variants else 0 for k in range(len(shifted))]
-    whole = model.acting(shifted[variants])
-    step = _step(model, theta, state, model.in_windows(whole)[:, :, :-1].flatten(1, 2), variant)
-    followings = [shown for each in whole if (shown := model.following(theta, each)) is not None]
+    acting = model.acting(shifted[variants])
+    step = _step(model, theta, state, model.in_windows(acting)[:, :, :-1].flatten(1, 2), variant)
+    followings = [shown for each in acting if (shown := model.following(theta, each)) is not None]
     after = [followings[k] for k in variant] if followings else []
-    applied = [model.applied(each) for each in whole] if model.reads_commands else []
+    applied = [model.applied(each) for each in acting] if model.reads_commands else []
     applied = [applied[k] for k in variant] if applied else []
     values = model.by_row(theta, length)
     read = linearise_reading(model.at(theta), values, state.flatten(0, 1), after, applied, by_state=known is None)

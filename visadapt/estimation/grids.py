@@ -87,7 +87,7 @@ def starts(effect: type[Effect], spans: Spans) -> Tensor:
         elif parameter.is_edge:
             axes.append(_edges(parameter, spans, SHAPE_POINTS))
         else:
-            values = values_of(_reached(parameter, spans))
+            values = values_of(_up_to_largest_command(parameter, spans))
             coarse = parameter.neutral is None and parameter.role is not Role.FREQUENCY
             axes.append(values[:: max(1, len(values) // 2)] if coarse else values)
     return torch.cartesian_prod(*axes).reshape(-1, len(effect.table))
@@ -97,7 +97,7 @@ def _edges(parameter: Parameter, spans: Spans, count: int) -> Tensor:
     return torch.linspace(*spans.get(parameter.unit, (parameter.low, parameter.high)), count, dtype=torch.float64)
 
 
-def _reached(parameter: Parameter, spans: Spans) -> Parameter:
+def _up_to_largest_command(parameter: Parameter, spans: Spans) -> Parameter:
     """The parameter; if a size of the command, with a range that ends at the largest one recorded."""
     largest = spans.get(Role.COMMAND, (0.0, math.inf))[1]
     if parameter.role is not Role.COMMAND or not parameter.low < largest < parameter.high:
