@@ -59,7 +59,7 @@ def fit(
     elif not process_noise:
         start = replace(start, log_process=torch.full_like(start.log_process, MIN_LOG_PROCESS))
     bounds = _bounds(models, start)
-    every = torch.ones(start.state.shape[:2], dtype=torch.float64)
+    all_windows = torch.ones(start.state.shape[:2], dtype=torch.float64)
     damping = torch.full((len(models),), FIRST_DAMPING, dtype=torch.float64)
     stalled = torch.zeros(len(models), dtype=torch.long)
     gained = torch.full_like(damping, math.inf)  # by the last step that gained something
@@ -71,7 +71,7 @@ def fit(
         if (iteration + 1) % period == 0:
             for model in models:
                 model.slopes = None
-        now = differentiate([models[k] for k in active.tolist()], here[active]).summed(every[active])
+        now = differentiate([models[k] for k in active.tolist()], here[active]).summed(all_windows[active])
         tried = replace(here[active], likelihood=now.likelihood, information=now.information)
         if at is None:
             best, at = tried, now
@@ -117,15 +117,15 @@ def refitted(model: CandidateModel, fits: FitState, window_used: Tensor) -> FitS
     which the model is linearised next, stay those of the fit to all windows: moved linearly, they might cross an
     instant at which a joint with dry friction stops, where its motion is not linear.
     """
-    every = torch.zeros(len(window_used), dtype=torch.long)
+    copied = torch.zeros(len(window_used), dtype=torch.long)
     whole = differentiate([model], fits)
-    at, copies = whole.summed(window_used), fits[every]
-    low, high = (end[every] for end in _bounds([model], fits))
+    at, copies = whole.summed(window_used), fits[copied]
+    low, high = (end[copied] for end in _bounds([model], fits))
     widths = (high - low).clamp(min=1e-300)
     information = whole.summed(torch.ones_like(window_used)).information + torch.diag_embed((2 / widths).square())
     most = MAX_REFIT_CHANGE * torch.linalg.inv(information).diagonal(dim1=1, dim2=2).sqrt()
     bounds = torch.maximum(low, copies.theta - most), torch.minimum(high, copies.theta + most)
-    damping = torch.full((len(every),), FIRST_DAMPING, dtype=torch.float64)
+    damping = torch.full((len(copied),), FIRST_DAMPING, dtype=torch.float64)
     return replace(_step(copies, at, damping, bounds, model), state=copies.state, likelihood=at.likelihood)
 
 
@@ -137,16 +137,14 @@ def _step(
     # A prior weak enough to matter only where the data hold no information; the 1.0 is for padding, which stays 0.
     prior = torch.where(high > low, (2 / (high - low)).square(), 1.0)
     diagonal = torch.diagonal(at.information, dim1=1, dim2=2)
-    matrix = at.information + torch.diag_embed(prior + damping[:, None] * diagonal)
-    # Where derivatives are not finite there is no step, and the fit of that set ends; those of the others go on.
-    change = torch.linalg.solve_ex(matrix, at.gradient[..., None]).result[..., 0].nan_to_num(0, 0, 0)
-    theta = (fits.theta + change).clamp(low, high)
-    change = theta - fits.theta
-    moves = torch.cat((torch.ones(len(change), 1, dtype=change.dtype), change), 1)
+    damped = at.information + torch.diag_embed(prior + damping[:, None] * diagonal)
+    theta = (fits.theta + _solution(damped, at.gradient)).clamp(low, high)
+    # `smoothed` is the correction of the states, and its derivative by each parameter.
+    weights = torch.cat((theta.new_ones(len(theta), 1), theta - fits.theta), 1)
+    noise_information = at.noise_information + 0.3 * torch.eye(at.noise_gradient.shape[1], dtype=theta.dtype)
+    log_change = _solution(noise_information, at.noise_gradient)
     share = 1 / (1 + damping)[:, None]
-    matrix = at.noise_information + 0.3 * torch.eye(at.noise_gradient.shape[1], dtype=change.dtype)
-    move = torch.linalg.solve_ex(matrix, at.noise_gradient[..., None]).result[..., 0].nan_to_num(0, 0, 0)
-    log_change = move.clamp(-MAX_LOG_VARIANCE_CHANGE, MAX_LOG_VARIANCE_CHANGE) * share
+    log_change = log_change.clamp(-MAX_LOG_VARIANCE_CHANGE, MAX_LOG_VARIANCE_CHANGE) * share
     groups = fits.log_process.shape[1]
     noise_change = log_change @ noise_members(model)[1]
     # Rounding to a resolution is noise with a deviation of resolution / sqrt(12).
@@ -156,7 +154,15 @@ def _step(
     return replace(
         fits,
         theta=theta,
-        state=fits.state + (at.smoothed * moves[:, None, None, None]).sum(-1),
+        state=fits.state + (at.smoothed * weights[:, None, None, None]).sum(-1),
         log_process=(fits.log_process + log_change[:, :groups]).clamp(MIN_LOG_PROCESS, MAX_LOG_PROCESS),
         log_noise=torch.maximum(fits.log_noise + noise_change, lowest_noise),
     )
+
+
+def _solution(matrix: Tensor, right: Tensor) -> Tensor:
+    """The solutions (C, K) of C linear systems (C, K, K) with right sides (C, K).
+
+    Where derivatives are not finite it is 0: there is no step, and the fit of that set ends; those of the others go on.
+    """
+    return torch.linalg.solve_ex(matrix, right[..., None]).result[..., 0].nan_to_num(0, 0, 0)
