@@ -222,14 +222,16 @@ def _normal(by_pose: Tensor, by_value: Tensor, error: Tensor) -> tuple[Tensor, T
     )
 
 
-def _solved(poses: Tensor, both: Tensor, whole: Tensor, g: Tensor, b: Tensor, damping: float) -> tuple[Tensor, Tensor]:
+def _solved(
+    poses: Tensor, both: Tensor, values: Tensor, pose_side: Tensor, value_side: Tensor, damping: float
+) -> tuple[Tensor, Tensor]:
     """Steps (P,) of the values and (N, 2) of the poses, from the blocks and right sides that `_normal` gives."""
     poses = poses + torch.diag_embed(poses.diagonal(dim1=1, dim2=2) * damping + 1e-9)
-    whole = whole + torch.diag(whole.diagonal() * damping + 1e-9)
+    values = values + torch.diag(values.diagonal() * damping + 1e-9)
     gain = torch.linalg.solve(poses, both.mT).mT  # (N, P, 2)
-    reduced = whole - (gain @ both.mT).sum(0)
-    change = torch.linalg.solve(reduced, b - (gain @ g[..., None])[..., 0].sum(0))
-    moves = torch.linalg.solve(poses, (g - (change @ both))[..., None])[..., 0]
+    reduced = values - (gain @ both.mT).sum(0)
+    change = torch.linalg.solve(reduced, value_side - (gain @ pose_side[..., None])[..., 0].sum(0))
+    moves = torch.linalg.solve(poses, (pose_side - (change @ both))[..., None])[..., 0]
     return change, moves
 
 
