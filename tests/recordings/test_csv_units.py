@@ -1,10 +1,12 @@
+import re
+
 import numpy as np
 import pytest
 
 from tests.diagnosis.test_diagnosis_flights import record as a_flight
 from tests.own_systems import Winch
 from tests.recorded import a_run, a_table, load, refuses, write
-from visadapt.recordings import RecordingError, load_recording
+from visadapt.recordings import Episode, RecordingError, load_recording, write_recording
 from visadapt.systems import Quadrotor
 
 
@@ -205,3 +207,71 @@ class TestCommands:
         (warning,) = load(write(file, table)).warnings
         assert "command never changes" in warning
         assert "cannot be identified" in warning
+
+
+class TestConversions:
+    """What a user says with --columns of numbers in other units."""
+
+    def test_numbers_in_other_units_become_ours(self, file):
+        table = a_run(start=0.2, noise=1e-3)
+        theirs = {
+            "stamp": 1000 * table["time"] + 5e9,
+            "counts": (table["theta"] + np.pi) * 4096 / (2 * np.pi),
+            "deg/s": -np.degrees(table["theta_dot"]),
+            "mm": 1000 * table["x"],
+            "u-1": table["command"],
+        }
+        given = {
+            "time": "stamp/1000",
+            "theta": "counts * 2*pi/4096 - pi",
+            "theta_dot": "deg/s*-1*pi/180",
+            "x": "mm*1e-3",
+            "command": "u-1",
+        }
+        (expected,), (found,) = (
+            load(write(file, one), columns=columns).episodes
+            for one, columns in (({n: v for n, v in table.items() if n != "x_dot"}, None), (theirs, given))
+        )
+        np.testing.assert_allclose(found.state, expected.state, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(found.time, expected.time, atol=1e-6)
+        np.testing.assert_array_equal(found.action, expected.action)
+
+    @pytest.mark.parametrize(
+        ("name", "theirs"),
+        [
+            ("theta", np.degrees),
+            ("theta", lambda values: values + np.pi),
+            ("theta_dot", np.degrees),
+            ("theta_dot", lambda values: -values),
+            ("x", lambda values: 1000 * values),
+            ("time", lambda values: values / 60),
+        ],
+        ids=["degrees", "from hanging", "degrees/s", "a rate's sign", "mm", "minutes"],
+    )
+    def test_what_a_refusal_says_converts_them(self, file, name, theirs):
+        table = a_run(start=0.2, noise=1e-3)
+        (expected,) = load(write(file, table)).episodes
+        with pytest.raises(RecordingError, match=f"; --columns {name}={name}.* converts") as refused:
+            load(write(file, {**table, name: theirs(table[name])}))
+        said = re.findall(r"--columns (\w+)=(\S+)", str(refused.value))
+        (found,) = load(file, columns=dict(said)).episodes
+        np.testing.assert_allclose(found.state, expected.state, atol=1e-9)
+        np.testing.assert_allclose(found.time, expected.time, atol=1e-9)
+
+    @pytest.mark.parametrize(("text", "says"), [("angle*0", "times 0 plus 0"), ("angle/0", "times inf plus 0")])
+    def test_a_factor_that_is_no_factor(self, file, text, says):
+        refuses(
+            f"^--columns ...=angle.0: {says}; finite numbers, the factor not 0, are right$",
+            write(file, a_table()),
+            columns={"theta": text},
+        )
+
+    def test_of_hdf5_too(self, tmp_path):
+        path, table = tmp_path / "run.h5", a_run(start=0.2, noise=1e-3)
+        state = np.column_stack([1000 * table["x"], table["x_dot"], table["theta"], table["theta_dot"]])
+        episode = Episode(1000 * table["time"], -table["command"][:, None], state)
+        write_recording(path, [episode], ["x", "x_dot", "theta", "theta_dot"], ["command"])
+        given = {"time": "time/1000", "x": "x/1000", "command": "command*-1"}
+        (found,) = load(path, columns=given).episodes
+        np.testing.assert_allclose(found.state[:, 0], table["x"])
+        np.testing.assert_allclose(found.action[:, 0], table["command"])

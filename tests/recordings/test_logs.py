@@ -66,6 +66,16 @@ def test_a_slower_topic_gives_the_rows_and_the_others_are_interpolated(tmp_path)
     assert "/theta is interpolated" in " ".join(found.warnings)
 
 
+def test_fields_in_other_units_are_converted_before_they_are_interpolated(tmp_path):
+    stamps = {"/x": np.arange(0, 4, 0.05), "/theta": np.arange(-0.02, 4.1, 0.013), "/u": np.arange(0, 4, 0.05)}
+    path = numbers(tmp_path / "bag", stamps)
+    (plain,) = load_recording(path, CartPole(), FIELDS).episodes
+    given = {**FIELDS, "x": "/x.data*0.5", "theta": "/theta.data*-1", "command": "/u.data/2"}
+    (found,) = load_recording(path, CartPole(), given).episodes
+    np.testing.assert_allclose(found.state, plain.state * [0.5, -1], atol=1e-9)
+    np.testing.assert_allclose(found.action, plain.action / 2)
+
+
 def test_commands_before_the_first_row_count_for_nothing(tmp_path):
     steady = np.arange(0, 3, 0.05)  # an actuator that is not armed yet is commanded nan
     stamps = {"/x": steady, "/theta": steady, "/u": np.arange(-1, 3, 0.05)}

@@ -31,8 +31,8 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add("recording", nargs="+", metavar="RECORDING", help="CSV or HDF5 files, logs of ROS or PX4, or folders of these")
     _add_system(parser, OWN_HELP)
     columns_help = (
-        "our name=the name in the file, as in x=position,theta=phi; theta= is a state that was not measured; may be "
-        "repeated"
+        "our name=the name in the file, as in x=position,theta=phi, perhaps converted: theta=encoder*2*pi/4096-pi, "
+        "time=stamp/1000; theta= is a state that was not measured; may be repeated"
     )
     add("--columns", metavar="A=B,...", type=_columns, default={}, action=_Merged, help=columns_help)
     add("--effects", metavar="FILE.py", help="a file that defines effects of your own")

@@ -114,7 +114,7 @@ def _check_jumps(raw: RawEpisode, angles: Sequence[str]) -> None:
         if steps.max() > 1.25 * TURN:
             raise RecordingError(
                 f"{raw.cell(row, name)} jumps from {raw.states[name][row - 1]:g} to {raw.states[name][row]:g}; "
-                "radians are right (these look like degrees)"
+                f"radians are right (these look like degrees){raw.conversion(name, '*pi/180')}"
             )
 
 
@@ -130,13 +130,13 @@ def _check_answers(judged: Sequence[RawEpisode], system: System, angles: Sequenc
         zero = "0 upright" if isinstance(system, CartPole) else "the source's zero"
         raise RecordingError(
             f"{whole.origin}: {whole.column(angles[0])} answers the command as it should half a turn further; "
-            f"{zero} is right"
+            f"{zero} is right{whole.conversion(angles[0], '-pi')}"
         )
     if are_degrees(judged, system):
         name, values = angles[0], np.concatenate([raw.states[angles[0]] for raw in judged])
         raise RecordingError(
             f"{whole.origin}: {whole.column(name)} goes from {values.min():.3g} to {values.max():.3g} and answers the "
-            "command as if in degrees; radians are right"
+            f"command as if in degrees; radians are right{whole.conversion(name, '*pi/180')}"
         )
     for name, other in product(lengths, angles):
         if exchanged(judged, system, name, other):
@@ -165,7 +165,7 @@ def _check_clock(raw: RawEpisode, system: System) -> None:
         if len(ratios) > 1 and all(0.8 < ratio / seconds < 1.25 for ratio in ratios.values()):
             raise RecordingError(
                 f"{raw.origin}: column 'time': by it {', '.join(ratios)} change {seconds:g} times as fast as their "
-                f"rates say: the clock is in {unit}; seconds are right"
+                f"rates say: the clock is in {unit}; seconds are right{raw.conversion('time', f'*{seconds:g}')}"
             )
 
 
@@ -176,6 +176,7 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable, stride: int
     angle = variable.unit == "rad"
     unit, mistaken = ("radians", "degrees") if angle else ("metres", "centimetres or millimetres")
     right = f"{unit} are right (these look like {mistaken})"
+    to_ours = "*pi/180" if angle else "/1000 (or /100)"
     change = _rates(raw.time, values, angle)
     coarse = np.convolve(change, np.ones(stride) / stride, "valid")
     fast = float(np.quantile(np.abs(coarse), 0.9))
@@ -185,28 +186,32 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable, stride: int
         row = int(np.abs(values).argmax())
         raise RecordingError(
             f"{raw.cell(row, variable.name)} is {values[row]:g} {variable.unit}, and it changes by up to "
-            f"{np.abs(coarse).max():.3g} {rate.unit}; {right}; or is the clock not in seconds?"
+            f"{np.abs(coarse).max():.3g} {rate.unit}; {right}{raw.conversion(variable.name, to_ours)}; or is the clock "
+            "not in seconds?"
         )
     if measured is None:
         return
     if float(np.quantile(np.abs(measured), 0.9)) > limit:
         row = int(np.abs(measured).argmax())
-        raise RecordingError(f"{raw.cell(row, rate.name)} is {measured[row]:g} {rate.unit}; {right}")
+        raise RecordingError(
+            f"{raw.cell(row, rate.name)} is {measured[row]:g} {rate.unit}; {right}{raw.conversion(rate.name, to_ours)}"
+        )
     between = 0.5 * (measured[1:] + measured[:-1])
     if _is_opposite(change, between):
         raise RecordingError(
             f"{raw.origin}: {raw.column(rate.name)} has the opposite sign of the change of {variable.name}"
+            f"{raw.conversion(rate.name, '*-1')}"
         )
     if correlation(change, between) < IS_RATE_CORRELATION:
         return
     sizes = float(change.std()), float(between.std())
-    for times in (1 / DEGREE,) if angle else (100.0, 1000.0):
+    for times, exact in ((1 / DEGREE, to_ours),) if angle else ((100.0, "/100"), (1000.0, "/1000")):
         for wrong, (large, small) in ((variable, sizes), (rate, sizes[::-1])):
             if 0.5 * times * small < large < 2 * times * small:
                 raise RecordingError(
                     f"{raw.origin}: {raw.column(wrong.name)} is {times:.0f} times what the other says "
                     f"({variable.name} changes by {change.std():.3g} {rate.unit}, {rate.name} is {between.std():.3g} "
-                    f"{rate.unit}, root mean square); {right}"
+                    f"{rate.unit}, root mean square); {right}{raw.conversion(wrong.name, exact)}"
                 )
 
 

@@ -81,6 +81,10 @@ class RawEpisode:
         there = self.names.get(name, name)
         return f"column {name!r}" if there.lower() == name else f"column {there!r} ({name})"
 
+    def conversion(self, name: str, how: str) -> str:
+        """The end of a message: how a user has a variable's numbers converted; empty where no file's column is read."""
+        return f"; --columns {name}={self.names[name]}{how} converts" if name in self.names else ""
+
     def cell(self, row: int, name: str) -> str:
         """Where in the file a value stands, for messages."""
         return f"{self.origin}: {self.place(row)}, {self.column(name)}"

@@ -1,9 +1,16 @@
-"""Which column of a recording is which variable: the names that are recognised, and the states that may be missing."""
+"""Which column of a recording is which variable: the names that are recognised, the states that may be missing, and
+how a column's numbers become ours."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from visadapt.recordings.episode import RecordingError
 from visadapt.systems import RigidBody, System
@@ -18,6 +25,56 @@ OTHER_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
     }
 }
 """Other common names of a system's variables; upper and lower case are the same."""
+
+
+_NUMBER = r"\s*-?(?:pi|(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*"
+_CONVERTED = re.compile(rf"(?P<name>.+?)(?P<factor>(?:[*/]{_NUMBER})*)(?P<offset>(?:[+-]{_NUMBER}(?:[*/]{_NUMBER})*)?)")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a file, and how its numbers are converted to our units: number * factor + offset."""
+
+    name: str
+    factor: float = 1.0
+    offset: float = 0.0
+
+    def converted(self, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The numbers (T,) in our units."""
+        return numbers if (self.factor, self.offset) == (1.0, 0.0) else numbers * self.factor + self.offset
+
+
+def read_column(text: str, names: Collection[str] = ()) -> Column:
+    """The column that a user names, perhaps with a conversion behind its name; `names` are those of the file, which may
+    look like one.
+
+    Raises:
+        RecordingError: the factor is 0 or not finite.
+
+    >>> read_column("encoder*2*pi/4096-pi")
+    Column(name='encoder', factor=0.0015339807878856412, offset=-3.141592653589793)
+    >>> read_column("/motor/command.data")
+    Column(name='/motor/command.data', factor=1.0, offset=0.0)
+    """
+    found = _CONVERTED.fullmatch(text)
+    if found is None or text.lower() in {name.lower() for name in names}:
+        return Column(text)
+    factor, offset = _product(found["factor"]), _product(found["offset"]) if found["offset"] else 0.0
+    if not (math.isfinite(factor) and factor and math.isfinite(offset)):
+        raise RecordingError(
+            f"--columns ...={text}: times {factor:g} plus {offset:g}; finite numbers, the factor not 0, are right"
+        )
+    return Column(found["name"].strip(), factor, offset)
+
+
+def _product(text: str) -> float:
+    """The number that factors and divisors behind one another make: *2*pi/4096, or -pi/2."""
+    product = -1.0 if text.startswith("-") else 1.0
+    for operator, number in re.findall(rf"([*/]|^[+-])({_NUMBER})", text):
+        sign, digits = (-1.0, number.strip()[1:]) if number.strip().startswith("-") else (1.0, number.strip())
+        value = sign * (math.pi if digits == "pi" else float(digits))
+        product = product * value if operator != "/" else product / value if value else math.inf
+    return product
 
 
 def needed(system: System) -> tuple[str, ...]:
@@ -68,7 +125,8 @@ def match(
     for name in ours:
         if given.get(name) == "":
             continue
-        candidates = _candidates(header, name, given.get(name), others.get(name, ()))
+        named = read_column(given[name], header).name if name in given else None
+        candidates = _candidates(header, name, named, others.get(name, ()))
         if len(candidates) > 1:
             which = ", ".join(repr(header[index]) for index in candidates)
             ask = f"say which: --columns {name}=..."
@@ -81,7 +139,7 @@ def match(
                 raise RecordingError(f"{path}: column {header[candidates[0]]!r} is taken for both {taken} and {name}")
             found[name] = candidates[0]
         elif name in given:
-            raise RecordingError(f"{path}: has no column {given[name]!r} for {name}; it has {', '.join(header)}")
+            raise RecordingError(f"{path}: has no column {named!r} for {name}; it has {', '.join(header)}")
         elif name in needed(system):
             raise RecordingError(
                 f"{path}: column {name!r} is missing; it has {', '.join(header)}; "
@@ -102,6 +160,16 @@ def _candidates(header: Sequence[str], name: str, given: str | None, others: Seq
         return [index for index in called(given) if header[index] == given] or called(given)
     alias = [index for other in others for index in called(other) if len(other) > 1 or header[index] == other]
     return called(name) or sorted(alias)
+
+
+def convert(
+    values: Mapping[str, NDArray[np.float64]], given: Mapping[str, str], header: Sequence[str]
+) -> dict[str, NDArray[np.float64]]:
+    """Columns (T,) of a file with this header, by our names, in our units: converted as `given` says."""
+    return {
+        name: read_column(given[name], header).converted(numbers) if name in given else numbers
+        for name, numbers in values.items()
+    }
 
 
 def if_unmeasured(system: System, name: str) -> str:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from visadapt.progress import Progress
 from visadapt.recordings.clock import Note, RawEpisode
-from visadapt.recordings.columns import match
+from visadapt.recordings.columns import convert, match
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.runs import runs
 from visadapt.recordings.thinning import STRETCH, thinned
@@ -227,7 +227,7 @@ def read_rows(
     rows = table.rows(list(found.values()), most_bytes / (8 * len(found)), progress)
     if len(rows.values) < rows.total:
         note(thinned(len(rows.values), rows.total), str(path))
-    values = dict(zip(found, rows.values.T, strict=True))
+    values = convert(dict(zip(found, rows.values.T, strict=True)), given, table.header)
     measured = tuple(variable.name for variable in system.states if variable.name in found)
     state = np.column_stack([values[name] for name in measured])
     action = np.column_stack([values[variable.name] for variable in system.actions])

@@ -15,7 +15,7 @@ import numpy as np
 from visadapt.progress import Report, staged
 from visadapt.recordings.checks import check_commands, check_finite, check_units
 from visadapt.recordings.clock import Note, RawEpisode, check_forward, check_steps, uninterrupted, with_common_period
-from visadapt.recordings.columns import match
+from visadapt.recordings.columns import convert, match
 from visadapt.recordings.csv import read_rows
 from visadapt.recordings.episode import Episode, Recording, RecordingError
 from visadapt.recordings.hdf5 import read_names, read_stretches
@@ -56,7 +56,8 @@ def load_recording(
     Args:
         paths: one or several: files, bags of ROS 2, or folders whose recordings are taken in the order of their names.
         system: the source, which defines names and units.
-        columns: our names of columns to the file's, where these are not evident; "" for a state that was not measured.
+        columns: our names of columns to the file's, where these are not evident, perhaps with a conversion to our units
+            behind them, as in "encoder*2*pi/4096"; "" for a state that was not measured.
         frames: whether to read frames in place of states.
         progress: called with (stage, MB done, MB in all, nan).
 
@@ -210,11 +211,11 @@ def _read_hdf5(
                 f"{', '.join(state_names)} and {', '.join(action_names)} are right"
             )
         table = np.column_stack([episode.time, states, episode.action]).astype(float)
-        action = table[:, [found[variable.name] for variable in system.actions]]
-        state = table[:, [found[name] for name in measured]]
+        values = convert({name: table[:, index] for name, index in found.items()}, given, header)
+        action = np.column_stack([values[variable.name] for variable in system.actions])
+        state = np.column_stack([values[name] for name in measured]) if measured else np.zeros((len(table), 0))
         seen = episode.frame if frames else None
-        time = table[:, found["time"]]
-        raw.append(RawEpisode(path, time, action, state, measured, names=names, number=number, frame=seen))
+        raw.append(RawEpisode(path, values["time"], action, state, measured, names=names, number=number, frame=seen))
     return raw
 
 

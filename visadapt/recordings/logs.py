@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from visadapt.recordings.clock import Note, RawEpisode
-from visadapt.recordings.columns import check_given, if_unmeasured, needed
+from visadapt.recordings.columns import Column, check_given, if_unmeasured, needed, read_column
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.topics import Read, Topic
 from visadapt.systems import RigidBody, System
@@ -41,11 +41,12 @@ def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], n
             f"{path}: say where {', '.join(missing)} are: --columns {missing[0]}=TOPIC.FIELD,... "
             f"(`ros2 bag info` and `ulog_info` list topics){if_unmeasured(system, missing[0])}"
         )
-    columns = {name: _topic_and_field(path, given[name]) for name in ours if given.get(name)}
+    named = {name: read_column(given[name]) for name in ours if given.get(name)}
+    columns = {name: _topic_and_field(path, column.name) for name, column in named.items()}
     wanted: dict[str, set[str]] = {}
     for topic, field in columns.values():
         wanted.setdefault(topic, set()).add(field)
-    log = _Log(path, system, columns, _topics(path, read, wanted))
+    log = _Log(path, system, columns, named, _topics(path, read, wanted))
     log.check_stamps()
     rows = log.rows(note)
     time = log.topics[log.slowest].time[rows]
@@ -84,6 +85,8 @@ class _Log:
     system: System
     columns: Mapping[str, tuple[str, str]]
     """topic and field of each measured state and each action"""
+    conversions: Mapping[str, Column]
+    """of each of these to our units"""
     topics: Mapping[str, Topic]
 
     @cached_property
@@ -142,7 +145,7 @@ class _Log:
     def state(self, name: str, rows: NDArray[np.intp]) -> NDArray[np.float64]:
         """A measured state in these rows (T,): as read there, or interpolated to the rows' stamps."""
         topic, field = self.columns[name]
-        stamps, values = self.topics[topic].time, self.topics[topic].values[field]
+        stamps, values = self.topics[topic].time, self.conversions[name].converted(self.topics[topic].values[field])
         if topic == self.slowest:
             return values[rows]
         attitude = self.system.states[ATTITUDE] if isinstance(self.system, RigidBody) else ()
@@ -159,7 +162,8 @@ class _Log:
     def command(self, name: str, time: NDArray[np.float64]) -> NDArray[np.float64]:
         """The command of an action in rows with these stamps (T,)."""
         topic, field = self.columns[name]
-        return _held(time, self.topics[topic].time, self.topics[topic].values[field])
+        values = self.conversions[name].converted(self.topics[topic].values[field])
+        return _held(time, self.topics[topic].time, values)
 
 
 def _without_gaps_at_the_ends(numbers: NDArray[np.float64]) -> slice:
