@@ -28,7 +28,8 @@ OTHER_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 _NUMBER = r"\s*-?(?:pi|(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*"
-_CONVERTED = re.compile(rf"(?P<name>.+?)(?P<factor>(?:[*/]{_NUMBER})*)(?P<offset>(?:[+-]{_NUMBER}(?:[*/]{_NUMBER})*)?)")
+_FACTORS = rf"(?:[*/]{_NUMBER})*"
+_CONVERTED = re.compile(rf"(?P<name>\s*\S.*?)(?P<factor>{_FACTORS})(?P<offset>(?:[+-]{_NUMBER}{_FACTORS})?)")
 
 
 @dataclass(frozen=True)
