@@ -32,7 +32,7 @@ from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import Row, miss_row, read_rows, write_rows
 from visadapt.effects import Residual
 from visadapt.evaluation import SCORE_SEED, FlightScore
-from visadapt.learning.grounding import gap, left_over
+from visadapt.learning.grounding import gap, gap_with_residual
 from visadapt.learning.transitions import Transitions
 from visadapt.policies import AutoregressivePolicy, Policy
 from visadapt.setups.base import Setup
@@ -200,7 +200,8 @@ def _stand(settings: Settings, setup: Setup, name: str, folder: Path, key: str, 
 
 def _error(residual: Residual | None, setup: Setup, transitions: Transitions) -> torch.Tensor:
     """Of one step of the simulator (N, n_state)."""
-    return gap(setup.source, transitions) if residual is None else left_over(residual, setup.source, transitions)
+    source = setup.source
+    return gap(source, transitions) if residual is None else gap_with_residual(residual, source, transitions)
 
 
 if __name__ == "__main__":

@@ -14,5 +14,5 @@ def coarse_targets(step: float) -> Iterator[None]:
     """Smooth targets are integrated in steps of `step` s, and learnt worlds judged by three plans."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "SMOOTH_STEP", step)
-        patch.setattr(stability, "PLANS", 3)
+        patch.setattr(stability, "CHECKED_PLANS", 3)
         yield

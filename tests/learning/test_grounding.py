@@ -11,8 +11,8 @@ from visadapt.learning.grounding import (
     GroundSettings,
     fit_named,
     gap,
+    gap_with_residual,
     ground,
-    left_over,
     rescale,
     split,
 )
@@ -91,7 +91,7 @@ class TestOnStates:
         transitions = Transitions.cut(recorded(0))
         residual = Residual(state_residual_network(False), torch.ones(4))
         fit(residual, SOURCE, transitions, GroundSettings(steps=50), torch.Generator().manual_seed(0))
-        left = left_over(residual, SOURCE, transitions)
+        left = gap_with_residual(residual, SOURCE, transitions)
         torch.testing.assert_close(left, gap_left(transitions, residual), rtol=1e-4, atol=1e-6)
         assert left.square().mean() < gap(SOURCE, transitions).square().mean()
 

@@ -84,7 +84,7 @@ class TestRidge:
         assert not self.equal(kept, self.learnt(tmp_path / "c", ridges=(1.0,)))
 
     def test_a_larger_one_is_taken_where_the_world_is_unstable(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(stability, "GROWTH", 0.0)  # so that every world is
+        monkeypatch.setattr(stability, "MAX_GROWTH", 0.0)  # so that every world is
         kept = self.learnt(tmp_path / "a", ridges=(0.1, 1.0))
         assert self.equal(kept, self.learnt(tmp_path / "b", ridges=(1.0,)))
 

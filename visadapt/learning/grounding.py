@@ -25,6 +25,8 @@ from visadapt.world import World
 
 STRETCH = 10  # Samples in a row that are held out together
 
+EMBEDDED = 256  # Histories that pass through the network at once, which bounds the memory that frames take
+
 FOLDS = 5  # Parts of the samples that are held out in turn where a ridge is chosen
 
 
@@ -60,8 +62,8 @@ def gap(world: World, transitions: Transitions) -> Tensor:
         return transitions.next_state - world.step(transitions.start(world), transitions.action).state
 
 
-def left_over(residual: Residual, source: World, transitions: Transitions) -> Tensor:
-    """The gap minus the residual's correction, (N, n_state)."""
+def gap_with_residual(residual: Residual, source: World, transitions: Transitions) -> Tensor:
+    """(N, n_state) the part of the gap that the residual's correction does not close."""
     every = torch.arange(len(transitions))
     with torch.no_grad():
         return gap(source, transitions) - residual.delta(transitions.history(every).acting(transitions.action))
@@ -120,22 +122,22 @@ def ground(
     the one of the `ridges` that predicts held-out samples best. As long as `accept` returns False, it is fitted again
     with the next larger ridge; the largest is kept without a call of `accept`.
     """
-    wanted = gap(source, transitions) / residual.scale
+    targets = gap(source, transitions) / residual.scale
     network = residual.network
     if not isinstance(network, ResidualNetwork):
         raise TypeError(f"grounding fits the head of a ResidualNetwork, not a {type(network).__name__}")
     with torch.no_grad():
-        parts = torch.arange(len(transitions)).split(256)
-        seen = torch.cat([network.embed(transitions.history(p).acting(transitions.action[p])) for p in parts])
-    complete = network.has_full_history(seen)
+        parts = torch.arange(len(transitions)).split(EMBEDDED)
+        inputs = torch.cat([network.embed(transitions.history(p).acting(transitions.action[p])) for p in parts])
+    complete = network.has_full_history(inputs)
     if bool(complete.any()):
-        seen, wanted = seen[complete], wanted[complete]
-    train, held_out = split(len(seen), settings.held_out, generator)
+        inputs, targets = inputs[complete], targets[complete]
+    train, held_out = split(len(inputs), settings.held_out, generator)
     if not isinstance(network.head, nn.Linear):
-        return _descend(network.head, seen, wanted, train, held_out, settings, generator, progress)
-    penalties = [ridge * network.penalties(seen) for ridge in settings.ridges]
-    for number in range(_best_penalty(seen, wanted, penalties), len(penalties)):
-        losses = _solve(network.head, seen, wanted, train, held_out, penalties[number])
+        return _descend(network.head, inputs, targets, train, held_out, settings, generator, progress)
+    penalties = [ridge * network.penalties(inputs) for ridge in settings.ridges]
+    for number in range(_best_penalty(inputs, targets, penalties), len(penalties)):
+        losses = _solve(network.head, inputs, targets, train, held_out, penalties[number])
         if number == len(penalties) - 1 or accept():
             break
     return losses
@@ -166,7 +168,7 @@ def _best_penalty(inputs: Tensor, targets: Tensor, penalties: Sequence[Tensor]) 
 
 @torch.no_grad()
 def _solve(
-    head: nn.Linear, seen: Tensor, wanted: Tensor, train: Tensor, held_out: Tensor, penalty: Tensor
+    head: nn.Linear, inputs: Tensor, targets: Tensor, train: Tensor, held_out: Tensor, penalty: Tensor
 ) -> list[GroundLoss]:
     """Fit a linear head to all samples, with the `penalty` (inputs,) on its squared weights.
 
@@ -174,12 +176,12 @@ def _solve(
     """
 
     def loss(step: int, weight: Tensor) -> GroundLoss:
-        error = (seen @ weight - wanted).square().mean(1)
+        error = (inputs @ weight - targets).square().mean(1)
         return GroundLoss(step, float(error[train].mean()), float(error[held_out].mean()))
 
-    none = seen.new_zeros(seen.shape[1], wanted.shape[1])
-    losses = [loss(0, none), loss(1, _ridge(seen[train], wanted[train], penalty))]
-    head.weight.copy_(_ridge(seen, wanted, penalty).T)
+    zeros = inputs.new_zeros(inputs.shape[1], targets.shape[1])
+    losses = [loss(0, zeros), loss(1, _ridge(inputs[train], targets[train], penalty))]
+    head.weight.copy_(_ridge(inputs, targets, penalty).T)
     return losses
 
 
@@ -190,8 +192,8 @@ def _ridge(inputs: Tensor, targets: Tensor, penalty: Tensor) -> Tensor:
 
 def _descend(
     head: nn.Module,
-    seen: Tensor,
-    wanted: Tensor,
+    inputs: Tensor,
+    targets: Tensor,
     train: Tensor,
     held_out: Tensor,
     settings: GroundSettings,
@@ -203,28 +205,28 @@ def _descend(
     optimiser = torch.optim.AdamW(head.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
     best, best_weights, waited = float("inf"), copy.deepcopy(head.state_dict()), 0
     losses: list[GroundLoss] = []
-    running = 0.0
+    train_sum = 0.0  # of the training losses since the last evaluation
     for step in range(settings.steps + 1):
         if step % settings.every == 0:
             with torch.no_grad():
-                score = float((head(seen[held_out]) - wanted[held_out]).square().mean())
-            losses.append(GroundLoss(step, running / settings.every if step else score, score))
-            running = 0.0
-            if score < best:
-                best, best_weights, waited = score, copy.deepcopy(head.state_dict()), 0
+                loss_held_out = float((head(inputs[held_out]) - targets[held_out]).square().mean())
+            losses.append(GroundLoss(step, train_sum / settings.every if step else loss_held_out, loss_held_out))
+            train_sum = 0.0
+            if loss_held_out < best:
+                best, best_weights, waited = loss_held_out, copy.deepcopy(head.state_dict()), 0
             else:
                 waited += 1
             ends = waited > settings.patience or step == settings.steps
             if progress is not None:
-                progress(settings.steps if ends else step, settings.steps, score)
+                progress(settings.steps if ends else step, settings.steps, loss_held_out)
             if ends:
                 break
         rows = train[torch.randint(len(train), (settings.batch,), generator=generator)]
-        loss = (head(seen[rows]) - wanted[rows]).square().mean()
+        loss = (head(inputs[rows]) - targets[rows]).square().mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-        running += float(loss.detach())
+        train_sum += float(loss.detach())
     head.load_state_dict(best_weights)
     head.requires_grad_(False)
     return losses

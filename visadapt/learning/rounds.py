@@ -122,11 +122,11 @@ class JointLearning:
     grounded: bool = False  # whether the residual has been fitted
 
     def __post_init__(self) -> None:
-        self.first = self._weights()
-        """weights of the policy before the first round, with its feed-forward once that is known"""
-        self.tuned: dict[str, Tensor] | None = None
-        """weights of the policy after the last round that tuned it with the residual"""
-        self.untrained = copy.deepcopy(self.residual.network.state_dict())
+        self._initial_weights = self._weights()
+        """the policy's before the first round, with its feed-forward once that is known"""
+        self._tuned_weights: dict[str, Tensor] | None = None
+        """the policy's after the last round that tuned it with the residual; None before"""
+        self._untrained_residual = copy.deepcopy(self.residual.network.state_dict())
         """weights of a new residual, which it gets back where named causes explain the gap"""
         if self.policy.residual is not None:
             with suppress(CheckpointError):  # one of another architecture is dropped
@@ -139,7 +139,7 @@ class JointLearning:
         return self.source.with_effects([*self.source.effects, *self.found.effects])
 
     @property
-    def _learnt(self) -> World:
+    def _grounded_world(self) -> World:
         """The known world with the residual."""
         return self.known.with_effects([*self.known.effects, self.residual])
 
@@ -160,7 +160,7 @@ class JointLearning:
                 network.predict = self.known.steps_along
         if self.found.complete:
             losses: list[GroundLoss] = []
-            self.residual.network.load_state_dict(self.untrained)
+            self.residual.network.load_state_dict(self._untrained_residual)
             tuning = self._tune_with_names(folder)
         else:
             losses, transitions = self._ground(folder)
@@ -196,14 +196,14 @@ class JointLearning:
     def _ground(self, folder: RoundFolder) -> tuple[list[GroundLoss], Transitions]:
         """Fit the named effects and the residual to all samples; the residual's losses, and the transitions with the
         states and times that `fit_named` gives them."""
-        transitions, known, world = self._transitions(), self.known, self._learnt
+        transitions, known, world = self._transitions(), self.known, self._grounded_world
         if not folder.residual.exists():
-            true = fit_named(known, transitions)
-            placed = true.to(self.residual.scale)
+            refined = fit_named(known, transitions)
+            on_device = refined.to(self.residual.scale)
             if not self.grounded:
-                rescale(self.residual, known, placed, self.settings.ground.negligible)
-            losses = self._fit(folder, placed)
-            changed = {} if true is transitions else {"states": true.states, "times": true.times}
+                rescale(self.residual, known, on_device, self.settings.ground.negligible)
+            losses = self._fit_residual(folder, on_device)
+            changed = {} if refined is transitions else {"states": refined.states, "times": refined.times}
             save_tree(folder.residual, {"weights": world.state_dict(), "losses": losses, "windows": changed})
         tree = load_tree(folder.residual)
         with fitting(folder.residual):
@@ -211,10 +211,10 @@ class JointLearning:
             transitions = replace(transitions, **tree["windows"])
             return [GroundLoss(*each) for each in tree["losses"]], transitions
 
-    def _fit(self, folder: RoundFolder, transitions: Transitions) -> list[GroundLoss]:
+    def _fit_residual(self, folder: RoundFolder, transitions: Transitions) -> list[GroundLoss]:
         """Fit the residual, again with the next larger ridge where the policy is unstable in the world with it."""
         self._begin_tuning()
-        world = self._learnt
+        world = self._grounded_world
 
         def accept() -> bool:
             return stable(self._plan_costs(folder, world, transitions))
@@ -223,36 +223,39 @@ class JointLearning:
         return ground(self.residual, self.known, transitions, self.settings.ground, generator, progress, accept)
 
     def _begin_tuning(self) -> None:
-        """Give the policy the weights that tuning with the residual begins with."""
+        """Give the policy the weights that tuning with the residual begins with.
+
+        Also called before the residual is fitted: a fit is accepted where this policy is stable.
+        """
         if not self.grounded and self.settings.feedforward:
             initialise_feedforward(self.policy, self.source, self.residual.scale)
-            self.first["feedforward.weight"] = self.policy.feedforward.weight.detach().clone()
+            self._initial_weights["feedforward.weight"] = self.policy.feedforward.weight.detach().clone()
         if not self.settings.tunes_on:
-            self._start_anew()
+            self._restore_initial_weights()
 
     def _tune_with_residual(self, folder: RoundFolder, transitions: Transitions) -> list[float]:
         """Tune the policy in the source with the named effects and the residual; the loss of every iteration."""
         self._begin_tuning()
         self.grounded = True
-        world, settings = self._learnt, self.settings.tuning
+        world, settings = self._grounded_world, self.settings.tuning
         later = self.settings.later
-        if later is not None and not folder.policy.exists() and self._goes_on(folder, world, transitions):
+        if later is not None and not folder.policy.exists() and self._takes_tuned_weights(folder, world, transitions):
             settings = replace(settings, iterations=min(later, settings.iterations))
         losses = self._tune(folder, world, settings, transitions)
-        self.tuned = self._weights()
+        self._tuned_weights = self._weights()
         return losses
 
-    def _goes_on(self, folder: RoundFolder, world: World, transitions: Transitions) -> bool:
+    def _takes_tuned_weights(self, folder: RoundFolder, world: World, transitions: Transitions) -> bool:
         """Give the policy the weights of the round before, if it then costs less in `world` than with those it has;
         returns whether it does."""
-        if self.tuned is None:
+        if self._tuned_weights is None:
             return False
-        has, cost = self._weights(), early_cost(self._plan_costs(folder, world, transitions))
-        self.policy.load_state_dict(self.tuned, strict=False)
-        goes_on = early_cost(self._plan_costs(folder, world, transitions)) < cost
-        if not goes_on:
-            self.policy.load_state_dict(has, strict=False)
-        return goes_on
+        present, cost = self._weights(), early_cost(self._plan_costs(folder, world, transitions))
+        self.policy.load_state_dict(self._tuned_weights, strict=False)
+        costs_less = early_cost(self._plan_costs(folder, world, transitions)) < cost
+        if not costs_less:
+            self.policy.load_state_dict(present, strict=False)
+        return costs_less
 
     def _plan_costs(self, folder: RoundFolder, world: World, transitions: Transitions) -> Iterator[float]:
         """Costs of the policy's plans in `world`; all policies of a round start in the same states."""
@@ -265,7 +268,7 @@ class JointLearning:
         world, settings = self.known, self.settings.with_names
         no_gap = not len(world.effects)
         if no_gap or not self.settings.tunes_on:
-            self._start_anew()
+            self._restore_initial_weights()
         return self._tune(folder, world, replace(settings, iterations=0) if no_gap else settings)
 
     def _weights(self) -> dict[str, Tensor]:
@@ -273,9 +276,9 @@ class JointLearning:
         weights = self.policy.state_dict()
         return {key: value.clone() for key, value in weights.items() if not key.startswith("residual.")}
 
-    def _start_anew(self) -> None:
+    def _restore_initial_weights(self) -> None:
         """Give the policy its weights from before the first round."""
-        self.policy.load_state_dict(self.first, strict=False)
+        self.policy.load_state_dict(self._initial_weights, strict=False)
 
     def _tune(
         self, folder: RoundFolder, world: World, settings: TuneSettings, transitions: Transitions | None = None

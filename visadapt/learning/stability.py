@@ -17,15 +17,15 @@ from visadapt.learning.tuning import TuneSettings, plans_of
 from visadapt.policies import Policy
 from visadapt.world import World
 
-PLANS = 15
+CHECKED_PLANS = 15
 """Plans of 10 steps that are imagined one after the other. Where a cart-pole's motion grew until a plan cost 1,000
 times the first, the first 3 plans showed nothing, the fourth 5 times, the seventh 700 times."""
 
-GROWTH = 3.0
+MAX_GROWTH = 3.0
 """Ratio of a plan's mean cost to that of the first beyond which a world counts as unstable. A policy that was tuned in
 a world with 5.5 lost 35 of 40 episodes, with 1.6 none; in most worlds it is below 1."""
 
-COMPARED = 5
+COMPARED_PLANS = 5
 """Plans of 10 steps by whose cost a policy is compared with another in the same world."""
 
 
@@ -33,12 +33,12 @@ def stable(costs: Iterator[float]) -> bool:
     """Whether the `plan_costs` of a policy, from where its tuning starts, stay near the first."""
     first = next(costs)
     # A cost that is not a number is not within the bound either.
-    return first < math.inf and all(cost <= GROWTH * first for cost in islice(costs, PLANS - 1))
+    return first < math.inf and all(cost <= MAX_GROWTH * first for cost in islice(costs, CHECKED_PLANS - 1))
 
 
 def early_cost(costs: Iterator[float]) -> float:
-    """The sum of the first COMPARED `plan_costs` of a policy, by which it is compared with another."""
-    return sum(islice(costs, COMPARED))
+    """The sum of the first COMPARED_PLANS `plan_costs` of a policy, by which it is compared with another."""
+    return sum(islice(costs, COMPARED_PLANS))
 
 
 @torch.no_grad()
