@@ -3,7 +3,7 @@
 import torch
 
 from renderers import LayeredRenderer
-from visadapt.learning.perception import PerceptionSettings, scale
+from visadapt.learning.perception import PerceptionSettings, kinematics_units
 from visadapt.policies.networks import ImageResidualNetwork, StateHistoryResidualNetwork, StateResidualNetwork
 from visadapt.systems import CartPole
 
@@ -48,7 +48,7 @@ def stir(module, seed=0, spread=1.0):
 
 def image_residual_network(renderer):
     """A residual network for the small renderer's frames, 0.05 s apart, of the default cart-pole."""
-    unit = scale(PerceptionSettings(), 0.05)
+    unit = kinematics_units(PerceptionSettings(), 0.05)
     return ImageResidualNetwork(background(renderer), CONTRAST, CartPole(), 0.05, unit)
 
 

@@ -3,7 +3,7 @@ import torch
 
 from tests.scenes import CONTRAST, background, small_renderer
 from visadapt.history import LENGTH, History
-from visadapt.learning.perception import Paths, PerceptionSettings, kinematics, learn_to_see
+from visadapt.learning.perception import Paths, PerceptionSettings, kinematics, train_encoder
 from visadapt.policies.frame_encoder import FrameEncoder
 
 PERIOD = 0.05
@@ -72,7 +72,7 @@ def learn(checkpoint=None, stop=None):
     renderer = small_renderer()
     encoder = FrameEncoder(background(renderer), CONTRAST, n_action=1)
     generator = torch.Generator().manual_seed(1)
-    losses = learn_to_see(encoder, renderer, PERIOD, SMALL, generator, progress, checkpoint)
+    losses = train_encoder(encoder, renderer, PERIOD, SMALL, generator, progress, checkpoint)
     return encoder, losses
 
 

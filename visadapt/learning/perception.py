@@ -18,7 +18,7 @@ from visadapt.learning.training_state import TrainingState
 from visadapt.policies.frame_encoder import FrameEncoder
 from visadapt.progress import Progress
 
-BEND_WEIGHT = 8.0  # Weight in the loss of the second differences of positions: they alone show a force
+SECOND_DIFFERENCE_WEIGHT = 8.0  # Of positions, in the loss: second differences alone show a force
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class Paths:
     def draw(self, batch: int, length: int, period: float, generator: torch.Generator) -> Tensor:
         """Positions (batch, length), `period` s apart."""
         start = self.reach * (2 * torch.rand(batch, 1, generator=generator) - 1)
-        velocity = self.velocity * torch.randn(batch, 1, generator=generator)
-        pushes = self.acceleration * torch.randn(batch, length - 1, generator=generator)
-        gained = period * pushes
-        before = velocity + gained.cumsum(1) - gained
-        return torch.cat((start, start + (period * before + period**2 / 2 * pushes).cumsum(1)), 1)
+        first_velocity = self.velocity * torch.randn(batch, 1, generator=generator)
+        accelerations = self.acceleration * torch.randn(batch, length - 1, generator=generator)
+        gained = period * accelerations
+        velocities = first_velocity + gained.cumsum(1) - gained  # at the beginning of each period
+        return torch.cat((start, start + (period * velocities + period**2 / 2 * accelerations).cumsum(1)), 1)
 
     def scale(self, period: float) -> Tensor:
         """(LENGTH,) typical size of the position and of its changes per period."""
@@ -59,7 +59,7 @@ class PerceptionSettings:
     pole: Paths = Paths(reach=0.2, velocity=0.4, acceleration=4.0)
 
 
-def scale(settings: PerceptionSettings, period: float) -> Tensor:
+def kinematics_units(settings: PerceptionSettings, period: float) -> Tensor:
     """(N_KINEMATICS,) units, in m and rad, of the positions and changes that an encoder trained so returns."""
     return torch.cat((settings.cart.scale(period), settings.pole.scale(period)))
 
@@ -69,7 +69,7 @@ def kinematics(positions: Tensor) -> Tensor:
     return torch.cat((positions[..., -1:], positions.diff(dim=-1)), -1)
 
 
-def learn_to_see(
+def train_encoder(
     encoder: FrameEncoder,
     render: Callable[[Tensor, Tensor], Tensor],
     period: float,
@@ -87,7 +87,7 @@ def learn_to_see(
     training = TrainingState(encoder, optimiser, generator, rate, steps, progress, checkpoint)
     training.resume()
     like = next(encoder.parameters())
-    unit = scale(settings, period).to(like)
+    units = kinematics_units(settings, period).to(like)
     for _ in range(len(training.losses), steps):
         paths = [
             coordinate.draw(settings.streams, settings.length, period, generator).to(like)
@@ -97,10 +97,10 @@ def learn_to_see(
             frames = render(paths[0].flatten(), paths[1].flatten()).unflatten(0, paths[0].shape)
             frames = frames + settings.pixel_noise * torch.randn(frames.shape, generator=generator).to(like)
         windows = frames.unfold(1, LENGTH, 1).permute(0, 1, 4, 2, 3).flatten(0, 1)
-        truth = torch.cat([kinematics(path.unfold(1, LENGTH, 1).flatten(0, 1)) for path in paths], 1) / unit
+        truth = torch.cat([kinematics(path.unfold(1, LENGTH, 1).flatten(0, 1)) for path in paths], 1) / units
         actions = windows.new_zeros(len(windows), LENGTH, encoder.n_action)
         error = encoder.kinematics(History(windows, actions)) - truth
-        bends = torch.cat([error[:, 1:LENGTH].diff(dim=1), error[:, LENGTH + 1 :].diff(dim=1)], 1)
-        training.descend(error.square().mean() + BEND_WEIGHT * bends.square().mean())
+        second = torch.cat([error[:, 1:LENGTH].diff(dim=1), error[:, LENGTH + 1 :].diff(dim=1)], 1)
+        training.descend(error.square().mean() + SECOND_DIFFERENCE_WEIGHT * second.square().mean())
         training.keep({})
     return training.losses

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from visadapt.batch import placed
 from visadapt.history import HORIZON, History
-from visadapt.learning.streams import Streams, StreamState, Visited, look
+from visadapt.learning.streams import Streams, StreamState, Visited, sense
 from visadapt.learning.transitions import Observe
 from visadapt.policies import Policy
 from visadapt.world import World, WorldState
@@ -76,7 +76,7 @@ class ClosedLoop(Plans):
         began = streams.now
         plan = torch.stack(actions, 1)
         loss = streams.task.cost(torch.stack(states, 1), plan, began.at.state, began.task_state).mean()
-        streams.go_on(stream, HORIZON, progress, self.generator)
+        streams.continue_from(stream, HORIZON, progress, self.generator)
         return loss
 
 
@@ -147,7 +147,7 @@ def imagine(
         if k == 0:
             first = at
         if history is not None and world.has_residual and k + 1 < plan.shape[1]:
-            seen, at = look(world, observe, at, generator)
+            seen, at = sense(world, observe, at, generator)
             history = history.acting(plan[:, k]).observing(show(seen))
     return torch.stack(states, 1), first
 

@@ -38,7 +38,10 @@ from visadapt.world import World
 SHOCK = 0.03
 """m/s2, the unit of shocks: they are expected to be smaller than what a load drifts by in a period (unit 1 m/s2)."""
 
-SMOOTHINGS = 4  # Times that the physics are linearised around the path so far; the noise is fitted in the first two
+SMOOTHINGS, NOISE_FITS = 4, 2
+"""Times that the physics are linearised around the path so far; in so many of them, the first, the noise is fitted."""
+
+PERIOD_TOLERANCE = 0.01  # Share of the source's period by which two rows may be further apart, or closer
 
 ACCELERATION = 10.0  # m/s2 and rad/s2, standard deviation of the acceleration by a load before any frame is seen
 
@@ -75,12 +78,13 @@ class Tracker:
         self._seen = [system.index("x"), system.index("theta")]
         self._rates = [system.index("x_dot"), system.index("theta_dot")]
         load = load_effect(type(system))
-        nothing = load(**{parameter.name: 0.0 for parameter in load.table})
-        self._pushed = world.with_effects((nothing,))
-        self._late = [effect.name for effect in camera if not effect.in_one_frame]
+        no_load = load(**{parameter.name: 0.0 for parameter in load.table})
+        self._loaded_world = world.with_effects((no_load,))
+        """the world with an effect whose values are the loads, for derivatives by these"""
+        self._late_effects = [effect.name for effect in camera if not effect.in_one_frame]
         camera = [effect for effect in camera if effect.in_one_frame]
         self.poses = PoseFinder(SeenBy(renderer, camera) if camera else renderer, reach_of(renderer, system))
-        self._known = within_frame(camera, torch.zeros(self.poses.size)).to(torch.uint8)
+        self._drawn = within_frame(camera, torch.zeros(self.poses.size)).to(torch.uint8)
         """(H, W) 1 where the renderer draws what is seen, else 0"""
 
     def track(self, episodes: Sequence[Episode]) -> list[Episode]:
@@ -93,20 +97,20 @@ class Tracker:
 
         One or two rows cannot tell a load from a velocity: in so short an episode the estimated gap is 0.
         """
-        if self._late:
+        if self._late_effects:
             raise TrackingError(
-                f"states are not estimated from frames with {' and '.join(self._late)}: they would be of other rows; "
-                "without a residual (--diagnose) none are needed"
+                f"states are not estimated from frames with {' and '.join(self._late_effects)}: they would be of other "
+                "rows; without a residual (--diagnose) none are needed"
             )
         if not episodes:
             return []
-        found = [self._see(number, episode) for number, episode in enumerate(episodes)]
+        found = [self._poses(number, episode) for number, episode in enumerate(episodes)]
         commands = [torch.as_tensor(episode.action[:-1], dtype=torch.float64) for episode in episodes]
         paths = [self._first_guess(poses) for poses in found]
         noise: Noise | None = None
         for pass_number in range(SMOOTHINGS):
             problems = [self._problem(*parts) for parts in zip(found, commands, paths, strict=True)]
-            if pass_number < 2:
+            if pass_number < NOISE_FITS:
                 noise = most_probable_noise(problems, noise)
             assert noise is not None
             paths = [backward(each.filtered(noise))[0][0, ..., 0] for each in problems]
@@ -120,7 +124,8 @@ class Tracker:
         """The same episodes with states estimated from their frames; those of 1 or 2 rows are left out."""
         return self.track([episode for episode in episodes if len(episode.time) > 2])
 
-    def _see(self, number: int, episode: Episode) -> Poses:
+    def _poses(self, number: int, episode: Episode) -> Poses:
+        """The poses that the frames of an episode show; raises TrackingError as `track`."""
         if episode.frame is None:
             raise TrackingError(f"episode {number} has no frames to estimate states from")
         height, width = self.poses.size
@@ -130,10 +135,10 @@ class Tracker:
                 f"(height x width); the renderer draws {height} x {width}"
             )
         periods = np.diff(episode.time)
-        if len(periods) and np.abs(periods - self.world.period).max() > 0.01 * self.world.period:
+        if len(periods) and np.abs(periods - self.world.period).max() > PERIOD_TOLERANCE * self.world.period:
             worst = float(periods[np.abs(periods - self.world.period).argmax()])
             raise TrackingError(f"episode {number} has rows {worst:g} s apart; the period is {self.world.period:g} s")
-        poses = self.poses(self._known * torch.from_numpy(np.ascontiguousarray(episode.frame)))
+        poses = self.poses(self._drawn * torch.from_numpy(np.ascontiguousarray(episode.frame)))
         missed = (~poses.explained).nonzero()[:, 0]
         if len(missed):
             first = int(missed[0])
@@ -166,7 +171,7 @@ class Tracker:
         before = path[:-1]
         acting = self.world.system.within_range(command)[:, None].expand(-1, self.world.substeps, -1)
         tangent = linearise_step(
-            self._pushed, before[:, states:], torch.zeros(len(before)).to(path), before[:, :states], acting
+            self._loaded_world, before[:, states:], torch.zeros(len(before)).to(path), before[:, :states], acting
         )
         transition = torch.eye(n, dtype=path.dtype).repeat(len(before), 1, 1)
         transition[:, :states] = torch.cat((tangent.by_state, tangent.by_parameter), 2)

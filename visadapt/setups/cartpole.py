@@ -13,7 +13,7 @@ from torch import Tensor
 from renderers import Camera, LayeredRenderer, RendererError, load_renderer
 from visadapt.effects import CameraEffect
 from visadapt.learning.grounding import GroundSettings
-from visadapt.learning.perception import PerceptionSettings, learn_to_see
+from visadapt.learning.perception import PerceptionSettings, train_encoder
 from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.tracking import Tracker
 from visadapt.learning.training_state import train_or_load
@@ -161,7 +161,7 @@ def cartpole_frames(
         perception = settings.perception or PerceptionSettings()
         eyes = policy.perception.requires_grad_(True)
         generator, progress = torch.Generator().manual_seed(seed), staged(report, "perception")
-        train = partial(learn_to_see, eyes, render, source.period, perception, generator, progress)
+        train = partial(train_encoder, eyes, render, source.period, perception, generator, progress)
         train_or_load(path, eyes, {"seed": seed, **asdict(perception)}, train)
         policy.encoder.load_state_dict(eyes.requires_grad_(False).state_dict())
 

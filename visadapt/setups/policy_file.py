@@ -16,7 +16,7 @@ from torch import Tensor
 
 from visadapt.effects import EFFECTS, Effect, Residual
 from visadapt.effects.own import is_own, own_effects
-from visadapt.learning.perception import PerceptionSettings, scale
+from visadapt.learning.perception import PerceptionSettings, kinematics_units
 from visadapt.policies import (
     FlightPolicy,
     FollowPolicy,
@@ -211,10 +211,10 @@ def residual_for(
     system, period = source.system, source.period
     network: ResidualNetwork
     if isinstance(policy, ImagePolicy):
-        eyes = policy.perception
-        unit = scale(perception or PerceptionSettings(), period)
-        network = ImageResidualNetwork(eyes.background, float(eyes.contrast), system, period, unit)
-        network.to(eyes.background).encoder.load_state_dict(eyes.state_dict())
+        encoder = policy.perception
+        units = kinematics_units(perception or PerceptionSettings(), period)
+        network = ImageResidualNetwork(encoder.background, float(encoder.contrast), system, period, units)
+        network.to(encoder.background).encoder.load_state_dict(encoder.state_dict())
     elif isinstance(policy, RegulatorPolicy):
         network = RegulatorResidualNetwork(system, period, policy)
     elif isinstance(policy, StatePolicy) and policy.with_history:
