@@ -16,6 +16,7 @@ from visadapt.cli.user_code import describe, find_factory, own_code
 from visadapt.policies import Policy
 from visadapt.setups.policy_file import load_policy, load_source
 from visadapt.targets import Target
+from visadapt.targets.base import periods_differ
 from visadapt.targets.env_map import EnvMap
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.targets.rollout import SHOWN, checked_copy
@@ -111,7 +112,7 @@ def _check(path: str, policy: Policy, source: World, target: Target) -> None:
         if policy.shown == "frame":
             differ = f"frames of {shown[1]} x {shown[0]} px; {path} was trained on {needed[1]} x {needed[0]}"
         raise InputError(f"{target.name} shows {differ}")
-    if abs(target.period - source.period) > 1e-6:
+    if periods_differ(target.period, source.period):
         raise InputError(
             f"{target.name} has {target.period:g} s between actions, {path} was trained for {source.period:g} s: "
             f"train with --period {target.period:g}, or give the target that period"

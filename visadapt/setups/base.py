@@ -29,6 +29,7 @@ from visadapt.storage.checkpoints import weights_digest
 from visadapt.storage.run_folder import open_run
 from visadapt.systems import System
 from visadapt.targets import Target
+from visadapt.targets.base import periods_differ
 from visadapt.tasks.base import Task
 from visadapt.world import World
 
@@ -38,8 +39,8 @@ or, where the file exists, reads it from there."""
 
 Made = TypeVar("Made")
 
-NEWER = ("perception", "refinement")
-"""Settings that policy files of earlier versions do not state; such files are taken as they are."""
+NEWER_SETTINGS = ("perception", "refinement")
+"""Policy files of earlier versions do not state these; such files are taken as they are."""
 
 
 @dataclass(frozen=True)
@@ -106,31 +107,30 @@ class Setup:
         Raises:
             CheckpointError: `path` holds another network, or one that was trained in another way.
         """
-        policy = _seeded(seed, self.policy)
-        prepared = path.with_suffix(".prepared.safetensors")
+        policy, refinement = _seeded(seed, self.policy), self.settings.refinement
+        prepared, unrefined = (path.with_suffix(f".{stage}.safetensors") for stage in ("prepared", "rough"))
         if self.prepare is not None and not path.exists():
             self.prepare(policy, prepared, seed, self.settings, report)
         numbers = self.settings.numbers()
-        given = {"arguments": policy.arguments, "source": describe(self.source), "seed": seed}
-        about = {**given, **numbers["source"], "perception": numbers["perception"]}
-        whole = {**about, "refinement": numbers["refinement"]}
-        rough, fine = path.with_suffix(".rough.safetensors"), self.settings.refinement
+        about_unrefined = {"arguments": policy.arguments, "source": describe(self.source), "seed": seed}
+        about_unrefined |= {**numbers["source"], "perception": numbers["perception"]}
+        about = {**about_unrefined, "refinement": numbers["refinement"]}
         # `prepare` draws from a generator of `seed` itself, so training uses the seeds after it.
-        first = seed if self.prepare is None else seed + 1
+        first_seed = seed if self.prepare is None else seed + 1
 
-        def stage(made: Path, settings: TuneSettings, described: dict[str, Any], draws: int, name: str) -> None:
-            generator = torch.Generator().manual_seed(draws)
+        def train(file: Path, about: dict[str, Any], settings: TuneSettings, seed: int, name: str) -> None:
+            generator = torch.Generator().manual_seed(seed)
             progress = staged(report, f"{self.source.system.name}: {name}")
-            train = partial(tune, policy, self.source, self.observe, settings, generator, None, progress)
-            train_or_load(made, policy, described, train, NEWER)
+            tuned = partial(tune, policy, self.source, self.observe, settings, generator, None, progress)
+            train_or_load(file, policy, about, tuned, NEWER_SETTINGS)
 
-        if fine is None:
-            stage(path, self.settings.source, whole, first, "source policy")
+        if refinement is None:
+            train(path, about, self.settings.source, first_seed, "source policy")
         else:
             if not path.exists():
-                stage(rough, self.settings.source, about, first, "source policy")
-            stage(path, fine, whole, first + 1, "source policy, refined")
-        for finished in (prepared, rough):
+                train(unrefined, about_unrefined, self.settings.source, first_seed, "source policy")
+            train(path, about, refinement, first_seed + 1, "source policy, refined")
+        for finished in (prepared, unrefined):
             finished.unlink(missing_ok=True)
         policy.trained_in = describe(self.source)
         return policy.eval()
@@ -220,18 +220,20 @@ class Setup:
                 f"a {self.source.system.name} needs a {type(wanted).__name__} of {wanted.n_state} and {wanted.n_action}"
             )
         if isinstance(policy, ImagePolicy) and isinstance(wanted, ImagePolicy):
-            own, seen = policy.perception.background.double().cpu(), wanted.perception.background.double().cpu()
-            if own.shape != seen.shape or not torch.allclose(own, seen):
+            own, ours = (each.perception.background.double().cpu() for each in (policy, wanted))
+            if own.shape != ours.shape or not torch.allclose(own, ours):
                 raise ValueError(
                     "the policy was not trained with this renderer: give the one that it was trained with (--renderer)"
                 )
-        apart, here = (each.arguments.get("period", self.source.period) for each in (policy, wanted))
-        if abs(apart - here) > 1e-6:
-            raise ValueError(f"the policy aims at goals {apart:g} s apart, the source has {here:g} s between actions")
+        own_period, period = (each.arguments.get("period", self.source.period) for each in (policy, wanted))
+        if periods_differ(own_period, period):
+            raise ValueError(
+                f"the policy aims at goals {own_period:g} s apart, the source has {period:g} s between actions"
+            )
 
     def check_target(self, target: Target) -> None:
         """Raises ValueError where `target` has another period or another number of actions than the source."""
-        if abs(target.period - self.source.period) > 1e-6:
+        if periods_differ(target.period, self.source.period):
             raise ValueError(
                 f"{target.name} has {target.period:g} s between actions, the source {self.source.period:g} s: "
                 f"make the source World(system, period={target.period:g})"

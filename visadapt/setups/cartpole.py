@@ -29,7 +29,7 @@ from visadapt.world import World
 
 CONTRAST = 0.2  # Grey levels, where white is 1: frames are divided by it before the networks see them
 
-REACH = 1.45  # m to either side that a camera must see for `from_frames` as it is; the drawn cart-pole's sees 1.5 m
+FULL_VIEW = 1.45  # m to either side that a camera must see for `from_frames` as it is; the drawn cart-pole's sees 1.5 m
 
 UNLIMITED = 1e9  # m, no limit on the cart's position: without a camera nothing depends on it
 
@@ -84,16 +84,16 @@ def from_frames(source: World) -> SetupSettings:
     The policy is refined and tuned in closed loop: each imagined step is rendered, and gradients flow through renderer,
     residual and physics.
     """
-    rendered = replace(_near_rest(source), streams=None, every=1, batch=16, iterations=250, closed_loop=True)
+    in_closed_loop = replace(_near_rest(source), streams=None, every=1, batch=16, iterations=250, closed_loop=True)
     return SetupSettings(
         source=TuneSettings(Balance(CENTRED_CARTPOLE), iterations=2500),
         # After 250 iterations the source policy drives the cart at 0.022 m/s, after 1,000 at 0.019, after these at
         # 0.018; without a refinement at 0.025.
-        refinement=replace(rendered, iterations=2500, learning_rate=1e-3),
+        refinement=replace(in_closed_loop, iterations=2500, learning_rate=1e-3),
         # An iteration takes 0.4 s of CPU. 60 in the first round are too few; so are 30 in later ones with a late motor.
-        tuning=replace(rendered, iterations=100, batch=8, learning_rate=1e-3),
+        tuning=replace(in_closed_loop, iterations=100, batch=8, learning_rate=1e-3),
         later=50,
-        named=rendered,
+        named=in_closed_loop,
         # After 50 samples of a force that changes, six seeds reach cart speeds of 0.023 to 0.285 m/s with the ridge 0.1
         # alone, and of 0.023 to 0.045 m/s with these ridges to choose from.
         ground=GroundSettings(ridges=(0.1, 0.3, 1.0, 3.0, 10.0)),
@@ -137,20 +137,20 @@ def cartpole_frames(
     """
     source = source or World(CartPole())
     given = renderer if isinstance(renderer, LayeredRenderer) else _load(Path(renderer or shipped("renderer")))
-    seen = copy.deepcopy(given).requires_grad_(False).eval()
+    trained = copy.deepcopy(given).requires_grad_(False).eval()
     camera = [effect for effect in source.effects if isinstance(effect, CameraEffect)]
-    tracker = Tracker(seen, source.with_effects(()), camera)
-    settings = settings or _narrowed(from_frames(source), seen)
+    tracker = Tracker(trained, source.with_effects(()), camera)
+    settings = settings or _narrowed(from_frames(source), trained)
 
     @cache
     def copied(device: torch.device, dtype: torch.dtype) -> LayeredRenderer:
         # The renderer stays where it is: the tracker reads frames of the target with it.
-        return copy.deepcopy(seen).to(device, dtype)
+        return copy.deepcopy(trained).to(device, dtype)
 
     def render(x: Tensor, theta: Tensor) -> Tensor:
-        own = seen.background
+        own = trained.background
         here = (x.device, x.dtype) == (own.device, own.dtype)
-        return (seen if here else copied(x.device, x.dtype))(x, theta)
+        return (trained if here else copied(x.device, x.dtype))(x, theta)
 
     def observe(state: Tensor) -> Tensor:
         return render(state[:, 0], state[:, 2])
@@ -159,18 +159,18 @@ def cartpole_frames(
         """Train the policy's frame encoder and keep it in `path`, or take the one that is there."""
         assert isinstance(policy, ImagePolicy)
         perception = settings.perception or PerceptionSettings()
-        eyes = policy.perception.requires_grad_(True)
+        encoder = policy.perception.requires_grad_(True)
         generator, progress = torch.Generator().manual_seed(seed), staged(report, "perception")
-        train = partial(train_encoder, eyes, render, source.period, perception, generator, progress)
-        train_or_load(path, eyes, {"seed": seed, **asdict(perception)}, train)
-        policy.encoder.load_state_dict(eyes.requires_grad_(False).state_dict())
+        train = partial(train_encoder, encoder, render, source.period, perception, generator, progress)
+        train_or_load(path, encoder, {"seed": seed, **asdict(perception)}, train)
+        policy.encoder.load_state_dict(encoder.requires_grad_(False).state_dict())
 
     return Setup(
         source=source,
-        policy=lambda: ImagePolicy(seen.background.sigmoid().detach(), CONTRAST),
+        policy=lambda: ImagePolicy(trained.background.sigmoid().detach(), CONTRAST),
         residual=partial(residual_for, perception=settings.perception),
         settings=settings,
-        renderer=seen,
+        renderer=trained,
         observe=observe,
         label=tracker.label,
         prepare=prepare,
@@ -178,9 +178,9 @@ def cartpole_frames(
 
 
 def _narrowed(settings: SetupSettings, renderer: LayeredRenderer) -> SetupSettings:
-    """The settings with all positions of the cart scaled down, where the camera sees less than `REACH`."""
+    """The settings with all positions of the cart scaled down, where the camera sees less than `FULL_VIEW`."""
     camera = Camera(width=renderer.size[1], scale=float(renderer.gain[0]), column=float(renderer.origin[0]))
-    share = camera.reach / REACH
+    share = camera.reach / FULL_VIEW
     if share >= 1:
         return settings
 

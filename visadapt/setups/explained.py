@@ -40,16 +40,15 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         raise ValueError("a diagnosis starts from the bare system: give the source without effects")
     catalogue(source.system)  # makes the effects of a system of one's own known, by which a file names them
     measured = () if renderer else tuple(state.name for state in source.system.states)
-
     shortest = source.system.prediction_time
 
     def explain(episodes: Sequence[Episode], path: Path) -> Explanation:
-        long = tuple(e for e in episodes if e.time[-1] - e.time[0] >= shortest)
-        if not long:
-            none = f"all {len(episodes)} episodes are shorter than {shortest:g} s, not diagnosed"
-            return Explanation(none, [], complete=False)
-        sources = tuple(f"episode {number}" for number in range(len(long)))
-        recording = Recording(long, measured, source.period, sources)
+        diagnosable = tuple(e for e in episodes if e.time[-1] - e.time[0] >= shortest)
+        if not diagnosable:
+            verdict = f"all {len(episodes)} episodes are shorter than {shortest:g} s, not diagnosed"
+            return Explanation(verdict, [], complete=False)
+        origins = tuple(f"episode {number}" for number in range(len(diagnosable)))
+        recording = Recording(diagnosable, measured, source.period, origins)
         diagnosed = partial(diagnose, recording, source, seed=seed, progress=report, renderer=renderer)
         found = None
         if not path.exists():
@@ -72,8 +71,8 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
             planned.write(path.with_name("plan.csv"))
             return torch.as_tensor(planned.added)
 
-        settles = experiment if verdict == AMBIGUOUS and renderer is None else None
-        return Explanation(verdict, effects, verdict != UNEXPLAINED, slight, settles)
+        designs = experiment if verdict == AMBIGUOUS and renderer is None else None
+        return Explanation(verdict, effects, verdict != UNEXPLAINED, slight, designs)
 
     return explain
 

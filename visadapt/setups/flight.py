@@ -12,6 +12,7 @@ from visadapt.policies import FollowPolicy, ReachPolicy
 from visadapt.setups.base import Setup
 from visadapt.setups.policy_file import residual_for
 from visadapt.systems import FixedWing, Quadrotor
+from visadapt.targets.base import periods_differ
 from visadapt.tasks.follow import Follow, RecoverCost
 from visadapt.tasks.reach import Reach
 from visadapt.tasks.references import Reference
@@ -22,8 +23,8 @@ RECORDED = 0.8
 """Share of the streams that start in a recorded flight, with its history, where the residual reads the history: in
 other starts it shows no changing force, or only the residual's own."""
 
-_learn = partial(TuneSettings, longest=100, observation_noise=0.0)
-_settings = partial(SetupSettings, ground=GROUND, feedforward=False, tunes_on=True)
+_tune_settings = partial(TuneSettings, longest=100, observation_noise=0.0)
+_setup_settings = partial(SetupSettings, ground=GROUND, feedforward=False, tunes_on=True)
 
 
 def quadrotor(
@@ -40,7 +41,7 @@ def quadrotor(
     Raises:
         ValueError: a source whose period is not that of the references, or these are too short for a history.
     """
-    if source is not None and abs(source.period - train.period) > 1e-6:
+    if source is not None and periods_differ(source.period, train.period):
         raise ValueError(
             f"the references have rows {train.period:g} s apart, the source {source.period:g} s between commands"
         )
@@ -50,17 +51,25 @@ def quadrotor(
     task, far_off = follow(train), partial(follow, train, start_spread=(0.3, 0.8), divergence=3.0)
     if with_history and task.steps < LENGTH:
         raise ValueError(f"references of {task.steps + 1} rows are too short for a history: {LENGTH + 1} are right")
-    tuning = _learn(task, 200, 256, 1e-3, curriculum=False)
+    tuning = _tune_settings(task, iterations=200, batch=256, learning_rate=1e-3, curriculum=False)
     if with_history:
-        tuning = _learn(far_off(RecoverCost()), 400, 128, 5e-3, longest=60, curriculum=False, recorded=RECORDED)
+        tuning = _tune_settings(
+            far_off(RecoverCost()),
+            iterations=400,
+            batch=128,
+            learning_rate=5e-3,
+            longest=60,
+            curriculum=False,
+            recorded=RECORDED,
+        )
     return Setup(
         source=source,
         policy=lambda: FollowPolicy(train.period),
         residual=partial(residual_for, with_history=with_history),
         # First to keep to the reference, then to come back from far off.
-        settings=_settings(
-            source=_learn(task, 4000, 256, 4e-3),
-            refinement=_learn(far_off(), 2000, 256, 1e-3, curriculum=False),
+        settings=_setup_settings(
+            source=_tune_settings(task, iterations=4000, batch=256, learning_rate=4e-3),
+            refinement=_tune_settings(far_off(), iterations=2000, batch=256, learning_rate=1e-3, curriculum=False),
             tuning=tuning,
             longest_episode=task.steps,
         ),
@@ -80,11 +89,15 @@ def fixed_wing(source: World | None = None, with_history: bool = False, task: Re
     assert isinstance(source.system, FixedWing)
     task = task or Reach(source.period, source.system)
     recorded = RECORDED if with_history else 0.0
-    tuning = _learn(task, 200, 128, 3e-4, curriculum=False, recorded=recorded)
+    tuning = _tune_settings(task, iterations=200, batch=128, learning_rate=3e-4, curriculum=False, recorded=recorded)
     return Setup(
         source=source,
         policy=ReachPolicy,
         residual=partial(residual_for, with_history=with_history),
-        settings=_settings(_learn(task, 3000, 128, 3e-3), tuning, longest_episode=task.steps),
+        settings=_setup_settings(
+            source=_tune_settings(task, iterations=3000, batch=128, learning_rate=3e-3),
+            tuning=tuning,
+            longest_episode=task.steps,
+        ),
         test=task,
     )

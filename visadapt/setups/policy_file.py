@@ -56,11 +56,11 @@ def save_policy(path: str | Path, policy: Policy, about: Mapping[str, Any] | Non
     >>> type(va.load_policy(path)).__name__
     'FollowPolicy'
     """
-    made: dict[str, Any] = {"arguments": policy.arguments}
-    made |= {"grounded_in": policy.grounded_in, "source": policy.trained_in}
+    settings: dict[str, Any] = {"arguments": policy.arguments}
+    settings |= {"grounded_in": policy.grounded_in, "source": policy.trained_in}
     if policy.residual is not None and isinstance(policy.residual.network, FlightResidualNetwork):
-        made["with_history"] = policy.residual.network.predict is not None
-    save_network(Path(path), policy, {**made, **(about or {})})
+        settings["with_history"] = policy.residual.network.predict is not None
+    save_network(Path(path), policy, {**settings, **(about or {})})
 
 
 def load_policy(path: str | Path) -> Policy:
@@ -82,13 +82,13 @@ def load_policy(path: str | Path) -> Policy:
             "your own is read by the `load` of that setup"
         )
     with fitting(path):
-        made, weights = tree["settings"], tree["weights"]
-        kind, arguments = KINDS[tree["class"]], made["arguments"]
+        settings, weights = tree["settings"], tree["weights"]
+        kind, arguments = KINDS[tree["class"]], settings["arguments"]
         with torch.device("meta"):  # without memory: a damaged file may ask for more than there is
             sizes = kind(**arguments).to(_dtype(weights)).state_dict()
         check_sizes(sizes, {key: value for key, value in weights.items() if not key.startswith("residual.")}, path)
         policy = kind(**arguments)
-        residual = partial(residual_for, with_history=made.get("with_history", False))
+        residual = partial(residual_for, with_history=settings.get("with_history", False))
         return _restored(policy, tree, path, residual)
 
 
@@ -108,6 +108,7 @@ def load_into(path: Path, policy: Policy, residual: Callable[[Policy, World], Re
 def _restored(
     policy: Policy, tree: Mapping[str, Any], path: Path, residual: Callable[[Policy, World], Residual]
 ) -> Policy:
+    """`policy` with the weights, the worlds and the residual of a file's `tree`."""
     policy.to(_dtype(tree["weights"]))
     policy.trained_in = tree["settings"].get("source")
     if (grounded_in := tree["settings"].get("grounded_in")) is not None:
@@ -134,15 +135,16 @@ def load_source(path: str | Path) -> World:
     ('quadrotor', 0.1)
     """
     path = Path(path)
-    made = _load(path)["settings"]
+    settings = _load(path)["settings"]
     with fitting(path):
-        description = made.get("grounded_in") or made.get("source")
+        description = settings.get("grounded_in") or settings.get("source")
         if description is None:
             raise CheckpointError(f"{path}: does not say in which world the policy was trained; train it again")
         return _world(description, path)
 
 
 def _load(path: Path) -> dict[str, Any]:
+    """The class, settings and weights in a policy's file; raises CheckpointError where one of them is missing."""
     tree = load_tree(path)
     keys = {"class", "settings", "weights"}
     if not isinstance(tree, dict) or not keys <= tree.keys() or not isinstance(tree["class"], str):
@@ -178,19 +180,19 @@ def parameters_of(system: System) -> dict[str, float]:
 def _world(description: Mapping[str, Any], path: Path) -> World:
     """The world that `describe` described; raises CheckpointError where its system or an effect is not known."""
 
-    def known(name: str, where: Mapping[str, Any], option: str) -> Any:
+    def class_of(name: str, classes: Mapping[str, Any], option: str) -> Any:
         if not isinstance(name, str):
             raise CheckpointError(f"{path}: the name of a system or an effect is no text but a {type(name).__name__}")
-        if name not in where:
+        if name not in classes:
             line = f"{path}: needs {name!r}, which is not known here: import the file that defines it{option}"
             raise CheckpointError(line)
-        return where[name]
+        return classes[name]
 
-    kind = known(description["system"], {**NAMED, **SYSTEMS}, ", or name it by --system")
+    kind = class_of(description["system"], {**NAMED, **SYSTEMS}, ", or name it by --system")
     if is_own(kind):
         own_effects(kind)  # which makes them known
-    given = [dict(one) for one in description["effects"]]
-    effects = [known(values.pop("effect"), EFFECTS, ", or name it by --effects")(**values) for values in given]
+    described = [dict(effect) for effect in description["effects"]]
+    effects = [class_of(values.pop("effect"), EFFECTS, ", or name it by --effects")(**values) for values in described]
     clock = {name: description[name] for name in ("period", "integrator", "substeps")}
     return World(kind(**description["parameters"]), effects, **clock)
 

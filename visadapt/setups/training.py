@@ -77,10 +77,10 @@ def setup_for(
                 raise ValueError("a policy that is shown frames reads the last 5 in any case: leave the history out")
             setup = cartpole_frames(world, renderer)
         else:
-            own = policy.with_history if isinstance(policy, StatePolicy) else with_history
-            if with_history and not own:
+            reads_history = policy.with_history if isinstance(policy, StatePolicy) else with_history
+            if with_history and not reads_history:
                 raise ValueError("the policy reads the last state alone: train one with a history, or leave it out")
-            setup = cartpole_states(world, own)
+            setup = cartpole_states(world, reads_history)
     elif isinstance(system, Quadrotor):
         if references is None:
             raise ValueError("a quadrotor follows references: give some, by references= or --references")
@@ -219,12 +219,13 @@ def adapt(
     if target is None:
         setup.tune(policy, seed, report)
         return policy
-    in_round = min(samples, max(20, samples // 5)) if round_samples is None else round_samples
+    if round_samples is None:
+        round_samples = min(samples, max(20, samples // 5))
     with tempfile.TemporaryDirectory() as temporary:
-        place = Path(folder or temporary)
-        adapted = setup.adapt(policy, target, place, samples, in_round, seed, report, diagnose=diagnose)
+        run_folder = Path(folder or temporary)
+        adapted = setup.adapt(policy, target, run_folder, samples, round_samples, seed, report, diagnose=diagnose)
         if folder is not None:
-            save_policy(place / "policy.safetensors", policy)
+            save_policy(run_folder / "policy.safetensors", policy)
     return adapted if folder is not None else replace(adapted, folder=None)
 
 

@@ -10,6 +10,13 @@ from torch import Tensor
 
 from visadapt.systems import System
 
+PERIOD_ROUNDING = 1e-6  # s, by which equal periods may differ
+
+
+def periods_differ(one: float, other: float) -> bool:
+    """Whether two periods in s differ by more than rounding."""
+    return abs(one - other) > PERIOD_ROUNDING
+
 
 class TargetError(RuntimeError):
     """The target did something that no adaptation can go on from; the message says what, in one line."""

@@ -15,6 +15,7 @@ from visadapt.history import History
 from visadapt.policies import Policy
 from visadapt.recordings import Episode
 from visadapt.targets import Observation, Target, TargetError
+from visadapt.targets.base import periods_differ
 from visadapt.tasks.balance import within_a_turn
 
 See = Callable[[Observation], Tensor]
@@ -125,7 +126,7 @@ def run(
 def check_period(policy: Policy, target: Target) -> None:
     """Raises ValueError where the policy is known to be trained for another period than the target's."""
     trained = policy.trained_in["period"] if policy.trained_in else target.period
-    if abs(trained - target.period) > 1e-6:
+    if periods_differ(trained, target.period):
         raise ValueError(
             f"{target.name} has {target.period:g} s between actions, the policy was trained for {trained:g} s: give "
             "the target that period, or train a policy for its own"
