@@ -13,8 +13,10 @@ from visadapt.policies.base import Policy, ignore_correction
 from visadapt.policies.networks import N_DISTURBANCE, FlightResidualNetwork, mlp
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, RATES, VELOCITY, RigidBody, matvec, rotation
 
-FARTHEST, FASTEST = 1.5, 2.5
-"""m and m/s, the errors of position and velocity above which `FollowPolicy` reacts no more strongly."""
+LARGEST_POSITION_ERROR, LARGEST_VELOCITY_ERROR = 1.5, 2.5
+"""m and m/s, above which `FollowPolicy` reacts no more strongly."""
+REACH_DISTANCE = 50.0  # m, the unit of the distance to its point that `ReachPolicy` reads
+HEADING_GAIN = 10.0  # what it multiplies the small error of its heading by
 
 
 class FlightPolicy(Policy):
@@ -106,14 +108,15 @@ class FollowPolicy(FlightPolicy):
     def aim(self, state: Tensor, goal: Tensor) -> Tensor:
         """The reference minus the path at constant present velocity, (B, 6 HORIZON): positions in m, velocities in m/s.
 
-        Errors of position and velocity are limited to FARTHEST and FASTEST. Since a vehicle tilts slowly, one that
-        tilted in proportion to a large error would tilt back too late, and overshoot further each time.
+        Errors of position and velocity are limited to LARGEST_POSITION_ERROR and LARGEST_VELOCITY_ERROR. Since a
+        vehicle tilts slowly, one that tilted in proportion to a large error would tilt back too late, and overshoot
+        further each time.
         """
         reference = goal.unflatten(1, (HORIZON, 6))
         next_velocity = reference[:, :1, 3:]
-        now = reference[:, :1, :3] - self.period * next_velocity
-        position = now - _at_most(FARTHEST, now - state[:, None, POSITION])
-        velocity = next_velocity - _at_most(FASTEST, next_velocity - state[:, None, VELOCITY])
+        now = reference[:, :1, :3] - self.period * next_velocity  # where the reference is
+        position = now - _at_most(LARGEST_POSITION_ERROR, now - state[:, None, POSITION])
+        velocity = next_velocity - _at_most(LARGEST_VELOCITY_ERROR, next_velocity - state[:, None, VELOCITY])
         steps = torch.arange(1, HORIZON + 1).to(state)[:, None]
         away = reference[..., :3] - position - self.period * steps * velocity
         return torch.cat((away, reference[..., 3:] - velocity), -1).flatten(1)
@@ -142,13 +145,14 @@ class ReachPolicy(FlightPolicy):
         return torch.cat((*moving, self.aim(state, goal, axes)), 1)
 
     def aim(self, state: Tensor, goal: Tensor, axes: Tensor) -> Tensor:
-        """(B, 10): distance / 50 m, direction to the point in body axes, heading error, and that error / distance.
+        """(B, 10): distance / REACH_DISTANCE, direction to the point in body axes, heading error, and that error /
+        distance.
 
-        The heading error is 10 times the direction to the point minus that of the velocity, in world axes; `axes`
-        (B, 3, 3) are the body's, the rotation matrix of the attitude.
+        The heading error is HEADING_GAIN times the direction to the point minus that of the velocity, in world axes;
+        `axes` (B, 3, 3) are the body's, the rotation matrix of the attitude.
         """
-        to, velocity = goal - state[:, POSITION], state[:, VELOCITY]
-        distance = to.norm(dim=1, keepdim=True).clamp_min(1.0)
-        way, path = to / distance, velocity / velocity.norm(dim=1, keepdim=True).clamp_min(1.0)
-        aside = 10 * (way - path)
-        return torch.cat((distance / 50, matvec(axes.mT, way), aside, aside / distance), 1)
+        to_point, velocity = goal - state[:, POSITION], state[:, VELOCITY]
+        distance = to_point.norm(dim=1, keepdim=True).clamp_min(1.0)
+        direction, heading = to_point / distance, velocity / velocity.norm(dim=1, keepdim=True).clamp_min(1.0)
+        error = HEADING_GAIN * (direction - heading)
+        return torch.cat((distance / REACH_DISTANCE, matvec(axes.mT, direction), error, error / distance), 1)

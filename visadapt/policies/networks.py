@@ -121,8 +121,8 @@ class ImageResidualNetwork(ResidualNetwork):
         """
         latest = kinematics[:, [0, LENGTH]]
         changes = torch.stack((kinematics[:, 1:LENGTH], kinematics[:, LENGTH + 1 :]), -1)
-        back = changes.flip(1).cumsum(1).flip(1)
-        positions = latest[:, None] - back[:, 1:]
+        since = changes.flip(1).cumsum(1).flip(1)  # from the frame before each change to the latest
+        positions = latest[:, None] - since[:, 1:]
         velocities = (changes[:, 1:] + changes[:, :-1]) / (2 * self.period)
         states = torch.stack((positions, velocities), -1).flatten(-2)
         before = accelerations(self.system, states, actions[:, : LENGTH - 2])
@@ -192,8 +192,8 @@ class StateHistoryResidualNetwork(ResidualNetwork):
         """
         ends = [accelerations(self.system, part, actions[:, :-1]) for part in (states[:, :-1], states[:, 1:])]
         measured = states.diff(dim=1)[..., [velocity for _, velocity in self.system.coordinates]] / self.period
-        left = measured - (ends[0] + ends[1]) / 2
-        return fill_before_start(left, states.diff(dim=1).any(2, keepdim=True))
+        unexplained = measured - (ends[0] + ends[1]) / 2
+        return fill_before_start(unexplained, states.diff(dim=1).any(2, keepdim=True))
 
 
 def accelerations(system: System, states: Tensor, actions: Tensor) -> Tensor:
@@ -209,10 +209,10 @@ def fill_before_start(values: Tensor, known: Tensor) -> Tensor:
     `known` (B, periods, 1) says which periods are of the episode: before it, its first state is repeated. Where no
     period is known, all values are 0.
     """
-    past = [values[:, -1] * known[:, -1]]
+    newest_first = [values[:, -1] * known[:, -1]]
     for k in range(values.shape[1] - 2, -1, -1):
-        past.append(torch.where(known[:, k], values[:, k], past[-1]))
-    return torch.stack(past[::-1], 1)
+        newest_first.append(torch.where(known[:, k], values[:, k], newest_first[-1]))
+    return torch.stack(newest_first[::-1], 1)
 
 
 class FlightResidualNetwork(ResidualNetwork):
@@ -273,8 +273,8 @@ class FlightResidualNetwork(ResidualNetwork):
         """
         predicted = predict(states[:, :-1], actions[:, :-1]).flatten(0, 1)
         before, after = states[:, :-1].flatten(0, 1), states[:, 1:].flatten(0, 1)
-        left = after - predicted
-        moving = torch.cat((left[:, VELOCITY], left[:, RATES]), 1) / (HISTORY_ACCELERATION_UNIT * self.period)
+        errors = after - predicted
+        changes = torch.cat((errors[:, VELOCITY], errors[:, RATES]), 1) / (HISTORY_ACCELERATION_UNIT * self.period)
         known = (after != before).any(1, keepdim=True)
         periods = (len(states), LENGTH - 1)
-        return fill_before_start(moving.unflatten(0, periods), known.unflatten(0, periods)).flatten(1)
+        return fill_before_start(changes.unflatten(0, periods), known.unflatten(0, periods)).flatten(1)

@@ -14,8 +14,8 @@ from visadapt.policies.networks import StateHistoryResidualNetwork, mlp
 from visadapt.systems import System
 
 WIDTH = 64  # of the MLP's layers
-LARGEST = 4.0
-"""Largest correction in units of the residual's scale, the root mean square of the gap. A linear map has no bound of
+LARGEST_CORRECTION = 4.0
+"""In units of the residual's scale, the root mean square of the gap. A linear map has no bound of
 its own where a trajectory leaves the recorded states: without this one, tuning ended in NaN under a delay and a lag."""
 UNIT_PERIODS = 10  # Periods in which the unit of acceleration changes a velocity by its unit
 
@@ -109,4 +109,4 @@ class RegulatorResidualNetwork(StateHistoryResidualNetwork):
         return torch.cat((seen.observations.flatten(1), seen.actions.flatten(1), unexplained.flatten(1)), 1)
 
     def forward(self, history: History) -> Tensor:
-        return super().forward(history).clamp(-LARGEST, LARGEST)
+        return super().forward(history).clamp(-LARGEST_CORRECTION, LARGEST_CORRECTION)
