@@ -175,7 +175,7 @@ class Following(Flying):
 
     def judge(self, before: Tensor, command: Tensor, state: Tensor, task_state: Tensor) -> Judged:
         own, row = self.task.plan_cost, task_state[:, 1].clamp(max=self.steps)
-        away = state - self.task.on(task_state[:, 0], row)
+        away = state - self.task.states_on(task_state[:, 0], row)
         cost = own.position * away[:, POSITION].square().sum(1) + own.velocity * away[:, VELOCITY].square().sum(1)
         cost = cost + own.action * command.square().sum(1)
         failed = ~(self.task.distance_off(state, task_state) <= self.FARTHEST)

@@ -101,7 +101,7 @@ def test_a_rate_command_ends_at_the_same_rate(axis):
 def test_without_air_and_with_fast_motors_it_flies_as_the_source(monkeypatch):
     commands = rough(12)
     world = World(SOURCE, period=PERIOD, substeps=20)
-    at = world.start(level().on(torch.tensor([0]), torch.tensor([0])))
+    at = world.start(level().states_on(torch.tensor([0]), torch.tensor([0])))
     expected = [at.state]
     for command in commands:
         at = world.step(at, command)

@@ -72,7 +72,7 @@ class TestFollow:
         torch.testing.assert_close(task.misses(states, task_state), wanted)
 
     def test_it_is_as_far_off_as_from_the_row_that_is_due_and_beyond_the_end_from_the_last(self, task):
-        state = task.on(torch.tensor([2, 5]), torch.tensor([7, ROWS - 1]))
+        state = task.states_on(torch.tensor([2, 5]), torch.tensor([7, ROWS - 1]))
         state[:, POSITION] += torch.tensor([[0.0, 3.0, 4.0], [0.0, 0.0, -2.0]])
         away = task.distance_off(state, torch.tensor([[2, 7], [5, ROWS + 3]]))
         torch.testing.assert_close(away, torch.tensor([5.0, 2.0]))

@@ -51,7 +51,7 @@ class TestFollowCost:
 
     def on_it(self):
         which, row = self.task_state.unbind(1)
-        rows = [self.task.on(which, row + k) for k in range(HORIZON + 1)]
+        rows = [self.task.states_on(which, row + k) for k in range(HORIZON + 1)]
         return rows[0], torch.stack(rows[1:], 1)
 
     def cost(self, states, plan=None):
@@ -77,7 +77,7 @@ class TestFollowCost:
     def test_on_a_curved_reference_what_it_turns_by_costs_nothing_and_what_is_missing_of_it_counts(self):
         task = following(plan_cost=self.task.plan_cost)
         which, rows = torch.tensor([[0], [4]]), torch.tensor([[3], [7]]) + torch.arange(HORIZON + 1)
-        states, plan = task.on(which.expand_as(rows), rows), torch.zeros(2, HORIZON, 4)
+        states, plan = task.states_on(which.expand_as(rows), rows), torch.zeros(2, HORIZON, 4)
         about = states[:, 0], torch.cat((which, rows[:, :1]), 1)
         torch.testing.assert_close(task.cost(states[:, 1:], plan, *about), torch.zeros(2), rtol=0, atol=1e-7)
         rates = states[:, 1:, RATES].clone()
@@ -92,7 +92,7 @@ class TestFollowCost:
 
     def test_being_a_row_late_is_being_off_by_a_rows_way(self):
         which, row = self.task_state.unbind(1)
-        late = torch.stack([self.task.on(which, row + k) for k in range(HORIZON)], 1)
+        late = torch.stack([self.task.states_on(which, row + k) for k in range(HORIZON)], 1)
         way = self.task.references.velocities[which, 0] * PERIOD
         torch.testing.assert_close(self.cost(late), 2.0 * HORIZON * way.square().sum(1), rtol=1e-4, atol=1e-6)
 
@@ -144,7 +144,7 @@ class TestWhereStreamsStart:
     def test_around_a_reference_as_far_off_as_the_curriculum_allows(self, progress, share):
         task = following()
         state, task_state = task.training_start(3000, progress, seeded())
-        off = state - task.on(*task_state.unbind(1))
+        off = state - task.states_on(*task_state.unbind(1))
         torch.testing.assert_close(off[:, POSITION].std(0), torch.full((3,), 0.1 * share), rtol=0.06, atol=0)
         torch.testing.assert_close(off[:, VELOCITY].std(0), torch.full((3,), 0.2 * share), rtol=0.06, atol=0)
         assert not off[:, VELOCITY.stop :].any()
@@ -194,7 +194,7 @@ class TestStreams:
         made = streams(following(), self.WORLD, batch)
         made.age[:] = 7
         task_state = torch.stack((torch.arange(batch), torch.full((batch,), 12)), 1)
-        at = self.WORLD.start(made.task.on(*task_state.unbind(1)))
+        at = self.WORLD.start(made.task.states_on(*task_state.unbind(1)))
         made.now = dataclasses.replace(made.now, at=at, task_state=task_state)
         return made
 
@@ -216,7 +216,7 @@ class TestStreams:
     def test_one_at_the_end_of_its_reference_starts_anew(self):
         made = self.middle()
         made.now.task_state[2, 1] = ROWS - 2
-        made.now.at.state[2] = made.task.on(*made.now.task_state[2:3].unbind(1))[0]
+        made.now.at.state[2] = made.task.states_on(*made.now.task_state[2:3].unbind(1))[0]
         self.step(made, torch.zeros(6, 3), 1.0)
         assert made.age.tolist() == [8, 8, 0, 8, 8, 8]
 
@@ -259,7 +259,7 @@ class TestStreams:
             return network.unexplained(network.predict, history.observations[..., :13], history.actions)
 
         def off(state, task_state):
-            return state[..., : VELOCITY.stop] - task.on(*task_state.long().unbind(-1))[..., : VELOCITY.stop]
+            return state[..., : VELOCITY.stop] - task.states_on(*task_state.long().unbind(-1))[..., : VELOCITY.stop]
 
         now, found, further = made.now, set(), []
         every = transitions.history(torch.arange(len(transitions)))

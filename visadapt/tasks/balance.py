@@ -21,6 +21,9 @@ EPISODE_STEPS = 250
 """Steps of a cart-pole's episode, in training and in scores."""
 
 
+KICK_PROBABILITY = 0.05  # Of a random change of the state in a step of training
+
+
 @dataclass(frozen=True)
 class Cost:
     """Weights of the squared distances, one per state, and of the squared commands. The goal is the origin."""
@@ -100,7 +103,8 @@ class Balance(Task):
     start_spread: tuple[float, ...] = (0.5, 0.3, 0.15, 0.3)
     """half-widths of the uniform distribution of states that streams start from"""
     kick: tuple[float, ...] = (0.0, 0.3, 0.0, 0.5)
-    """standard deviations of a random change of the state, once in 20 steps: it widens the states seen in training"""
+    """standard deviations of a random change of the state, in a share KICK_PROBABILITY of the steps: it widens the
+    states seen in training"""
     divergence: tuple[float, ...] = (1.5, 4.0, 0.5, 10.0)
     """delta_div at the end of the curriculum: a stream starts anew where a state is beyond it"""
     first_divergence: float = 0.1
@@ -118,7 +122,7 @@ class Balance(Task):
         return ~(state.abs() <= self._limit(progress).to(state)).all(1)  # also where a state is not a number
 
     def disturb(self, state: Tensor, generator: torch.Generator) -> Tensor:
-        kicked = torch.rand(len(state), 1, generator=generator) < 0.05
+        kicked = torch.rand(len(state), 1, generator=generator) < KICK_PROBABILITY
         kick = torch.tensor(self.kick) * torch.randn(state.shape, generator=generator)
         return state + (kicked * kick).to(state)
 

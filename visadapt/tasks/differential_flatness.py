@@ -20,7 +20,7 @@ from torch import Tensor
 
 from visadapt.systems import Quadrotor
 
-SHIFT = 1e-4  # s, of the difference that takes the place of a derivative: in float64, right to about 1e-7 rad/s2
+TIME_STEP = 1e-4  # s, of the difference that takes the place of a derivative: in float64, right to about 1e-7 rad/s2
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,9 @@ def commands(acceleration: Tensor, jerk: Tensor, snap: Tensor, quadrotor: Quadro
     snap (..., 3) in m/s4, is the difference of omega a little earlier and later.
     """
     a, j, s = (derivative.double() for derivative in (acceleration, jerk, snap))
-    before, now, after = (demanded(a + h * j, j + h * s, float(quadrotor.gravity)) for h in (-SHIFT, 0.0, SHIFT))
-    thrust, rates, change = now.thrust, now.rates, (after.rates - before.rates) / (2 * SHIFT)
+    times, gravity = (-TIME_STEP, 0.0, TIME_STEP), float(quadrotor.gravity)
+    before, now, after = (demanded(a + t * j, j + t * s, gravity) for t in times)
+    thrust, rates, change = now.thrust, now.rates, (after.rates - before.rates) / (2 * TIME_STEP)
     gain = rates.new_tensor([float(g) for g in (quadrotor.roll_gain, quadrotor.roll_gain, quadrotor.yaw_gain)])
     low, high = float(quadrotor.min_thrust), float(quadrotor.max_thrust)
     lift = (2 * thrust - high - low) / (high - low)

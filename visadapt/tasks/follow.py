@@ -112,14 +112,14 @@ class Follow(FlightTask):
         drawn = [torch.randperm(count, generator=generator) for _ in range(-(-batch // count))]
         which = torch.cat(drawn)[:batch].to(self.references.positions.device)
         row = torch.zeros_like(which)
-        return self.on(which, row), torch.stack((which, row), 1)
+        return self.states_on(which, row), torch.stack((which, row), 1)
 
     def training_start(self, batch: int, progress: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Somewhere on a reference, and a little off it."""
         positions = self.references.positions
         which = torch.randint(len(positions), (batch,), generator=generator).to(positions.device)
         row = torch.randint(self.steps, (batch,), generator=generator).to(which)
-        state = self.on(which, row)
+        state = self.states_on(which, row)
         state = state + curriculum(self.first_divergence, progress) * self._spread(state, generator)
         return state, torch.stack((which, row), 1)
 
@@ -145,7 +145,7 @@ class Follow(FlightTask):
         rows = task_state[:, 1].clamp(max=self.steps)
         return (state[:, POSITION] - self.references.positions[task_state[:, 0], rows]).norm(dim=-1)
 
-    def on(self, which: Tensor, row: Tensor) -> Tensor:
+    def states_on(self, which: Tensor, row: Tensor) -> Tensor:
         """The quadrotor's states (..., 13) on the references `which` (...,) at rows (...,)."""
         own = self.references
         every = (own.positions, own.velocities, own.accelerations, own.jerks)
@@ -163,7 +163,7 @@ class Follow(FlightTask):
     def _turning_ahead(self, task_state: Tensor) -> Tensor:
         """Angular velocities (B, HORIZON, 3), in world axes, of the next rows; zero beyond the end of a reference."""
         which, rows = self._rows_ahead(task_state)
-        return turning(self.on(which, rows.clamp(max=self.steps))).masked_fill(rows[..., None] > self.steps, 0.0)
+        return turning(self.states_on(which, rows.clamp(max=self.steps))).masked_fill(rows[..., None] > self.steps, 0.0)
 
     def _rows_ahead(self, task_state: Tensor) -> tuple[Tensor, Tensor]:
         """References (B, 1) and the next rows (B, HORIZON) of each, of which some may be beyond its end."""
@@ -179,30 +179,30 @@ class Follow(FlightTask):
         and acceleration is taken, so that drag and tilt change little. The random error has the `start_spread` of other
         starts: recorded errors are few, and smaller than those that a gust causes under a new policy.
         """
-        own, batch = self.references, len(observed)
-        draws, device = (batch, self.candidates), own.positions.device
-        which = torch.randint(len(own.positions), draws, generator=generator).to(device)
-        row = torch.randint(task_state.shape[1] - 1, self.steps, draws, generator=generator).to(device)
+        references, length = self.references, task_state.shape[1]
+        draws, device = (len(observed), self.candidates), references.positions.device
+        which = torch.randint(len(references.positions), draws, generator=generator).to(device)
+        row = torch.randint(length - 1, self.steps, draws, generator=generator).to(device)
 
         def motion(which: Tensor, row: Tensor) -> Tensor:
-            return torch.cat((own.velocities[which, row], own.accelerations[which, row]), -1)
+            return torch.cat((references.velocities[which, row], references.accelerations[which, row]), -1)
 
         now = task_state[:, -1]
-        unlike = (motion(which, row) - motion(now[:, :1], now[:, 1:])).square().sum(-1)
-        best = unlike.argmin(1, keepdim=True)
-        chosen, until = which.gather(1, best)[:, 0], row.gather(1, best)[:, 0]
+        difference = (motion(which, row) - motion(now[:, :1], now[:, 1:])).square().sum(-1)
+        best = difference.argmin(1, keepdim=True)
+        chosen, last_row = which.gather(1, best)[:, 0], row.gather(1, best)[:, 0]
         shift = torch.zeros_like(state)
-        for part, values in ((POSITION, own.positions), (VELOCITY, own.velocities)):
-            shift[:, part] = values[chosen, until] - values[now[:, 0], now[:, 1]]
+        for part, values in ((POSITION, references.positions), (VELOCITY, references.velocities)):
+            shift[:, part] = values[chosen, last_row] - values[now[:, 0], now[:, 1]]
         shift = shift + self._spread(state, generator)
-        back = torch.arange(1 - task_state.shape[1], 1).to(row)
-        there = torch.stack((chosen[:, None].expand(-1, len(back)), until[:, None] + back), -1)
-        return observed + shift[:, None], state + shift, there.to(task_state)
+        rows = last_row[:, None] + torch.arange(1 - length, 1).to(row)
+        shifted = torch.stack((chosen[:, None].expand_as(rows), rows), -1)
+        return observed + shift[:, None], state + shift, shifted.to(task_state)
 
     def _spread(self, state: Tensor, generator: torch.Generator) -> Tensor:
         """Random differences of position and velocity, zeros elsewhere; as large as `state` (B, 13)."""
-        metres, speed = self.start_spread
-        spread = torch.tensor([metres] * 3 + [speed] * 3)
+        position, velocity = self.start_spread
+        spread = torch.tensor([position] * 3 + [velocity] * 3)
         off = torch.zeros_like(state)
         off[:, : len(spread)] = (spread * torch.randn(len(state), len(spread), generator=generator)).to(state)
         return off

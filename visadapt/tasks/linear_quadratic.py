@@ -10,8 +10,8 @@ from torch import Tensor
 from visadapt.estimation.linearise import linearise_step
 from visadapt.world import World
 
-LASTING = 50.0  # s over which costs are summed; what comes later adds next to nothing
-STEADY = 1e-4
+SUMMED_TIME = 50.0  # s over which costs are summed; what comes later adds next to nothing
+MAX_GROWTH = 1e-4
 """Growth in a period, under the regulator, up to which a motion is steady: a position that costs nothing stays where it
 is, by an eigenvalue of 1."""
 
@@ -33,7 +33,7 @@ def linear_quadratic(
     """The regulator with the least sum of weighted squared distances and commands, in float64.
 
     The source, without its effects, is linearised at rest; the discrete algebraic Riccati equation is iterated from
-    V = 0 over LASTING.
+    V = 0 over SUMMED_TIME.
 
     Args:
         weights: (n_state,) of the squared distances. command_weights: (n_action,) of the squared commands.
@@ -51,11 +51,11 @@ def linear_quadratic(
     step = linearise_step(bare, bare.values.to(at), at.new_zeros(1), at, still, by_command=True)
     a, b = step.by_state[0], step.by_command[0]
     to_go = torch.zeros_like(weights)
-    for _ in range(round(LASTING / source.period)):
+    for _ in range(round(SUMMED_TIME / source.period)):
         after = weights + to_go
         gain = torch.linalg.solve_ex(command_weights + b.T @ after @ b, b.T @ after @ a).result
         to_go = a.T @ after @ (a - b @ gain)
     closed = a - b @ gain
-    if not bool(to_go.isfinite().all()) or float(torch.linalg.eigvals(closed).abs().max()) > 1 + STEADY:
+    if not bool(to_go.isfinite().all()) or float(torch.linalg.eigvals(closed).abs().max()) > 1 + MAX_GROWTH:
         raise ValueError(f"no commands keep a {source.system.name} at rest there: what moves away is not moved by them")
     return Regulator(closed, gain, to_go)

@@ -14,6 +14,8 @@ from visadapt.tasks.base import FlightTask
 
 DEFAULT_WING = FixedWing()
 
+FLIGHT_TIME_RATIO = 1.6  # A flight that is scored to one over the point's distance at the first speed
+
 
 @dataclass(frozen=True)
 class Reach(FlightTask):
@@ -40,7 +42,7 @@ class Reach(FlightTask):
 
     @property
     def steps(self) -> int:
-        return round(1.6 * self.distance / self.speed / self.period)
+        return round(FLIGHT_TIME_RATIO * self.distance / self.speed / self.period)
 
     @cached_property
     def _level(self) -> Tensor:
@@ -59,16 +61,16 @@ class Reach(FlightTask):
     def misses(self, states: Tensor, task_state: Tensor) -> Tensor:
         """The least distance (B, 1) between the point and the path, taken as straight between rows."""
         path = states[..., POSITION]
-        start, way = path[:, :-1], path.diff(dim=1)
-        to = task_state[:, None] - start
-        share = ((to * way).sum(-1) / way.square().sum(-1).clamp(min=1e-12)).clamp(0, 1)
-        return (to - share[..., None] * way).norm(dim=-1).amin(1, keepdim=True)
+        start, piece = path[:, :-1], path.diff(dim=1)
+        to_point = task_state[:, None] - start
+        share = ((to_point * piece).sum(-1) / piece.square().sum(-1).clamp(min=1e-12)).clamp(0, 1)
+        return (to_point - share[..., None] * piece).norm(dim=-1).amin(1, keepdim=True)
 
     def distance_off(self, state: Tensor, task_state: Tensor) -> Tensor:
         """The distance to the line from the start through the point."""
-        along = task_state / task_state.norm(dim=-1, keepdim=True)
+        direction = task_state / task_state.norm(dim=-1, keepdim=True)
         position = state[:, POSITION]
-        return (position - (position * along).sum(-1, keepdim=True) * along).norm(dim=-1)
+        return (position - (position * direction).sum(-1, keepdim=True) * direction).norm(dim=-1)
 
     def passed(self, state: Tensor, task_state: Tensor) -> Tensor:
         return (state[:, POSITION] * task_state).sum(-1) >= task_state.square().sum(-1)
@@ -83,15 +85,16 @@ class Reach(FlightTask):
         return state, task_state
 
     def cost(self, states: Tensor, plan: Tensor, now: Tensor, task_state: Tensor) -> Tensor:
-        to = task_state - now[:, POSITION]
-        way = to / to.norm(dim=1, keepdim=True).clamp_min(1e-3)
-        steps = self.speed * self.period * torch.arange(1, states.shape[1] + 1).to(states)
-        reference = now[:, None, POSITION] + steps[:, None] * way[:, None]
-        away = states[..., POSITION] - reference
-        behind = (away * way[:, None]).sum(-1).square()
+        to_point = task_state - now[:, POSITION]
+        direction = to_point / to_point.norm(dim=1, keepdim=True).clamp_min(1e-3)
+        flown = self.speed * self.period * torch.arange(1, states.shape[1] + 1).to(states)
+        reference = now[:, None, POSITION] + flown[:, None] * direction[:, None]
+        error = states[..., POSITION] - reference
+        along_line = (error * direction[:, None]).sum(-1)
+        # |e off the line|^2 is |e|^2 - |e along it|^2.
         return (
-            (self.along - self.across) * behind.sum(1)
-            + self.across * away.square().sum((1, 2))
+            (self.along - self.across) * along_line.square().sum(1)
+            + self.across * error.square().sum((1, 2))
             + self.rates * states[..., RATES].square().sum((1, 2))
             + self.action * plan.square().sum((1, 2))
         )

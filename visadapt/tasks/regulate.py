@@ -17,13 +17,15 @@ from visadapt.systems import System
 from visadapt.tasks.base import Task
 
 TABLES = ("goal", "tolerance", "start", "limits")  # Fields with a number for each state that they name
-LEAST = torch.finfo(torch.float32).tiny  # of a positive number
-ATTEMPTS = 20  # of Newton's method for the commands that hold a goal
-HOLDS = 1e-3
+LEAST_POSITIVE = torch.finfo(torch.float32).tiny  # Smaller numbers count as zero
+NEWTON_STEPS = 20  # for the commands that hold a goal
+COMMAND_STEP = 1e-6  # Share of a command's range that is the step of the differences in these
+MAX_RATE_AT_GOAL = 1e-3
 """Largest rate of a state at the goal, as a share of the state's tolerance in a second, and largest change of that rate
 in a second as other states drift."""
-DRIFT = 1e-3  # s, by which states without a tolerance drift in this test
-SLIGHT = 1e-3  # Weight of their rates, as a share of their range in a second, in finding the commands that hold a goal
+DRIFT_TIME = 1e-3  # s, for which states without a tolerance drift in this test
+FREE_STATE_WEIGHT = 1e-3
+"""Weight of the rates of states without a tolerance, as a share of their range in a second, in Newton's method."""
 
 
 class TaskFileError(ValueError):
@@ -75,12 +77,12 @@ class Regulate(Task):
             for name, value in getattr(self, table).items():
                 if name not in names:
                     raise ValueError(f"{table}: a {self.system.name} has no state {name!r}: {', '.join(names)}")
-                if not is_number(value) or (table != "goal" and value < LEAST):
+                if not is_number(value) or (table != "goal" and value < LEAST_POSITIVE):
                     right = "finite" if table == "goal" else "positive"
                     raise ValueError(f"{table}: {name} must be a {right} number, got {value!r}")
         for name in ("effort", "seconds"):
             value = getattr(self, name)
-            if not is_number(value) or value < LEAST:
+            if not is_number(value) or value < LEAST_POSITIVE:
                 raise ValueError(f"{name} must be a positive number, got {value!r}")
         if not self.tolerance:
             raise ValueError(
@@ -90,14 +92,15 @@ class Regulate(Task):
         for state, spread, limit in zip(names, self.spread.tolist(), self.limit.tolist(), strict=True):
             if spread >= limit:
                 raise ValueError(f"limits: {state} starts up to {spread:g} from the goal, and fails at {limit:g}")
-        self._check_holds()
+        self._check_goal_is_held()
 
-    def _check_holds(self) -> None:
+    def _check_goal_is_held(self) -> None:
+        """Raises ValueError where states move off the goal under `held`, at once or as other states drift."""
         rates = self._rates(self.held[None])[0]
-        changes = (self._rates(self.held[None], DRIFT * rates)[0] - rates) / DRIFT
-        for found, unit in ((rates, "s"), (changes, "s2")):
-            for state, rate, weight in zip(self.system.states, found.tolist(), self.weights.tolist(), strict=True):
-                if weight and abs(rate) * math.sqrt(weight) > HOLDS:
+        changes = (self._rates(self.held[None], DRIFT_TIME * rates)[0] - rates) / DRIFT_TIME
+        for each, unit in ((rates, "s"), (changes, "s2")):
+            for state, rate, weight in zip(self.system.states, each.tolist(), self.weights.tolist(), strict=True):
+                if weight and abs(rate) * math.sqrt(weight) > MAX_RATE_AT_GOAL:
                     raise ValueError(
                         f"goal: no command within its range holds it: there {state.name} changes by {rate:.3g} "
                         f"{state.unit}/{unit}"
@@ -152,10 +155,10 @@ class Regulate(Task):
         low, high = self.command_range
         held = ((low + high) / 2).where((low > 0) | (high < 0), torch.zeros_like(low))
         ranges = torch.tensor([state.high - state.low for state in self.system.states], dtype=torch.float64)
-        scale = self.weights.sqrt().where(self.weights > 0, SLIGHT / ranges)
-        for _ in range(ATTEMPTS):
+        scale = self.weights.sqrt().where(self.weights > 0, FREE_STATE_WEIGHT / ranges)
+        for _ in range(NEWTON_STEPS):
             rates = self._rates(held[None])[0]
-            step = 1e-6 * (high - low)
+            step = COMMAND_STEP * (high - low)
             by_command = (self._rates(held + step.diag()) - rates).T / step
             off, slopes = scale * rates, scale[:, None] * by_command
             if not bool(off.isfinite().all() and slopes.isfinite().all()):
