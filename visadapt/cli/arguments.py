@@ -29,7 +29,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     )
     add = parser.add_argument
     add("recording", nargs="+", metavar="RECORDING", help="CSV or HDF5 files, logs of ROS or PX4, or folders of these")
-    _add_system(parser, OWN_HELP)
+    _add_system(parser)
     columns_help = (
         "our name=the name in the file, as in x=position,theta=phi, perhaps converted: theta=encoder*2*pi/4096-pi, "
         "time=stamp/1000; theta= is a state that was not measured; may be repeated"
@@ -103,7 +103,7 @@ def train(parser: argparse.ArgumentParser) -> None:
         "where it was."
     )
     add = parser.add_argument
-    _add_system(parser, OWN_HELP)
+    _add_system(parser)
     task_help = "where a system of your own is to come to rest, and how exactly (docs/own_system.md)"
     add("--task", metavar="TASK.toml", help=task_help)
     add("--out", required=True, metavar="P.safetensors", help="write the policy here")
@@ -182,8 +182,8 @@ def export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--effects", metavar="FILE.py", help=effects_help)
 
 
-def _add_system(parser: argparse.ArgumentParser, own_help: str) -> None:
-    system_help = f"the source physics: {SYSTEMS_HELP}, {own_help}"
+def _add_system(parser: argparse.ArgumentParser) -> None:
+    system_help = f"the source physics: {SYSTEMS_HELP}, {OWN_HELP}"
     parser.add_argument("--system", required=True, type=_system, metavar="NAME", help=system_help)
     parser.add_argument("--params", metavar="RIG.toml", help="the rig's own parameters, in a table [parameters]")
 

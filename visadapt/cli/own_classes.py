@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from visadapt.cli.errors import InputError
-from visadapt.cli.own_effects import complaints
+from visadapt.cli.own_effects import effect_complaints
 from visadapt.cli.user_code import import_file
 from visadapt.effects import EFFECTS
 from visadapt.systems import SYSTEMS, System
@@ -58,7 +58,7 @@ def import_effects(options: argparse.Namespace) -> None:
         raise InputError(f"{options.effects}: defines no effect: a class with a name that derives from visadapt.Effect")
     for effect in own:
         for kind in [system] if system else SYSTEMS.values():
-            if issubclass(kind, effect.systems) and (wrong := complaints(effect, kind())):
+            if issubclass(kind, effect.systems) and (wrong := effect_complaints(effect, kind())):
                 raise InputError(f"{options.effects}: {effect.__name__}: {wrong[0]}")
     if system and not any(issubclass(system, effect.systems) for effect in own):
         raise InputError(f"{options.effects}: none of its effects acts on a {system.name}")

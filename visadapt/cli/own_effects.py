@@ -17,11 +17,11 @@ from visadapt.world import World
 STAGES = (ActuationEffect, DynamicsEffect, SensingEffect)
 
 
-def complaints(effect: type[Effect], system: System) -> list[str]:
+def effect_complaints(effect: type[Effect], system: System) -> list[str]:
     """What the class of an effect lacks or does wrong on a system that it acts on, a line each.
 
     >>> import visadapt as va
-    >>> complaints(va.effects.ViscousFriction, va.CartPole())
+    >>> effect_complaints(va.effects.ViscousFriction, va.CartPole())
     []
     """
     if wrong := [*_form(effect), *_table(effect)]:

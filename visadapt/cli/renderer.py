@@ -33,13 +33,15 @@ from visadapt.targets import Start
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.world import World
 
-CALIBRATION_STATES, WITHIN = 4000, (1.0, 0.35)
+CALIBRATION_STATES, CALIBRATION_RANGE = 4000, (1.0, 0.35)
 """States that an environment is put into, and the largest |x| in m and |theta| in rad of these."""
 
 FAINT = 20 / 255
 """Difference from the background up to which a pixel shows neither cart nor pole."""
 
-HELD_OUT = 10
+DRAWN_AT_ONCE = 64  # Frames, which bounds the memory that drawing takes
+
+HELD_OUT_EVERY = 10
 """Every tenth frame is left out of the training and compared with what the renderer makes of its state."""
 
 
@@ -49,29 +51,30 @@ def run(options: argparse.Namespace) -> None:
         raise InputError("give recordings, or a gymnasium environment by --target and --map")
     if options.recording and (options.map or options.show or options.within):
         raise InputError("--map, --show and --within are for --target: recordings have their frames")
-    x, theta, frames = _read(options.recording) if options.recording else _show(options)
+    x, theta, frames = _from_recordings(options.recording) if options.recording else _from_target(options)
     _check(options, x, frames)
     (height, width), (column, row) = frames.shape[1:], options.hinge
     torch.manual_seed(options.seed)
     renderer = LayeredRenderer(height, width, column, row, options.scale, options.pole)
-    held = torch.arange(len(frames)) % HELD_OUT == 0
+    held_out = torch.arange(len(frames)) % HELD_OUT_EVERY == 0
     settings = run_settings(options, "recording", "map")
     out = Path(options.out)
     with unfinished(out, settings) as folder, progress() as report:
         state = folder / "training.safetensors"
         kept, keep = load_tree(state) if state.exists() else None, partial(save_tree, state)
         generator, bar = torch.Generator().manual_seed(options.seed), staged(report, "renderer")
-        shown = x[~held], theta[~held], frames[~held]
+        shown = x[~held_out], theta[~held_out], frames[~held_out]
         fit(renderer, *shown, options.iterations, generator, progress=bar, keep=keep, kept=kept)
         with torch.no_grad():
-            drawn = torch.cat([renderer(*each) for each in zip(x[held].split(64), theta[held].split(64), strict=True)])
-        residual = frames[held] / 255 - drawn
+            poses = zip(x[held_out].split(DRAWN_AT_ONCE), theta[held_out].split(DRAWN_AT_ONCE), strict=True)
+            drawn = torch.cat([renderer(*each) for each in poses])
+        residual = frames[held_out] / 255 - drawn
         with replacing(out) as temporary:
             save_renderer(temporary, renderer, {**settings, "error": size_of(structure(residual))})
     # Almost all of a frame is background, which says nothing of a pole that is missing.
     background = renderer.background.detach().sigmoid()
-    moves = torch.maximum((frames[held] / 255 - background).abs(), (drawn - background).abs()) > FAINT
-    error = 255 * residual[moves].abs().mean()
+    is_moving_part = torch.maximum((frames[held_out] / 255 - background).abs(), (drawn - background).abs()) > FAINT
+    error = 255 * residual[is_moving_part].abs().mean()
     column, row = renderer.origin.tolist()
     print(
         f"{out}: {error:.2f} grey levels of 255 off where cart and pole are, on average, in {len(drawn)} frames left "
@@ -81,7 +84,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _check(options: argparse.Namespace, x: Tensor, frames: Tensor) -> None:
     """Raises InputError where nothing could be learnt: too few frames, or a first guess of the camera far off them."""
-    if len(frames) < 2 * HELD_OUT:
+    if len(frames) < 2 * HELD_OUT_EVERY:
         raise InputError(f"{len(frames)} frames are too few to learn from; some hundred are right")
     if options.iterations < 3:
         raise InputError(f"--iterations {options.iterations}: at least 3 are right")
@@ -91,26 +94,26 @@ def _check(options: argparse.Namespace, x: Tensor, frames: Tensor) -> None:
             f"--hinge {column:g},{row:g}: more than a frame's size outside the frames, which are {width} px wide and "
             f"{height} px high; the column and row at which the hinge is seen at x = 0 are right"
         )
-    away = options.scale * float(x.abs().median())
-    if away > 2 * width:
+    distance = options.scale * float(x.abs().median())
+    if distance > 2 * width:
         raise InputError(
             f"x goes from {float(x.min()):.3g} to {float(x.max()):.3g}: at --scale {options.scale:g} px a metre the "
-            f"cart is mostly {away:.0f} px or more from x = 0, in frames {width} px wide; x in m is right"
+            f"cart is mostly {distance:.0f} px or more from x = 0, in frames {width} px wide; x in m is right"
         )
 
 
-def _show(options: argparse.Namespace) -> tuple[Tensor, Tensor, Tensor]:
-    """As `_read`, of states that an environment is put into: a calibration, for which it is not stepped."""
+def _from_target(options: argparse.Namespace) -> tuple[Tensor, Tensor, Tensor]:
+    """As `_from_recordings`, of states that an environment is put into: a calibration, for which it is not stepped."""
     target = load_target(options, World(CartPole()), True)
     if not isinstance(target, GymnasiumTarget):
         raise InputError(f"{options.target}: cannot be put into chosen states; give recordings of frames and states")
-    x, theta = options.within or WITHIN
+    largest_x, largest_theta = options.within or CALIBRATION_RANGE
     count, generator = options.show or CALIBRATION_STATES, torch.Generator().manual_seed(options.seed)
-    states = Start(x, 0.0, theta, 0.0).draw(count, generator)
+    states = Start(largest_x, 0.0, largest_theta, 0.0).draw(count, generator)
     return states[:, 0], states[:, 2], torch.from_numpy(target.show(states.double().numpy()))
 
 
-def _read(paths: list[str]) -> tuple[Tensor, Tensor, Tensor]:
+def _from_recordings(paths: list[str]) -> tuple[Tensor, Tensor, Tensor]:
     """Cart positions (N,) in m, pole angles (N,) in rad and frames (N, H, W) uint8 of all recordings."""
     states: list[NDArray[np.floating]] = []
     frames: list[NDArray[np.uint8]] = []

@@ -59,6 +59,7 @@ def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
 
 
 def _effect(text: str, system: System) -> Effect:
+    """The effect of an --effect, NAME:PARAMETER=VALUE,...; a value beyond what a diagnosis searches is remarked on."""
     name, _, rest = text.partition(":")
     if name not in EFFECTS or EFFECTS[name] not in catalogue():
         near = difflib.get_close_matches(name, [effect.name for effect in catalogue()], 1)
@@ -70,15 +71,15 @@ def _effect(text: str, system: System) -> Effect:
         raise InputError(f"--effect {text}: {error}") from error
     values: dict[str, float] = {}
     for part in rest.split(",") if rest else ():
-        asked, _, number = part.partition("=")
-        if asked in values:
-            raise InputError(f"--effect {text}: {asked} is given twice")
+        parameter_name, _, number = part.partition("=")
+        if parameter_name in values:
+            raise InputError(f"--effect {text}: {parameter_name} is given twice")
         try:
-            values[asked] = float(number)
+            values[parameter_name] = float(number)
         except ValueError:
             raise InputError(f"--effect {text}: {part!r} is not of the form PARAMETER=NUMBER") from None
-        if not abs(values[asked]) < float("inf"):
-            raise InputError(f"--effect {text}: {asked} must be finite")
+        if not abs(values[parameter_name]) < float("inf"):
+            raise InputError(f"--effect {text}: {parameter_name} must be finite")
     try:
         effect = EFFECTS[name](**values)
         world = World(system, [effect])
