@@ -106,10 +106,10 @@ class EnvMap:
         self._check_aspect(f"crop {crop}", right - left, bottom - top)
 
     def _check_aspect(self, part: str, columns: int, rows: int) -> None:
-        wanted, got = self._width(columns, rows) / self.height, columns / rows
-        if self.width is not None and abs(got / wanted - 1) > ASPECT_TOLERANCE:
+        wanted, given = self._width(columns, rows) / self.height, columns / rows
+        if self.width is not None and abs(given / wanted - 1) > ASPECT_TOLERANCE:
             raise TargetError(
-                f"{part} is {columns} x {rows} px, {got:.3f} wide for 1 high; "
+                f"{part} is {columns} x {rows} px, {given:.3f} wide for 1 high; "
                 f"frames of {self.width} x {self.height} px need {wanted:.3f}"
             )
 

@@ -26,6 +26,9 @@ RETURNED = {"reset": ("observation", "info"), "step": ("observation", "reward", 
 """What these methods of an environment return."""
 
 
+STEP_TOLERANCE = 0.01  # Part of a step by which a period may differ from a whole number of them
+
+
 class _Shown(NamedTuple):
     """What one environment shows."""
 
@@ -83,9 +86,9 @@ class GymnasiumTarget(Target):
         self.name = name or (first.spec.id if first.spec is not None else type(first.unwrapped).__name__)
         self.n_action = len(mapping.actions)
         self._n_env_action = self._check(first)
-        own = _own_step(first, mapping.period)
-        self.period, self.period_origin = self._period(first, own)
-        self.held = _steps(self.period, own[1]) if own else 1
+        own_step = _own_step(first, mapping.period)
+        self.period, self.period_origin = self._period(first, own_step)
+        self.held = _whole_steps(self.period, own_step[1]) if own_step else 1
         """steps of the environment for which each action is held"""
         self._mujoco = frames and mujoco_frames.is_mujoco(first)
         if self._mujoco:
@@ -133,9 +136,9 @@ class GymnasiumTarget(Target):
         for b, env in enumerate(self._envs[:batch]):
             if not self._shown[b].alive:
                 continue
-            ours = self.mapping.action(commands[b], self._n_env_action)
+            env_action = self.mapping.action(commands[b], self._n_env_action)
             for _ in range(self.held):
-                seen, _, terminated, truncated, _ = self._call(env, "step", ours.astype(env.action_space.dtype))
+                seen, _, terminated, truncated, _ = self._call(env, "step", env_action.astype(env.action_space.dtype))
                 if terminated or truncated:
                     break
             if truncated and not terminated:
@@ -187,7 +190,7 @@ class GymnasiumTarget(Target):
             # Importing mujoco fails in many ways if MUJOCO_GL names a missing library.
             if "/mujoco/__init__.py" in "".join(traceback.format_tb(error.__traceback__)).replace(os.sep, "/"):
                 raise mujoco_frames.cannot_render(self.name, error) from error
-            raise TargetError(f"{self.name}: cannot be made: {_line(error)}") from error
+            raise TargetError(f"{self.name}: cannot be made: {_first_line(error)}") from error
 
     def _call(self, env: Any, method: str, *arguments: object, **named: object) -> tuple[Any, ...]:
         """What the environment's `reset` or `step` returns, with the observation in floating point."""
@@ -196,7 +199,7 @@ class GymnasiumTarget(Target):
         except Exception as error:  # whatever the environment raises becomes one line
             last = traceback.extract_tb(error.__traceback__)[-1]
             raise TargetError(
-                f"{self.name}: {method}() failed: {type(error).__name__}: {_line(error)} "
+                f"{self.name}: {method}() failed: {type(error).__name__}: {_first_line(error)} "
                 f"({last.filename}, line {last.lineno})"
             ) from error
         right = RETURNED[method]
@@ -234,19 +237,19 @@ class GymnasiumTarget(Target):
         self.mapping.check_range(self.name, self.system, env.action_space.low, env.action_space.high)
         return n_action
 
-    def _period(self, env: Any, own: tuple[str, float] | None) -> tuple[float, str]:
-        """s between actions, and where that number comes from; `own`: what the environment calls its step, in s."""
+    def _period(self, env: Any, own_step: tuple[str, float] | None) -> tuple[float, str]:
+        """s between actions, and where that number comes from; `own_step` is that of `_own_step`."""
         given, rate = self.mapping.period, env.metadata.get("render_fps")
         if given is not None:
             # No environment is stepped for a part of its step.
-            if own and not _steps(given, own[1]):
+            if own_step and not _whole_steps(given, own_step[1]):
                 raise TargetError(
-                    f"{self.name}: its {own[0]} says {own[1]:g} s a step, so that the period given, {given:g} s, is no "
-                    "whole number of steps"
+                    f"{self.name}: its {own_step[0]} says {own_step[1]:g} s a step, so that the period given, "
+                    f"{given:g} s, is no whole number of steps"
                 )
             return float(given), "as given"
-        if own:
-            return own[1], f"its {own[0]}"
+        if own_step:
+            return own_step[1], f"its {own_step[0]}"
         if not rate:
             raise TargetError(
                 f"{self.name}: the environment states no step length (tau, dt or render_fps); give `period` in s"
@@ -259,9 +262,9 @@ class GymnasiumTarget(Target):
         """Put an environment that observes `seen` and has not been stepped into our state; its observation there."""
         wanted = self.mapping.observation(state, self.system, seen)
         body = env.unwrapped
-        n = getattr(getattr(body, "model", None), "nq", None)
-        if n is not None and hasattr(body, "set_state") and len(seen) == n + body.model.nv:
-            body.set_state(wanted[:n], wanted[n:])
+        n_position = getattr(getattr(body, "model", None), "nq", None)
+        if n_position is not None and hasattr(body, "set_state") and len(seen) == n_position + body.model.nv:
+            body.set_state(wanted[:n_position], wanted[n_position:])
             got = np.asarray(body._get_obs())
             if not np.allclose(got, wanted, atol=1e-6):
                 raise TargetError(f"{self.name}: put into the observation {wanted}, it shows {got}")
@@ -296,7 +299,7 @@ class GymnasiumTarget(Target):
         except Exception as error:  # whatever the renderer raises becomes one line
             if self._mujoco:
                 raise mujoco_frames.cannot_render(self.name, error) from error
-            raise TargetError(f"{self.name}: render() failed: {_line(error)}") from error
+            raise TargetError(f"{self.name}: render() failed: {_first_line(error)}") from error
         if not self._closed_at_exit:
             # Registered after the first frame, so that it runs before the exit functions that the renderer registered
             # while drawing: a viewer that is freed later than its display prints tracebacks.
@@ -321,14 +324,14 @@ def _own_step(env: Any, period: float | None) -> tuple[str, float] | None:
     """
     values = {name: env.get_wrapper_attr(name) for name in ("tau", "dt") if env.has_wrapper_attr(name)}
     stated = [(name, float(value)) for name, value in values.items() if isinstance(value, Real) and float(value) > 0]
-    fitting = [each for each in stated if period is not None and _steps(period, each[1])]
+    fitting = [each for each in stated if period is not None and _whole_steps(period, each[1])]
     return max(fitting or stated[:1], key=lambda each: each[1], default=None)
 
 
-def _steps(period: float, step: float) -> int:
-    """Steps in s that make up a period; 0 where it is no whole number of them."""
+def _whole_steps(period: float, step: float) -> int:
+    """How many steps, of `step` s each, make up a period in s; 0 where that is no whole number."""
     count = round(period / step)
-    return count if abs(period / step - count) <= 0.01 else 0
+    return count if abs(period / step - count) <= STEP_TOLERANCE else 0
 
 
 def _close(target: weakref.ref[GymnasiumTarget]) -> None:
@@ -336,5 +339,5 @@ def _close(target: weakref.ref[GymnasiumTarget]) -> None:
         alive.close()
 
 
-def _line(error: BaseException) -> str:
+def _first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]

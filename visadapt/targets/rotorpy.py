@@ -97,13 +97,13 @@ class RotorpyTarget(FlightTarget):
         state, self.first = self.task.evaluation_start(batch, generator)
         self._task_state = self.first
         state = state.double()
-        hover = (self.vehicle["mass"] * 9.81 / 4 / self.vehicle["k_eta"]) ** 0.5
+        hover_speed = (self.vehicle["mass"] * 9.81 / 4 / self.vehicle["k_eta"]) ** 0.5  # rad/s
         self._state = {
             "x": state[:, POSITION],
             "v": state[:, VELOCITY],
             "q": state[:, ATTITUDE].roll(-1, 1),
             "w": state[:, RATES],
-            "rotor_speeds": state.new_full((batch, 4), hover),
+            "rotor_speeds": state.new_full((batch, 4), hover_speed),
         }
         self._steps, self._profiles = 0, self._wind(batch, generator)
         self._set_wind()
@@ -132,22 +132,24 @@ class RotorpyTarget(FlightTarget):
 
     def _wind(self, batch: int, generator: torch.Generator) -> list[Any]:
         """rotorpy's wind profiles, whose sum is the wind."""
-        own = self.air
-        amplitude, frequency = (torch.tensor([each] * batch).double() for each in (own.amplitude, own.frequency))
+        air = self.air
+        amplitude, frequency = (torch.tensor([each] * batch).double() for each in (air.amplitude, air.frequency))
         delay = torch.rand(batch, 3, generator=generator, dtype=torch.double) / frequency
         return [
-            self._winds.BatchedConstantWind(batch, *own.steady),
+            self._winds.BatchedConstantWind(batch, *air.steady),
             self._winds.BatchedSinusoidWind(amplitude, frequency, delay),
         ]
 
     def _set_wind(self) -> None:
         """Set the wind for the next step of the rate loop."""
-        now, where = self._steps * RATE_LOOP_PERIOD_S, self._state["x"]
-        self._state["wind"] = sum((each.update(now, where) for each in self._profiles), torch.zeros_like(where))
+        time, position = self._steps * RATE_LOOP_PERIOD_S, self._state["x"]
+        winds = (each.update(time, position) for each in self._profiles)
+        self._state["wind"] = sum(winds, torch.zeros_like(position))
 
     def _observe(self) -> Observation:
-        own = self._state
-        state = torch.cat((own["x"], own["v"], own["q"].roll(1, 1), own["w"]), 1).to(torch.get_default_dtype())
+        theirs = self._state
+        ours = torch.cat((theirs["x"], theirs["v"], theirs["q"].roll(1, 1), theirs["w"]), 1)
+        state = ours.to(torch.get_default_dtype())
         alive = state.isfinite().all(1)
         return Observation(state, alive, goal=self.task.goal(self._task_state), task_state=self._task_state)
 

@@ -162,8 +162,8 @@ class SyntheticTarget(WorldTarget):
             alive &= state[:, 0].abs() <= self.camera.camera.reach
             assert self._world is not None
             with torch.no_grad():
-                seen_by_camera, self._at = self._world.show(self._at, self.draw, self._generator)
-            frame = (255 * seen_by_camera).round().clamp(0, 255).to(torch.uint8)
+                grey, self._at = self._world.show(self._at, self.draw, self._generator)
+            frame = (255 * grey).round().clamp(0, 255).to(torch.uint8)
         assert seen.force is not None
         return replace(seen, alive=alive, frame=frame, force=seen.force[:, 0])
 
@@ -221,7 +221,7 @@ class FlightTarget(WorldTarget):
     def _observe(self) -> Observation:
         seen = super()._observe()
         assert seen.force is not None
-        where = self._at.state, self._task_state
-        near = (self.task.distance_off(*where) <= self.reach) | self.task.passed(*where)
-        goal = self.task.goal(self._task_state)
-        return Observation(seen.state, seen.alive & near, None, seen.force[:, :3], goal, self._task_state)
+        state, task_state = self._at.state, self._task_state
+        near = (self.task.distance_off(state, task_state) <= self.reach) | self.task.passed(state, task_state)
+        goal, force = self.task.goal(task_state), seen.force[:, :3]
+        return replace(seen, alive=seen.alive & near, force=force, goal=goal, task_state=task_state)
