@@ -37,8 +37,9 @@ class ChaseCamera:
 
 FOLLOWING_CAMERA = ChaseCamera((-1.2, -2.6, 1.15), (0.0, 0.0, 0.0), 820.0)
 """Of a flight along a reference; moves with the reference's point, so that a vehicle beside the middle is an error."""
+PASSING_STOPS_M = 4.0
 PASSING_CAMERA = ChaseCamera((-4.8, -2.7, 1.9), (4.0, 0.3, 0.1), 560.0)
-"""Of a flight through a point; moves with the vehicle, and stops 4 m before the point."""
+"""Of a flight through a point; moves with the vehicle, and stops PASSING_STOPS_M before the point."""
 
 
 def axes_towards(ahead: Any) -> Floats:

@@ -29,6 +29,8 @@ from visadapt.targets.rollout import Run
 
 PANEL_WIDTH, SCENE_TOP, SCENE_HEIGHT, NUMBERS_TOP, CHART_TOP = 480, 40, 400, 462, 594
 """px"""
+EARLIER_POSES, EARLIER_POSES_EVERY = 16, 2
+"""Poses that a pole that swings up leaves behind, and the rows from one to the next."""
 UPRIGHT_RAD = math.radians(10)
 """A pole that swings up counts as up to this angle to either side of upright."""
 
@@ -184,7 +186,9 @@ class CartPoleFilm(Film):
         base = sizes.cart_height + 0.04
         scene.axhspan(-base - 0.03, -base, color=MUTED)
         cone = Wedge((0, 0), 1.08 * sizes.pole_length, 80, 100, alpha=0.3, visible=panel.swings_up)
-        earlier = PolyCollection([], facecolors=to_rgba_array([BLUE] * 16, np.linspace(0.28, 0.02, 16)))
+        earlier = PolyCollection(
+            [], facecolors=to_rgba_array([BLUE] * EARLIER_POSES, np.linspace(0.28, 0.02, EARLIER_POSES))
+        )
         cart = Rectangle((0, -base), sizes.cart_width, base, facecolor=INK)
         pole = Polygon(sizes.pole(0.0, 0.0))
         hinge = Circle((0, 0), 0.05, facecolor=TROUGH)
@@ -202,8 +206,8 @@ class CartPoleFilm(Film):
             pole.set(xy=sizes.pole(x, float(theta)), facecolor=TEAL if up else BLUE)
             hinge.set_center((x, 0))
             if panel.swings_up:
-                rows = range(row - 2, max(row - 34, -1), -2)
-                earlier.set_verts([sizes.pole(*panel.state[each, [0, 2]].tolist()) for each in rows])
+                rows = [row - EARLIER_POSES_EVERY * k for k in range(1, EARLIER_POSES + 1)]
+                earlier.set_verts([sizes.pole(*panel.state[each, [0, 2]].tolist()) for each in rows if each >= 0])
             force = 0.0 if panel.run.force is None else float(panel.run.force[row]) / self.full_force
             tip = x - math.copysign(sizes.cart_width / 2 + 0.03, force)
             arrow.set_positions((tip - 0.19 * wide * force, -base / 2), (tip, -base / 2))

@@ -31,6 +31,8 @@ from visadapt.storage.atomic_files import replacing
 StrPath = str | os.PathLike[str]
 PX_PER_INCH = 72
 """With these, matplotlib's points, in which it measures text and lines, are pixels."""
+MARGIN, TOP_MARGIN, COLUMN_GAP, ROW_GAP = 28, 16, 36, 14
+"""px around the panels of a film, above them, and between them"""
 
 
 class FilmError(OSError):
@@ -68,7 +70,7 @@ class Film(ABC):
     def size(self) -> tuple[int, int]:
         """Width and height of a frame in px, both even, as yuv420p demands."""
         width, height = self._corner(self._columns - 1)[0], self._corner(len(self.panels) - 1)[1]
-        width, height = width + self.panel_width + 28, height + self.panel_height + 28
+        width, height = width + self.panel_width + MARGIN, height + self.panel_height + MARGIN
         return width + width % 2, height + height % 2
 
     def still(self, t: float) -> NDArray[np.uint8]:
@@ -152,6 +154,6 @@ class Film(ABC):
         return len(self.panels) if len(self.panels) <= 3 else -(-len(self.panels) // 2)
 
     def _corner(self, index: int) -> tuple[int, int]:
-        """Left and top in px of a panel: 28 px from the left edge, 16 px from the top, 36 px and 14 px apart."""
+        """Left and top in px of a panel."""
         row, column = divmod(index, self._columns)
-        return 28 + column * (self.panel_width + 36), 16 + row * (self.panel_height + 14)
+        return MARGIN + column * (self.panel_width + COLUMN_GAP), TOP_MARGIN + row * (self.panel_height + ROW_GAP)

@@ -14,8 +14,15 @@ from matplotlib.patches import FancyArrowPatch, Polygon
 
 from visadapt.evaluation.scoring import FAR
 from visadapt.films import widgets
-from visadapt.films.camera import FARTHEST_PX, FOLLOWING_CAMERA, PASSING_CAMERA, ChaseCamera, ground_grid
-from visadapt.films.flight_panel import INSTANT_PERIOD_S, FlightPanel, length
+from visadapt.films.camera import (
+    FARTHEST_PX,
+    FOLLOWING_CAMERA,
+    PASSING_CAMERA,
+    PASSING_STOPS_M,
+    ChaseCamera,
+    ground_grid,
+)
+from visadapt.films.flight_panel import INSTANT_PERIOD_S, FlightPanel, length_text
 from visadapt.films.flight_scales import FlightScales, Seen, moving_line
 from visadapt.films.vehicle_shapes import ROUND, drawn_parts, hull, vehicle_parts
 from visadapt.films.widgets import BLUE, GROUND, HAIRLINE, INK, MUTED, PAPER, RED, SKY, VIOLET, Floats
@@ -25,6 +32,8 @@ PANEL_WIDTH, SCENE_TOP, SCENE_HEIGHT = 480, 40, 360
 """px"""
 SECOND = round(1 / INSTANT_PERIOD_S)
 """instants in 1 s, for which the reference ahead is highlighted"""
+ROTOR_THRUST_M_PER_N, PROPELLER_THRUST_M_PER_N = 0.045, 0.3
+"""length of the arrow of a thrust, of a quadrotor and of an aeroplane"""
 
 
 def close_up(page: Axes, panel: FlightPanel, scales: FlightScales) -> Callable[[int], None]:
@@ -60,10 +69,10 @@ def close_up(page: Axes, panel: FlightPanel, scales: FlightScales) -> Callable[[
 
 def _camera_moves_with(panel: FlightPanel, i: int, scales: FlightScales) -> Floats:
     """The point (3,) that the close-up's camera moves with at instant i: that of the reference; or the vehicle, up
-    to 4 m before the point that it flies through."""
+    to PASSING_STOPS_M before the point that it flies through."""
     if scales.follows:
         return panel.goal[i]
-    arrived = np.flatnonzero(panel.position[: i + 1, 0] > panel.goal[0, 0] - 4.0)
+    arrived = np.flatnonzero(panel.position[: i + 1, 0] > panel.goal[0, 0] - PASSING_STOPS_M)
     return panel.position[arrived[0] if len(arrived) else i]
 
 
@@ -115,10 +124,10 @@ def _forces(scene: Axes, panel: FlightPanel, scales: FlightScales) -> Callable[[
 
     def draw(seen: Seen, i: int) -> None:
         position = panel.position[i]
-        newtons, way = _thrust(panel, i)
-        show_thrust(seen(position + np.outer([0, newtons], way)), f"thrust {newtons:.1f} N")
-        way = longest / scales.most_force * panel.force[i]
-        show_force(seen(position + np.outer([0, 1], way)), f"{np.linalg.norm(panel.force[i]):.2f} N")
+        newtons, per_newton = _thrust(panel, i)
+        show_thrust(seen(position + np.outer([0, newtons], per_newton)), f"thrust {newtons:.1f} N")
+        arrow = longest / scales.most_force * panel.force[i]
+        show_force(seen(position + np.outer([0, 1], arrow)), f"{np.linalg.norm(panel.force[i]):.2f} N")
 
     return draw
 
@@ -131,7 +140,7 @@ def _words(scene: Axes, panel: FlightPanel, scales: FlightScales) -> Callable[[i
         failed = panel.failed is not None and panel.times[i] >= panel.failed - 1e-6
         show_failure(panel.failure(i) if failed else "", panel.lost(i))
         off = panel.away[i] if scales.follows else panel.worst
-        words = f"{length(off)} off" if scales.follows else f"passed {length(off)} off"
+        words = f"{length_text(off)} off" if scales.follows else f"passed {length_text(off)} off"
         distance.set(text=words, color=scales.colours(off))
         distance.set_visible(not failed and (scales.follows or panel.times[i] >= panel.passed))
 
@@ -175,13 +184,13 @@ def _vehicle(scene: Axes, panel: FlightPanel) -> Callable[[Callable[[Floats], tu
 
 
 def _thrust(panel: FlightPanel, i: int) -> tuple[float, Floats]:
-    """The commanded thrust in N, and the way (3,) in which it is drawn, m/N."""
+    """The commanded thrust in N, and the vector (3,) by which 1 N is drawn, m/N."""
     vehicle, command = panel.vehicle, panel.command(i)
     share = 0.0 if command is None else (float(command[0]) + 1) / 2
     if isinstance(vehicle, Quadrotor):
         low, high = (float(vehicle.mass) * float(limit) for limit in (vehicle.min_thrust, vehicle.max_thrust))
-        return low + (high - low) * share, 0.045 * panel.attitude[i][:, 2]
-    return float(getattr(vehicle, "max_thrust", 1.0)) * share, 0.3 * panel.attitude[i][:, 0]
+        return low + (high - low) * share, ROTOR_THRUST_M_PER_N * panel.attitude[i][:, 2]
+    return float(getattr(vehicle, "max_thrust", 1.0)) * share, PROPELLER_THRUST_M_PER_N * panel.attitude[i][:, 0]
 
 
 def _arrow(scene: Axes, colour: str) -> Callable[[Floats, str], None]:

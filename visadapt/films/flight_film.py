@@ -19,10 +19,12 @@ from visadapt.films import widgets
 from visadapt.films.camera import axes_towards, ground_grid
 from visadapt.films.film import Film
 from visadapt.films.flight_close_up import PANEL_WIDTH, SECOND, close_up
-from visadapt.films.flight_panel import INSTANT_PERIOD_S, FlightPanel, length
+from visadapt.films.flight_panel import INSTANT_PERIOD_S, FlightPanel, length_text
 from visadapt.films.flight_scales import FlightScales, moving_line
 from visadapt.films.widgets import BLUE, GROUND, HAIRLINE, INK, MUTED, PAPER, RED, SKY, VIOLET, Floats
 
+FRAME_PERIOD_S, LAST_INSTANT_S = 0.04, 1.5
+"""s between frames, and s for which the last instant is shown longer"""
 BOX_TOP, BOX_SIDE = 414, 152
 """px"""
 READINGS_TOP, BARS_TOP, CHART_TOP = 578, 640, 706
@@ -34,7 +36,7 @@ OVERVIEW_DIRECTION = (0.55, 1.0, -0.6)
 
 
 class FlightFilm(Film):
-    """Flights side by side; the last instant is shown for another 1.5 s.
+    """Flights side by side; the last instant is shown for another LAST_INSTANT_S.
 
     Raises:
         ValueError: no panels, or flights along a reference beside flights through a point.
@@ -43,14 +45,14 @@ class FlightFilm(Film):
     panel_width, panel_height = PANEL_WIDTH, CHART_TOP + widgets.CHART_HEIGHT
 
     def __init__(self, panels: Sequence[FlightPanel]) -> None:
-        super().__init__(panels, 0.04)
+        super().__init__(panels, FRAME_PERIOD_S)
         self.scales = FlightScales(panels)
         self.follows = self.scales.follows
         self.duration = max(max(panel.end for panel in panels), INSTANT_PERIOD_S)
 
     @property
     def times(self) -> list[float]:
-        return [k * self.period for k in range(round((self.duration + 1.5) / self.period) + 1)]
+        return [k * self.period for k in range(round((self.duration + LAST_INSTANT_S) / self.period) + 1)]
 
     def draw_panel(self, page: Axes, panel: FlightPanel) -> Callable[[float], None]:
         set_clock = widgets.headline(page, panel.title)
@@ -103,7 +105,7 @@ class FlightFilm(Film):
         )
         bar = widgets.ceiling(side / 2.5)
         view.plot([-0.9 * side, -0.9 * side + bar], [-0.88 * side] * 2, color=MUTED, linewidth=2)
-        view.text(-0.82 * side + bar, -0.92 * side, length(bar, 0), fontsize=11, color=MUTED)
+        view.text(-0.82 * side + bar, -0.92 * side, length_text(bar, 0), fontsize=11, color=MUTED)
         _name(view, "from above" if self.follows else "target, from behind")
         course, draw_path, error = moving_line(view, MUTED, 1), self.scales.path(view, panel), moving_line(view, RED, 2)
         view.plot(0, 0, "o", color=INK, markersize=8, mec=PAPER)
@@ -139,7 +141,7 @@ class FlightFilm(Film):
 
         def move(i: int) -> None:
             force = "\N{EN DASH}" if panel.run.force is None else f"{np.linalg.norm(panel.force[i]):.2f} N"
-            words = (f"{panel.speed[i]:.2f} m/s", length(panel.away[i]), length(panel.score[i]), force)
+            words = (f"{panel.speed[i]:.2f} m/s", length_text(panel.away[i]), length_text(panel.score[i]), force)
             for text, value in zip(readings, words, strict=True):
                 text.set_text(value)
             command = panel.command(i)
@@ -159,9 +161,11 @@ class FlightFilm(Film):
         else:
             axes.set(yscale="log", ylim=(8e-4, 150))
             axes.minorticks_off()
-        axes.set_yticks(levels, [length(level, None) for level in levels])
+        axes.set_yticks(levels, [length_text(level, None) for level in levels])
         score = "mean {}" if self.follows else "nearest {}"
-        draw = widgets.trace(axes, panel.times, panel.away, panel.score, lambda metres: score.format(length(metres)))
+        draw = widgets.trace(
+            axes, panel.times, panel.away, panel.score, lambda metres: score.format(length_text(metres))
+        )
         return lambda i: draw(i, panel.lost(i))
 
 

@@ -19,6 +19,8 @@ from visadapt.tasks.references import Reference
 
 INSTANT_PERIOD_S = 0.02
 """s between the instants at which a flight is interpolated"""
+SHOWN_AFTER_PASSING_S = 0.5
+"""s for which a flight is shown after it passed its point"""
 LARGEST_DRAWN = 1e4
 """m, m/s and N: positions, velocities and forces are clipped to +- this before they are drawn"""
 
@@ -73,37 +75,38 @@ class FlightPanel:
         if isinstance(task, Reach):
             misses = _misses(task, states, task_state)
             first = int(misses.argmin()) + 1 if len(misses) else 0
-            states = states[: first + 1 + round(0.5 / task.period)]
+            states = states[: first + 1 + round(SHOWN_AFTER_PASSING_S / task.period)]
         self.states = states
         self.end = (len(states) - 1) * task.period
         self.times: Floats = np.arange(round(self.end / INSTANT_PERIOD_S) + 1) * INSTANT_PERIOD_S
         self.rows = np.minimum((self.times / task.period + 1e-6).astype(int), len(states) - 1)
-        self.position = self._smooth(states[:, POSITION], states[:, VELOCITY], self.times)
-        self.speed = self._between(np.linalg.norm(states[:, VELOCITY], axis=1))
+        self.position = self._spline(states[:, POSITION], states[:, VELOCITY], self.times)
+        self.speed = self._linear(np.linalg.norm(states[:, VELOCITY], axis=1))
         quaternions = continuous_quaternion(torch.from_numpy(states[:, ATTITUDE])).numpy()
-        self.attitude: Floats = rotation(torch.from_numpy(self._between(quaternions))).numpy()
+        self.attitude: Floats = rotation(torch.from_numpy(self._linear(quaternions))).numpy()
         force = np.zeros((len(states), 3)) if run.force is None else run.force[: len(states)]
-        self.force = self._between(force.clip(-LARGEST_DRAWN, LARGEST_DRAWN))
-        lost = None if run.survived else self.end
+        self.force = self._linear(force.clip(-LARGEST_DRAWN, LARGEST_DRAWN))
+        ended_early = None if run.survived else self.end
         if isinstance(task, Follow):
-            self._along(task.references, int(task_state[0]), int(task_state[1]), lost)
+            self._along(task.references, int(task_state[0]), int(task_state[1]), ended_early)
         else:
-            self._past(task_state.double().numpy(), misses[: len(states) - 1], lost)
+            self._past(task_state.double().numpy(), misses[: len(states) - 1], ended_early)
 
-    def _along(self, course: Reference, which: int, start: int, lost: float | None) -> None:
-        """What is shown of a flight along one of the references, from its row `start` on."""
+    def _along(self, course: Reference, which: int, start: int, ended_early: float | None) -> None:
+        """What is shown of a flight along one of the references, from its row `start` on; `ended_early` is the time in
+        s at which the flight did, None where it did not."""
         positions, slopes = (part[which, start:].double().numpy() for part in (course.positions, course.velocities))
         count = round((len(positions) - 1) * course.period / INSTANT_PERIOD_S) + 1
-        self.reference = self._smooth(positions, slopes, np.arange(count) * INSTANT_PERIOD_S)
+        self.reference = self._spline(positions, slopes, np.arange(count) * INSTANT_PERIOD_S)
         self.goal = self.reference[: len(self.times)]
         self.away: Floats = np.linalg.norm(self.position - self.goal, axis=1)
         at_rows = np.linalg.norm(self.states[:, POSITION] - positions[: len(self.states)], axis=1)
         self.score: Floats = np.concatenate([at_rows[:1], running_mean(at_rows[1:])])[self.rows]
         self.worst, self.passed = float(self.away.max()), self.end
         far = np.flatnonzero(self.away > FAR)
-        self.failed = float(self.times[far[0]]) if len(far) else lost
+        self.failed = float(self.times[far[0]]) if len(far) else ended_early
 
-    def _past(self, point: Floats, misses: Floats, lost: float | None) -> None:
+    def _past(self, point: Floats, misses: Floats, ended_early: float | None) -> None:
         """What is shown of a flight through a point (3,), which it misses by `misses` (rows - 1,) m in each period."""
         states = self.states
         self.reference = np.stack([states[0, POSITION], point])
@@ -113,10 +116,11 @@ class FlightPanel:
         self.score, self.worst, row = least[self.rows], float(least[-1]), int(least.argmin())
         self.away[self.away.argmin()] = self.worst
         self.passed = row * self.period
-        self.failed = self.passed if self.worst > FAR else lost
-        before, way = states[max(row - 1, 0), POSITION], states[row, POSITION] - states[max(row - 1, 0), POSITION]
-        share = float((point - before) @ way / max(float(way @ way), 1e-12))
-        self.nearest: Floats = before + min(max(share, 0.0), 1.0) * way
+        self.failed = self.passed if self.worst > FAR else ended_early
+        before = states[max(row - 1, 0), POSITION]
+        piece = states[row, POSITION] - before
+        share = float((point - before) @ piece / max(float(piece @ piece), 1e-12))
+        self.nearest: Floats = before + min(max(share, 0.0), 1.0) * piece
 
     def command(self, instant: int) -> Floats | None:
         """(4,) in [-1, 1], held from a row to the next; None in the episode's last row"""
@@ -131,16 +135,16 @@ class FlightPanel:
         """In words, how a flight that has failed by an instant did so."""
         if self.lost(instant):
             return f"LOST at t = {self.end:.2f} s"
-        return f"STRAYED at t = {self.failed:.2f} s" if self.follows else f"MISSED by {length(self.worst)}"
+        return f"STRAYED at t = {self.failed:.2f} s" if self.follows else f"MISSED by {length_text(self.worst)}"
 
-    def _smooth(self, values: Floats, slopes: Floats, times: Floats) -> Floats:
+    def _spline(self, values: Floats, slopes: Floats, times: Floats) -> Floats:
         """Values (M, n) at times (M,) of the cubic Hermite splines of values and slopes (rows, n)."""
         if len(values) == 1:
             return values
         rows = torch.arange(len(values)).double() * self.period
         return cubic(rows, torch.from_numpy(values), torch.from_numpy(slopes), torch.from_numpy(times)).numpy()
 
-    def _between(self, values: Floats) -> Floats:
+    def _linear(self, values: Floats) -> Floats:
         """Values (N, ...) at the instants, linear between rows (rows, ...)."""
         row = np.minimum(self.rows, max(len(values) - 2, 0))
         share = (self.times / self.period - row).reshape(-1, *[1] * (values.ndim - 1))
@@ -153,7 +157,7 @@ def _misses(task: Reach, states: Floats, point: Tensor) -> Floats:
     return np.asarray(task.misses(steps, point.double().expand(len(steps), 3))[:, 0])
 
 
-def length(metres: float, digits: int | None = 1) -> str:
+def length_text(metres: float, digits: int | None = 1) -> str:
     """A length with its unit; without `digits`, as short as it goes, from mm on."""
     if digits is None and 0 < metres < 0.01:
         return f"{1000 * metres:g} mm"
