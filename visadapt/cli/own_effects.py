@@ -16,6 +16,8 @@ from visadapt.world import World
 
 STAGES = (ActuationEffect, DynamicsEffect, SensingEffect)
 
+PERIOD = 0.05  # s between the commands and readings with which an effect is tried
+
 
 def effect_complaints(effect: type[Effect], system: System) -> list[str]:
     """What the class of an effect lacks or does wrong on a system that it acts on, a line each.
@@ -62,25 +64,25 @@ def _tried(effect: type[Effect], system: System) -> Iterator[str]:
     state, command, _ = inputs(system)
     shares = torch.linspace(0.3, 0.7, ROWS, dtype=torch.float64)
     values = torch.stack([each.low + (each.high - each.low) * shares for each in effect.table], 1)
-    one = effect(**{each.name: 0.5 * (each.low + each.high) for each in effect.table}).with_values(values)
-    name, shape, found = "apply_to", tuple(state.shape), object()
-    if isinstance(one, DynamicsEffect):
-        name, shape, found = "load", (ROWS, len(system.loads)), one.load(shares, state, one.alter(system))
-    elif isinstance(one, ActuationEffect):
+    made = effect(**{each.name: 0.5 * (each.low + each.high) for each in effect.table}).with_values(values)
+    method, shape, returned = "apply_to", tuple(state.shape), object()
+    if isinstance(made, DynamicsEffect):
+        method, shape, returned = "load", (ROWS, len(system.loads)), made.load(shares, state, made.alter(system))
+    elif isinstance(made, ActuationEffect):
         commands = command[:, None].expand(-1, 3, -1)
-        bound = one.acting_on(system)
-        shape, found = tuple(commands.shape), bound.apply_to(commands, bound.memory(commands[:, :1], 0.05), 0.05)[0]
-    elif isinstance(one, SensingEffect):
-        found = one.apply_to(state, one.memory(state, 0.05), 0.05, torch.Generator().manual_seed(0))[0]
-    if not isinstance(found, Tensor) or found.shape != shape:
-        kind = f"the shape {tuple(found.shape)}" if isinstance(found, Tensor) else f"a {type(found).__name__}"
-        yield f"{name} returns {kind}; a tensor {shape} is right"
-    elif found.dtype != state.dtype:
-        yield f"{name} turns {state.dtype} into {found.dtype}: make new tensors with state.new_tensor"
-    elif not bool(found.isfinite().all()):
-        yield f"{name} gives a number that is not finite in states within the ranges"
+        bound, shape = made.acting_on(system), tuple(commands.shape)
+        returned = bound.apply_to(commands, bound.memory(commands[:, :1], PERIOD), PERIOD)[0]
+    elif isinstance(made, SensingEffect):
+        returned = made.apply_to(state, made.memory(state, PERIOD), PERIOD, torch.Generator().manual_seed(0))[0]
+    if not isinstance(returned, Tensor) or returned.shape != shape:
+        kind = f"the shape {tuple(returned.shape)}" if isinstance(returned, Tensor) else f"a {type(returned).__name__}"
+        yield f"{method} returns {kind}; a tensor {shape} is right"
+    elif returned.dtype != state.dtype:
+        yield f"{method} turns {state.dtype} into {returned.dtype}: make new tensors with state.new_tensor"
+    elif not bool(returned.isfinite().all()):
+        yield f"{method} gives a number that is not finite in states within the ranges"
     else:
-        world = World(system, [one])
+        world = World(system, [made])
         after = world.measure(world.step(world.start(state), command), torch.Generator().manual_seed(0))[0]
         if not bool(after.isfinite().all()):
             yield "a step with it gives a state that is not finite, from states within the ranges"

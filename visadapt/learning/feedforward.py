@@ -27,12 +27,13 @@ def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None
     effects = [effect for effect in source.effects if isinstance(effect, Effect)]
     source = source.with_effects([e for e in effects if not (isinstance(e, DynamicsEffect) and e.rubs())])
     rest = torch.zeros(1, policy.n_state, dtype=torch.float64)
-    still = rest.new_zeros(1, source.substeps, policy.n_action)
+    no_command = rest.new_zeros(1, source.substeps, policy.n_action)
     with torch.no_grad():
-        step = linearise_step(source, source.values.to(rest), rest[:, 0], rest, still, by_state=False, by_command=True)
+        values, time = source.values.to(rest), rest[:, 0]
+        step = linearise_step(source, values, time, rest, no_command, by_state=False, by_command=True)
         by_command = step.by_command[0] * lasting_gain(source).to(rest)
-        undo = -torch.linalg.pinv(by_command / scale.to(rest)[:, None])
-        policy.feedforward.weight.copy_(undo.repeat(HORIZON, 1))
+        cancelling = -torch.linalg.pinv(by_command / scale.to(rest)[:, None])
+        policy.feedforward.weight.copy_(cancelling.repeat(HORIZON, 1))
 
 
 def lasting_gain(source: World) -> Tensor:

@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from visadapt.batch import placed
+from visadapt.batch import Batch, placed
 from visadapt.history import HORIZON, History
-from visadapt.learning.streams import Streams, StreamState, Visited, sense
+from visadapt.learning.streams import Streams, StreamState, sense
 from visadapt.learning.transitions import Observe
 from visadapt.policies import Policy
 from visadapt.world import World, WorldState
+
+
+@dataclass(frozen=True)
+class Visited(Batch):
+    """States that streams visited, with all that plans from there need, but without the frames."""
+
+    at: WorldState
+    task_state: Tensor  # (B, ...) the task's
+    inputs: Tensor  # (B, inputs) of the policy's plan, `Policy.embed`
+    expected: Tensor  # (B, n_state) the correction that the policy expects, in units of the residual's scale
+    correction: Tensor  # (B, n_state) that the residual made
 
 
 class Plans:

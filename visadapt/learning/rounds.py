@@ -64,6 +64,7 @@ class RoundFolder:
     def of(cls, run: Path, number: int, count: int, seed: int) -> RoundFolder:
         """Round `number`, from 0, of `count` rounds in the folder `run`, with the run's seed."""
         path, name = run / f"round-{number + 1:02d}", f"round {number + 1}/{count}"
+        # A stage adds its number, below 10, so that no two stages of up to 100,000 rounds share a seed.
         return cls(path, name, (1_000_000 * seed + 10 * number) % LARGEST_SEED)
 
     @property

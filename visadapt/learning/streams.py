@@ -27,17 +27,6 @@ class StreamState(Batch):
     task_state: Tensor  # (B, ...) the task's
 
 
-@dataclass(frozen=True)
-class Visited(Batch):
-    """States that streams visited, with all that plans from there need, but without the frames."""
-
-    at: WorldState
-    task_state: Tensor  # (B, ...) the task's
-    inputs: Tensor  # (B, inputs) of the policy's plan, `Policy.embed`
-    expected: Tensor  # (B, n_state) the correction that the policy expects, in units of the residual's scale
-    correction: Tensor  # (B, n_state) that the residual made
-
-
 @dataclass
 class Streams:
     """A batch of simulated episodes in progress."""

@@ -104,19 +104,19 @@ class Tracker:
             )
         if not episodes:
             return []
-        found = [self._poses(number, episode) for number, episode in enumerate(episodes)]
+        poses = [self._poses(number, episode) for number, episode in enumerate(episodes)]
         commands = [torch.as_tensor(episode.action[:-1], dtype=torch.float64) for episode in episodes]
-        paths = [self._first_guess(poses) for poses in found]
+        paths = [self._first_guess(each) for each in poses]
         noise: Noise | None = None
         for pass_number in range(SMOOTHINGS):
-            problems = [self._problem(*parts) for parts in zip(found, commands, paths, strict=True)]
+            problems = [self._problem(*parts) for parts in zip(poses, commands, paths, strict=True)]
             if pass_number < NOISE_FITS:
                 noise = most_probable_noise(problems, noise)
             assert noise is not None
             paths = [backward(each.filtered(noise))[0][0, ..., 0] for each in problems]
-        n = len(self.world.system.states)
+        states = len(self.world.system.states)
         return [
-            replace(episode, state=path[:, :n].numpy().astype(episode.action.dtype))
+            replace(episode, state=path[:, :states].numpy().astype(episode.action.dtype))
             for episode, path in zip(episodes, paths, strict=True)
         ]
 
@@ -177,21 +177,21 @@ class Tracker:
         transition[:, :states] = torch.cat((tangent.by_state, tangent.by_parameter), 2)
         after = torch.cat((tangent.value, before[:, states:]), 1)
         offset = after - (transition @ before[..., None])[..., 0]
-        unit, drift = self._drifts()
-        wide = torch.tensor([(v.high - v.low) / 2 for v in self.world.system.states], dtype=path.dtype)
+        unit_loads, drift = self._drifts()
+        half_ranges = torch.tensor([(v.high - v.low) / 2 for v in self.world.system.states], dtype=path.dtype)
         used = poses.explained[:, None].to(path)
-        seen = used[..., None] * torch.eye(n, dtype=path.dtype)[self._seen]
-        pose = used * poses.pose.nan_to_num()
+        sensing = used[..., None] * torch.eye(n, dtype=path.dtype)[self._seen]
+        reading = used * poses.pose.nan_to_num()
         root = torch.linalg.cholesky(torch.where(used[..., None] > 0, poses.covariance, torch.eye(2).to(path)))
-        system = Linear(
+        linear = Linear(
             transition=transition[None],
             drive=offset[None, ..., None],
-            sensing=torch.linalg.solve_triangular(root, seen, upper=False)[None],
-            reading=torch.linalg.solve_triangular(root, pose[..., None], upper=False)[None],
+            sensing=torch.linalg.solve_triangular(root, sensing, upper=False)[None],
+            reading=torch.linalg.solve_triangular(root, reading[..., None], upper=False)[None],
             start=path.new_zeros(1, n, 1),
-            initial_variance=torch.cat((wide, ACCELERATION * unit)).square()[None],
+            initial_variance=torch.cat((half_ranges, ACCELERATION * unit_loads)).square()[None],
         )
-        return UnknownNoise(system, used.expand(-1, len(self._seen))[None], drift)
+        return UnknownNoise(linear, used.expand(-1, len(self._seen))[None], drift)
 
     def _drifts(self) -> tuple[Tensor, Tensor]:
         """Unit loads (n_load,), in N and N m: each accelerates its own body at upright rest by 1 m/s2 or 1 rad/s2.
@@ -202,9 +202,9 @@ class Tracker:
         system, h = self.world.system, self.world.period
         states, loads = len(system.states), len(system.loads)
         rest = torch.zeros(loads, states, dtype=torch.float64)
-        nothing = torch.zeros(loads, len(system.actions), dtype=torch.float64)
-        newtons = torch.eye(loads, dtype=torch.float64)
-        change = system.derivative(rest, nothing, newtons) - system.derivative(rest, nothing, 0 * newtons)
+        no_command = torch.zeros(loads, len(system.actions), dtype=torch.float64)
+        one_each = torch.eye(loads, dtype=torch.float64)  # 1 N or 1 N m, one load at a time
+        change = system.derivative(rest, no_command, one_each) - system.derivative(rest, no_command, 0 * one_each)
         unit = 1 / change[:, self._rates].diagonal().abs()
         drift = torch.zeros(loads + 1, states + loads, states + loads, dtype=torch.float64)
         for k in range(loads):

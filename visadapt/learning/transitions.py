@@ -63,7 +63,7 @@ class Transitions:
             back = torch.arange(-LENGTH + 1, 1) + torch.arange(episode.samples)[:, None]
             parts.append((seen, action, state, time, task_state, first + back.clamp(min=0)))
             first += len(state)
-        if first == len(episodes):
+        if not any(episode.samples for episode in episodes):
             raise RecordingError(
                 "there is no sample to learn from: every episode is too short; collect more in a round"
             )

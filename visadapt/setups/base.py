@@ -191,9 +191,18 @@ class Setup:
         open_run(folder, {**asked, "known": describe(self.source), **self.settings.numbers()}, "adaptation.json")
         residual = _seeded(seed, partial(self.residual, policy, self.source)).to(next(policy.parameters()))
         explain = explained(self.source, self.renderer, seed, report) if diagnose else None
-        source, settings, observe, label = self.source, self.settings, self.observe, self.label
         learning = JointLearning(
-            policy, residual, source, target, settings, Ledger(budget), observe, label, report, explorer, explain
+            policy,
+            residual,
+            self.source,
+            target,
+            self.settings,
+            Ledger(budget),
+            observe=self.observe,
+            label=self.label,
+            report=report,
+            explorer=explorer,
+            explain=explain,
         )
         adapted = adapt(learning, folder, round_samples, seed)
         policy.grounded_in = describe(adapted.source)
@@ -209,7 +218,7 @@ class Setup:
         named = [each for each in self.source.effects if isinstance(each, Effect) and each.stage is not Stage.CAMERA]
         check_fittable([sized(type(each), system) for each in named], system)
         if self.label is not None:
-            self.label([])
+            self.label([])  # raises where no states can be estimated
 
     def check_policy(self, policy: Policy) -> None:
         """Raises ValueError where `policy` is not one that this setup makes."""

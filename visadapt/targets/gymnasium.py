@@ -92,7 +92,7 @@ class GymnasiumTarget(Target):
         """steps of the environment for which each action is held"""
         self._mujoco = frames and mujoco_frames.is_mujoco(first)
         if self._mujoco:
-            mujoco_frames.probe(self.name)
+            mujoco_frames.check_rendering(self.name)
         self._envs = [first]
         self._closed_at_exit = False
         self._steps = 0

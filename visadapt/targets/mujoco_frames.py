@@ -36,7 +36,7 @@ def is_mujoco(env: Any) -> bool:
     return hasattr(getattr(env.unwrapped, "mujoco_renderer", None), "_get_viewer")
 
 
-def probe(name: str) -> None:
+def check_rendering(name: str) -> None:
     """Create and free a GL context; raises TargetError if that fails.
 
     Done before gymnasium's viewer is created, which on failure also prints a traceback from its destructor.

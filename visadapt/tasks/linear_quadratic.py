@@ -45,10 +45,10 @@ def linear_quadratic(
     """
     bare = source.with_effects(())
     weights, command_weights = weights.double().diag(), command_weights.double().diag()
-    at = torch.zeros(1, len(weights)).to(weights) if rest is None else rest.to(weights)[None]
-    acting = at.new_zeros(len(command_weights)) if held is None else held.to(at)
-    still = acting.expand(1, bare.substeps, -1)
-    step = linearise_step(bare, bare.values.to(at), at.new_zeros(1), at, still, by_command=True)
+    state = torch.zeros(1, len(weights)).to(weights) if rest is None else rest.to(weights)[None]
+    command = state.new_zeros(len(command_weights)) if held is None else held.to(state)
+    commands = command.expand(1, bare.substeps, -1)
+    step = linearise_step(bare, bare.values.to(state), state.new_zeros(1), state, commands, by_command=True)
     a, b = step.by_state[0], step.by_command[0]
     to_go = torch.zeros_like(weights)
     for _ in range(round(SUMMED_TIME / source.period)):
