@@ -55,22 +55,9 @@ def load_target(options: argparse.Namespace, source: World, frames: bool) -> Tar
     name = env = options.target
     # gymnasium too has ids of the form module:Name-v0, whose last part is no name of Python's.
     if ":" in name and name.rpartition(":")[2].isidentifier():
-        factory = find_factory(name)
-        if needed := _arguments(factory):
-            raise InputError(f"{name}: takes arguments ({', '.join(needed)}); a function without arguments is right")
-        with own_code(lambda error: f"{name}: {describe(error)}"):
-            made = factory()
-        if isinstance(made, Target):
-            if mapping is not None:
-                raise InputError(f"{name}: returns a visadapt.Target, for which --map has no use: leave it out")
-            return made
-        if not hasattr(made, "action_space") or not hasattr(made, "reset"):
-            kind = type(made).__name__
-            raise InputError(f"{name}: returned a {kind}; a visadapt.Target or a gymnasium environment is needed")
-        if mapping is None:
-            raise InputError(f"{name}: returned a gymnasium environment, which needs --map MAP.toml")
-        ready = [made]
-        env = lambda: ready.pop() if ready else factory()  # noqa: E731  # the one that is made already, then new ones
+        env = _from_factory(name, mapping)
+        if isinstance(env, Target):
+            return env
     if mapping is None:
         raise InputError(f"{name}: a gymnasium id needs --map MAP.toml; a target of your own is package.module:factory")
     with warnings.catch_warnings(action="ignore"):  # of an inherited period: said below
@@ -81,6 +68,27 @@ def load_target(options: argparse.Namespace, source: World, frames: bool) -> Tar
         step = target.period / target.held
         print(f"visadapt: {name}: each command is held for {target.held} of its steps of {step:g} s", file=sys.stderr)
     return target
+
+
+def _from_factory(name: str, mapping: EnvMap | None) -> Target | Callable[[], Any]:
+    """The target that the function `name` returns or, if that is a gymnasium environment, a function that makes these:
+    first the one that was made here."""
+    factory = find_factory(name)
+    if needed := _arguments(factory):
+        raise InputError(f"{name}: takes arguments ({', '.join(needed)}); a function without arguments is right")
+    with own_code(lambda error: f"{name}: {describe(error)}"):
+        made = factory()
+    if isinstance(made, Target):
+        if mapping is not None:
+            raise InputError(f"{name}: returns a visadapt.Target, for which --map has no use: leave it out")
+        return made
+    if not hasattr(made, "action_space") or not hasattr(made, "reset"):
+        kind = type(made).__name__
+        raise InputError(f"{name}: returned a {kind}; a visadapt.Target or a gymnasium environment is needed")
+    if mapping is None:
+        raise InputError(f"{name}: returned a gymnasium environment, which needs --map MAP.toml")
+    ready = [made]
+    return lambda: ready.pop() if ready else factory()
 
 
 def _arguments(factory: Callable[..., Any]) -> list[str]:

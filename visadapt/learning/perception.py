@@ -60,7 +60,7 @@ class PerceptionSettings:
 
 
 def kinematics_units(settings: PerceptionSettings, period: float) -> Tensor:
-    """(N_KINEMATICS,) units, in m and rad, of the positions and changes that an encoder trained so returns."""
+    """(N_KINEMATICS,) units, in m and rad, of the positions and changes that an encoder reads."""
     return torch.cat((settings.cart.scale(period), settings.pole.scale(period)))
 
 

@@ -75,8 +75,8 @@ class Tracker:
             raise TrackingError(f"tracking needs the source physics alone, not {len(world.effects)} effects")
         system = world.system
         self.world = world
-        self._seen = [system.index("x"), system.index("theta")]
-        self._rates = [system.index("x_dot"), system.index("theta_dot")]
+        self._pose_columns = [system.index("x"), system.index("theta")]
+        self._rate_columns = [system.index("x_dot"), system.index("theta_dot")]
         load = load_effect(type(system))
         no_load = load(**{parameter.name: 0.0 for parameter in load.table})
         self._loaded_world = world.with_effects((no_load,))
@@ -160,9 +160,9 @@ class Tracker:
         used = poses.explained.numpy()
         seen = np.stack([np.interp(rows, rows[used], column[used]) for column in poses.pose.numpy().T], 1)
         guess = torch.zeros(len(rows), len(system.states) + len(system.loads), dtype=torch.float64)
-        guess[:, self._seen] = torch.from_numpy(seen)
+        guess[:, self._pose_columns] = torch.from_numpy(seen)
         if len(rows) > 1:
-            guess[:, self._rates] = torch.from_numpy(np.gradient(seen, axis=0) / self.world.period)
+            guess[:, self._rate_columns] = torch.from_numpy(np.gradient(seen, axis=0) / self.world.period)
         return guess
 
     def _problem(self, poses: Poses, command: Tensor, path: Tensor) -> UnknownNoise:
@@ -180,7 +180,7 @@ class Tracker:
         unit_loads, drift = self._drifts()
         half_ranges = torch.tensor([(v.high - v.low) / 2 for v in self.world.system.states], dtype=path.dtype)
         used = poses.explained[:, None].to(path)
-        sensing = used[..., None] * torch.eye(n, dtype=path.dtype)[self._seen]
+        sensing = used[..., None] * torch.eye(n, dtype=path.dtype)[self._pose_columns]
         reading = used * poses.pose.nan_to_num()
         root = torch.linalg.cholesky(torch.where(used[..., None] > 0, poses.covariance, torch.eye(2).to(path)))
         linear = Linear(
@@ -191,7 +191,7 @@ class Tracker:
             start=path.new_zeros(1, n, 1),
             initial_variance=torch.cat((half_ranges, ACCELERATION * unit_loads)).square()[None],
         )
-        return UnknownNoise(linear, used.expand(-1, len(self._seen))[None], drift)
+        return UnknownNoise(linear, used.expand(-1, len(self._pose_columns))[None], drift)
 
     def _drifts(self) -> tuple[Tensor, Tensor]:
         """Unit loads (n_load,), in N and N m: each accelerates its own body at upright rest by 1 m/s2 or 1 rad/s2.
@@ -205,14 +205,16 @@ class Tracker:
         no_command = torch.zeros(loads, len(system.actions), dtype=torch.float64)
         one_each = torch.eye(loads, dtype=torch.float64)  # 1 N or 1 N m, one load at a time
         change = system.derivative(rest, no_command, one_each) - system.derivative(rest, no_command, 0 * one_each)
-        unit = 1 / change[:, self._rates].diagonal().abs()
+        unit = 1 / change[:, self._rate_columns].diagonal().abs()
         drift = torch.zeros(loads + 1, states + loads, states + loads, dtype=torch.float64)
         for k in range(loads):
             drift[k, states + k, states + k] = unit[k].square()
         # Velocity and position after white acceleration of variance 1 / h (Bar-Shalom, Li and Kirubarajan 2001, section
         # 6.2.2): their common part, and the part of the position that depends on when in the period it came.
-        pushed = SHOCK * unit[0] * change[0, self._rates]
-        both, late = torch.zeros(2, states + loads, dtype=torch.float64)
-        both[self._rates], both[self._seen], late[self._seen] = pushed * h, pushed * h**2 / 2, pushed * h**2 / 12**0.5
-        drift[-1] = both.outer(both) + late.outer(late)
+        acceleration = SHOCK * unit[0] * change[0, self._rate_columns]
+        common, late = torch.zeros(2, states + loads, dtype=torch.float64)
+        common[self._rate_columns] = acceleration * h
+        common[self._pose_columns] = acceleration * h**2 / 2
+        late[self._pose_columns] = acceleration * h**2 / 12**0.5
+        drift[-1] = common.outer(common) + late.outer(late)
         return unit, drift

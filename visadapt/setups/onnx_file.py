@@ -87,11 +87,11 @@ def export_policy(path: str | Path, policy: Policy, source: World | None = None)
         onnx.helper.set_model_props(proto, about(policy, source))
         onnx.save(proto, temporary)
         session = runtime.InferenceSession(temporary, providers=["CPUExecutionProvider"])
-        read = {each.name for each in session.get_inputs()}  # without inputs that the policy does not use
+        used = {each.name for each in session.get_inputs()}  # without inputs that the policy does not use
         for example, plan in zip(examples, plans, strict=True):
-            found = session.run(None, {name: example[name].cpu().numpy() for name in read})[0]
+            written_plan = session.run(None, {name: example[name].cpu().numpy() for name in used})[0]
             low, high = (bound.cpu().numpy() for bound in policy.command_range)
-            if not (difference := abs((found - plan) / (high - low) * 2).max()) <= LARGEST_DIFFERENCE:
+            if not (difference := abs((written_plan - plan) / (high - low) * 2).max()) <= LARGEST_DIFFERENCE:
                 raise ExportError(f"{path} was not written: its actions would differ by {difference:.2g} of 1")
 
 
@@ -102,9 +102,11 @@ def _examples(policy: Policy) -> list[dict[str, Tensor]]:
     drawn = torch.rand(LENGTH, *policy.observation_shape, generator=generator).to(weight)
     observations = (255 * drawn).byte() if policy.shown == "frame" else drawn
     actions = torch.rand(LENGTH, policy.n_action, generator=generator).to(weight)
-    begun = History.start(observations[:1], policy.n_action)
-    start = {"observations": begun.observations[0], "actions": torch.zeros_like(actions)}
-    return [{"observations": observations, "actions": actions}, start]
+    start = History.start(observations[:1], policy.n_action).observations[0]
+    return [
+        {"observations": observations, "actions": actions},
+        {"observations": start, "actions": torch.zeros_like(actions)},
+    ]
 
 
 def about(policy: Policy, source: World | None = None) -> dict[str, str]:

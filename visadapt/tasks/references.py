@@ -122,18 +122,19 @@ def _read(path: Path) -> tuple[NDArray[np.float64], bool]:
 
 
 def _motion(
-    stamps: NDArray[np.float64], positions: NDArray[np.float64], speeds: NDArray[np.float64] | None, period: float
+    times: NDArray[np.float64], positions: NDArray[np.float64], speeds: NDArray[np.float64] | None, period: float
 ) -> list[NDArray[np.float64]]:
     """Positions, velocities, accelerations and jerks, each (T, 3), a period apart, of positions and, if known,
     velocities (N, 3) at rising times (N,) in s."""
-    time = torch.from_numpy(stamps - stamps[0])
-    at = torch.arange(int(float(time[-1]) / period + 1e-5) + 1, dtype=torch.float64) * period
+    since_start = torch.from_numpy(times - times[0])
+    # Up to 1e-5 of a period of rounding does not cost the last row.
+    clock = torch.arange(int(float(since_start[-1]) / period + 1e-5) + 1, dtype=torch.float64) * period
 
     def at_periods(values: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-        return cubic(time, torch.from_numpy(values), torch.from_numpy(slopes), at).numpy()
+        return cubic(since_start, torch.from_numpy(values), torch.from_numpy(slopes), clock).numpy()
 
     def slopes_of(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.gradient(values, stamps, axis=0, edge_order=2)
+        return np.gradient(values, times, axis=0, edge_order=2)
 
     if speeds is None:
         motion = [at_periods(positions, slopes_of(positions))]
