@@ -25,7 +25,7 @@ from experiments.curves import Chart, plot_charts
 from experiments.flights import EXPERIMENTS, flight_target
 from experiments.result_tables import Row, read_rows, write_rows
 from visadapt.effects import Residual
-from visadapt.learning.grounding import gap, ground, left_over, rescale
+from visadapt.learning.grounding import gap, gap_with_residual, ground, rescale
 from visadapt.learning.transitions import Transitions
 from visadapt.policies import Policy
 from visadapt.policies.networks import FlightResidualNetwork, ResidualNetwork, StateResidualNetwork
@@ -113,7 +113,7 @@ def _share(setup: Setup, method: str, train: Transitions, samples: int, test: Tr
     few = _first(train, samples)
     rescale(residual, source, few, own.negligible)
     ground(residual, source, few, own, torch.Generator().manual_seed(seed))
-    return _size(left_over(residual, source, test)) / _size(gap(source, test))
+    return _size(gap_with_residual(residual, source, test)) / _size(gap(source, test))
 
 
 def _first(transitions: Transitions, count: int) -> Transitions:

@@ -70,30 +70,30 @@ class FlightFilm(Film):
     def _overview(self, page: Axes, panel: FlightPanel) -> Callable[[int], None]:
         """The whole course from afar, above its shadow on the ground."""
         course, position, size = panel.reference, panel.position, np.array([PANEL_WIDTH - BOX_SIDE - 12, BOX_SIDE])
-        across = axes_towards(OVERVIEW_DIRECTION)[:2].T
+        to_view = axes_towards(OVERVIEW_DIRECTION)[:2].T  # (3, 2) projects points
         view = widgets.framed(page, 0, BOX_TOP, *size, facecolor=GROUND)
-        both = np.concatenate([course, self.scales.dropped(course)]) @ across
-        low, high = both.min(0), both.max(0)
+        with_shadow = np.concatenate([course, self.scales.dropped(course)]) @ to_view
+        low, high = with_shadow.min(0), with_shadow.max(0)
         half = ((high - low) / (size - 36)).max() * size / 2
         (left, bottom), (right, top) = (low + high) / 2 - half, (low + high) / 2 + half
         view.set(xlim=(left, right), ylim=(bottom, top))
         step = max(widgets.ceiling(float(np.ptp(course, axis=0).max()) / 8), 0.5)
         grid, colours = ground_grid(step)
         view.add_collection(
-            LineCollection(list((grid + self.scales.dropped(course.mean(0))) @ across), colors=colours), autolim=False
+            LineCollection(list((grid + self.scales.dropped(course.mean(0))) @ to_view), colors=colours), autolim=False
         )
         marks = course[::SECOND] if self.follows else np.linspace(course[0], course[-1], 9)
-        view.add_collection(LineCollection([self.scales.plumb(mark) @ across for mark in marks], colors=HAIRLINE))
+        view.add_collection(LineCollection([self.scales.plumb(mark) @ to_view for mark in marks], colors=HAIRLINE))
         for points, colour in ((self.scales.dropped(course), MUTED), (course, INK)):
-            view.plot(*(points @ across).T, color=colour, linewidth=1, alpha=0.6)
+            view.plot(*(points @ to_view).T, color=colour, linewidth=1, alpha=0.6)
         draw_path, plumb = self.scales.path(view, panel), moving_line(view, MUTED, 1)
         dot = moving_line(view, BLUE, 0, marker="o", markersize=8)
         _name(view, f"whole course, grid {step:g} m")
 
         def move(i: int) -> None:
-            draw_path(lambda points: points @ across, i)
-            plumb.set_data(*(self.scales.plumb(position[i]) @ across).T)
-            dot.set_data(*(position[i : i + 1] @ across).T)
+            draw_path(lambda points: points @ to_view, i)
+            plumb.set_data(*(self.scales.plumb(position[i]) @ to_view).T)
+            dot.set_data(*(position[i : i + 1] @ to_view).T)
 
         return move
 
@@ -118,12 +118,11 @@ class FlightFilm(Film):
 
             course.set_data(*seen(panel.reference).T)
             draw_path(seen, i)
-            over = self.follows or panel.times[i] >= panel.passed
+            visible = self.follows or panel.times[i] >= panel.passed
             x, y = seen(panel.position[i] if self.follows else panel.nearest).clip(-0.9 * side, 0.9 * side)
-            error.set(data=((0, x), (0, y)), visible=over)
-            dot.set(
-                data=([x], [y]), mfc=self.scales.colours(panel.away[i] if self.follows else panel.worst), visible=over
-            )
+            error.set(data=((0, x), (0, y)), visible=visible)
+            colour = self.scales.colours(panel.away[i] if self.follows else panel.worst)
+            dot.set(data=([x], [y]), mfc=colour, visible=visible)
 
         return move
 

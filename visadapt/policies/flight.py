@@ -92,7 +92,8 @@ class FollowPolicy(FlightPolicy):
     goal = f"the next {HORIZON} points of the reference, a period apart: x, y, z in m and their rates in m/s"
 
     def __init__(self, period: float) -> None:
-        super().__init__(6 * HORIZON, 9 + 6 * HORIZON, {"period": period})
+        # Velocity, the vertical, rates and the aim.
+        super().__init__(n_goal=6 * HORIZON, n_own=3 + 3 + 3 + 6 * HORIZON, arguments={"period": period})
         self.period = period
 
     def own_inputs(self, state: Tensor, goal: Tensor, axes: Tensor) -> Tensor:
@@ -137,7 +138,8 @@ class ReachPolicy(FlightPolicy):
     goal = "the point to fly through: x, y, z in m"
 
     def __init__(self) -> None:
-        super().__init__(3, 25)
+        # Velocity in both axes, two columns of the rotation matrix, rates and the aim.
+        super().__init__(n_goal=3, n_own=3 + 3 + 6 + 3 + 10)
 
     def own_inputs(self, state: Tensor, goal: Tensor, axes: Tensor) -> Tensor:
         velocity = state[:, VELOCITY]

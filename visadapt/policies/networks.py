@@ -14,7 +14,8 @@ from visadapt.policies.frame_encoder import N_KINEMATICS, FrameEncoder
 from visadapt.systems import System
 from visadapt.systems.rigid_body import ATTITUDE, RATES, VELOCITY, RigidBody, rotation
 
-N_DISTURBANCE = 12  # Width of `FlightResidualNetwork.disturbance`
+N_ACCELERATIONS = 6  # of a rigid body: of velocity, and of rates
+N_DISTURBANCE = 2 * N_ACCELERATIONS  # Width of `FlightResidualNetwork.disturbance`
 ACTION_UNIT = 0.1
 """Size of a cart-pole's commands near rest, as a share of their range."""
 FRAMES_ACTION_PENALTY = 0.1
@@ -230,7 +231,9 @@ class FlightResidualNetwork(ResidualNetwork):
     """
 
     def __init__(self, system: RigidBody, period: float, predict: Predict | None = None) -> None:
-        inputs = 15 + len(system.actions) + (0 if predict is None else 6 * (LENGTH - 1))
+        inputs = 3 + 9 + 3 + len(system.actions)  # velocity, rotation matrix, rates, action
+        if predict is not None:
+            inputs += N_ACCELERATIONS * (LENGTH - 1)
         super().__init__(nn.Linear(inputs, len(system.states), bias=False))
         self.n_state = len(system.states)
         self.period = period
@@ -249,11 +252,11 @@ class FlightResidualNetwork(ResidualNetwork):
         """(B,) False in the first LENGTH - 1 rows of a flight, whose history is incomplete; True if none is read."""
         if self.predict is None:
             return super().has_full_history(inputs)
-        past = inputs[:, -6 * (LENGTH - 1) :].unflatten(1, (LENGTH - 1, 6))
+        past = inputs[:, -N_ACCELERATIONS * (LENGTH - 1) :].unflatten(1, (LENGTH - 1, N_ACCELERATIONS))
         return past.diff(dim=1).any(2).all(1)
 
     def disturbance(self, history: History) -> Tensor:
-        """The disturbance estimate (B, N_DISTURBANCE): unexplained accelerations (6) and their rates of change (6).
+        """The disturbance estimate (B, N_DISTURBANCE): the last unexplained accelerations and their rates.
 
         In ACCELERATION_UNIT, and ACCELERATION_UNIT per second; zeros without `predict`. The last action of the
         history, the one being executed, is not used.
@@ -267,9 +270,10 @@ class FlightResidualNetwork(ResidualNetwork):
         return torch.cat((past[:, -1], change), 1)
 
     def unexplained(self, predict: Predict, states: Tensor, actions: Tensor) -> Tensor:
-        """Changes of velocity and rates minus the source's over the periods between states, (B, 6 (LENGTH - 1)).
+        """Changes of velocity and rates minus the source's over the periods between states, flattened.
 
-        In units of HISTORY_ACCELERATION_UNIT times a period. `fill_before_start` fills the periods before a flight.
+        (B, (LENGTH - 1) N_ACCELERATIONS), in units of HISTORY_ACCELERATION_UNIT times a period. `fill_before_start`
+        fills the periods before a flight.
         """
         predicted = predict(states[:, :-1], actions[:, :-1]).flatten(0, 1)
         before, after = states[:, :-1].flatten(0, 1), states[:, 1:].flatten(0, 1)
