@@ -59,7 +59,7 @@ def test_an_angle_of_the_opposite_sign_is_refused_since_the_policy_would_drive_t
 def test_what_two_causes_explain_is_settled_by_an_experiment_in_the_next_round(tmp_path, monkeypatch, only_effects):
     only_effects("viscous_friction", "coulomb_friction", "actuator_gain")
     # Three excitations of one size, and coarser steps of the target, for the time they take.
-    monkeypatch.setattr(planning, "FREQUENCIES", (0.8,))
+    monkeypatch.setattr(planning, "CYCLES", (0.4,))
     monkeypatch.setattr(planning, "BIT_ROWS", ())
     monkeypatch.setattr(planning, "SIZES", (0.4,))
     monkeypatch.setattr(synthetic, "SMOOTH_STEP", 0.0125)
