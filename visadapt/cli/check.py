@@ -21,4 +21,5 @@ def run(options: argparse.Namespace) -> None:
     for kind in ("states", "actions", "loads"):
         shown = (f"{one.name} {one.unit} ({one.low:g} to {one.high:g})" for one in getattr(system, kind))
         print(f"{kind:8} {', '.join(shown)}")
+    print(f"{'time':8} predictions reach {system.prediction_time:g} s ahead (prediction_time)")
     print(f"{system.name} is right; {len(catalogue(system()))} effects act on it (visadapt effects --system ...)")

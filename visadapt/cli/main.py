@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")  # as stderr: a file's name may not fit the encoding
     with suppress(ValueError):  # outside the main thread
         # As after an interrupt, so that nothing half-written is left.
-        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+        signal.signal(signal.SIGTERM, _terminate)
     try:
         options = _parser().parse_args(arguments)
         command = options.command
@@ -51,6 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         resumes = "; run the same command to go on" if command in RESUMED else ""
         print(f"visadapt: interrupted{resumes}", file=sys.stderr)
         return 130  # as of a shell
+    except _Terminated:
+        raise
     except BrokenPipeError:
         # The reader closed the pipe, as `head` does; without this, Python would complain at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -64,6 +66,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"visadapt: {in_one_line(message)}", file=sys.stderr)
         return 2  # argparse's own
     return 0
+
+
+class _Terminated(SystemExit):
+    """The process was asked to end, whatever it was doing: no exit of the user's code."""
+
+
+def _terminate(number: int, _: object) -> None:
+    raise _Terminated(128 + number)
 
 
 class _Parser(argparse.ArgumentParser):

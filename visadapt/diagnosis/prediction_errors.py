@@ -35,7 +35,7 @@ class PredictionErrors:
         before, after, floor, box = (_last(e) for e in (self.before, self.after, self.floor, self.black_box))
         held_out = f"held-out {'episodes' if self.several else 'stretches'}"
         measure = (
-            f"root mean square error of predictions {len(self.before) * self.period:.2g} s ahead on "
+            f"root mean square error of predictions {float(f'{len(self.before) * self.period:.2g}'):g} s ahead on "
             f"{held_out if self.held_out else 'the rows that were fitted'}, in standard deviations of the "
             "measurement noise"
         )

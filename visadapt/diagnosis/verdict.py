@@ -134,9 +134,10 @@ def at_bounds(comparison: ModelComparison, found: Sequence[Cause], effects: Sequ
 
 def at_bound(effect: str, parameter: str, end: float, unit: str) -> str:
     """The warning that a strength of a cause is at an end of the range searched."""
+    longer = "; of a system of your own, a longer prediction_time searches longer times" if unit == "s" else ""
     return (
         f"{effect}: {parameter} is at {with_unit(f'{end:g}', unit)}, the end of the range searched; the truth may lie "
-        "beyond it, and the other causes are then wrong as well"
+        f"beyond it, and the other causes are then wrong as well{longer}"
     )
 
 

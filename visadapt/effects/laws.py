@@ -114,17 +114,17 @@ class PulseLaw(JointLoad):
     """A constant load between two times, counted from the start of the episode.
 
     Its edges are logistic, 10 % to 90 % in 18 ms, so that integration steps of 12.5 ms resolve them; its impulse,
-    load (end - start), is that of sharp edges.
+    load (end - start), is that of sharp edges. On a slow machine both are longer, as its prediction time is.
     """
 
     abrupt = True
     source = "Newton's second law"
 
-    EDGE: ClassVar[float] = 0.004  # s
+    EDGE: ClassVar[float] = 0.008  # Width of the edges, in prediction times
 
     def push(self, time: Tensor, state: Tensor, system: System) -> Tensor:
         start, end = self.value("start", state), self.value("end", state)
-        return self.value(self.table[2].name, state) * inside(time, start, end, self.EDGE)
+        return self.value(self.table[2].name, state) * inside(time, start, end, self.EDGE * system.prediction_time)
 
 
 class DryFrictionLaw(JointEffect):

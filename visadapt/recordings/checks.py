@@ -30,6 +30,8 @@ LEAST_ROWS = 8
 """Rows of an episode below which its units are not judged."""
 MOST_RATE_RANGES = 3.0
 """Rates above this multiple of the system's stated range are taken to be in another unit."""
+SMALL_COMMAND = 0.01
+"""Share of its range within which a command that stays there is asked about."""
 IS_RATE_CORRELATION, NOT_RATE_CORRELATION = 0.8, 0.3
 """Correlation of a column with the change of another above which it is its rate, and below which it is not."""
 
@@ -57,6 +59,12 @@ def check_commands(episodes: Sequence[RawEpisode], system: System, note: Note) -
         every = np.concatenate([raw.action[:, column] for raw in episodes])
         share = float(((every < variable.low) | (every > variable.high)).mean())
         if share == 0:
+            if 0 < np.abs(every).max() < SMALL_COMMAND * max(-variable.low, variable.high):
+                note(
+                    f"{variable.name} stays within {np.abs(every).max():.3g} {variable.unit}, of a range of "
+                    f"[{variable.low:g}, {variable.high:g}]: is it in another unit?",
+                    "the recording",
+                )
             if np.ptp(every) == 0:
                 note(
                     f"{variable.name} never changes: effects between command and motor (gain, delay, lag, dead zone) "

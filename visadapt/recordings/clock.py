@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from visadapt.recordings.columns import read_column
 from visadapt.recordings.episode import RecordingError
 from visadapt.systems import System
 
@@ -59,6 +60,8 @@ class RawEpisode:
     """names a row, counted from 0, in messages"""
     names: Mapping[str, str] = field(default_factory=dict)
     """the file's names of the variables"""
+    given: Mapping[str, str] = field(default_factory=dict)
+    """the columns that the user named, perhaps with conversions"""
     number: float | None = None
     """of the episode, if the file has several"""
     frame: NDArray[np.uint8] | None = None
@@ -82,8 +85,11 @@ class RawEpisode:
         return f"column {name!r}" if there.lower() == name else f"column {there!r} ({name})"
 
     def conversion(self, name: str, how: str) -> str:
-        """The end of a message: how a user has a variable's numbers converted; empty where no file's column is read."""
-        return f"; --columns {name}={self.names[name]}{how} converts" if name in self.names else ""
+        """The end of a message: how a user has a variable's numbers converted, behind a factor that was given; empty
+        where no file's column is read, or an offset was given."""
+        if name not in self.names or (name in self.given and read_column(self.given[name], self.names.values()).offset):
+            return ""
+        return f"; --columns {name}={self.given.get(name) or self.names[name]}{how} converts"
 
     def cell(self, row: int, name: str) -> str:
         """Where in the file a value stands, for messages."""
@@ -127,10 +133,12 @@ def check_steps(episodes: Sequence[RawEpisode], system: System) -> None:
     longest = system.prediction_time / LEAST_STEPS * (1 + 1e-4)
     if not SHORTEST_PERIOD_S <= period <= longest:
         units = [name for name, unit in UNITS_S.items() if SHORTEST_PERIOD_S <= unit * period <= longest]
+        slower = f"; the class of a slower machine states a prediction_time above {system.prediction_time:g} s"
         raise RecordingError(
             f"{raw.origin}: column 'time': rows are {period:.4g} s apart; {SHORTEST_PERIOD_S:g} to {longest:.4g} s are "
-            f"right" + (f" (is the clock in {' or '.join(units)}?)" if units else "") + ", since predictions reach "
-            f"{system.prediction_time:g} s ahead (prediction_time of the class {type(system).__name__})"
+            "right"
+            + (f" (is the clock in {' or '.join(units)}?)" if units else "")
+            + (slower if period > longest else "")
         )
     for raw, own in zip(episodes, steps, strict=True):
         if len(own) and own.min() < LEAST_STEP_PERIODS * period:

@@ -29,7 +29,7 @@ OTHER_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
 
 _NUMBER = r"\s*-?(?:pi|(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*"
 _FACTORS = rf"(?:[*/]{_NUMBER})*"
-_CONVERTED = re.compile(rf"(?P<name>\s*\S.*?)(?P<factor>{_FACTORS})(?P<offset>(?:[+-]{_NUMBER}{_FACTORS})?)")
+_CONVERSION = rf"\s*(?P<factor>{_FACTORS})(?P<offset>(?:[+-]{_NUMBER}{_FACTORS})?)"
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Column:
 
 def read_column(text: str, names: Collection[str] = ()) -> Column:
     """The column that a user names, perhaps with a conversion behind its name; `names` are those of the file, which may
-    look like one.
+    look like one, so that the longest of them is taken.
 
     Raises:
         RecordingError: the factor is 0 or not finite.
@@ -57,8 +57,12 @@ def read_column(text: str, names: Collection[str] = ()) -> Column:
     >>> read_column("/motor/command.data")
     Column(name='/motor/command.data', factor=1.0, offset=0.0)
     """
-    found = _CONVERTED.fullmatch(text)
-    if found is None or text.lower() in {name.lower() for name in names}:
+    known = (name for name in sorted(names, key=len, reverse=True) if text.lower().startswith(name.lower()))
+    any_name = r"\s*\S.*?"
+    for name in (*map(re.escape, known), any_name):
+        if found := re.fullmatch(rf"(?P<name>{name}){_CONVERSION}", text, re.IGNORECASE):
+            break
+    else:
         return Column(text)
     factor, offset = _product(found["factor"]), _product(found["offset"]) if found["offset"] else 0.0
     if not (math.isfinite(factor) and factor and math.isfinite(offset)):
@@ -140,7 +144,9 @@ def match(
                 raise RecordingError(f"{path}: column {header[candidates[0]]!r} is taken for both {taken} and {name}")
             found[name] = candidates[0]
         elif name in given:
-            raise RecordingError(f"{path}: has no column {named!r} for {name}; it has {', '.join(header)}")
+            form = f"; a conversion is COLUMN*FACTOR+OFFSET, as in {header[0]}*2*pi/4096-0.5"
+            hint = form if re.search(r"[*/+()\d-]", given[name]) and named == given[name] else ""
+            raise RecordingError(f"{path}: has no column {named!r} for {name}; it has {', '.join(header)}{hint}")
         elif name in needed(system):
             raise RecordingError(
                 f"{path}: column {name!r} is missing; it has {', '.join(header)}; "

@@ -232,7 +232,7 @@ def read_rows(
     state = np.column_stack([values[name] for name in measured])
     action = np.column_stack([values[variable.name] for variable in system.actions])
     names = {name: table.header[index] for name, index in found.items()}
-    whole = RawEpisode(path, values["time"], action, state, measured, rows.place, names)
+    whole = RawEpisode(path, values["time"], action, state, measured, rows.place, names, given)
     if "episode" not in found:
         return [whole]
     label = values["episode"]

@@ -215,7 +215,11 @@ def _read_hdf5(
         action = np.column_stack([values[variable.name] for variable in system.actions])
         state = np.column_stack([values[name] for name in measured]) if measured else np.zeros((len(table), 0))
         seen = episode.frame if frames else None
-        raw.append(RawEpisode(path, values["time"], action, state, measured, names=names, number=number, frame=seen))
+        raw.append(
+            RawEpisode(
+                path, values["time"], action, state, measured, names=names, given=given, number=number, frame=seen
+            )
+        )
     return raw
 
 
@@ -273,8 +277,8 @@ def _long_enough(parts: Sequence[RawEpisode], shortest: float, note: Note) -> li
     longest = parts[int(np.argmax(durations))]
     if max(durations) < least:
         raise RecordingError(
-            f"{longest.origin}: too short: {len(longest.time)} rows, {max(durations):.3g} s; "
-            f"an uninterrupted run of at least {shortest:g} s, with a clock in seconds, is right"
+            f"{longest.origin}: too short: {len(longest.time)} rows, {max(durations):.4g} s; an uninterrupted run of "
+            f"at least {shortest:g} s, with a clock in seconds, is right: so far predictions reach"
         )
     for part, duration in zip(parts, durations, strict=True):
         if duration < least:

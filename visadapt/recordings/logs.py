@@ -63,7 +63,7 @@ def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], n
         return f"message {rows[row] + 1} of {log.slowest}"
 
     names = {name: ".".join(column) for name, column in columns.items()}
-    return RawEpisode(path, time - time[0], action[kept], states[kept], log.measured, message, names)
+    return RawEpisode(path, time - time[0], action[kept], states[kept], log.measured, message, names, given)
 
 
 def _topics(path: Path, read: Read, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:

@@ -23,7 +23,8 @@ def on_joints(system: type[System]) -> Iterator[Made]:
         for kind, (law, equation, table) in kinds.items():
             yield f"{load.name}.{kind}", law, {"joint": joint, "equation": equation, "table": table}
         most = 5 * inertia_of(system(), joint)
-        unit = {"N": "kg", "N m": "kg m2"}.get(load.unit, _per(load, system.states[velocity]))
+        per_rate = replace(system.states[velocity], unit=f"{system.states[velocity].unit}/s")
+        unit = {"N": "kg", "N m": "kg m2"}.get(load.unit, _per(load, per_rate))
         yield (
             f"{load.name}.added_inertia",
             AddedInertia,
