@@ -72,7 +72,7 @@ class Search(FittedModels):
             beam = self._worth_extending(ranked)
         self._settle(exchanged)
         if not self.explains_all(self.best):
-            self.try_late_sensors()
+            self._grow_late(self.try_late_sensors())
             self._settle(exchanged)
             self._phases_of_episodes()
         self._report(progress, MAX_EFFECTS)
@@ -154,13 +154,19 @@ class Search(FittedModels):
             beam = [each for each in beam if each.log_odds > beam[0].log_odds - OUT_OF_REACH]
         return [each for each in beam if not any(_imitates(each, other) for other in beam)]
 
-    def _fit_from_quiet(self, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int]) -> None:
+    def _fit_from_quiet(self, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int]) -> list[ScoredModel]:
         """Fit sets without process noise and, from there, with it."""
-        quiet = self.fit(starts, effort, process_noise=False)
-        self.fit([(each.effects, each.fits) for each in quiet], effort)
+        # Not from the best fit so far of each set, which may be likelier than the one without process noise; and with
+        # the noise of the start: from almost none, a fit far from the right parameters rises slowly and is given up.
+        quiet = self._fits(starts, effort, -math.inf, process_noise=False)
+        again = [
+            (effects, replace(found, log_process=start.log_process, log_noise=start.log_noise))
+            for (effects, start), found in zip(starts, quiet, strict=True)
+        ]
+        return self.fit(again, effort)
 
-    def try_late_sensors(self) -> None:
-        """The source, the best set and the best single effects with each late sensor in addition.
+    def try_late_sensors(self) -> list[ScoredModel]:
+        """The source, the best set and the best single effects with each late sensor in addition, as fitted.
 
         The screening, which is linear in the delay, does not see a sensor that is far too late. It is made along states
         that were fitted to the late readings as if these were on time: there a small delay gains little, and a joint
@@ -168,9 +174,21 @@ class Search(FittedModels):
         """
         alone = [each for each in self.ranked if len(each.effects) == 1]
         bases = {each.names: each for each in (self.source, self.best, *alone[:LATE_BASES])}
-        self._fit_late([(base.effects, base.fits) for base in bases.values()])
+        return self._fit_late([(base.effects, base.fits) for base in bases.values()])
 
-    def _fit_late(self, bases: Sequence[tuple[Effects, FitState]]) -> None:
+    def _grow_late(self, late: Sequence[ScoredModel]) -> None:
+        """Add effects to a set with a late sensor that is the best of its size, while that raises the posterior odds.
+
+        All sets so far grew from others, which may have more effects and be more probable: a lag, a delay far from the
+        right one and three more effects, in the place of a delay and dry friction.
+        """
+        for best in late:
+            if best is next(each for each in self.ranked if len(each.effects) == len(best.effects)):
+                while best is not None and len(best.effects) < MAX_EFFECTS:
+                    larger = max(self.extend([best]), key=lambda each: each.log_odds, default=best)
+                    best = larger if larger.log_odds > best.log_odds else None
+
+    def _fit_late(self, bases: Sequence[tuple[Effects, FitState]]) -> list[ScoredModel]:
         """Fit sets, each with its states, with each late sensor in addition."""
         late = [e for e in self.catalogue if issubclass(e, LateSensors)]
         starts = [
@@ -179,7 +197,7 @@ class Search(FittedModels):
             for e in late
             if e not in effects
         ]
-        self._fit_from_quiet(starts, QUICK)
+        return self._fit_from_quiet(starts, QUICK)
 
     def _settle(self, exchanged: Exchanges) -> None:
         """Exchange, remove and fit carefully until the best set stays the best; no exchange is made again, and those
