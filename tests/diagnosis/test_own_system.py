@@ -130,6 +130,28 @@ def test_rows_of_a_slow_machine_may_be_far_apart(tmp_path):
         load_recording(path, Pendulum())
 
 
+def test_a_push_of_a_slow_machine_is_the_fast_one_s_slowed():
+    slow = {effect.name: effect for effect in catalogue(SlowPendulum())}["joint.push"]
+    states = []
+    for system, effect, period in (
+        (Pendulum(), BY_NAME["joint.push"], PERIOD),
+        (SlowPendulum(), slow, SLOWER * PERIOD),
+    ):
+        scale = period / PERIOD
+        world = (
+            World(system, [effect(start=0.313 * scale, end=0.514 * scale, torque=0.5)], period, substeps=8)
+            .double()
+            .requires_grad_(False)
+        )
+        at, angles = world.start(torch.zeros(1, 2).double()), []
+        for _ in range(50):
+            at = world.step(at, torch.zeros(1, 1).double())
+            angles.append(float(at.state[0, 0]))
+        states.append(angles)
+    np.testing.assert_allclose(states[1], states[0], rtol=1e-9)
+    assert max(states[0]) > 0.1
+
+
 def test_a_machine_that_moves_slowly_is_diagnosed_as_a_fast_one():
     slow = {effect.name: effect for effect in catalogue(SlowPendulum())}
     assert slow["joint.push"].table[1].high == SLOWER * BY_NAME["joint.push"].table[1].high

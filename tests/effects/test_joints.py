@@ -182,6 +182,24 @@ def test_a_late_measurement_is_a_late_command():
     torch.testing.assert_close(seen[0], seen[1])
 
 
+def test_added_inertia_on_a_load_that_is_no_force_has_the_load_s_unit_over_an_acceleration_s():
+    @dataclass(frozen=True)
+    class Oven(System):
+        capacity: float = 2000.0
+
+        name = "warm_oven"
+        states = (Variable("air", "K", 0.0, 100.0),)
+        actions = (Variable("heater", "W", 0.0, 400.0),)
+        loads = (Variable("heat", "W", -100.0, 100.0),)
+        coordinates = ((None, 0),)
+
+        def derivative(self, state, command, load):
+            return (command + load) / self.capacity
+
+    found = {effect.name: effect for effect in catalogue(Oven())}
+    assert found["heat.added_inertia"].table[0].unit == "W s/K"
+
+
 def test_the_catalogue_of_a_system_leaves_the_librarys_effects_out():
     assert "actuator_gain" not in BY_NAME
     assert "cart_mass" not in BY_NAME

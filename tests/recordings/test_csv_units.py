@@ -258,6 +258,24 @@ class TestConversions:
         np.testing.assert_allclose(found.state, expected.state, atol=1e-9)
         np.testing.assert_allclose(found.time, expected.time, atol=1e-9)
 
+    def test_what_a_refusal_says_goes_behind_what_was_given(self, file):
+        table = a_run(start=0.2, noise=1e-3)
+        theirs = {**table, "V*": -np.degrees(table["theta_dot"])}
+        del theirs["theta_dot"]
+        with pytest.raises(RecordingError, match=r"; --columns theta_dot=V\*\*pi/180\*-1 converts"):
+            load(write(file, theirs), columns={"theta_dot": "V**pi/180"})
+        assert load(file, columns={"theta_dot": "V**pi/180*-1"}).warnings == ()
+
+    def test_the_longest_name_of_the_file_is_taken(self, file):
+        table = a_run(start=0.2, noise=1e-3)
+        table["Joint-1"] = table.pop("theta") / 2
+        load(write(file, table), columns={"theta": "joint-1*2"})
+        refuses(
+            "no column '5-joint' for theta; .*; a conversion is COLUMN\\*FACTOR\\+OFFSET, as in time\\*2",
+            file,
+            columns={"theta": "5-joint-1"},
+        )
+
     @pytest.mark.parametrize(("text", "says"), [("angle*0", "times 0 plus 0"), ("angle/0", "times inf plus 0")])
     def test_a_factor_that_is_no_factor(self, file, text, says):
         refuses(

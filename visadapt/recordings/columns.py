@@ -145,7 +145,7 @@ def match(
             found[name] = candidates[0]
         elif name in given:
             form = f"; a conversion is COLUMN*FACTOR+OFFSET, as in {header[0]}*2*pi/4096-0.5"
-            hint = form if re.search(r"[*/+()\d-]", given[name]) and named == given[name] else ""
+            hint = form if re.search(r"[*/+()-]", given[name]) else ""
             raise RecordingError(f"{path}: has no column {named!r} for {name}; it has {', '.join(header)}{hint}")
         elif name in needed(system):
             raise RecordingError(
