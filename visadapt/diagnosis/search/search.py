@@ -182,11 +182,13 @@ class Search(FittedModels):
         All sets so far grew from others, which may have more effects and be more probable: a lag, a delay far from the
         right one and three more effects, in the place of a delay and dry friction.
         """
-        for best in late:
-            if best is next(each for each in self.ranked if len(each.effects) == len(best.effects)):
-                while best is not None and len(best.effects) < MAX_EFFECTS:
-                    larger = max(self.extend([best]), key=lambda each: each.log_odds, default=best)
-                    best = larger if larger.log_odds > best.log_odds else None
+        for one in late:
+            if one is next(each for each in self.ranked if len(each.effects) == len(one.effects)):
+                best, larger = None, one
+                while larger is not best:
+                    best = larger
+                    children = self.extend([best]) if len(best.effects) < MAX_EFFECTS else []
+                    larger = max((best, *children), key=lambda each: each.log_odds)
 
     def _fit_late(self, bases: Sequence[tuple[Effects, FitState]]) -> list[ScoredModel]:
         """Fit sets, each with its states, with each late sensor in addition."""
