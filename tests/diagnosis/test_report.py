@@ -1,4 +1,5 @@
 import base64
+import html
 import json
 import math
 import re
@@ -30,6 +31,7 @@ from visadapt.diagnosis.result import (
     Pixels,
     PolicyTerms,
     Prediction,
+    Push,
     Ranked,
     RecordingSummary,
     Region,
@@ -335,6 +337,17 @@ class TestWords:
         for value in ("2.50", "0.0400", "0.520", "0.270"):  # L, the distance of commands, the bounds
             assert value in text
         assert "nan" not in text
+
+    @pytest.mark.parametrize(("p_value", "says"), [(0.0004, "(p = 0.0004)"), (0.0, "(p < 1e-09)")])
+    def test_pushes_and_how_likely_chance_makes_them(self, p_value, says):
+        push = Push(0, "cart_force", 1.2, 1.9, 4.0, "N", 1.6, (1.2, 2.0), p_value)
+        found = a_diagnosis("unexplained")
+        found = replace(found, where=replace(found.where, regions=(), pushes=(push,)))
+        (line,) = (line for line in as_text(found).splitlines() if "pushed from 1.20 to 1.90 s" in line)
+        assert line.endswith(says)
+        page = as_html(found, SETTINGS)
+        assert says.strip("()") in html.unescape(page)
+        assert "No stretch of a state" not in page
 
 
 class Page(HTMLParser):

@@ -27,6 +27,14 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
 
 
+LEAST_P = 1e-9  # p-values below it are not told apart: so far out no distribution of errors is known
+
+
+def chance(p_value: float) -> str:
+    """A p-value in words: "p = 0.0004", or "p < 1e-09"."""
+    return f"p = {p_value:.2g}" if p_value >= LEAST_P else f"p < {LEAST_P:g}"
+
+
 def percent(share: float) -> str:
     """A share as a percentage; "unknown" for NaN."""
     return f"{round(100 * share)} %" if math.isfinite(share) else UNKNOWN

@@ -21,7 +21,7 @@ from visadapt.diagnosis.result import (
     Region,
     without_slight,
 )
-from visadapt.diagnosis.words import MISFIT, estimate, interval, listed, number, percent, plain, with_unit
+from visadapt.diagnosis.words import MISFIT, chance, estimate, interval, listed, number, percent, plain, with_unit
 from visadapt.effects import EFFECTS, CameraEffect
 from visadapt.systems.base import NAMED
 
@@ -225,7 +225,7 @@ def rendered(template: str, diagnosis: Diagnosis, **values: Any) -> str:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    for function in (plain, number, percent, estimate, interval, effects, shares, alone):
+    for function in (plain, number, percent, chance, estimate, interval, effects, shares, alone):
         environment.filters[function.__name__] = function
     environment.filters["either"] = lambda names: listed(names, "or")
     environment.filters["push"] = lambda one: push(one, diagnosis.recording)
