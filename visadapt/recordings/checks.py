@@ -105,9 +105,10 @@ def check_units(episodes: Sequence[RawEpisode], system: System) -> None:
         _check_clock(raw, system)
     _check_exchanged(judged, variables, {name: rate for name in columns if (rate := system.rate_of(name))})
     for raw in judged:
+        stride = rows_apart(raw, system)
         for name in columns:
             if (rate := system.rate_of(name)) is not None:
-                _check_rate(raw, variables[name], variables[rate], rows_apart(raw, system))
+                _check_rate(raw, variables[name], variables[rate], stride)
         check_attitude(raw, system)
     _check_answers(judged, system, angles, [name for name in columns if variables[name].unit == "m"])
 

@@ -101,11 +101,17 @@ class Search(FittedModels):
 
     def grow_best(self, progress: Progress | None = None) -> None:
         """Add effects to the best set while that raises the posterior odds."""
+        self._grow(self.best, progress)
+
+    def _grow(self, one: ScoredModel, progress: Progress | None = None) -> None:
+        """Add effects to a set while that raises its posterior odds."""
         before = None
-        while self.best is not before and len(self.best.effects) < MAX_EFFECTS:
-            before = self.best
-            self._report(progress, len(before.effects))
-            self.extend([before])
+        while one is not before and len(one.effects) < MAX_EFFECTS:
+            before = one
+            self._report(progress, len(one.effects))
+            children = self.extend([one])
+            # Of the set itself, a better fit may have been found on the way.
+            one = max((self.fitted[key_of(one.effects)], *children), key=lambda each: each.log_odds)
 
     def resume(self, found: ScoredModel) -> bool:
         """Fit a set that another search has found; return whether the best set is another one than before.
@@ -184,11 +190,7 @@ class Search(FittedModels):
         """
         for one in late:
             if one is next(each for each in self.ranked if len(each.effects) == len(one.effects)):
-                best, larger = None, one
-                while larger is not best:
-                    best = larger
-                    children = self.extend([best]) if len(best.effects) < MAX_EFFECTS else []
-                    larger = max((best, *children), key=lambda each: each.log_odds)
+                self._grow(one)
 
     def _fit_late(self, bases: Sequence[tuple[Effects, FitState]]) -> list[ScoredModel]:
         """Fit sets, each with its states, with each late sensor in addition."""
