@@ -49,7 +49,6 @@ from visadapt.storage.run_folder import once
 from visadapt.systems.rigid_body import POSITION
 from visadapt.targets import FlightTarget, SyntheticTarget, Target, constant_force
 from visadapt.targets.rollout import run
-from visadapt.tasks.balance import EPISODE_STEPS
 from visadapt.tasks.base import Task
 from visadapt.tasks.follow import Follow
 from visadapt.tasks.reach import Reach
@@ -178,7 +177,7 @@ def _row(setup: Setup, target: Target, folder: Path, experiment: str, seed: int,
 def measured(setup: Setup, policy: Policy, target: Target, episodes: int = EPISODES) -> Terms:
     """Both sides of Theorem 1 over the steps of a policy's episodes in the target."""
     task, source = setup.test or setup.settings.tuning.task, setup.source
-    steps = target.task.steps if isinstance(target, FlightTarget) else EPISODE_STEPS
+    steps = (target.task if isinstance(target, FlightTarget) else task).episode_steps(source.period)
     drawn = torch.Generator().manual_seed(SCORE_SEED)
     runs = run(target, policy.eval(), episodes, steps, drawn, strict=False)
     transitions = to_come(task, Transitions.cut([each.episode for each in runs]))

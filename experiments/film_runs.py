@@ -7,7 +7,7 @@ import torch
 from visadapt.policies import Policy
 from visadapt.targets import Target
 from visadapt.targets.rollout import Run, run
-from visadapt.tasks.balance import EPISODE_STEPS
+from visadapt.tasks.base import EPISODE_STEPS
 
 FILM_SEED = 12
 """Seed of these episodes: neither that of a training nor that of a score."""

@@ -23,8 +23,7 @@ from visadapt.policies.flight import FlightPolicy
 from visadapt.systems import CartPole, FixedWing, Quadrotor, System
 from visadapt.systems.rigid_body import ATTITUDE, POSITION, VELOCITY, rotation
 from visadapt.targets import Start
-from visadapt.tasks.balance import EPISODE_STEPS
-from visadapt.tasks.base import FlightTask
+from visadapt.tasks.base import EPISODE_STEPS, FlightTask
 from visadapt.tasks.follow import Follow
 from visadapt.tasks.reach import Reach
 

@@ -18,7 +18,7 @@ from benchmarks.baselines.problem import Sizes, Stage, drawn, unadapted
 from visadapt.learning.training_state import train_or_load
 from visadapt.learning.tuning import tune
 from visadapt.setups.cartpole import cartpole_states
-from visadapt.tasks.balance import EPISODE_STEPS
+from visadapt.tasks.base import EPISODE_STEPS
 
 DRAWS = EPISODE_STEPS
 """draws of the effect, one for each stream; as many as an episode has steps, since `Streams` tests whether the world

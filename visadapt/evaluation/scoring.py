@@ -14,7 +14,7 @@ from visadapt.policies import Policy, RegulatorPolicy
 from visadapt.systems import CartPole
 from visadapt.targets import FlightTarget, Target
 from visadapt.targets.rollout import Run, check_period, run
-from visadapt.tasks.balance import EPISODE_STEPS
+from visadapt.tasks.base import EPISODE_STEPS
 from visadapt.tasks.regulate import steps_in
 
 SCORE_SEED = 2026

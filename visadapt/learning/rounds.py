@@ -10,6 +10,7 @@ import copy
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -126,7 +127,7 @@ class JointLearning:
         self._initial_weights = self._weights()
         """the policy's before the first round, with its feed-forward once that is known"""
         self._tuned_weights: dict[str, Tensor] | None = None
-        """the policy's after the last round that tuned it with the residual; None before"""
+        """the policy's after the last round; None before"""
         self._untrained_residual = copy.deepcopy(self.residual.network.state_dict())
         """weights of a new residual, which it gets back where named causes explain the gap"""
         if self.policy.residual is not None:
@@ -218,7 +219,7 @@ class JointLearning:
         world = self._grounded_world
 
         def accept() -> bool:
-            return stable(self._plan_costs(folder, world, transitions))
+            return stable(self._plan_costs(folder, world, self.settings.tuning, transitions))
 
         generator, progress = folder.generator(GROUNDING), self._progress(folder, "ground")
         return ground(self.residual, self.known, transitions, self.settings.ground, generator, progress, accept)
@@ -228,6 +229,8 @@ class JointLearning:
 
         Also called before the residual is fitted: a fit is accepted where this policy is stable.
         """
+        if not self.grounded:
+            self._tuned_weights = None  # Those tuned with names alone have no feed-forward
         if not self.grounded and self.settings.feedforward:
             initialise_feedforward(self.policy, self.source, self.residual.scale)
             self._initial_weights["feedforward.weight"] = self.policy.feedforward.weight.detach().clone()
@@ -238,30 +241,7 @@ class JointLearning:
         """Tune the policy in the source with the named effects and the residual; the loss of every iteration."""
         self._begin_tuning()
         self.grounded = True
-        world, settings = self._grounded_world, self.settings.tuning
-        later = self.settings.later
-        if later is not None and not folder.policy.exists() and self._takes_tuned_weights(folder, world, transitions):
-            settings = replace(settings, iterations=min(later, settings.iterations))
-        losses = self._tune(folder, world, settings, transitions)
-        self._tuned_weights = self._weights()
-        return losses
-
-    def _takes_tuned_weights(self, folder: RoundFolder, world: World, transitions: Transitions) -> bool:
-        """Give the policy the weights of the round before, if it then costs less in `world` than with those it has;
-        returns whether it does."""
-        if self._tuned_weights is None:
-            return False
-        present, cost = self._weights(), early_cost(self._plan_costs(folder, world, transitions))
-        self.policy.load_state_dict(self._tuned_weights, strict=False)
-        costs_less = early_cost(self._plan_costs(folder, world, transitions)) < cost
-        if not costs_less:
-            self.policy.load_state_dict(present, strict=False)
-        return costs_less
-
-    def _plan_costs(self, folder: RoundFolder, world: World, transitions: Transitions) -> Iterator[float]:
-        """Costs of the policy's plans in `world`; all policies of a round start in the same states."""
-        generator = folder.generator(ACCEPTING)
-        return plan_costs(self.policy, world, self.observe, self.settings.tuning, generator, transitions)
+        return self._tune(folder, self._grounded_world, self.settings.tuning, transitions)
 
     def _tune_with_names(self, folder: RoundFolder) -> list[float]:
         """Tune the policy in the source with the named effects alone; where there is no gap, it gets its weights from
@@ -271,6 +251,24 @@ class JointLearning:
         if no_gap or not self.settings.tunes_on:
             self._restore_initial_weights()
         return self._tune(folder, world, replace(settings, iterations=0) if no_gap else settings)
+
+    def _takes_tuned_weights(self, costs: Callable[[], Iterator[float]]) -> bool:
+        """Give the policy the weights of the round before, if it then costs less than with those it has; returns
+        whether it does. `costs` gives the policy's `plan_costs` in the world where it is to be tuned."""
+        if self._tuned_weights is None:
+            return False
+        present, cost = self._weights(), early_cost(costs())
+        self.policy.load_state_dict(self._tuned_weights, strict=False)
+        costs_less = early_cost(costs()) < cost
+        if not costs_less:
+            self.policy.load_state_dict(present, strict=False)
+        return costs_less
+
+    def _plan_costs(
+        self, folder: RoundFolder, world: World, settings: TuneSettings, transitions: Transitions | None
+    ) -> Iterator[float]:
+        """Costs of the policy's plans in `world`; all policies of a round start in the same states."""
+        return plan_costs(self.policy, world, self.observe, settings, folder.generator(ACCEPTING), transitions)
 
     def _weights(self) -> dict[str, Tensor]:
         """A copy of the policy's weights, without those of the residual."""
@@ -284,18 +282,25 @@ class JointLearning:
     def _tune(
         self, folder: RoundFolder, world: World, settings: TuneSettings, transitions: Transitions | None = None
     ) -> list[float]:
-        """Tune the policy in `world`, or give it the weights of a round that was tuned before; the losses."""
-        path = folder.policy
+        """Tune the policy in `world`, or give it the weights of a round that was tuned before; the losses.
+
+        It goes on, with fewer iterations, from the weights of the round before, where these cost less in `world`.
+        """
+        path, later = folder.policy, self.settings.later
         if not path.exists():
-            partial = path.with_suffix(".partial.safetensors")
+            costs = partial(self._plan_costs, folder, world, settings, transitions)
+            if later is not None and settings.iterations and self._takes_tuned_weights(costs):
+                settings = replace(settings, iterations=min(later, settings.iterations))
+            unfinished = path.with_suffix(".partial.safetensors")
             generator, progress = folder.generator(TUNING), self._progress(folder, "tune")
-            losses = tune(self.policy, world, self.observe, settings, generator, transitions, progress, partial)
+            losses = tune(self.policy, world, self.observe, settings, generator, transitions, progress, unfinished)
             save_tree(path, {"weights": self.policy.state_dict(), "losses": losses})
-            partial.unlink(missing_ok=True)
+            unfinished.unlink(missing_ok=True)
         tree = load_tree(path)
         with fitting(path):
             load_weights(self.policy, tree["weights"], path)
-            return list(tree["losses"])
+        self._tuned_weights = self._weights()
+        return list(tree["losses"])
 
     def _progress(self, folder: RoundFolder, stage: str) -> Progress | None:
         return staged(self.report, f"{folder.name}: {stage}")

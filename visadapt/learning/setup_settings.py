@@ -30,8 +30,8 @@ class SetupSettings:
     tunes_on: bool = False
     """a round tunes on from the weights of the round before; False: it begins with those before the first round"""
     later: int | None = None
-    """iterations, at most those of `tuning`, of a round that tunes on because the policy of the round before costs less
-    in the newly grounded source than the one before the first round; None: `tunes_on` alone decides"""
+    """iterations, at most those of `tuning` or `named`, of a round that tunes on because the policy of the round before
+    costs less in the world of this round than the one before the first round; None: `tunes_on` alone decides"""
     refinement: TuneSettings | None = None
     """second training of the policy in the source, after `source`: near rest, say, where it is scored"""
     named: TuneSettings | None = None

@@ -48,7 +48,7 @@ def plan_costs(
     observe: Observe | None,
     settings: TuneSettings,
     generator: torch.Generator,
-    transitions: Transitions,
+    transitions: Transitions | None,
 ) -> Iterator[float]:
     """Mean costs of the policy's plans, without end, imagined one after the other from where its tuning starts.
 

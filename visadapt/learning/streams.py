@@ -10,7 +10,6 @@ from torch import Tensor
 from visadapt.batch import Batch, placed
 from visadapt.history import History
 from visadapt.learning.transitions import Observe, Transitions
-from visadapt.tasks.balance import EPISODE_STEPS
 from visadapt.tasks.base import FlightTask, Task
 from visadapt.world import World, WorldState
 
@@ -149,8 +148,7 @@ def sense(
 def episode_times_and_start(world: World, task: Task) -> tuple[Tensor, Tensor]:
     """Times (T,), in s, of the rows of an episode, and a state (1, n_state) in which one may start."""
     state, _ = task.training_start(1, 0.0, torch.Generator().manual_seed(0))
-    rows = torch.arange(task.steps if isinstance(task, FlightTask) else EPISODE_STEPS)
-    return (world.period * rows).to(state), state
+    return (world.period * torch.arange(task.episode_steps(world.period))).to(state), state
 
 
 def depends_on_time(world: World, time: Tensor, state: Tensor) -> bool:

@@ -38,7 +38,7 @@ def regulator(source: World, task: Regulate) -> Setup:
     """
     solved = linear_quadratic(source, task.weights, task.command_weights, task.at_goal, task.held)
     task = replace(task, to_go=tuple(tuple(row) for row in solved.to_go.tolist()))
-    steps = task.steps(source.period)
+    steps = task.episode_steps(source.period)
     tuning = TuneSettings(
         task,
         iterations=400,

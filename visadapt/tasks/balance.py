@@ -17,10 +17,6 @@ from visadapt.tasks.base import Task, curriculum
 from visadapt.tasks.linear_quadratic import linear_quadratic
 from visadapt.world import World
 
-EPISODE_STEPS = 250
-"""Steps of a cart-pole's episode, in training and in scores."""
-
-
 KICK_PROBABILITY = 0.05  # Of a random change of the state in a step of training
 
 

@@ -8,6 +8,9 @@ from typing import Self
 import torch
 from torch import Tensor
 
+EPISODE_STEPS = 250
+"""Steps of an episode, in training and in scores, of a task that states no other number; a cart-pole's."""
+
 
 class Task(ABC):
     """Base of tasks, which are frozen dataclasses: their fields are kept in a policy's file and in a run's settings.
@@ -25,6 +28,10 @@ class Task(ABC):
     >>> isinstance(task, va.Task), state.shape, task_state.shape
     (True, torch.Size([3, 4]), torch.Size([3, 0]))
     """
+
+    def episode_steps(self, period: float) -> int:
+        """Steps of an episode, with commands `period` s apart."""
+        return EPISODE_STEPS
 
     def to(self, like: Tensor) -> Self:
         """The same task; tensors that it holds get the device and dtype of `like`."""
@@ -102,6 +109,9 @@ class FlightTask(Task):
     def passed(self, state: Tensor, task_state: Tensor) -> Tensor:
         """(B,) whether the task is behind states (B, 13), so that it no longer matters where the vehicle is."""
         return torch.zeros_like(state[:, 0], dtype=torch.bool)
+
+    def episode_steps(self, period: float) -> int:
+        return self.steps
 
     def show(self, observed: Tensor, task_state: Tensor) -> Tensor:
         return torch.cat((observed, self.goal(task_state)), 1)

@@ -171,8 +171,7 @@ class Regulate(Task):
         state = (self.at_goal + off).expand(len(commands), -1)
         return self.system.derivative(state, commands, commands.new_zeros(len(commands), len(self.system.loads)))
 
-    def steps(self, period: float) -> int:
-        """Periods in an episode."""
+    def episode_steps(self, period: float) -> int:
         return steps_in(self.seconds, period)
 
     def deviation(self, state: Tensor) -> Tensor:
