@@ -45,7 +45,9 @@ def test_the_tutorial_as_a_user_runs_it(rig, capsys, monkeypatch):
     assert [effect.name for effect in world.effects] == ["arm_axis.coulomb_friction"]
     del sys.modules["furuta"]
     assert cli.main(["check", "furuta.py:Furuta"]) == 0
-    assert "furuta is right; 46 effects act on it" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "furuta is right; 46 effects act on it" in said
+    assert "changes no rate" not in said
     assert cli.main(["effects", "--system", "furuta.py"]) == 0
     assert "hinge.coulomb_friction (dynamics)" in capsys.readouterr().out
     assert len((rig / "run.csv").read_text().splitlines()) == 161
@@ -90,6 +92,14 @@ def test_a_system_may_import_a_file_beside_it_from_any_folder(rig, tmp_path, mon
     monkeypatch.setattr(sys, "path", list(sys.path))
     assert cli.main(["effects", "--system", f"{rig / 'mine_only.py'}:Furuta"]) == 0
     assert "arm_axis.coulomb_friction" in capsys.readouterr().out
+
+
+def test_a_parameter_that_the_derivative_does_not_use_is_named(rig, capsys):
+    unused = "    encoder_counts: float = 4096.0\n    gravity:"
+    (rig / "furuta.py").write_text(page_code()[0].replace("    gravity:", unused))
+    assert cli.main(["check", "furuta.py:Furuta"]) == 0
+    line = "encoder_counts changes no rate within the ranges: derivative does not use this parameter"
+    assert line in capsys.readouterr().out.splitlines()
 
 
 def test_a_class_that_lacks_something_is_refused_by_every_command(rig, capsys):

@@ -44,7 +44,7 @@ def test_slight_causes_need_no_experiment():
     pairs: list[list[type[Effect]]] = [[ActuatorBias, ConstantForce], [CoulombFriction, QuadraticDrag]]
     groups = [[Alternative(effect, nothing, effect) for effect in pair] for pair in pairs]
     found = [Cause(effect.name, {}, 0.5, 0.5, slight=pair is pairs[1]) for pair in pairs for effect in pair]
-    advice = next_step(search, nothing, AMBIGUOUS, groups, found, nothing, (), ())
+    advice = next_step(search, nothing, AMBIGUOUS, groups, found, nothing, (), (), ())
     assert advice.startswith("To tell actuator_bias and constant_force apart: ")
     assert "friction" not in advice
 
@@ -90,3 +90,13 @@ def test_a_variable_that_the_data_do_not_show_is_not_named():
 
 def test_what_depends_on_time_is_looked_for_in_repeated_runs():
     assert "several long runs under the same commands" in explain(SmoothFunction("cart_force", False, "time", 12.0))
+
+
+@pytest.mark.parametrize(
+    ("variable", "log_odds", "of_reading", "pushes"),
+    [("time", 12.0, False, True), ("x", -0.5, False, True), ("x", 12.0, False, False), ("time", 12.0, True, False)],
+)
+def test_a_load_of_no_state_on_a_joint_that_was_pushed_is_the_pushes(variable, log_odds, of_reading, pushes):
+    advice = explain(SmoothFunction("hinge", of_reading, variable, log_odds), ["hinge"])
+    assert advice.startswith("Pushes on hinge were found: record runs in which nothing touches the machine") == pushes
+    assert "Pushes" not in explain(SmoothFunction("hinge", of_reading, variable, log_odds), ["slide"])

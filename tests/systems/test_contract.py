@@ -84,6 +84,16 @@ ANGLE, RATE = Pendulum.states
             "loads: joint does not accelerate rate",
         ),
         ({"derivative": rates(lambda r, s, load: r + load**2 * s)}, "derivative is not linear in the load"),
+        (
+            {"derivative": rates(lambda r, s, load: r + 0.1 * (s**2).sqrt())},
+            "derivative is not differentiable at angle 0, rate 0, command and load 0: a root, a norm or a power has",
+        ),
+        (
+            {"derivative": rates(lambda r, s, load: r + (2.9 - s[:, :1]).sqrt())},
+            "derivative: the rate of angle is nan at angle 2.9",
+        ),
+        ({"predicton_time": 10.0}, "predicton_time is nothing that visadapt reads; prediction_time is: is that meant?"),
+        ({"name": "cartpole"}, "name is 'cartpole', a system of visadapt's own; another word would be right"),
         ({"inertia": -0.1, "__annotations__": {"inertia": float}}, "pendulum: inertia must be positive, got -0.1"),
         ({"inertia": "heavy", "__annotations__": {"inertia": str}}, "Altered() raises TypeError"),
     ],

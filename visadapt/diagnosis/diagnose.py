@@ -45,6 +45,7 @@ from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repea
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.searched_effects import searched, shown_by
 from visadapt.diagnosis.search.unexplained import SmoothFunction
+from visadapt.diagnosis.search.unexplained_load import unmeasured
 from visadapt.diagnosis.verdict import at_bounds, is_slow, left_by_source, left_unexplained, next_step, verdict_of
 from visadapt.diagnosis.words import listed, printable
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
@@ -128,6 +129,7 @@ def diagnose(
     verdict, found, partial = _judge(explored, measured)
     source_leaves = [] if found else left_by_source(search)
     before, after = disturbances(search, comparison)
+    pushed = _pushes(explored, world, source_leaves)
     regions = _regions(found, before if found else after, explored.effects, profile_of(system).region_variables, seed)
     found_in_motion = Diagnosis(
         system=system.name,
@@ -142,13 +144,21 @@ def diagnose(
             stage_shares(search, comparison, groups, _found_before(explored, film)),
             measured.errors.by_state(system, explored.prepared.rows.channels, bool(found)),
             regions,
-            _pushes(explored, world, source_leaves),
+            pushed,
         ),
         causes=found,
         ranking=ranking(comparison, explored.effects, system, measured.closed, repeats),
         gap=measured.gap,
         next_experiment=next_step(
-            search, comparison, verdict, groups, found, measured.gap, explored.prepared.coarse, source_leaves
+            search,
+            comparison,
+            verdict,
+            groups,
+            found,
+            measured.gap,
+            explored.prepared.coarse,
+            source_leaves,
+            {push.load for push in pushed},
         ),
         warnings=(
             *used.warnings,
@@ -292,8 +302,10 @@ def _warnings(
     explored: _Explored, measured: MeasuredGap, verdict: str, found: Sequence[Cause], origin: str
 ) -> Iterator[str]:
     """What a reader of the diagnosis must know of the recording from `origin`, the comparison and the causes found."""
-    comparison = explored.comparison
+    comparison, whole = explored.comparison, explored.prepared.whole
     yield from explored.prepared.warnings
+    if verdict == UNEXPLAINED and whole is not None and (unread := unmeasured(whole, explored.search.system)):
+        yield f"pushes in single episodes were not looked for: they need {listed(unread)}, which no sensor read"
     if not measured.errors.held_out:
         yield f"{origin}: {TOO_SHORT}"
     yield from left_unexplained(comparison, verdict, comparison.unexplained(measured.improvable))

@@ -73,9 +73,15 @@ def disturbance_in_words(function: SmoothFunction) -> str:
     return f"an unexplained {what} depends on {by}"
 
 
-def explain(function: SmoothFunction) -> str:
-    """The experiment that shows an unexplained disturbance more clearly."""
+def explain(function: SmoothFunction, pushed: Collection[str] = ()) -> str:
+    """The experiment that shows an unexplained disturbance more clearly; `pushed` are the loads with pushes."""
     said = disturbance_in_words(function)
+    of_no_state = function.variable == "time" or not function.log_odds > MIN_LOG_ODDS
+    if of_no_state and function.port in pushed and not function.of_reading:
+        return (
+            f"Pushes on {plain(function.port)} were found: record runs in which nothing touches the machine, to see "
+            "whether they return without a hand."
+        )
     if not function.log_odds > MIN_LOG_ODDS:
         runs = "the same commands twice, to see what returns, and motions of one kind at a time"
     elif function.variable == "time":

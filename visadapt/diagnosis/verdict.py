@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from visadapt.diagnosis import next_experiment
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Gap, without_slight
@@ -81,10 +81,12 @@ def next_step(
     gap: Gap,
     coarse: Sequence[CoarseSteps],
     source_leaves: Sequence[SmoothFunction],
+    pushed: Collection[str],
 ) -> str:
     """The experiment to make next, in words; slight causes among those `found` need none.
 
-    `source_leaves` are the functions that the source leaves unexplained, where nothing was found.
+    `source_leaves` are the functions that the source leaves unexplained, where nothing was found; `pushed` are the
+    loads with pushes.
     """
     if is_slow(comparison, verdict):
         return next_experiment.LONGER
@@ -94,7 +96,7 @@ def next_step(
         return next_experiment.finer([position.state for position in coarse])
     if verdict == UNEXPLAINED:
         closed = gap.closed >= MIN_CLOSED_TO_EXPLAIN
-        return next_experiment.explain((comparison.functions if closed else source_leaves)[0])
+        return next_experiment.explain((comparison.functions if closed else source_leaves)[0], pushed)
     carrying = {cause.effect for cause in without_slight(found)}
     classes = [[one.effect for one in group] for group in groups]
     return next_experiment.separate([c for c in classes if carrying & {one.name for one in c}], search.system)

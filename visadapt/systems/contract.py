@@ -5,19 +5,23 @@ from __future__ import annotations
 import traceback
 from collections.abc import Iterator
 from dataclasses import fields, replace
+from difflib import get_close_matches
 from math import inf, isfinite
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from visadapt.systems import SYSTEMS
 from visadapt.systems.base import System, Variable, parameters
 from visadapt.systems.rigid_body import RigidBody
 
 ROWS = 5  # States that the derivative is tried in, drawn from the states' ranges
+MANY_ROWS = 1000  # States in which only the rates are looked at
 TOLERANCE = 1e-4  # Largest error of an automatic derivative, as a share of max(1, the largest)
 STEP = 1e-6  # Finite difference, as a share of a variable's range
 ROUNDING = 1e-9  # Share by which numbers may differ that ought to be equal
+CHANGE = 1.02  # Factor by which a parameter is changed to see whether it acts
 SMALLEST = 0.01  # Least value that a state has to reach, in its unit: fits take steps and noises of 1e-6 and more
 
 
@@ -58,6 +62,14 @@ def _form(system: type[System]) -> Iterator[str]:
         if field.name in ("name", "states", "actions", "loads", "coordinates", "prediction_time"):
             yield f"{field.name} is a field, which is a parameter: write it without an annotation, or as a ClassVar"
 
+    for name in vars(system):
+        for meant in get_close_matches(name, OPTIONAL, 1, ALIKE):
+            if name != meant:
+                yield f"{name} is nothing that visadapt reads; {meant} is: is that meant?"
+
+
+OPTIONAL = ("coordinates", "prediction_time", "longest_step")  # What a class may state and need not
+ALIKE = 0.85  # Similarity of two names, 1 if equal, beyond which one is taken for the other, misspelt
 
 _EXAMPLES = {
     "name": 'name = "my_rig"',
@@ -70,6 +82,8 @@ _EXAMPLES = {
 def _variables(system: type[System]) -> Iterator[str]:
     if not isinstance(system.name, str) or not system.name.isidentifier():
         yield f"name is {system.name!r}; a word such as {_EXAMPLES['name']} would be right"
+    elif system not in SYSTEMS.values() and system.name in SYSTEMS:
+        yield f"name is {system.name!r}, a system of visadapt's own; another word would be right"
     seconds = system.prediction_time
     if not isinstance(seconds, int | float) or not 0 < seconds < inf:
         yield f"prediction_time is {seconds!r}; a positive number of s, such as prediction_time = 0.5, would be right"
@@ -107,13 +121,13 @@ def _variable(kind: str, variable: Variable) -> Iterator[str]:
         )
 
 
-def inputs(system: System) -> list[Tensor]:
-    """States, commands and loads (ROWS, ...) drawn from their ranges, in float64."""
+def inputs(system: System, rows: int = ROWS) -> list[Tensor]:
+    """States, commands and loads (rows, ...) drawn from their ranges, in float64."""
     generator = torch.Generator().manual_seed(0)
     out = []
     for variables in (system.states, system.actions, system.loads):
         low, high = torch.tensor([(one.low, one.high) for one in variables], dtype=torch.float64).T
-        out.append(low + (high - low) * torch.rand(ROWS, len(variables), dtype=torch.float64, generator=generator))
+        out.append(low + (high - low) * torch.rand(rows, len(variables), dtype=torch.float64, generator=generator))
     return out
 
 
@@ -133,12 +147,14 @@ def _shape(system: System) -> Iterator[str]:
         shape = f"the shape {tuple(rates.shape)}" if isinstance(rates, Tensor) else f"a {type(rates).__name__}"
         yield f"derivative of {called} has {shape}; a tensor {right}, the rate of each state, would be right"
         return
-    bad = ~rates.isfinite()
-    if bad.any():
-        row, column = bad.nonzero()[0].tolist()
-        at = ", ".join(f"{s.name} {v:.3g}" for s, v in zip(system.states, given[0][row].tolist(), strict=True))
-        yield f"derivative: the rate of {system.states[column].name} is {rates[row, column]} at {at}, within the ranges"
-        return
+    many = inputs(system, MANY_ROWS)
+    for states, found in ((given[0], rates), (many[0], system.derivative(*many))):
+        bad = ~found.isfinite()
+        if bad.any():
+            row, column = bad.nonzero()[0].tolist()
+            of, at = system.states[column].name, _at(system, states[row])
+            yield f"derivative: the rate of {of} is {found[row, column]} at {at}, within the ranges"
+            return
     if rates.dtype != given[0].dtype:
         yield f"derivative turns {given[0].dtype} into {rates.dtype}: make new tensors with state.new_tensor"
     alone = torch.cat([system.derivative(*(each[k : k + 1] for each in given)) for k in range(ROWS)])
@@ -158,6 +174,15 @@ def _gradients(system: System) -> Iterator[str]:
             )
             return
         by_column = [torch.autograd.grad(r, tracked, retain_graph=True, allow_unused=True) for r in rates.sum(0)]
+        rest = [each.requires_grad_() for each in at_rest(system)]
+        at_zero = system.derivative(*rest).sum()
+        slopes = torch.autograd.grad(at_zero, rest, allow_unused=True)
+    # The rates of a rigid body are no numbers there: its quaternion is not 0.
+    if at_zero.isfinite() and not all(slope is None or slope.isfinite().all() for slope in slopes):
+        yield (
+            f"derivative is not differentiable at {_at(system, rest[0][0])}, command and load 0: a root, a norm or a "
+            "power has no slope at 0; x * abs(x), or sqrt(x**2 + 1e-12), has one"
+        )
     for k, (kind, variables) in enumerate(
         (("state", system.states), ("command", system.actions), ("load", system.loads))
     ):
@@ -215,7 +240,7 @@ def _batches(system: System) -> Iterator[str]:
     given = inputs(system)
     itself: Any = system
     for name, value in parameters(system):
-        values = value * torch.linspace(1.0, 1.02, ROWS, dtype=torch.float64)
+        values = value * torch.linspace(1.0, CHANGE, ROWS, dtype=torch.float64)
         try:
             together = replace(itself, **{name: values}).derivative(*given)
         except Exception as error:
@@ -233,6 +258,34 @@ def _batches(system: System) -> Iterator[str]:
         ]
         if not equal(together, torch.cat(rows)):
             yield f"{name} as a tensor, one value for each row ({ROWS},), gives other rates than row by row"
+
+
+def at_rest(system: System) -> list[Tensor]:
+    """State, command and load (1, ...) of 0, or of what is next to 0 in their ranges, in float64."""
+    every = (system.states, system.actions, system.loads)
+    return [torch.tensor([[min(max(0.0, one.low), one.high) for one in each]], dtype=torch.float64) for each in every]
+
+
+def _at(system: System, state: Tensor) -> str:
+    """A state (n_state,), in words."""
+    return ", ".join(f"{of.name} {value:.3g}" for of, value in zip(system.states, state.tolist(), strict=True))
+
+
+def unused_parameters(system: System) -> list[str]:
+    """Parameters that change no rate, in states drawn from the ranges.
+
+    >>> import visadapt as va
+    >>> unused_parameters(va.CartPole())
+    []
+    """
+    given = inputs(system, MANY_ROWS)
+    itself: Any = system
+    rates = system.derivative(*given)
+    return [
+        name
+        for name, value in parameters(system)
+        if torch.equal(rates, replace(itself, **{name: CHANGE * value}).derivative(*given))
+    ]
 
 
 def equal(one: Tensor, other: Tensor) -> bool:

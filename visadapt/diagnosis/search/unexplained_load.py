@@ -21,6 +21,7 @@ from visadapt.diagnosis.search.load_columns import SLOW, columns_of
 from visadapt.diagnosis.search.unexplained import SmoothFunction
 from visadapt.recordings import Episode, Recording
 from visadapt.recordings.runs import runs
+from visadapt.systems import System
 from visadapt.world import World
 
 EDGE = GAUSSIAN_REACH + 0.2
@@ -82,13 +83,9 @@ def load_tracks(recording: Recording, worlds: Sequence[World], known: SmoothFunc
         known: a load that acts as a function of states, beyond those of the worlds.
     """
     system = worlds[0].system
+    if not _has_joints(system) or unmeasured(recording, system):
+        return []
     measured = [system.index(name) for name in recording.measured]
-    if not system.coordinates or len(system.coordinates) < len(system.loads):
-        return []
-    if any(position not in measured for position, _ in system.coordinates):
-        return []
-    if any(column not in measured for column in system.outside_joints()):
-        return []
     found = [
         part
         for number, episode in enumerate(recording.episodes)
@@ -115,6 +112,24 @@ def load_tracks(recording: Recording, worlds: Sequence[World], known: SmoothFunc
         )
         for track in found
     ]
+
+
+def unmeasured(recording: Recording, system: System) -> list[str]:
+    """What the unexplained load needs and no sensor read: positions of joints, and states that belong to no joint."""
+    if not _has_joints(system):
+        return []
+    joints = zip(system.coordinates, system.loads, strict=True)
+    positions = [
+        f"a position of {load.name}" if position is None else system.states[position].name
+        for (position, _), load in joints
+    ]
+    needed = [*positions, *(system.states[column].name for column in system.outside_joints())]
+    return [name for name in needed if name not in recording.measured]
+
+
+def _has_joints(system: System) -> bool:
+    """Whether each load acts on a joint, as on no aircraft's body."""
+    return len(system.coordinates) == len(system.loads)
 
 
 def _measured(episode: Episode, usable: NDArray[np.bool_] | None) -> Iterator[Episode]:
