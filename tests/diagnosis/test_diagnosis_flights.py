@@ -107,6 +107,24 @@ def test_a_wing_s_lift_slope_is_named_with_its_size():
     assert result.where.stages["dynamics"] == 1.0
 
 
+@pytest.mark.parametrize(
+    ("system", "effect", "true"),
+    [(Quadrotor(), LinearDrag(coefficient=0.5), 0.5), (FixedWing(), LiftSlope(scale=0.8), 0.8)],
+)
+def test_flights_need_not_be_equally_long(system, effect, true):
+    whole = record(system, [effect])
+    cut = [
+        Episode(one.time[:rows], one.action[:rows], one.state[:rows])
+        for one, rows in zip(whole.episodes, (25, 24, 22, 17, 11), strict=True)
+    ]
+    result = diagnose(
+        dataclasses.replace(whole, episodes=tuple(cut)), World(system, period=whole.period), [type(effect)]
+    )
+    assert [cause.effect for cause in result.causes] == [effect.name]
+    (estimate,) = result.causes[0].parameters.values()
+    assert estimate.value == pytest.approx(true, abs=1.5 * (estimate.ci90[1] - estimate.ci90[0]))
+
+
 def test_the_command_reads_a_quadrotor_s_csv(tmp_path, capsys, monkeypatch):
     # Not by its dotted name, which is that of the function.
     module = importlib.import_module("visadapt.diagnosis.diagnose")

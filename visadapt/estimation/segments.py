@@ -145,7 +145,7 @@ def unmeasured(rows: Segments, system: System) -> list[int]:
 def initial_states(rows: Segments, system: System) -> Tensor:
     """Initial guess (W, T, n) of the states: the measurements that may be used, those in between interpolated,
     difference quotients for missing velocities (one-sided in a window's first and last row), and what is `estimated` of
-    states that no reading gives."""
+    states that no reading gives. Beyond a window's end its last row goes on: no attitude is a quaternion of zeros."""
     out = torch.zeros(*rows.shape, len(system.states), dtype=torch.float64)
     if rows.estimated is not None:
         columns = unmeasured(rows, system)
@@ -155,7 +155,8 @@ def initial_states(rows: Segments, system: System) -> Tensor:
     for channel, position_column in profile_of(system).position_of.items():
         if channel not in rows.channels and position_column in rows.channels:
             out[..., channel] = _difference_quotients(out[..., position_column], rows)
-    return out * rows.inside[..., None]
+    windows, lasts = _last_rows(rows)
+    return torch.where(rows.inside[..., None] > 0, out, out[windows, lasts][:, None])
 
 
 def _difference_quotients(position: Tensor, rows: Segments) -> Tensor:
@@ -164,10 +165,15 @@ def _difference_quotients(position: Tensor, rows: Segments) -> Tensor:
     rate = torch.zeros_like(position)
     rate[:, 1:-1] = (position[:, 2:] - position[:, :-2]) / (rows.time[:, 2:] - rows.time[:, :-2])
     rate[:, 0] = ahead[:, 0]
-    lasts = rows.inside.sum(1).long() - 1
-    windows = torch.arange(len(lasts))
+    windows, lasts = _last_rows(rows)
     rate[windows, lasts] = ahead[windows, (lasts - 1).clamp(min=0)]
     return rate
+
+
+def _last_rows(rows: Segments) -> tuple[Tensor, Tensor]:
+    """(W,) each window, and the number of its last row."""
+    lasts = rows.inside.sum(1).long() - 1
+    return torch.arange(len(lasts)), lasts
 
 
 def noise_of_readings(rows: Segments) -> Tensor:
