@@ -16,6 +16,7 @@ from visadapt.diagnosis.measured_gap import MeasuredGap, measure
 from visadapt.diagnosis.result import (
     AMBIGUOUS,
     IDENTIFIED,
+    NO_GAP,
     UNEXPLAINED,
     Cause,
     Diagnosis,
@@ -130,6 +131,9 @@ def diagnose(
     source_leaves = [] if found else left_by_source(search)
     before, after = disturbances(search, comparison)
     pushed = _pushes(explored, world, source_leaves)
+    gap, stages = measured.gap, stage_shares(search, comparison, groups, _found_before(explored, film))
+    if verdict == NO_GAP:  # The best set may hold an effect, which is none of the causes
+        gap, stages = gap.without_causes(), dict.fromkeys(stages, 0.0)
     regions = _regions(found, before if found else after, explored.effects, profile_of(system).region_variables, seed)
     found_in_motion = Diagnosis(
         system=system.name,
@@ -141,21 +145,21 @@ def diagnose(
         ),
         verdict=verdict,
         where=Where(
-            stage_shares(search, comparison, groups, _found_before(explored, film)),
+            stages,
             measured.errors.by_state(system, explored.prepared.rows.channels, bool(found)),
             regions,
             pushed,
         ),
         causes=found,
         ranking=ranking(comparison, explored.effects, system, measured.closed, repeats),
-        gap=measured.gap,
+        gap=gap,
         next_experiment=next_step(
             search,
             comparison,
             verdict,
             groups,
             found,
-            measured.gap,
+            gap,
             explored.prepared.coarse,
             source_leaves,
             {push.load for push in pushed},

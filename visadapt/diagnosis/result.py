@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from numbers import Integral
 from pathlib import PurePath
 from typing import Any
@@ -148,6 +148,10 @@ class Gap:
     floor: float  # of the measurement noise alone
     black_box: float  # the best that a black box reaches beside the causes; at most `after`
     closed: float  # (before - after) / (before - floor); NaN where there is no gap to close
+
+    def without_causes(self) -> Gap:
+        """The gap where no cause is named."""
+        return replace(self, after=self.before, black_box=min(self.before, self.black_box))
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,11 @@ def percent(share: float) -> str:
     return f"{round(100 * share)} %" if math.isfinite(share) else UNKNOWN
 
 
+def closed(share: float) -> str:
+    """A share of the gap that is closed, as a percentage: beyond 100 %, errors below the noise floor are chance."""
+    return percent(1.0 if share > 1 else share)
+
+
 def with_unit(text: str, unit: str) -> str:
     """A number and its unit, which is "1" where there is none."""
     return text if unit in ("1", "") else f"{text} {unit}"

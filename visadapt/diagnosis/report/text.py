@@ -21,7 +21,18 @@ from visadapt.diagnosis.result import (
     Region,
     without_slight,
 )
-from visadapt.diagnosis.words import MISFIT, chance, estimate, interval, listed, number, percent, plain, with_unit
+from visadapt.diagnosis.words import (
+    MISFIT,
+    chance,
+    closed,
+    estimate,
+    interval,
+    listed,
+    number,
+    percent,
+    plain,
+    with_unit,
+)
 from visadapt.effects import EFFECTS, CameraEffect
 from visadapt.systems.base import NAMED
 
@@ -155,9 +166,9 @@ def _unexplained(diagnosis: Diagnosis) -> str:
     if best <= 0:
         text += f"{most} close none of the gap"
     elif black_box > best:
-        text += f"{most} close {percent(best)} of the gap, with a black box {percent(min(1.0, black_box))}"
+        text += f"{most} close {closed(best)} of the gap, with a black box {closed(black_box)}"
     else:
-        text += f"{most} close {percent(best)} of the gap, and what is left is not noise"
+        text += f"{most} close {closed(best)} of the gap, and what is left is not noise"
     if diagnosis.where.regions:
         text += f"; it shows most at {region(diagnosis.where.regions[0], diagnosis.system)}"
     return f"{text}."
@@ -175,7 +186,7 @@ def _closes(diagnosis: Diagnosis, causes: Sequence[Cause], sets: Sequence[Sequen
     named = [frozenset(cause.effect for cause in each) for each in sets]
     each = [one.gap_closed for one in diagnosis.ranking if frozenset(one.effects) in named]
     least, most = (end([diagnosis.gap.closed, *filter(math.isfinite, each)]) for end in (min, max))
-    share = percent(most) if percent(least) == percent(most) else f"{round(100 * least)} to {percent(most)}"
+    share = closed(most) if closed(least) == closed(most) else f"{round(100 * least)} to {closed(most)}"
     return f"{_verb('close', causes)} {share} of the gap to the simulator"
 
 
@@ -183,7 +194,7 @@ def alone(cause: Cause) -> str:
     """What a cause closes by itself, and what opens again without it, where that is known."""
     said, of = "", " of the pixels' misfit" if _in_pixels(cause) else ""
     if math.isfinite(cause.gap_closed):
-        said += f", closes {percent(cause.gap_closed)}{of} alone"
+        said += f", closes {closed(cause.gap_closed)}{of} alone"
     if math.isfinite(cause.gap_reopened):
         said += f", without it {percent(cause.gap_reopened)} opens again"
     return said
@@ -225,7 +236,7 @@ def rendered(template: str, diagnosis: Diagnosis, **values: Any) -> str:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    for function in (plain, number, percent, chance, estimate, interval, effects, shares, alone):
+    for function in (plain, number, percent, closed, chance, estimate, interval, effects, shares, alone):
         environment.filters[function.__name__] = function
     environment.filters["either"] = lambda names: listed(names, "or")
     environment.filters["push"] = lambda one: push(one, diagnosis.recording)

@@ -47,6 +47,9 @@ MIN_JITTER = 1e-3
 """Largest deviation of time stamps from even spacing, in periods, above which fits with the recorded and with evenly
 spaced stamps decide whether the readings share the jitter."""
 
+EVEN_LOG_ODDS = 5.0
+"""Log likelihood that evenly spaced stamps must gain over those recorded: at rest, both fit alike."""
+
 MOST_FILLED = 2
 """Rows in a row whose readings are filled in by cubics: the acceleration in more of them would be made up."""
 
@@ -215,7 +218,7 @@ def _on_its_clock(draft: _Draft) -> _Draft:
     positions, channels = profile_of(readings.system).position_of, readings.channels
     kept = [k for k, channel in enumerate(channels) if positions.get(channel) not in channels]
     fitted, other = (replace(each, rows=each.rows.with_channels(kept)).source_fit() for each in (draft, steady))
-    chosen, fit = (steady, other) if other.likelihood[0] > fitted.likelihood[0] else (draft, fitted)
+    chosen, fit = (steady, other) if other.likelihood[0] > fitted.likelihood[0] + EVEN_LOG_ODDS else (draft, fitted)
     return replace(chosen, source=fit if len(kept) == len(channels) else None)
 
 
