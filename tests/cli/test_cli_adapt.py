@@ -125,7 +125,7 @@ def test_episodes_that_are_too_short_for_a_diagnosis_are_said_to_be(here, traine
     )
     policy = ("--policy", trained / "states.safetensors", "--target", "slippery:Slippery", "--diagnose")
     assert run("adapt", *policy, "--samples", 20, "--round", 20, "--iterations", 1, "--out", "run") == 0
-    said = "all 5 episodes are shorter than 0.5 s, not diagnosed: a residual learnt the gap\n"
+    said = "20 of 20 samples are in episodes shorter than 0.5 s, not diagnosed: a residual learnt the gap\n"
     assert capsys.readouterr().out.startswith(said)
 
 

@@ -50,10 +50,12 @@ def test_an_angle_of_the_opposite_sign_is_refused_since_the_policy_would_drive_t
     policy, generator = va.load_policy(va.shipped("cartpole_states")), torch.Generator().manual_seed(0)
     (found,) = va.run(va.SyntheticTarget(), policy, 1, 150, generator, exploration=0.05)
     turned = replace(found.episode, state=found.episode.state * np.array([1, 1, -1, -1]))
+    for name, episode in (("as it is", found.episode), ("turned", turned)):
+        va.write_recording(tmp_path / f"{name}.h5", [episode])
     explain = explained(va.World(va.CartPole()))
-    assert explain([found.episode], tmp_path / "as it is.json").verdict == "no_gap"
+    assert explain([tmp_path / "as it is.h5"], tmp_path / "as it is.json").verdict == "no_gap"
     with pytest.raises(TargetError, match=r"the angle of the target has the opposite sign .* scale = -1\.0"):
-        explain([turned], tmp_path / "turned.json")
+        explain([tmp_path / "turned.h5"], tmp_path / "turned.json")
 
 
 def test_what_two_causes_explain_is_settled_by_an_experiment_in_the_next_round(tmp_path, monkeypatch, only_effects):

@@ -79,6 +79,15 @@ def trained() -> RegulatorPolicy:
     return policy
 
 
+def test_an_episode_beyond_the_limits_has_failed_where_the_target_does_not_know_them(trained):
+    pushed = va.RegulationTarget(replace(TASK, limits={}), PERIOD, lambda *_: [OWN["joint.constant_load"](torque=5.0)])
+    (one,) = va.run(pushed, trained, 1, 100, torch.Generator().manual_seed(0))
+    assert one.survived
+    assert abs(one.episode.state[:, 0] - 0.5).max() > 1.5
+    found = va.score(trained, pushed, episodes=5)
+    assert (found.survived, found.errors) == (0, None)
+
+
 def test_a_policy_tuned_with_the_effect_brings_the_machine_to_its_goal(trained):
     assert error(trained, lambda *_: ()) < 0.002
     before = error(trained, weak)

@@ -52,7 +52,10 @@ def run(options: argparse.Namespace) -> None:
     rounds = [{"samples": one.samples, "policy_loss": one.policy[-1] if one.policy else None} for one in adapted.rounds]
     write_json(folder / "ledger.json", {**asdict(adapted.ledger), "used": adapted.ledger.used, "rounds": rounds})
     if options.diagnose:
-        print(_in_words(adapted.rounds[-1].explanation))
+        last = adapted.rounds[-1].explanation
+        print(_in_words(last))
+        for warning in last.warnings:
+            print(f"Warning    {warning}")
     print(f"{adapted.ledger.used} samples of {target.name} used; the policy is {folder / 'policy.safetensors'}")
 
 
@@ -64,7 +67,8 @@ def _in_words(explanation: Explanation) -> str:
         for effect in sorted(explanation.effects, key=lambda effect: effect.name in explanation.slight)
     )
     if not explanation.complete:
-        return f"{explanation.verdict}: a residual learnt the gap"
+        learnt = f"{causes}; a residual learnt what they leave" if causes else "a residual learnt the gap"
+        return f"{explanation.verdict}: {learnt}"
     return f"{explanation.verdict}: {causes}" if causes else f"{explanation.verdict}: the policy is left as it was"
 
 

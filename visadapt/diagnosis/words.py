@@ -12,6 +12,9 @@ UNKNOWN = "unknown"
 OPPOSITE = " has the opposite sign of the source's"
 """What a diagnosis warns of, after the quantity's name, where it inverted a sign of the recording."""
 
+DERIVED = "derived on the rig, not measured; left out"
+"""What it warns of where it set a velocity aside."""
+
 MISFIT = "root mean square of frames less those drawn by the renderer, in grey levels of 255"
 """`Gap.measure` of a film whose motion shows no gap."""
 

@@ -153,12 +153,19 @@ def score_runs(runs: Sequence[Run]) -> CartPoleScore:
 
 
 def _score_regulation(runs: Sequence[Run], policy: RegulatorPolicy) -> RegulationScore:
-    states = [run.episode.state for run in runs if run.survived and run.episode.state is not None]
+    # A target need not know the limits of the task, beyond which an episode has failed.
+    limit = np.array([policy.task["limits"].get(name, math.inf) for name in policy.states])
+    goal = policy.goal.cpu().numpy()
+    states = [
+        state
+        for run in runs
+        if run.survived and (state := run.episode.state) is not None and (np.abs(state - goal) <= limit).all()
+    ]
     units = {name: unit for name, unit in policy.states.items() if name in policy.task["tolerance"]}
     errors = None
     if states:
         later = np.concatenate([each[len(each) // 2 :] for each in states])
-        apart = np.sqrt(np.square(later - policy.goal.cpu().numpy()).mean(0))
+        apart = np.sqrt(np.square(later - goal).mean(0))
         errors = {name: float(apart[k]) for k, name in enumerate(policy.states) if name in units}
     return RegulationScore(len(runs), len(states), errors, units)
 

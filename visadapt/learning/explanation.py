@@ -10,7 +10,6 @@ from torch import Tensor
 
 from visadapt.effects import Effect
 from visadapt.policies import Policy
-from visadapt.recordings import Episode
 
 Experiment = Callable[[Policy, int], Tensor | None]
 """From a policy and a number of steps, the commands (steps, n_action) to add to the policy's; None where none help."""
@@ -27,11 +26,13 @@ class Explanation:
     """whether they leave nothing for a residual to learn"""
     slight: frozenset[str] = frozenset()
     """names of those effects whose removal would reopen less than 1 % of the gap"""
+    warnings: tuple[str, ...] = ()
+    """of the recordings, and of the diagnosis"""
     experiment: Experiment | None = field(default=None, compare=False)
     """designs an excitation for the next round that tells causes apart; None unless other causes fit as well"""
 
 
 NOT_DIAGNOSED = Explanation("", (), complete=False)
 
-Explain = Callable[[Sequence[Episode], Path], Explanation]
-"""Diagnoses episodes of the target and writes the diagnosis to the file, or reads it where the file exists."""
+Explain = Callable[[Sequence[Path], Path], Explanation]
+"""Diagnoses recordings of the target and writes the diagnosis to a file, or reads it where that exists."""

@@ -117,7 +117,7 @@ class JointLearning:
     """names the causes of the gap, which are then added to the source. The residual learns the gap only where they do
     not explain it; where there is no gap, the policy gets its weights from before the first round. Where other causes
     explain the data as well, the next round adds to its commands the excitation that tells them apart."""
-    recorded: list[Episode] = field(default_factory=list)  # all episodes of the target
+    recordings: list[Path] = field(default_factory=list)  # of the target, one of each round
     labelled: list[Episode] = field(default_factory=list)  # those with the states that grounding learns from
     waiting: list[Episode] = field(default_factory=list)  # those not labelled yet: no residual has needed them so far
     found: Explanation = NOT_DIAGNOSED  # by the last round's diagnosis
@@ -154,7 +154,7 @@ class JointLearning:
         """Collect at most `samples`, explain all that was collected, ground, and tune."""
         self._collect(folder, samples)
         if self.explain is not None:
-            self.found = self.explain(self.recorded, folder.diagnosis)
+            self.found = self.explain(self.recordings, folder.diagnosis)
             network = self.residual.network
             if isinstance(network, FlightResidualNetwork) and network.predict is not None:
                 # A vehicle's disturbance estimate then holds only what source and named effects leave unexplained. A
@@ -180,9 +180,9 @@ class JointLearning:
             added = self.found.experiment(collector, min(wanted, longest)) if self.found.experiment else None
             episodes = collect(collector, self.target, wanted, longest, folder.generator(COLLECTING), added)
             write_recording(folder.recording, episodes)
+        self.recordings.append(folder.recording)
         for episode in read_recording(folder.recording):
             self.ledger.count(f"{folder.name}: data", episode.samples)
-            self.recorded.append(episode)
             self.waiting.append(episode)
 
     def _transitions(self) -> Transitions:

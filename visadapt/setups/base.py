@@ -23,7 +23,7 @@ from visadapt.learning.transitions import Observe
 from visadapt.learning.tuning import TuneSettings, tune
 from visadapt.policies import ImagePolicy, Policy
 from visadapt.progress import Report, staged
-from visadapt.setups.explained import explained
+from visadapt.setups.explained import check_diagnosable, explained
 from visadapt.setups.policy_file import describe, load_into, parameters_of
 from visadapt.storage.checkpoints import weights_digest
 from visadapt.storage.run_folder import open_run
@@ -179,12 +179,15 @@ class Setup:
             diagnose: name the causes of the gap in each round: `explained`.
 
         Raises:
-            ValueError: as `check_adaptation`, or a budget that is smaller than a round.
+            ValueError: as `check_adaptation`, a budget that is smaller than a round, or rounds, or episodes, that are too
+                short to diagnose.
             TargetError: the target misbehaves. CheckpointError: `folder` holds a run of other networks.
             RunError: it holds one that was asked for otherwise: of another policy, source, or target. A target is
                 known by its name and, where it has one, its system.
         """
         self.check_adaptation(policy, target)
+        if diagnose:
+            check_diagnosable(self.source, min(round_samples, self.settings.longest_episode))
         asked = {"target": target.name, "samples": budget, "round": round_samples, "seed": seed, "diagnose": diagnose}
         asked["machine"] = parameters_of(target.system) if isinstance(target.system, System) else None
         asked |= {"policy": weights_digest(policy), "explorer": None if explorer is None else weights_digest(explorer)}

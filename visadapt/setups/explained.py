@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -13,42 +14,48 @@ from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED
 from visadapt.diagnosis.saved import load_effects
-from visadapt.diagnosis.words import OPPOSITE
+from visadapt.diagnosis.words import DERIVED, OPPOSITE
 from visadapt.effects.catalogue import catalogue
 from visadapt.learning.explanation import Explain, Explanation
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
-from visadapt.recordings import Episode, Recording
+from visadapt.recordings import load_recording
+from visadapt.recordings.hdf5 import read_stretches
 from visadapt.storage.run_folder import read_json, write_json
 from visadapt.targets.base import TargetError
 from visadapt.world import World
 
+MOST_SHORT = 0.5
+"""Share of the samples in episodes that are too short beyond which the others are not diagnosed: where the policy falls
+at once, what it does before says little."""
+
 
 def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, report: Report | None = None) -> Explain:
-    """Diagnoses episodes from all their states or, given the renderer of their scene, from their frames alone.
+    """Diagnoses recordings from all their states or, given the renderer of their scene, from their frames alone.
 
-    Each diagnosis is written as by `visadapt diagnose --json`. Episodes shorter than a prediction are left out.
-    Where the episodes cannot tell causes apart, the likeliest is taken and, unless they are frames, an experiment is
-    designed for the next round. Where the gap stays unexplained, all of it is left to a residual.
+    They are read and checked, and each diagnosis is written, as by `visadapt diagnose --json`. Where most samples are
+    in episodes shorter than a prediction, there is no diagnosis. Where the recordings cannot tell causes apart, the
+    likeliest is taken and, unless they are frames, an experiment is designed for the next round. Where the gap stays
+    unexplained, all of it is left to a residual.
 
     Raises:
         ValueError: the source has effects, which a diagnosis would have to know.
-        TargetError: from what is returned: the target shows or takes something with the opposite sign, with which the
-            policy would drive it the wrong way.
+        RecordingError: from what is returned, as the next one: the target's units, or the order of its states, are
+            wrong.
+        TargetError: the target shows or takes something with the opposite sign, with which the policy would drive it
+            the wrong way.
     """
     if len(source.effects):
         raise ValueError("a diagnosis starts from the bare system: give the source without effects")
     catalogue(source.system)  # makes the effects of a system of one's own known, by which a file names them
-    measured = () if renderer else tuple(state.name for state in source.system.states)
     shortest = source.system.prediction_time
 
-    def explain(episodes: Sequence[Episode], path: Path) -> Explanation:
-        diagnosable = tuple(e for e in episodes if e.time[-1] - e.time[0] >= shortest)
-        if not diagnosable:
-            verdict = f"all {len(episodes)} episodes are shorter than {shortest:g} s, not diagnosed"
+    def explain(recordings: Sequence[Path], path: Path) -> Explanation:
+        short, every = _samples(recordings, shortest)
+        if short > MOST_SHORT * every:
+            verdict = f"{short} of {every} samples are in episodes shorter than {shortest:g} s, not diagnosed"
             return Explanation(verdict, [], complete=False)
-        origins = tuple(f"episode {number}" for number in range(len(diagnosable)))
-        recording = Recording(diagnosable, measured, source.period, origins)
+        recording = load_recording(recordings, source.system, frames=renderer is not None)
         diagnosed = partial(diagnose, recording, source, seed=seed, progress=report, renderer=renderer)
         found = None
         if not path.exists():
@@ -71,10 +78,34 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
             planned.write(path.with_name("plan.csv"))
             return torch.as_tensor(planned.added)
 
+        # A policy that is shown derived velocities acts on what no effect in the world stands for.
+        complete = verdict != UNEXPLAINED and not any(DERIVED in warning for warning in content["warnings"])
         designs = experiment if verdict == AMBIGUOUS and renderer is None else None
-        return Explanation(verdict, effects, verdict != UNEXPLAINED, slight, designs)
+        return Explanation(verdict, effects, complete, slight, tuple(content["warnings"]), designs)
 
     return explain
+
+
+def steps_to_diagnose(source: World) -> int:
+    """Samples of the shortest episode that can be diagnosed."""
+    return math.ceil(source.system.prediction_time / source.period * (1 - 1e-6))
+
+
+def check_diagnosable(source: World, longest: int) -> None:
+    """Raises ValueError where episodes of at most `longest` samples are too short to be diagnosed."""
+    if longest < (least := steps_to_diagnose(source)):
+        raise ValueError(
+            f"episodes of at most {longest} samples last {longest * source.period:.3g} s, and a diagnosis predicts "
+            f"{source.system.prediction_time:g} s ahead: rounds, and episodes, of at least {least} samples are right; a "
+            "system of your own that is fast states a shorter prediction_time"
+        )
+
+
+def _samples(recordings: Sequence[Path], shortest: float) -> tuple[int, int]:
+    """Samples in episodes shorter than `shortest` s, and in all."""
+    episodes = [one for path in recordings for one in read_stretches(path, frames=False)[0].values()]
+    short = [one.samples for one in episodes if one.time[-1] - one.time[0] < shortest * (1 - 1e-6)]
+    return sum(short), sum(one.samples for one in episodes)
 
 
 def _refuse_opposite_signs(path: Path, warnings: Sequence[str]) -> None:

@@ -17,6 +17,7 @@ from visadapt.policies import ImagePolicy, Policy, RegulatorPolicy, StatePolicy
 from visadapt.progress import Report
 from visadapt.setups.base import Setup
 from visadapt.setups.cartpole import cartpole_frames, cartpole_states
+from visadapt.setups.explained import steps_to_diagnose
 from visadapt.setups.flight import fixed_wing, quadrotor
 from visadapt.setups.policy_file import save_policy
 from visadapt.setups.regulator import regulator
@@ -182,7 +183,8 @@ def adapt(
         samples: steps of the target in all; every one is counted.
         folder: where a run is kept, its policy as policy.safetensors; an interrupted run goes on from there. Without
             it nothing is kept, and `Adapted.restore` cannot be used.
-        round_samples: steps in a round; a fifth of `samples` without it, and at least 20.
+        round_samples: steps in a round; a fifth of `samples` without it, and at least 20, or as many as can be
+            diagnosed.
         iterations: of tuning (in each round), instead of the setup's own; the residual is fitted in as many at most.
         renderer, references, with_history: as for `setup_for`.
         diagnose: name the causes of the gap in each round and put them into `source`, which must have no effects; a
@@ -220,7 +222,8 @@ def adapt(
         setup.tune(policy, seed, report)
         return policy
     if round_samples is None:
-        round_samples = min(samples, max(20, samples // 5))
+        least = max(20, steps_to_diagnose(source)) if diagnose else 20
+        round_samples = min(samples, max(least, samples // 5))
     with tempfile.TemporaryDirectory() as temporary:
         run_folder = Path(folder or temporary)
         adapted = setup.adapt(policy, target, run_folder, samples, round_samples, seed, report, diagnose=diagnose)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from visadapt.diagnosis.search import angle_defect, sensor_checks, sign_conventions
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.words import OPPOSITE
+from visadapt.diagnosis.words import DERIVED, OPPOSITE
 from visadapt.effects import Effect
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import Convention, profile_of
@@ -255,10 +255,7 @@ def _without_derived_velocities(draft: _Draft) -> _Draft:
     if not derived:
         return draft
     kept = [k for k, channel in enumerate(channels) if system.states[channel].name not in derived]
-    told = [
-        f"{name} is {lag:.3g} s late against the slope of its position: derived on the rig, not measured; left out"
-        for name, lag in derived.items()
-    ]
+    told = [f"{name} is {lag:.3g} s late against the slope of its position: {DERIVED}" for name, lag in derived.items()]
     return draft.changed(draft.rows.with_channels(kept), draft.raw.with_channels(kept), *told)
 
 
