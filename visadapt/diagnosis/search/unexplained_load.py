@@ -33,6 +33,12 @@ STEP = 0.08
 
 LONGEST = 300  # Instants in a part: what drifts is fitted part by part, and the work grows with its square
 
+MOST_POWER = 9.0
+"""Squared loads, over the square of their unit, that count when it is found: it is the size of a model's errors, and a
+strong push must not make larger errors probable."""
+
+SIZE_ROUNDS = 30  # in which the unit is found
+
 KNOWN_SIZE = 3.0
 """Size of the columns of a function that is known to act: as large weights are as probable as small ones of others."""
 
@@ -43,7 +49,7 @@ class LoadTrack:
 
     episode: int
     time: Tensor  # (N,) s since the episode began
-    unit: Tensor  # (J,) root mean square of each joint's load over the recording, in its own unit: N or N m
+    unit: Tensor  # (J,) usual size of each joint's load over the recording, in its own unit: N or N m
     load: Tensor  # (N, J) in these units
     columns: Tensor
     """(K, N, J) loads that state and command may explain, of unit root mean square over the recording; those of a
@@ -94,7 +100,7 @@ def load_tracks(recording: Recording, worlds: Sequence[World], known: SmoothFunc
     ]
     if not found:
         return []
-    unit = torch.cat([track.load for track in found]).square().mean(0).sqrt()
+    unit = _usual_size(torch.cat([track.load for track in found]))
     unit = torch.where(unit > 0, unit, 1.0)
     # Only over a unit of its own for each joint do the loads of a slide and a hinge compare.
     columns = [(track.columns / unit).square().flatten(1) for track in found]
@@ -125,6 +131,15 @@ def unmeasured(recording: Recording, system: System) -> list[str]:
     ]
     needed = [*positions, *(system.states[column].name for column in system.outside_joints())]
     return [name for name in needed if name not in recording.measured]
+
+
+def _usual_size(load: Tensor) -> Tensor:
+    """(J,) root mean square of loads (N, J), of which larger ones count as MOST_POWER says."""
+    power = load.square()
+    usual = power.mean(0)
+    for _ in range(SIZE_ROUNDS):
+        usual = torch.minimum(power, MOST_POWER * usual).mean(0)
+    return usual.sqrt()
 
 
 def _has_joints(system: System) -> bool:
