@@ -1,7 +1,10 @@
 """A learnt world in which the policy does not hold the cart-pole is told from one in which it does, and learnt anew."""
 
+import math
 from dataclasses import replace
+from itertools import repeat
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -9,8 +12,10 @@ from torch import nn
 from visadapt.effects import Residual
 from visadapt.learning import stability
 from visadapt.learning.grounding import GroundSettings
-from visadapt.learning.stability import plan_costs, stable
+from visadapt.learning.rounds import out_of_range
+from visadapt.learning.stability import improved, plan_costs, stable
 from visadapt.learning.transitions import Transitions
+from visadapt.learning.tuning import DivergedError
 from visadapt.policies.networks import ResidualNetwork
 from visadapt.setups.cartpole import cartpole_states
 from visadapt.storage.checkpoints import load_tree
@@ -91,3 +96,43 @@ class TestRidge:
     def test_it_does_not_matter_where_the_head_is_not_linear(self, tmp_path):
         kept = self.learnt(tmp_path / "a", MlpOfHistory, ridges=(1.0, 10.0))
         assert self.equal(kept, self.learnt(tmp_path / "b", MlpOfHistory))
+
+
+class TestTuning:
+    """A policy that tuning makes far worse, in the world where it was tuned, keeps its weights."""
+
+    def tuned(self, cost, before=10.0, broken=False):
+        made, losses = nn.Linear(1, 1), [3.0, 2.0]
+        first = made.weight.detach().clone()
+
+        def tune():
+            made.weight.data += 1
+            if broken:
+                raise DivergedError("the policy's loss is nan at iteration 5")
+            return losses
+
+        def costs():
+            return repeat(before if torch.equal(made.weight, first) else cost)
+
+        kept = improved(made, costs, tune)  # type: ignore[arg-type]
+        assert kept == ([] if torch.equal(made.weight, first) else losses)
+        return bool(kept)
+
+    def test_one_that_is_better_or_nearly_as_good_is_taken(self):
+        assert self.tuned(1.0)
+        assert self.tuned(10.2)
+
+    @pytest.mark.parametrize("cost", [30.0, math.inf, math.nan])
+    def test_one_that_is_far_worse_is_not(self, cost):
+        assert not self.tuned(cost)
+
+    def test_where_it_diverges_the_weights_from_before_are_kept_if_they_are_any_better(self):
+        assert not self.tuned(1.0, broken=True)
+        with pytest.raises(DivergedError):
+            self.tuned(1.0, before=math.nan, broken=True)
+
+
+def test_a_state_far_out_of_its_range_is_named_where_the_loss_is_no_number():
+    hint = out_of_range([np.array([[0.0, 0.0, 9.0, 1.0]]), np.array([[0.1, 0.0, -57.3, 1.0]])], CartPole())
+    assert hint == "; theta of the target reaches 57.3, of a range up to 0.3 rad: is it in another unit?"
+    assert out_of_range([np.array([[0.0, 0.0, 0.1, 1.0]])], CartPole()) == out_of_range([], CartPole()) == ""

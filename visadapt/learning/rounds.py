@@ -13,7 +13,9 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from visadapt.effects import Residual
@@ -22,14 +24,15 @@ from visadapt.learning.feedforward import initialise_feedforward
 from visadapt.learning.grounding import GroundLoss, fit_named, ground, rescale
 from visadapt.learning.ledger import Ledger
 from visadapt.learning.setup_settings import SetupSettings
-from visadapt.learning.stability import early_cost, plan_costs, stable
+from visadapt.learning.stability import early_cost, improved, plan_costs, stable
 from visadapt.learning.transitions import Observe, Transitions
-from visadapt.learning.tuning import TuneSettings, tune
+from visadapt.learning.tuning import DivergedError, TuneSettings, tune
 from visadapt.policies import Policy
 from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, read_recording, write_recording
 from visadapt.storage.checkpoints import CheckpointError, fitting, load_tree, load_weights, save_tree
+from visadapt.systems import System
 from visadapt.targets import Target, TargetError
 from visadapt.targets.rollout import run
 from visadapt.world import World
@@ -49,7 +52,8 @@ class Round:
 
     samples: int
     grounding: Sequence[tuple[int, float, float]]  # (step, training loss, held-out loss)
-    policy: list[float]  # loss by iteration; empty where the policy was left as it is, since there is no gap
+    policy: list[float]
+    """loss by iteration; empty where the policy kept its weights: there is no gap, or tuning made it much worse"""
     explanation: Explanation = NOT_DIAGNOSED
 
 
@@ -293,7 +297,8 @@ class JointLearning:
                 settings = replace(settings, iterations=min(later, settings.iterations))
             unfinished = path.with_suffix(".partial.safetensors")
             generator, progress = folder.generator(TUNING), self._progress(folder, "tune")
-            losses = tune(self.policy, world, self.observe, settings, generator, transitions, progress, unfinished)
+            given = (self.policy, world, self.observe, settings, generator, transitions, progress, unfinished)
+            losses = self._improved(costs, partial(tune, *given)) if settings.iterations else []
             save_tree(path, {"weights": self.policy.state_dict(), "losses": losses})
             unfinished.unlink(missing_ok=True)
         tree = load_tree(path)
@@ -301,6 +306,14 @@ class JointLearning:
             load_weights(self.policy, tree["weights"], path)
         self._tuned_weights = self._weights()
         return list(tree["losses"])
+
+    def _improved(self, costs: Callable[[], Iterator[float]], tuned: Callable[[], list[float]]) -> list[float]:
+        """The losses of `tuned`, which tunes the policy; none where that makes it worse."""
+        try:
+            return improved(self.policy, costs, tuned)
+        except DivergedError as error:
+            states = [episode.state for episode in self.labelled if episode.state is not None]
+            raise DivergedError(f"{error}{out_of_range(states, self.source.system)}") from error
 
     def _progress(self, folder: RoundFolder, stage: str) -> Progress | None:
         return staged(self.report, f"{folder.name}: {stage}")
@@ -318,3 +331,19 @@ def collect(
             raise TargetError(f"{target.name}: the episode is over before its first step")
         wanted -= episodes[-1].samples
     return episodes
+
+
+def out_of_range(states: Sequence[NDArray[np.floating]], system: System) -> str:
+    """A hint at the state that is furthest out of its range in rows (T, n_state) of a target; empty where none is."""
+    if not states:
+        return ""
+    reached = np.abs(np.concatenate(states)).max(0)
+    beyond = [size / one.largest for size, one in zip(reached, system.states, strict=False)]
+    worst = int(np.argmax(beyond))
+    one = system.states[worst]
+    if beyond[worst] <= 1:
+        return ""
+    return (
+        f"; {one.name} of the target reaches {reached[worst]:.3g}, of a range up to {one.largest:g} {one.unit}: is it "
+        "in another unit?"
+    )

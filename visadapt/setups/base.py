@@ -179,8 +179,8 @@ class Setup:
             diagnose: name the causes of the gap in each round: `explained`.
 
         Raises:
-            ValueError: as `check_adaptation`, a budget that is smaller than a round, or rounds, or episodes, that are too
-                short to diagnose.
+            ValueError: as `check_adaptation`, a budget that is smaller than a round, or rounds or episodes that are
+                too short to diagnose.
             TargetError: the target misbehaves. CheckpointError: `folder` holds a run of other networks.
             RunError: it holds one that was asked for otherwise: of another policy, source, or target. A target is
                 known by its name and, where it has one, its system.

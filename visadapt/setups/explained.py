@@ -96,8 +96,8 @@ def check_diagnosable(source: World, longest: int) -> None:
     if longest < (least := steps_to_diagnose(source)):
         raise ValueError(
             f"episodes of at most {longest} samples last {longest * source.period:.3g} s, and a diagnosis predicts "
-            f"{source.system.prediction_time:g} s ahead: rounds, and episodes, of at least {least} samples are right; a "
-            "system of your own that is fast states a shorter prediction_time"
+            f"{source.system.prediction_time:g} s ahead: rounds, and episodes, of at least {least} samples are right; "
+            "a system of your own that is fast states a shorter prediction_time"
         )
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from visadapt.history import HORIZON
+from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.tuning import TuneSettings
 from visadapt.policies import RegulatorPolicy
@@ -55,7 +56,8 @@ def regulator(source: World, task: Regulate) -> Setup:
             source=tuning,
             tuning=replace(tuning, iterations=200, recorded=0.8),
             named=tuning,
-            later=200,
+            # An arm whose commands are two periods late falls, or its tuning diverges, with the ridge 1 alone.
+            ground=GroundSettings(ridges=(1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)),
             longest_episode=steps,
             feedforward=False,
         ),
