@@ -74,22 +74,22 @@ def test_an_experiment_for_a_cart_is_not_advised_on_a_vehicle_which_needs_none()
     ],
 )
 def test_a_disturbance_is_a_load_or_an_error_of_a_reading(port, of_reading, said):
-    assert explain(SmoothFunction(port, of_reading, "x_dot", 12.0)).startswith(said)
+    assert explain([SmoothFunction(port, of_reading, "x_dot", 12.0)]).startswith(said)
 
 
 def test_what_repeats_in_every_turn_is_looked_for_in_whole_turns():
-    advice = explain(SmoothFunction("motor_shaft", False, "motor_within_a_turn", 264.3))
+    advice = explain([SmoothFunction("motor_shaft", False, "motor_within_a_turn", 264.3)])
     assert advice.startswith("An unexplained load (motor shaft) depends on motor within a turn: record runs that cover")
     assert "whole turns of motor slowly and fast" in advice
 
 
 def test_a_variable_that_the_data_do_not_show_is_not_named():
-    advice = explain(SmoothFunction("motor_shaft", False, "time", -0.5))
+    advice = explain([SmoothFunction("motor_shaft", False, "time", -0.5)])
     assert advice.startswith("An unexplained load (motor shaft) depends on no single state, command or time: record")
 
 
 def test_what_depends_on_time_is_looked_for_in_repeated_runs():
-    assert "several long runs under the same commands" in explain(SmoothFunction("cart_force", False, "time", 12.0))
+    assert "several long runs under the same commands" in explain([SmoothFunction("cart_force", False, "time", 12.0)])
 
 
 @pytest.mark.parametrize(
@@ -97,6 +97,17 @@ def test_what_depends_on_time_is_looked_for_in_repeated_runs():
     [("time", 12.0, False, True), ("x", -0.5, False, True), ("x", 12.0, False, False), ("time", 12.0, True, False)],
 )
 def test_a_load_of_no_state_on_a_joint_that_was_pushed_is_the_pushes(variable, log_odds, of_reading, pushes):
-    advice = explain(SmoothFunction("hinge", of_reading, variable, log_odds), ["hinge"])
+    advice = explain([SmoothFunction("hinge", of_reading, variable, log_odds)], ["hinge"])
     assert advice.startswith("Pushes on hinge were found: record runs in which nothing touches the machine") == pushes
-    assert "Pushes" not in explain(SmoothFunction("hinge", of_reading, variable, log_odds), ["slide"])
+    assert "Pushes" not in explain([SmoothFunction("hinge", of_reading, variable, log_odds)], ["slide"])
+
+
+def test_variables_on_which_it_may_depend_as_well_are_named_beside_the_first():
+    first = SmoothFunction("pivot", False, "previous_command", 9.5)
+    others = [
+        SmoothFunction("pivot", False, "command", 9.4),
+        SmoothFunction("other", False, "theta", 9.3),
+        SmoothFunction("pivot", True, "pivot", 9.2),
+        SmoothFunction("pivot", False, "time", 4.0),
+    ]
+    assert explain([first, *others]).startswith("An unexplained load (pivot) depends on previous command or command:")

@@ -339,7 +339,7 @@ def test_a_gap_that_half_a_second_does_not_show_is_said():
     found = diagnose(heated(loss=0.7), World(Heater(), period=0.16), searched)
     assert found.verdict == "no_gap"
     assert any("explains whole episodes far better" in warning for warning in found.warnings)
-    assert "What acts more slowly shows in long runs" in found.next_experiment
+    assert "what acts slowly in long runs under commands" in found.next_experiment
     same = diagnose(heated(), World(Heater(), period=0.16), searched)
     assert (same.verdict, same.warnings) == ("no_gap", found.warnings[:-1])
 

@@ -47,7 +47,14 @@ from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.searched_effects import searched, shown_by
 from visadapt.diagnosis.search.unexplained import SmoothFunction
 from visadapt.diagnosis.search.unexplained_load import unmeasured
-from visadapt.diagnosis.verdict import at_bounds, is_slow, left_by_source, left_unexplained, next_step, verdict_of
+from visadapt.diagnosis.verdict import (
+    at_bounds,
+    left_by_source,
+    left_unexplained,
+    next_step,
+    shown_by_episodes,
+    verdict_of,
+)
 from visadapt.diagnosis.words import listed, printable
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized
@@ -299,7 +306,8 @@ def _judge(explored: _Explored, measured: MeasuredGap) -> tuple[str, tuple[Cause
     coarse = bool(explored.prepared.coarse)
     verdict = verdict_of(comparison, measured.gap, measured.improvable, explaining, bool(repeats), coarse)
     found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
-    return verdict, found, tuple(without_slight(explaining)) if verdict == UNEXPLAINED else ()
+    closes = verdict == UNEXPLAINED and not measured.gap.closed <= 0  # NaN where the source predicts within the noise
+    return verdict, found, tuple(without_slight(explaining)) if closes else ()
 
 
 def _warnings(
@@ -315,12 +323,7 @@ def _warnings(
     yield from left_unexplained(comparison, verdict, comparison.unexplained(measured.improvable))
     yield from at_bounds(comparison, found, explored.effects)
     bare = comparison.unchanged
-    if is_slow(comparison, verdict):
-        better = listed([effect.name for effect in comparison.best.effects])
-        yield (
-            f"over a prediction the simulator errs by no more than the noise, but {better} explains whole episodes far "
-            f"better (the unchanged simulator has a probability of {bare:.3f}): it acts slowly"
-        )
+    yield from shown_by_episodes(comparison, verdict, comparison.unexplained(measured.improvable))
     if found:
         yield from phases_of_episodes(comparison.best)
         if bare > MAX_UNCHANGED and not explored.repeats:

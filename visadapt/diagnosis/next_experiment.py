@@ -37,13 +37,16 @@ ALONG = (
 """For a film of a track without features."""
 
 
-MIN_LOG_ODDS = 0.0  # Log odds above which the variable of an unexplained disturbance is named: likelier than not
+MIN_LOG_ODDS = 4.0  # Log odds above which the variable of an unexplained disturbance is named
+
+AS_LIKELY = 3.0  # Difference of the log odds of two variables up to which both are named
 
 LONGER = (
-    "As far as predictions reach, nothing departs from the source beyond the noise. What acts more slowly shows in "
-    "long runs under commands that stay the same for longer than the machine takes to settle."
+    "As far as predictions reach, nothing departs from the source beyond the noise. What is small shows in motions in "
+    "which it is larger, what acts slowly in long runs under commands that stay the same for longer than the machine "
+    "takes to settle."
 )
-"""For a gap that shows only beyond the time of a prediction."""
+"""For a gap that whole episodes show, and predictions do not."""
 
 
 def separate(classes: Sequence[Collection[type[Effect]]], system: System) -> str:
@@ -65,17 +68,26 @@ def separate(classes: Sequence[Collection[type[Effect]]], system: System) -> str
     return " ".join(parts)
 
 
-def disturbance_in_words(function: SmoothFunction) -> str:
-    """An unexplained disturbance in words: a load, or an error of a state's reading, and what it depends on."""
-    port = plain(function.port)
-    what = f"error of the reading of {port}" if function.of_reading else f"load ({port})"
-    by = plain(function.variable) if function.log_odds > MIN_LOG_ODDS else "no single state, command or time"
-    return f"an unexplained {what} depends on {by}"
+def disturbance_in_words(functions: Sequence[SmoothFunction]) -> str:
+    """The most probable of unexplained `functions` in words: a load, or an error of a state's reading, and what it
+    depends on, with what it may depend on as well."""
+    first = functions[0]
+    port = plain(first.port)
+    what = f"error of the reading of {port}" if first.of_reading else f"load ({port})"
+    if not first.log_odds > MIN_LOG_ODDS:
+        return f"an unexplained {what} depends on no single state, command or time"
+    alike = [
+        plain(one.variable)
+        for one in functions
+        if (one.port, one.of_reading) == (first.port, first.of_reading) and one.log_odds > first.log_odds - AS_LIKELY
+    ]
+    return f"an unexplained {what} depends on {listed(alike, 'or')}"
 
 
-def explain(function: SmoothFunction, pushed: Collection[str] = ()) -> str:
-    """The experiment that shows an unexplained disturbance more clearly; `pushed` are the loads with pushes."""
-    said = disturbance_in_words(function)
+def explain(functions: Sequence[SmoothFunction], pushed: Collection[str] = ()) -> str:
+    """The experiment that shows the most probable of unexplained `functions` more clearly; `pushed` are the loads with
+    pushes."""
+    function, said = functions[0], disturbance_in_words(functions)
     of_no_state = function.variable == "time" or not function.log_odds > MIN_LOG_ODDS
     if of_no_state and function.port in pushed and not function.of_reading:
         return (

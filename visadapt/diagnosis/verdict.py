@@ -13,8 +13,8 @@ from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import CoarseSteps
 from visadapt.diagnosis.search.unexplained import SmoothFunction, smooth_functions
-from visadapt.diagnosis.words import with_unit
-from visadapt.effects import Effect
+from visadapt.diagnosis.words import listed, number, with_unit
+from visadapt.effects import Effect, Parameter
 from visadapt.estimation.candidate import CandidateModel
 
 MIN_GAP_CLOSED = 0.95
@@ -90,13 +90,15 @@ def next_step(
     """
     if is_slow(comparison, verdict):
         return next_experiment.LONGER
+    if verdict == NO_GAP and comparison.unexplained(False):
+        return next_experiment.explain(comparison.functions, pushed)
     if verdict == NO_GAP:
         return next_experiment.more(search.profile)
     if verdict == UNEXPLAINED and coarse:
         return next_experiment.finer([position.state for position in coarse])
     if verdict == UNEXPLAINED:
         closed = gap.closed >= MIN_CLOSED_TO_EXPLAIN
-        return next_experiment.explain((comparison.functions if closed else source_leaves)[0], pushed)
+        return next_experiment.explain(comparison.functions if closed else source_leaves, pushed)
     carrying = {cause.effect for cause in without_slight(found)}
     classes = [[one.effect for one in group] for group in groups]
     return next_experiment.separate([c for c in classes if carrying & {one.name for one in c}], search.system)
@@ -111,6 +113,27 @@ def left_by_source(search: Search) -> list[SmoothFunction]:
 def is_slow(comparison: ModelComparison, verdict: str) -> bool:
     """Whether there is no gap within a prediction, and one in the long run."""
     return verdict == NO_GAP and comparison.unchanged < LEAST_UNCHANGED
+
+
+def shown_by_episodes(comparison: ModelComparison, verdict: str, unexplained: bool) -> list[str]:
+    """A warning where predictions show no gap, and whole episodes do."""
+    if is_slow(comparison, verdict):
+        best = comparison.best
+        found = [
+            f"{effect.name} ({', '.join(_value(p, v) for p, v in zip(effect.table, values.tolist(), strict=True))})"
+            for effect, values in best.by_effect(best.fits.theta[0]).items()
+        ]
+        bare = "below 0.001" if comparison.unchanged < 1e-3 else f"{comparison.unchanged:.3f}"
+        what = f"{listed(found)} explains whole episodes far better (probability of the unchanged simulator {bare})"
+    elif verdict == NO_GAP and unexplained:
+        what = next_experiment.disturbance_in_words(comparison.functions)
+    else:
+        return []
+    return [f"over a prediction the simulator errs by no more than the noise, but {what}: it is small, or acts slowly"]
+
+
+def _value(parameter: Parameter, value: float) -> str:
+    return f"{parameter.name} {with_unit(number(value), parameter.unit)}"
 
 
 def at_bounds(comparison: ModelComparison, found: Sequence[Cause], effects: Sequence[type[Effect]]) -> list[str]:
@@ -146,5 +169,5 @@ def at_bound(effect: str, parameter: str, end: float, unit: str) -> str:
 def left_unexplained(comparison: ModelComparison, verdict: str, unexplained: bool) -> list[str]:
     """A warning where causes are named although they leave something."""
     if verdict in (IDENTIFIED, AMBIGUOUS) and unexplained:
-        return [f"{CLOSES_BUT}: {next_experiment.disturbance_in_words(comparison.functions[0])}"]
+        return [f"{CLOSES_BUT}: {next_experiment.disturbance_in_words(comparison.functions)}"]
     return []
