@@ -58,6 +58,24 @@ def test_an_angle_of_the_opposite_sign_is_refused_since_the_policy_would_drive_t
         explain([tmp_path / "turned.h5"], tmp_path / "turned.json")
 
 
+def test_a_command_of_the_opposite_sign_is_refused_where_no_episode_is_long_enough_to_diagnose(tmp_path):
+    policy, source = va.load_policy(va.shipped("cartpole_states")), va.World(va.CartPole())
+
+    class Turned(va.SyntheticTarget):
+        def step(self, action):
+            return super().step(-action)
+
+    for name, target in (("right", va.SyntheticTarget()), ("turned", Turned())):
+        runs = va.run(target, policy, 6, 8, torch.Generator().manual_seed(0), exploration=0.1)
+        va.write_recording(tmp_path / f"{name}.h5", [run.episode for run in runs])
+    explain = explained(source)
+    found = explain([tmp_path / "right.h5"], tmp_path / "right.json")
+    assert found.verdict == "48 of 48 samples are in episodes shorter than 0.5 s, not diagnosed"
+    assert not found.complete
+    with pytest.raises(TargetError, match=r"turned\.h5: command of the target has the opposite sign .* scale = -1\.0"):
+        explain([tmp_path / "turned.h5"], tmp_path / "turned.json")
+
+
 def test_what_two_causes_explain_is_settled_by_an_experiment_in_the_next_round(tmp_path, monkeypatch, only_effects):
     only_effects("viscous_friction", "coulomb_friction", "actuator_gain")
     # Three excitations of one size, and coarser steps of the target, for the time they take.

@@ -10,7 +10,7 @@ from visadapt.cli.own_classes import import_effects
 from visadapt.cli.target import load_policy_and_target
 from visadapt.cli.user_code import as_input_error
 from visadapt.evaluation import score
-from visadapt.films.filming import film
+from visadapt.films.filming import check_filmable, film
 from visadapt.storage.run_folder import versions, write_json
 
 
@@ -19,6 +19,8 @@ def run(options: argparse.Namespace) -> None:
     import_effects(options)
     policy, _, target = load_policy_and_target(options)
     with as_input_error():
+        if options.film:
+            check_filmable(target)
         found = score(policy, target, options.episodes, options.seed)
     if options.json:
         about = {"policy": options.policy, "target": target.name, "seed": options.seed, "versions": versions()}

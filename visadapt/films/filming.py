@@ -63,15 +63,20 @@ def film(
     >>> path.exists()
     True
     """
-    kind = target.system_class
-    if kind is not None and not issubclass(kind, CartPole | RigidBody):
-        raise ValueError(f"a film is that of a cart-pole or of a vehicle; {target.name} is a {kind.name}")
+    check_filmable(target)
     titled = shown if isinstance(shown, Mapping) else {target.name: shown}
     runs = {
         title: each if isinstance(each, Run) else _run(each, target, seconds, seed, see)
         for title, each in titled.items()
     }
     _film(runs, target, due).write(path, progress)
+
+
+def check_filmable(target: Target) -> None:
+    """Raises ValueError where the target is neither a cart-pole nor a vehicle."""
+    kind = target.system_class
+    if kind is not None and not issubclass(kind, CartPole | RigidBody):
+        raise ValueError(f"a film is that of a cart-pole or of a vehicle; {target.name} is a {kind.name}")
 
 
 def _run(policy: Policy, target: Target, seconds: float, seed: int, see: See | None) -> Run:

@@ -32,6 +32,8 @@ SUFFIXES = (".csv", ".h5", ".hdf5", ".bag", ".mcap", ".db3", ".ulg")
 """Suffixes of the files that are read from a folder."""
 TABLES = (".txt", ".tsv", ".dat")
 """Suffixes of files in a folder that may be tables, and are not read with the folder."""
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
+"""Suffixes of videos, which are told what they lack."""
 UPRIGHT_RAD = 1.0
 """rad from 0 up to which an angle counts as upright when it is unwrapped."""
 
@@ -176,6 +178,11 @@ def _read(
             is_hdf5 = file.read(4) == b"\x89HDF"
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    if path.suffix.lower() in VIDEOS:
+        raise RecordingError(
+            f"{path}: a video, which holds no commands: an HDF5 file with its frames and the commands, as "
+            "visadapt.write_recording writes it, is right"
+        )
     if frames and not is_hdf5:
         raise RecordingError(
             f"{path}: no HDF5 file; times, commands and frames as visadapt.write_recording writes them are right"

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -14,7 +16,7 @@ from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED
 from visadapt.diagnosis.saved import load_effects
-from visadapt.diagnosis.words import DERIVED, OPPOSITE
+from visadapt.diagnosis.words import DERIVED, OPPOSITE, listed
 from visadapt.effects.catalogue import catalogue
 from visadapt.learning.explanation import Explain, Explanation
 from visadapt.policies import Policy
@@ -28,6 +30,10 @@ from visadapt.world import World
 MOST_SHORT = 0.5
 """Share of the samples in episodes that are too short beyond which the others are not diagnosed: where the policy falls
 at once, what it does before says little."""
+
+OPPOSITE_ERROR = 0.25
+"""Mean square error of single steps with the opposite sign, over that with the source's, below which the target's sign
+is the opposite one."""
 
 
 def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, report: Report | None = None) -> Explain:
@@ -53,6 +59,8 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
     def explain(recordings: Sequence[Path], path: Path) -> Explanation:
         short, every = _samples(recordings, shortest)
         if short > MOST_SHORT * every:
+            if renderer is None and (turned := opposite_commands(recordings, source)):
+                raise _opposite(recordings[0], listed(turned))
             verdict = f"{short} of {every} samples are in episodes shorter than {shortest:g} s, not diagnosed"
             return Explanation(verdict, [], complete=False)
         recording = load_recording(recordings, source.system, frames=renderer is not None)
@@ -108,12 +116,41 @@ def _samples(recordings: Sequence[Path], shortest: float) -> tuple[int, int]:
     return sum(short), sum(one.samples for one in episodes)
 
 
+def opposite_commands(recordings: Sequence[Path], source: World) -> list[str]:
+    """The commands that the target takes with the opposite sign: single steps say so of episodes that are too short for
+    a diagnosis, as where the policy drives the target the wrong way."""
+    episodes = [one for path in recordings for one in read_stretches(path, frames=False)[0].values()]
+    rows = [(one.state, one.action[:-1]) for one in episodes if one.state is not None]
+    if not rows:
+        return []
+    parts = [state[:-1] for state, _ in rows], [state[1:] for state, _ in rows], [action for _, action in rows]
+    state, after, command = (torch.from_numpy(np.concatenate(part)).double() for part in parts)
+    size, world = (after - state).square().mean(0).clamp(min=1e-300), copy.deepcopy(source).double()
+
+    def error(signs: Tensor) -> float:
+        """Mean square error of a step, over the changes of the states."""
+        with torch.no_grad():
+            stepped = world.step(world.start(state), signs * command).state
+        return float(((stepped - after).square().mean(0) / size).mean())
+
+    actions = source.system.actions
+    each = 1 - 2 * torch.eye(len(actions), dtype=torch.float64)
+    signs = min((*each, -torch.ones_like(each[0])), key=error)
+    if not error(signs) < OPPOSITE_ERROR * error(torch.ones_like(signs)):
+        return []
+    return [action.name for action, sign in zip(actions, signs.tolist(), strict=True) if sign < 0]
+
+
 def _refuse_opposite_signs(path: Path, warnings: Sequence[str]) -> None:
     """Raises TargetError where a diagnosis, kept in `path`, warns that the target's sign of something is opposite."""
     for warning in warnings:
         name, opposite, _ = warning.partition(OPPOSITE)
         if opposite:
-            raise TargetError(
-                f"{path}: {name} of the target{OPPOSITE}, so that the policy would drive it the wrong way: negate it "
-                "in the target, by scale = -1.0 in a map, and begin in another folder"
-            )
+            raise _opposite(path, name)
+
+
+def _opposite(path: Path, name: str) -> TargetError:
+    return TargetError(
+        f"{path}: {name} of the target{OPPOSITE}, so that the policy would drive it the wrong way: negate it in the "
+        "target, by scale = -1.0 in a map, and begin in another folder"
+    )

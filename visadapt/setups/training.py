@@ -88,6 +88,11 @@ def setup_for(
         setup = quadrotor(references, source=world, with_history=with_history)
     elif isinstance(system, FixedWing):
         setup = fixed_wing(world, with_history)
+    elif policy is not None:
+        raise ValueError(
+            f"what a {type(policy).__name__} is to do with a {system.name} is not known: a policy that va.train made "
+            "with a task keeps it; for one of your own, use the adapt of a va.Setup (docs/own_rig.md)"
+        )
     else:
         raise ValueError(
             f"what a {system.name} is to do is not known: give a task, by task= or --task, that says where it is to "
