@@ -162,7 +162,7 @@ def at_bound(effect: str, parameter: str, end: float, unit: str) -> str:
     longer = "; of a system of your own, a longer prediction_time searches longer times" if unit == "s" else ""
     return (
         f"{effect}: {parameter} is at {with_unit(f'{end:g}', unit)}, the end of the range searched; the truth may lie "
-        f"beyond it, and the other causes are then wrong as well{longer}"
+        f"beyond it, and any other cause is then wrong as well{longer}"
     )
 
 

@@ -60,8 +60,9 @@ def check_commands(episodes: Sequence[RawEpisode], system: System, note: Note) -
         share = float(((every < variable.low) | (every > variable.high)).mean())
         if share == 0:
             if 0 < np.abs(every).max() < SMALL_COMMAND * max(-variable.low, variable.high):
+                unit = "" if variable.unit == "1" else f" {variable.unit}"
                 note(
-                    f"{variable.name} stays within {np.abs(every).max():.3g} {variable.unit}, of a range of "
+                    f"{variable.name} stays within {np.abs(every).max():.3g}{unit}, of a range of "
                     f"[{variable.low:g}, {variable.high:g}]: is it in another unit?",
                     "the recording",
                 )
