@@ -392,8 +392,12 @@ class TestBadInput:
 
     def test_a_film_without_times_and_commands(self, tmp_path, capsys):
         (tmp_path / "run.mp4").write_bytes(b"\0\0\0\x18ftypmp42")
-        assert "no HDF5 file; times, commands and frames" in refused(
+        assert "run.mp4: a video, which holds no commands: an HDF5 file" in refused(
             capsys, tmp_path / "run.mp4", "--renderer", RENDERER
+        )
+        (tmp_path / "run.csv").write_text("time,command\n0,0\n")
+        assert "no HDF5 file; times, commands and frames" in refused(
+            capsys, tmp_path / "run.csv", "--renderer", RENDERER
         )
 
     def test_a_film_without_commands(self, still, capsys):

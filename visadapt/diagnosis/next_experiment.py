@@ -37,7 +37,9 @@ ALONG = (
 """For a film of a track without features."""
 
 
-MIN_LOG_ODDS = 4.0  # Log odds above which the variable of an unexplained disturbance is named
+MIN_LOG_ODDS = 0.0  # Log odds above which the variable of an unexplained disturbance is named: likelier than not
+
+SURE_LOG_ODDS = 4.0  # Log odds above which the disturbance is said to depend on it
 
 AS_LIKELY = 3.0  # Difference of the log odds of two variables up to which both are named
 
@@ -79,9 +81,11 @@ def disturbance_in_words(functions: Sequence[SmoothFunction]) -> str:
     alike = [
         plain(one.variable)
         for one in functions
-        if (one.port, one.of_reading) == (first.port, first.of_reading) and one.log_odds > first.log_odds - AS_LIKELY
+        if (one.port, one.of_reading) == (first.port, first.of_reading)
+        and one.log_odds > max(MIN_LOG_ODDS, first.log_odds - AS_LIKELY)
     ]
-    return f"an unexplained {what} depends on {listed(alike, 'or')}"
+    depends = "depends" if first.log_odds > SURE_LOG_ODDS else "may depend"
+    return f"an unexplained {what} {depends} on {listed(alike, 'or')}"
 
 
 def explain(functions: Sequence[SmoothFunction], pushed: Collection[str] = ()) -> str:
