@@ -235,9 +235,9 @@ class JointLearning:
         """
         if not self.grounded:
             self._tuned_weights = None  # Those tuned with names alone have no feed-forward
-        if not self.grounded and self.settings.feedforward:
-            initialise_feedforward(self.policy, self.source, self.residual.scale)
-            self._initial_weights["feedforward.weight"] = self.policy.feedforward.weight.detach().clone()
+            if self.settings.feedforward:
+                initialise_feedforward(self.policy, self.source, self.residual.scale)
+                self._initial_weights["feedforward.weight"] = self.policy.feedforward.weight.detach().clone()
         if not self.settings.tunes_on:
             self._restore_initial_weights()
 
