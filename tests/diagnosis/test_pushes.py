@@ -160,7 +160,7 @@ def test_a_joint_that_stands_still_in_one_episode_hides_no_push_of_another():
 
 STEPS = np.array([1e-4, 2 * math.pi / 4096])
 STEADY = [(0.0, jitter, seed) for seed in range(3) for jitter in (0.0, 0.2)]
-PUSHED = [(2.0, 0.0, 0), (2.0, 0.2, 2), (2.0, 0.2, 7), (-4.0, 0.0, 3), (-4.0, 0.2, 0)]
+PUSHED = [(2.0, 0.0, 0), (2.0, 0.2, 2), (2.0, 0.2, 7), (-4.0, 0.0, 3), (-4.0, 0.2, 0), (10.0, 0.0, 0), (8.0, 0.1, 1)]
 """Runs of a balanced cart-pole: force in N, jitter of the clock, seed."""
 
 
