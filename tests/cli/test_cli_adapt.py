@@ -115,6 +115,16 @@ def test_without_a_gap_the_policy_is_left_as_it_is(here, capsys):
     assert json.loads((here / "run" / "ledger.json").read_text())["rounds"][0]["policy_loss"] is None
 
 
+def test_a_round_too_short_to_diagnose_is_refused_before_a_folder_is_made(here, capsys):
+    (here / "same.py").write_text("import visadapt as va\n\n\ndef target():\n    return va.SyntheticTarget()\n")
+    command = ("adapt", "--policy", SHIPPED, "--target", "same:target", "--diagnose", "--samples", 40, "--out", "run")
+    assert run(*command, "--round", 9) == 2
+    said = capsys.readouterr().err
+    assert "episodes of at most 9 samples last 0.45 s, and a diagnosis predicts 0.5 s ahead" in said
+    assert "of at least 10 samples are right" in said
+    assert not (here / "run").exists()
+
+
 def test_episodes_that_are_too_short_for_a_diagnosis_are_said_to_be(here, trained, capsys):
     (here / "slippery.py").write_text(
         "import rig\nfrom dataclasses import replace\n\n\nclass Slippery(rig.Bare):\n"

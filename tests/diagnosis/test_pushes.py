@@ -14,7 +14,7 @@ from tests.own_systems import DoublePendulum
 from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.pushes import pushes
-from visadapt.diagnosis.search.unexplained_load import unmeasured
+from visadapt.diagnosis.search.unexplained_load import unread_states
 from visadapt.effects import ActuatorSaturation, CoulombFriction
 from visadapt.effects.catalogue import catalogue
 from visadapt.recordings import Episode, Recording
@@ -106,8 +106,8 @@ def test_without_a_joints_position_none_are_looked_for():
     episode = dataclasses.replace(whole.episodes[0], state=whole.episodes[0].state[:, [0, 2, 3]])
     less = dataclasses.replace(whole, episodes=(episode,), measured=("angle_1", "velocity_1", "velocity_2"))
     assert found_in(less) == ()
-    assert unmeasured(less, DoublePendulum()) == ["angle_2"]
-    assert unmeasured(whole, DoublePendulum()) == []
+    assert unread_states(less, DoublePendulum()) == ["angle_2"]
+    assert unread_states(whole, DoublePendulum()) == []
     friction = [one for one in catalogue(DoublePendulum()) if one.name == "shoulder.viscous_friction"]
     warning = "pushes in single episodes were not looked for: they need angle_2, which no sensor read"
     found = diagnose(less, World(DoublePendulum(), period=less.period), friction)

@@ -13,7 +13,7 @@ from visadapt.effects import Residual
 from visadapt.learning import stability
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.rounds import out_of_range
-from visadapt.learning.stability import improved, plan_costs, stable
+from visadapt.learning.stability import early_cost, improved, plan_costs, stable
 from visadapt.learning.transitions import Transitions
 from visadapt.learning.tuning import DivergedError
 from visadapt.policies.networks import ResidualNetwork
@@ -114,7 +114,7 @@ class TestTuning:
         def costs():
             return repeat(before if torch.equal(made.weight, first) else cost)
 
-        kept = improved(made, costs, tune)  # type: ignore[arg-type]
+        kept = improved(made, early_cost(costs()), costs, tune)  # type: ignore[arg-type]
         assert kept == ([] if torch.equal(made.weight, first) else losses)
         return bool(kept)
 

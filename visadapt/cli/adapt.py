@@ -18,6 +18,7 @@ from visadapt.diagnosis.words import number, with_unit
 from visadapt.effects import Effect, Parameter
 from visadapt.learning.explanation import Explanation
 from visadapt.policies import ImagePolicy
+from visadapt.setups.explained import check_diagnosable
 from visadapt.setups.training import adapt, setup_to_adapt
 from visadapt.storage.run_folder import open_run, write_json
 from visadapt.tasks.references import read_reference
@@ -40,6 +41,8 @@ def run(options: argparse.Namespace) -> None:
     with as_input_error():  # before the machine is run
         setup = setup_to_adapt(policy, source, target, options.renderer, references, options.with_history)
         setup.check_adaptation(policy, target)
+        if options.diagnose:
+            check_diagnosable(source, min(options.round or options.samples, setup.settings.longest_episode))
     if options.round and options.round > options.samples:
         raise InputError(f"--round {options.round} is more than --samples {options.samples}: lower it, or raise those")
     folder = Path(options.out)

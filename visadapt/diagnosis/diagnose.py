@@ -46,7 +46,7 @@ from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repea
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.searched_effects import searched, shown_by
 from visadapt.diagnosis.search.unexplained import SmoothFunction
-from visadapt.diagnosis.search.unexplained_load import unmeasured
+from visadapt.diagnosis.search.unexplained_load import unread_states
 from visadapt.diagnosis.verdict import (
     at_bounds,
     left_by_source,
@@ -316,14 +316,15 @@ def _warnings(
     """What a reader of the diagnosis must know of the recording from `origin`, the comparison and the causes found."""
     comparison, whole = explored.comparison, explored.prepared.whole
     yield from explored.prepared.warnings
-    if verdict == UNEXPLAINED and whole is not None and (unread := unmeasured(whole, explored.search.system)):
+    if verdict == UNEXPLAINED and whole is not None and (unread := unread_states(whole, explored.search.system)):
         yield f"pushes in single episodes were not looked for: they need {listed(unread)}, which no sensor read"
     if not measured.errors.held_out:
         yield f"{origin}: {TOO_SHORT}"
-    yield from left_unexplained(comparison, verdict, comparison.unexplained(measured.improvable))
+    unexplained = comparison.unexplained(measured.improvable)
+    yield from left_unexplained(comparison, verdict, unexplained)
     yield from at_bounds(comparison, found, explored.effects)
     bare = comparison.unchanged
-    yield from shown_by_episodes(comparison, verdict, comparison.unexplained(measured.improvable))
+    yield from shown_by_episodes(comparison, verdict, unexplained)
     if found:
         yield from phases_of_episodes(comparison.best)
         if bare > MAX_UNCHANGED and not explored.repeats:

@@ -256,17 +256,17 @@ class JointLearning:
             self._restore_initial_weights()
         return self._tune(folder, world, replace(settings, iterations=0) if no_gap else settings)
 
-    def _takes_tuned_weights(self, costs: Callable[[], Iterator[float]]) -> bool:
-        """Give the policy the weights of the round before, if it then costs less than with those it has; returns
-        whether it does. `costs` gives the policy's `plan_costs` in the world where it is to be tuned."""
+    def _take_tuned_weights(self, cost: float, costs: Callable[[], Iterator[float]]) -> float:
+        """Give the policy the weights of the round before, if it then costs less than the `cost` with those it has;
+        returns the lower cost. `costs` gives the policy's `plan_costs` in the world where it is to be tuned."""
         if self._tuned_weights is None:
-            return False
-        present, cost = self._weights(), early_cost(costs())
+            return cost
+        present = self._weights()
         self.policy.load_state_dict(self._tuned_weights, strict=False)
-        costs_less = early_cost(costs()) < cost
-        if not costs_less:
-            self.policy.load_state_dict(present, strict=False)
-        return costs_less
+        if (lower := early_cost(costs())) < cost:
+            return lower
+        self.policy.load_state_dict(present, strict=False)
+        return cost
 
     def _plan_costs(
         self, folder: RoundFolder, world: World, settings: TuneSettings, transitions: Transitions | None
@@ -286,19 +286,11 @@ class JointLearning:
     def _tune(
         self, folder: RoundFolder, world: World, settings: TuneSettings, transitions: Transitions | None = None
     ) -> list[float]:
-        """Tune the policy in `world`, or give it the weights of a round that was tuned before; the losses.
-
-        It goes on, with fewer iterations, from the weights of the round before, where these cost less in `world`.
-        """
-        path, later = folder.policy, self.settings.later
+        """Tune the policy in `world`, or give it the weights of a round that was tuned before; the losses."""
+        path = folder.policy
         if not path.exists():
-            costs = partial(self._plan_costs, folder, world, settings, transitions)
-            if later is not None and settings.iterations and self._takes_tuned_weights(costs):
-                settings = replace(settings, iterations=min(later, settings.iterations))
             unfinished = path.with_suffix(".partial.safetensors")
-            generator, progress = folder.generator(TUNING), self._progress(folder, "tune")
-            given = (self.policy, world, self.observe, settings, generator, transitions, progress, unfinished)
-            losses = self._improved(costs, partial(tune, *given)) if settings.iterations else []
+            losses = self._improve(folder, world, settings, transitions, unfinished) if settings.iterations else []
             save_tree(path, {"weights": self.policy.state_dict(), "losses": losses})
             unfinished.unlink(missing_ok=True)
         tree = load_tree(path)
@@ -307,10 +299,27 @@ class JointLearning:
         self._tuned_weights = self._weights()
         return list(tree["losses"])
 
-    def _improved(self, costs: Callable[[], Iterator[float]], tuned: Callable[[], list[float]]) -> list[float]:
-        """The losses of `tuned`, which tunes the policy; none where that makes it worse."""
+    def _improve(
+        self,
+        folder: RoundFolder,
+        world: World,
+        settings: TuneSettings,
+        transitions: Transitions | None,
+        unfinished: Path,
+    ) -> list[float]:
+        """Tune the policy in `world`; the losses, none where that makes it much worse.
+
+        It goes on, with fewer iterations, from the weights of the round before, where these cost less in `world`. The
+        training is kept in the file `unfinished`.
+        """
+        costs = partial(self._plan_costs, folder, world, settings, transitions)
+        cost, later = early_cost(costs()), self.settings.later
+        if later is not None and (lower := self._take_tuned_weights(cost, costs)) < cost:
+            cost, settings = lower, replace(settings, iterations=min(later, settings.iterations))
+        generator, progress = folder.generator(TUNING), self._progress(folder, "tune")
+        given = (self.policy, world, self.observe, settings, generator, transitions, progress, unfinished)
         try:
-            return improved(self.policy, costs, tuned)
+            return improved(self.policy, cost, costs, partial(tune, *given))
         except DivergedError as error:
             states = [episode.state for episode in self.labelled if episode.state is not None]
             raise DivergedError(f"{error}{out_of_range(states, self.source.system)}") from error

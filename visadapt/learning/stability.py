@@ -64,16 +64,18 @@ def plan_costs(
         yield float(plans.loss(number, 1.0))
 
 
-def improved(policy: Policy, costs: Callable[[], Iterator[float]], tuned: Callable[[], list[float]]) -> list[float]:
-    """Tune the policy in place, by `tuned`, unless its `costs`, as `plan_costs`, then grow; the losses of `tuned`.
+def improved(
+    policy: Policy, cost: float, costs: Callable[[], Iterator[float]], tuned: Callable[[], list[float]]
+) -> list[float]:
+    """Tune the policy in place, by `tuned`, unless its `early_cost`, now `cost`, then grows; the losses of `tuned`.
 
-    Where they grow, or tuning diverges, the policy gets back the weights that it had, and there are no losses.
+    `costs` gives its `plan_costs`. Where the cost grows, or tuning diverges, the policy gets back the weights that it
+    had, and there are no losses.
 
     Raises:
         DivergedError: tuning diverges, and the policy's cost was not finite before either.
     """
     before = {name: value.clone() for name, value in policy.state_dict().items()}
-    cost = early_cost(costs())
     try:
         losses = tuned()
         if early_cost(costs()) <= MAX_WORSE * cost:

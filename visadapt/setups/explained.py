@@ -21,7 +21,7 @@ from visadapt.effects.catalogue import catalogue
 from visadapt.learning.explanation import Explain, Explanation
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
-from visadapt.recordings import load_recording
+from visadapt.recordings import Episode, load_recording
 from visadapt.recordings.hdf5 import read_stretches
 from visadapt.storage.run_folder import read_json, write_json
 from visadapt.targets.base import TargetError
@@ -57,9 +57,10 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
     shortest = source.system.prediction_time
 
     def explain(recordings: Sequence[Path], path: Path) -> Explanation:
-        short, every = _samples(recordings, shortest)
+        episodes = [one for each in recordings for one in read_stretches(each, frames=False)[0].values()]
+        short, every = _samples(episodes, shortest)
         if short > MOST_SHORT * every:
-            if renderer is None and (turned := opposite_commands(recordings, source)):
+            if renderer is None and (turned := opposite_commands(episodes, source)):
                 raise _opposite(recordings[0], listed(turned))
             verdict = f"{short} of {every} samples are in episodes shorter than {shortest:g} s, not diagnosed"
             return Explanation(verdict, [], complete=False)
@@ -109,17 +110,15 @@ def check_diagnosable(source: World, longest: int) -> None:
         )
 
 
-def _samples(recordings: Sequence[Path], shortest: float) -> tuple[int, int]:
+def _samples(episodes: Sequence[Episode], shortest: float) -> tuple[int, int]:
     """Samples in episodes shorter than `shortest` s, and in all."""
-    episodes = [one for path in recordings for one in read_stretches(path, frames=False)[0].values()]
     short = [one.samples for one in episodes if one.time[-1] - one.time[0] < shortest * (1 - 1e-6)]
     return sum(short), sum(one.samples for one in episodes)
 
 
-def opposite_commands(recordings: Sequence[Path], source: World) -> list[str]:
+def opposite_commands(episodes: Sequence[Episode], source: World) -> list[str]:
     """The commands that the target takes with the opposite sign: single steps say so of episodes that are too short for
     a diagnosis, as where the policy drives the target the wrong way."""
-    episodes = [one for path in recordings for one in read_stretches(path, frames=False)[0].values()]
     rows = [(one.state, one.action[:-1]) for one in episodes if one.state is not None]
     if not rows:
         return []

@@ -61,7 +61,6 @@ def _form(system: type[System]) -> Iterator[str]:
     for field in fields(itself):
         if field.name in ("name", "states", "actions", "loads", "coordinates", "prediction_time"):
             yield f"{field.name} is a field, which is a parameter: write it without an annotation, or as a ClassVar"
-
     for name in vars(system):
         for meant in get_close_matches(name, OPTIONAL, 1, ALIKE):
             if name != meant:
@@ -174,7 +173,7 @@ def _gradients(system: System) -> Iterator[str]:
             )
             return
         by_column = [torch.autograd.grad(r, tracked, retain_graph=True, allow_unused=True) for r in rates.sum(0)]
-        rest = [each.requires_grad_() for each in at_rest(system)]
+        rest = [each.requires_grad_() for each in _at_rest(system)]
         at_zero = system.derivative(*rest).sum()
         slopes = torch.autograd.grad(at_zero, rest, allow_unused=True)
     # The rates of a rigid body are no numbers there: its quaternion is not 0.
@@ -260,7 +259,7 @@ def _batches(system: System) -> Iterator[str]:
             yield f"{name} as a tensor, one value for each row ({ROWS},), gives other rates than row by row"
 
 
-def at_rest(system: System) -> list[Tensor]:
+def _at_rest(system: System) -> list[Tensor]:
     """State, command and load (1, ...) of 0, or of what is next to 0 in their ranges, in float64."""
     every = (system.states, system.actions, system.loads)
     return [torch.tensor([[min(max(0.0, one.low), one.high) for one in each]], dtype=torch.float64) for each in every]

@@ -89,7 +89,7 @@ def load_tracks(recording: Recording, worlds: Sequence[World], known: SmoothFunc
         known: a load that acts as a function of states, beyond those of the worlds.
     """
     system = worlds[0].system
-    if not _has_joints(system) or unmeasured(recording, system):
+    if not _has_joints(system) or unread_states(recording, system):
         return []
     measured = [system.index(name) for name in recording.measured]
     found = [
@@ -120,7 +120,7 @@ def load_tracks(recording: Recording, worlds: Sequence[World], known: SmoothFunc
     ]
 
 
-def unmeasured(recording: Recording, system: System) -> list[str]:
+def unread_states(recording: Recording, system: System) -> list[str]:
     """What the unexplained load needs and no sensor read: positions of joints, and states that belong to no joint."""
     if not _has_joints(system):
         return []
