@@ -5,6 +5,7 @@ import functools
 
 import numpy as np
 import pytest
+import torch
 
 from tests.diagnosed import NOISE, record
 from visadapt import diagnose
@@ -296,6 +297,17 @@ def test_velocities_differentiated_from_positions_are_left_out():
     prepared = prepare(dataclasses.replace(whole, episodes=tuple(episodes)), CartPole())
     assert [warning.split()[0] for warning in prepared.warnings] == ["x_dot", "theta_dot"]
     assert prepared.rows.channels == (0, 2)
+
+
+@pytest.mark.parametrize("effects", [(), (ViscousFriction(coefficient=2.0), CoulombFriction(force=1.0))])
+def test_commands_recorded_a_row_late_are_moved_up(effects):
+    whole = record(effects)
+    late = [np.concatenate((each.action[:1], each.action[:-1])) for each in whole.episodes]
+    episodes = [dataclasses.replace(each, action=action) for each, action in zip(whole.episodes, late, strict=True)]
+    prepared = prepare(dataclasses.replace(whole, episodes=tuple(episodes)), CartPole())
+    assert [warning for warning in prepared.warnings if "recorded a row late" in warning]
+    rows = len(late[0]) - 1  # the last command is not known
+    assert torch.equal(prepared.rows.command[:, :rows], prepare(whole, CartPole()).rows.command[:, :rows])
 
 
 @pytest.fixture(scope="module")

@@ -4,65 +4,48 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import nn
 
 from visadapt.diagnosis import policy_bound
+from visadapt.diagnosis.answer import Answer, answer
+from visadapt.diagnosis.exploration import Explored
 from visadapt.diagnosis.figures_data import disturbances, figure_data, film_frames
 from visadapt.diagnosis.frames import UNSEEN, Film, FramesError, watch, with_camera
-from visadapt.diagnosis.measured_gap import MeasuredGap, measure
 from visadapt.diagnosis.result import (
-    AMBIGUOUS,
-    IDENTIFIED,
     NO_GAP,
     UNEXPLAINED,
     Cause,
     Diagnosis,
-    Push,
     RecordingSummary,
     Region,
     Where,
     without_slight,
 )
-from visadapt.diagnosis.search import duration
-from visadapt.diagnosis.search.all_rows import best_on_all_rows, on_all_rows
 from visadapt.diagnosis.search.causes import (
-    Alternative,
-    alternatives,
-    causes,
     phases_of_episodes,
     ranking,
     stage_shares,
 )
-from visadapt.diagnosis.search.coloured import colour_left_by, with_coloured_noise
 from visadapt.diagnosis.search.disturbance import Disturbance, regions_of, share_between
-from visadapt.diagnosis.search.jumps import with_jumps
-from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
-from visadapt.diagnosis.search.preparation import PreparedRecording, limited, prepare
-from visadapt.diagnosis.search.pushes import pushes
-from visadapt.diagnosis.search.repeated_causes import errors_with_repeats, repeated_reading_causes
-from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.search.searched_effects import searched, shown_by
-from visadapt.diagnosis.search.unexplained import SmoothFunction
+from visadapt.diagnosis.search.preparation import limited
+from visadapt.diagnosis.search.searched_effects import shown_by
 from visadapt.diagnosis.search.unexplained_load import unread_states
 from visadapt.diagnosis.verdict import (
     at_bounds,
-    left_by_source,
     left_unexplained,
     next_step,
     shown_by_episodes,
-    verdict_of,
 )
 from visadapt.diagnosis.words import listed, printable
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized
 from visadapt.estimation.effect_fit import remembers
-from visadapt.estimation.episode_phases import has_episode_phases, in_episode
 from visadapt.estimation.profiles import profile_of
 from visadapt.processes import one_thread
-from visadapt.progress import Report, staged
+from visadapt.progress import Report
 from visadapt.recordings import Recording, RecordingError
 from visadapt.systems import System
 from visadapt.world import World
@@ -71,6 +54,12 @@ TOO_SHORT = "too short to hold a part of it out: the gap is that of the rows to 
 
 MAX_UNCHANGED = 0.1
 """Probability of the source above which a reader of the causes is told of it."""
+
+BESIDE_PUSHES = (
+    "the rows within pushes were left out, since pushes hide what else acts: the gap and its causes are those of the "
+    "other rows"
+)
+"""Where pushes were set aside."""
 
 NOT_SEARCHED = "what it reads depends on earlier rows, so it is not among the effects that are searched"
 
@@ -129,15 +118,10 @@ def diagnose(
     else:
         effects, recording = [effect for effect in effects if effect not in UNSEEN], film.positions
     used = limited(recording, system)
-    explored = _explore(used, system, effects, FrameDrop if film else Dropout, jobs, progress, announce)
+    answered = answer(used, world, effects, FrameDrop if film else Dropout, jobs, progress, announce)
+    explored, measured, verdict, found = answered.explored, answered.measured, answered.verdict, answered.causes
     search, comparison, groups = explored.search, explored.comparison, explored.groups
-    repeats = [cause for cause, _ in explored.repeats]
-    with_repeats = errors_with_repeats(explored.prepared, search) if repeats else None
-    measured = measure(search, comparison, groups, with_repeats, jobs, staged(progress, "predictions"))
-    verdict, found, partial = _judge(explored, measured)
-    source_leaves = [] if found else left_by_source(search)
     before, after = disturbances(search, comparison)
-    pushed = _pushes(explored, world, source_leaves)
     gap, stages = measured.gap, stage_shares(search, comparison, groups, _found_before(explored, film))
     if verdict == NO_GAP:  # The best set may hold an effect, which is none of the causes
         gap, stages = gap.without_causes(), dict.fromkeys(stages, 0.0)
@@ -155,10 +139,10 @@ def diagnose(
             stages,
             measured.errors.by_state(system, explored.prepared.rows.channels, bool(found)),
             regions,
-            pushed,
+            answered.pushes,
         ),
         causes=found,
-        ranking=ranking(comparison, explored.effects, system, measured.closed, repeats),
+        ranking=ranking(comparison, explored.effects, system, measured.closed, [one for one, _ in explored.repeats]),
         gap=gap,
         next_experiment=next_step(
             search,
@@ -168,13 +152,13 @@ def diagnose(
             found,
             gap,
             explored.prepared.coarse,
-            source_leaves,
-            {push.load for push in pushed},
+            answered.source_leaves,
+            {push.load for push in answered.pushes},
         ),
         warnings=(
             *used.warnings,
             *(f"{effect.name}: {NOT_SEARCHED}" for effect in effects if remembers(effect, system)),
-            *_warnings(explored, measured, verdict, found, recording.sources[0]),
+            *_warnings(answered, recording.sources[0]),
         ),
         figures=replace(
             figure_data(search, measured, before, after, regions),
@@ -184,7 +168,7 @@ def diagnose(
         policy=None
         if policy is None
         else policy_bound.policy_terms(policy, system, explored.prepared.rows, comparison.best),
-        partial=partial,
+        partial=answered.partial,
     )
     return found_in_motion if film is None else with_camera(found_in_motion, film, system)
 
@@ -217,57 +201,7 @@ def _watched(recording: Recording, system: System, renderer: nn.Module | None, p
     return watch(recording, system, renderer, progress)
 
 
-@dataclass(frozen=True)
-class _Explored:
-    """A recording of states, and which sets of effects explain it."""
-
-    effects: list[type[Effect]]  # that may be named
-    prepared: PreparedRecording
-    search: Search
-    comparison: ModelComparison
-    groups: list[list[Alternative]]  # the effects of the best set, each with those that fit as well in its place
-    repeats: list[tuple[Cause, float]]  # causes of repeated readings, and the log likelihood lost without them
-
-
-def _explore(
-    recording: Recording,
-    system: System,
-    effects: Sequence[type[Effect]],
-    repeating: type[Effect],
-    jobs: int,
-    progress: Report | None,
-    announce: Callable[[str], object] | None,
-) -> _Explored:
-    """Search for the sets of `effects` that explain a recording of states, and compare the best of them.
-
-    `repeating` is the effect that repeats whole rows.
-    """
-    candidates = searched(effects, system)
-    prepared = prepare(recording, system, candidates)
-    rows = prepared.rows
-    search = Search(system, rows.select(prepared.searched), candidates, prepared.source, jobs)
-    if announce is not None:
-        announce(duration.announcement(rows, len(effects), duration.expected(search, rows), jobs))
-    jumping = with_jumps(search)
-    if jumping is not None:
-        search, rows = jumping, replace(rows, jumps=True)
-    if jumping is not None and colour_left_by(search, search.best) is not None:
-        # A machine that resonates: its larger sets are looked for with coloured noise alone.
-        search = best_on_all_rows(search, rows)
-    else:
-        search.run(staged(progress, "search"))
-        search = on_all_rows(search, rows)
-    comparison = compare(search)
-    repeats = repeated_reading_causes(prepared, search, comparison, repeating)
-    again = staged(progress, "search with coloured noise")
-    search, comparison = with_coloured_noise(search, comparison, prepared.searched, again)
-    # Periodic effects may have got a phase for each episode.
-    in_use = {effect.name: effect for effect in search.catalogue}
-    named = [in_use.get(effect.name, effect) for effect in effects]
-    return _Explored(named, prepared, search, comparison, alternatives(comparison, named, system), repeats)
-
-
-def _found_before(explored: _Explored, film: Film | None) -> list[tuple[Stage, float]]:
+def _found_before(explored: Explored, film: Film | None) -> list[tuple[Stage, float]]:
     """The stages of causes that were found before the search, with the log likelihood lost without each."""
     found = [(EFFECTS[cause.effect].stage, lost) for cause, lost in explored.repeats]
     if film is not None and film.camera.best.camera:
@@ -275,47 +209,13 @@ def _found_before(explored: _Explored, film: Film | None) -> list[tuple[Stage, f
     return found
 
 
-def _pushes(explored: _Explored, world: World, source_leaves: Sequence[SmoothFunction]) -> tuple[Push, ...]:
-    """The pushes beyond the best set where it explains the recording; beyond the source where it does not, which
-    leaves these functions."""
-    whole, comparison = explored.prepared.whole, explored.comparison
-    if whole is None:
-        return ()
-    if source_leaves:
-        return pushes(whole, world, source_leaves)
-    if not any(has_episode_phases(effect) for effect in comparison.best.effects):
-        return pushes(whole, _explained(world, comparison, 0), comparison.functions)
-    worlds = [_explained(world, comparison, episode) for episode in range(len(whole.episodes))]
-    return pushes(whole, worlds, comparison.functions)
-
-
-def _explained(world: World, comparison: ModelComparison, episode: int) -> World:
-    """The source with the best set's effects as fitted, with their phases in an episode."""
-    best = comparison.best
-    effects = [
-        in_episode(effect, values.tolist(), episode) for effect, values in best.by_effect(best.fits.theta[0]).items()
-    ]
-    return world.with_effects(effects).double()
-
-
-def _judge(explored: _Explored, measured: MeasuredGap) -> tuple[str, tuple[Cause, ...], tuple[Cause, ...]]:
-    """The verdict, the causes that go with it, and those that close a part of a gap that is unexplained."""
-    comparison, groups = explored.comparison, explored.groups
-    repeats = [cause for cause, _ in explored.repeats]
-    explaining = (*repeats, *causes(explored.search, comparison, groups, measured.closed))
-    coarse = bool(explored.prepared.coarse)
-    verdict = verdict_of(comparison, measured.gap, measured.improvable, explaining, bool(repeats), coarse)
-    found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
-    closes = verdict == UNEXPLAINED and not measured.gap.closed <= 0  # NaN where the source predicts within the noise
-    return verdict, found, tuple(without_slight(explaining)) if closes else ()
-
-
-def _warnings(
-    explored: _Explored, measured: MeasuredGap, verdict: str, found: Sequence[Cause], origin: str
-) -> Iterator[str]:
+def _warnings(answered: Answer, origin: str) -> Iterator[str]:
     """What a reader of the diagnosis must know of the recording from `origin`, the comparison and the causes found."""
+    explored, measured, verdict, found = answered.explored, answered.measured, answered.verdict, answered.causes
     comparison, whole = explored.comparison, explored.prepared.whole
     yield from explored.prepared.warnings
+    if answered.set_aside:
+        yield BESIDE_PUSHES
     if verdict == UNEXPLAINED and whole is not None and (unread := unread_states(whole, explored.search.system)):
         yield f"pushes in single episodes were not looked for: they need {listed(unread)}, which no sensor read"
     if not measured.errors.held_out:

@@ -78,14 +78,14 @@ def disturbance_in_words(functions: Sequence[SmoothFunction]) -> str:
     what = f"error of the reading of {port}" if first.of_reading else f"load ({port})"
     if not first.log_odds > MIN_LOG_ODDS:
         return f"an unexplained {what} depends on no single state, command or time"
-    alike = [
+    alike = dict.fromkeys(  # of one variable there are several functions, with and without a factor
         plain(one.variable)
         for one in functions
         if (one.port, one.of_reading) == (first.port, first.of_reading)
         and one.log_odds > max(MIN_LOG_ODDS, first.log_odds - AS_LIKELY)
-    ]
+    )
     depends = "depends" if first.log_odds > SURE_LOG_ODDS else "may depend"
-    return f"an unexplained {what} {depends} on {listed(alike, 'or')}"
+    return f"an unexplained {what} {depends} on {listed(list(alike), 'or')}"
 
 
 def explain(functions: Sequence[SmoothFunction], pushed: Collection[str] = ()) -> str:
@@ -94,10 +94,7 @@ def explain(functions: Sequence[SmoothFunction], pushed: Collection[str] = ()) -
     function, said = functions[0], disturbance_in_words(functions)
     of_no_state = function.variable == "time" or not function.log_odds > MIN_LOG_ODDS
     if of_no_state and function.port in pushed and not function.of_reading:
-        return (
-            f"Pushes on {plain(function.port)} were found: record runs in which nothing touches the machine, to see "
-            "whether they return without a hand."
-        )
+        return untouched([function.port])
     if not function.log_odds > MIN_LOG_ODDS:
         runs = "the same commands twice, to see what returns, and motions of one kind at a time"
     elif function.variable == "time":
@@ -108,6 +105,14 @@ def explain(functions: Sequence[SmoothFunction], pushed: Collection[str] = ()) -
         covered = f"whole turns of {plain(angle)}" if turns else f"the whole range of {plain(angle)}"
         runs = f"runs that cover {covered} slowly and fast, with all else as constant as possible"
     return f"{said[0].upper()}{said[1:]}: record {runs}, and add an effect of your own for it (--effects)."
+
+
+def untouched(pushed: Collection[str]) -> str:
+    """The experiment that shows whether what pushes these loads is a hand."""
+    return (
+        f"Pushes on {listed([plain(load) for load in sorted(pushed)])} were found: record runs in which nothing "
+        "touches the machine, to see whether they return without a hand."
+    )
 
 
 def more(profile: SystemProfile) -> str:

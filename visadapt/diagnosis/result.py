@@ -60,6 +60,10 @@ class Push:
     ci90: tuple[float, float]  # 90 % confidence interval of the impulse
     p_value: float  # probability that errors alone look as much like a push anywhere in the recording
 
+    def overlaps(self, other: Push) -> bool:
+        """Whether both act in the same episode, at one time at least."""
+        return self.episode == other.episode and self.start <= other.end and other.start <= self.end
+
 
 @dataclass(frozen=True)
 class Box:

@@ -90,6 +90,8 @@ def next_step(
     """
     if is_slow(comparison, verdict):
         return next_experiment.LONGER
+    if verdict in (NO_GAP, IDENTIFIED) and pushed:
+        return next_experiment.untouched(pushed)
     if verdict == NO_GAP and comparison.unexplained(False):
         return next_experiment.explain(comparison.functions, pushed)
     if verdict == NO_GAP:

@@ -16,6 +16,11 @@ from visadapt.estimation.profiles import profile_of
 from visadapt.interpolation import cubic
 from visadapt.systems import System
 
+Stretch = tuple[int, int, int]
+"""A part of an episode: the episode's index, the first row, and the row past the last."""
+
+MIN_STRETCH_ROWS = 15  # Of what is left of an episode where rows within it are left out, for it to be used
+
 ROUNDING_ERROR = 1e-6
 """In a reading's unit; smaller differences between readings come from arithmetic, such as wrapping an angle."""
 
@@ -191,7 +196,7 @@ def cut(
     channels: tuple[int, ...],
     period: float,
     longest: int,
-    stretches: Sequence[tuple[int, int, int]] | None = None,
+    stretches: Sequence[Stretch] | None = None,
 ) -> Segments:
     """Cut each episode into windows of nearly equal length, at most `longest` rows.
 
@@ -200,7 +205,7 @@ def cut(
         commands: (T, n_action).
         stamps: (T,) s since the start of the episode.
         period: s between rows, the median of all.
-        stretches: the parts to use, as (episode index, first row, row past the last); whole episodes by default.
+        stretches: the parts to use; whole episodes by default.
     """
     if stretches is None:
         stretches = [(k, 0, len(values)) for k, values in enumerate(measured)]
@@ -230,6 +235,16 @@ def cut(
     episode = torch.tensor([index for index, _, _ in pieces])
     resolution = tuple(smallest_step(torch.cat([values[:, k] for values in measured])) for k in range(len(channels)))
     return Segments(out, used, inside, time, command, held, first, episode, channels, period, resolution)
+
+
+def stretches_without(bad: Sequence[Tensor], stretches: Sequence[Stretch]) -> list[Stretch]:
+    """What is left of stretches without the `bad` rows (T,) of each episode: the whole stretch, or parts of it."""
+    out = []
+    for index, begin, end in stretches:
+        edges = [begin - 1, *(begin + bad[index][begin:end].nonzero()[:, 0]).tolist(), end]
+        parts = [(index, a + 1, b) for a, b in pairwise(edges)]
+        out += parts if len(parts) == 1 else [part for part in parts if part[2] - part[1] >= MIN_STRETCH_ROWS]
+    return out
 
 
 def smallest_step(readings: Tensor) -> float:

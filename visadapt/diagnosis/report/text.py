@@ -71,8 +71,9 @@ def sentence(diagnosis: Diagnosis) -> str:
     """The verdict in one plain sentence, with physical units."""
     gap = diagnosis.gap
     if diagnosis.verdict == NO_GAP:
+        beside = " beside the pushes" if diagnosis.where.pushes else ""
         return (
-            f"No gap: the simulator predicts this recording as well as its noise allows "
+            f"No gap{beside}: the simulator predicts this recording as well as its noise allows "
             f"(error {number(gap.before)}, noise {number(gap.floor)})."
         )
     return _explained(diagnosis) if diagnosis.causes else _unexplained(diagnosis)

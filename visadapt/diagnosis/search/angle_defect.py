@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -29,8 +28,6 @@ over bands, on at least MIN_BAND_ROWS rows; the arc that holds all defective ban
 rows."""
 
 FULL_TURN_SHARE = 0.8  # Share of the circle's bands that the pole visits, above which it turns all the way round
-
-MIN_STRETCH_ROWS = 15  # Rows between two passes of a defective band for them to be used
 
 
 def defective_band(system: System, rows: Segments, fits: FitState) -> tuple[tuple[float, float], bool] | None:
@@ -84,15 +81,6 @@ def on_one_turn(measured: Tensor, angle: int, edge: float) -> Tensor:
     start = edge if edge < 0 else edge - 2 * math.pi
     out = measured.clone()
     out[:, angle] = (measured[:, angle] - start).remainder(2 * math.pi) + start
-    return out
-
-
-def stretches_without(bad: Sequence[Tensor]) -> list[tuple[int, int, int]]:
-    """Stretches of episodes without bad rows (T,): episode index, first row, row past the last."""
-    out = []
-    for index, rows in enumerate(bad):
-        edges = [-1, *rows.nonzero()[:, 0].tolist(), len(rows)]
-        out += [(index, a + 1, b) for a, b in pairwise(edges) if b - a - 1 >= MIN_STRETCH_ROWS]
     return out
 
 

@@ -10,14 +10,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from visadapt.diagnosis.result import Push
 from visadapt.diagnosis.search import angle_defect, sensor_checks, sign_conventions
+from visadapt.diagnosis.search.pushed_rows import pushed_rows
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.words import DERIVED, OPPOSITE
 from visadapt.effects import Effect
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import Convention, profile_of
 from visadapt.estimation.repeated_readings import RepeatedReadings, find_repeats
-from visadapt.estimation.segments import Segments, cut, smoothly_filled
+from visadapt.estimation.segments import Segments, Stretch, cut, smoothly_filled, stretches_without
 from visadapt.estimation.unmeasured_states import with_unmeasured
 from visadapt.recordings import Episode, Recording
 from visadapt.recordings.runs import runs
@@ -50,6 +52,10 @@ spaced stamps decide whether the readings share the jitter."""
 EVEN_LOG_ODDS = 5.0
 """Log likelihood that evenly spaced stamps must gain over those recorded: at rest, both fit alike."""
 
+EARLIER_LOG_ODDS = 20.0
+"""Log likelihood that the source must gain by commands a row earlier than recorded, as no machine answers before it is
+asked."""
+
 MOST_FILLED = 2
 """Rows in a row whose readings are filled in by cubics: the acceleration in more of them would be made up."""
 
@@ -73,13 +79,19 @@ def limited(recording: Recording, system: System) -> Recording:
     )
 
 
-def prepare(recording: Recording, system: System, catalogue: Sequence[type[Effect]] = ()) -> PreparedRecording:
-    """Prepare a recording of some or all states, and the commands; `catalogue` are the effects that may act."""
-    draft = _on_its_clock(_read(recording, system))
+def prepare(
+    recording: Recording, system: System, catalogue: Sequence[type[Effect]] = (), pushes: Sequence[Push] = ()
+) -> PreparedRecording:
+    """Prepare a recording of some or all states, and the commands.
+
+    Args:
+        catalogue: the effects that may act.
+        pushes: the rows within them are in no window.
+    """
+    draft, first = _with_commands_that_act(_on_its_clock(_read(recording, system, pushes)))
     if not profile_of(system).check_sensors:
         return draft.prepared()
-    first = draft.source or draft.source_fit()
-    draft = _without_derived_velocities(_without_defective_angles(replace(draft, source=first), first))
+    draft = _without_derived_velocities(_without_defective_angles(draft, first))
     # After the velocities, since those that lag make the wrong sign likelier.
     return _in_signs_of_source(draft, first, catalogue).prepared()
 
@@ -96,12 +108,14 @@ class _Readings:
     stamps: list[Tensor]  # (T,) s
     repeats: RepeatedReadings
     usable: list[Tensor]  # (T, m) 1 where the recording may be used
+    pushed: list[Tensor]  # (T,) whether the row is within a push
 
-    def draft(self, stretches: Sequence[tuple[int, int, int]] | None = None) -> _Draft:
-        """Windows of the episodes from their first usable row on, or of stretches of these."""
+    def draft(self, stretches: Sequence[Stretch] | None = None) -> _Draft:
+        """Windows of the episodes from their first usable row on, outside of pushes; or of stretches of these."""
         period = self.recording.period
         if stretches is None:
             stretches = [(k, first, len(self.states[k])) for k, first in enumerate(self.first_usable)]
+            stretches = stretches_without(self.pushed, stretches)
         # A window holds predictions from half of its rows, however fast these follow each other.
         least = round(2 * self.system.prediction_time / period)
         longest = max(profile_of(self.system).window_rows, least)
@@ -184,8 +198,8 @@ class _Draft:
         return PreparedRecording(self.rows, self.raw, whole, *about)
 
 
-def _read(recording: Recording, system: System) -> _Draft:
-    """All of the recording; readings that are repeated or may not be used are marked."""
+def _read(recording: Recording, system: System, pushes: Sequence[Push]) -> _Draft:
+    """All of the recording; readings that are repeated or may not be used, and rows within pushes, are marked."""
     profile = profile_of(system)
     channels = tuple(system.index(name) for name in recording.measured)
     quaternion = [k for k, channel in enumerate(channels) if channel in profile.quaternion]
@@ -202,7 +216,8 @@ def _read(recording: Recording, system: System) -> _Draft:
         seen = [torch.tensor(kept) for kept in recording.usable]
         lost = [rows & kept for rows, kept in zip(repeats.lost, seen, strict=True)]
         repeats = replace(repeats, used=used, lost=lost, seen=seen)
-    return _Readings(recording, system, channels, states, commands, stamps, repeats, usable).draft()
+    pushed = pushed_rows(pushes, stamps, system)
+    return _Readings(recording, system, channels, states, commands, stamps, repeats, usable, pushed).draft()
 
 
 def _on_its_clock(draft: _Draft) -> _Draft:
@@ -222,6 +237,19 @@ def _on_its_clock(draft: _Draft) -> _Draft:
     return replace(chosen, source=fit if len(kept) == len(channels) else None)
 
 
+def _with_commands_that_act(draft: _Draft) -> tuple[_Draft, FitState]:
+    """With the commands one row earlier, where the recording has each beside the readings that follow it; and the
+    source's fit."""
+    readings = draft.readings
+    fitted = draft.source or draft.source_fit()
+    earlier = replace(readings, commands=[torch.cat((each[1:], each[-1:])) for each in readings.commands]).draft()
+    other = earlier.source_fit()
+    if other.likelihood[0] <= fitted.likelihood[0] + EARLIER_LOG_ODDS:
+        return replace(draft, source=fitted), fitted
+    told = "each command is recorded a row late, beside the readings that it led to: the commands were moved a row up"
+    return replace(earlier, source=other, warnings=(*draft.warnings, told)), other
+
+
 def _without_defective_angles(draft: _Draft, source: FitState) -> _Draft:
     """Without readings of the angle where its sensor is defective; `source` is the source's fit to the draft's rows."""
     readings = draft.readings
@@ -236,7 +264,8 @@ def _without_defective_angles(draft: _Draft, source: FitState) -> _Draft:
         f"{sum(int(b.sum()) for b in bad)} readings of {name} between {band[0]:.2f} and {band[1]:.2f} rad "
         "contradict those around them and the physics: the sensor is defective there; they were set aside"
     )
-    stretches = angle_defect.stretches_without(bad)
+    left_out = [a | b for a, b in zip(bad, readings.pushed, strict=True)]
+    stretches = stretches_without(left_out, [(k, 0, len(rows)) for k, rows in enumerate(left_out)])
     if full_turns and stretches:
         # A potentiometer's dead zone has an unknown width, so windows end at it, and the angle runs from one of its
         # edges to the other, so that an error of the sensor's scale is symmetric about upright.

@@ -1,0 +1,140 @@
+"""What is said of a recording of states: the verdict, its causes, and the pushes beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+from visadapt.diagnosis.exploration import Explored, explore
+from visadapt.diagnosis.measured_gap import MeasuredGap, measure
+from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED, Cause, Push, without_slight
+from visadapt.diagnosis.search.causes import causes
+from visadapt.diagnosis.search.fitted_models import ScoredModel
+from visadapt.diagnosis.search.pushed_rows import share_pushed
+from visadapt.diagnosis.search.pushes import pushes
+from visadapt.diagnosis.search.repeated_causes import errors_with_repeats
+from visadapt.diagnosis.search.unexplained import SmoothFunction
+from visadapt.diagnosis.verdict import left_by_source, verdict_of
+from visadapt.effects import Effect
+from visadapt.estimation.episode_phases import has_episode_phases, in_episode
+from visadapt.progress import Report, staged
+from visadapt.recordings import Recording
+from visadapt.world import World
+
+MOST_PUSHED = 0.25  # Share of the rows within pushes above which these are not set aside
+
+ROUNDS = 2  # in which pushes are set aside: the first ones may hide others
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The verdict on a recording, and what it rests on."""
+
+    explored: Explored
+    measured: MeasuredGap
+    verdict: str
+    causes: tuple[Cause, ...]
+    partial: tuple[Cause, ...]  # those that close a part of a gap that is unexplained
+    source_leaves: list[SmoothFunction]  # where there are no causes
+    pushes: tuple[Push, ...]  # beyond the causes; beyond the source where there are none
+    set_aside: tuple[Push, ...] = ()  # pushes whose rows were left out
+
+
+def answer(
+    recording: Recording,
+    world: World,
+    effects: Sequence[type[Effect]],
+    repeating: type[Effect],
+    jobs: int = 1,
+    progress: Report | None = None,
+    announce: Callable[[str], object] | None = None,
+) -> Answer:
+    """What explains a recording, if need be beside pushes.
+
+    A push acts in one episode alone, as no effect does: while it is among the rows, the most probable set is one that
+    imitates it. So where a recording is unexplained, the rows within pushes are left out, and the others are explained.
+
+    Args:
+        world: the source.
+        effects: those that may be causes.
+        repeating: the effect that repeats whole rows.
+        jobs, progress, announce: as `diagnose` takes them.
+    """
+
+    def beside(aside: tuple[Push, ...]) -> Answer:
+        told = None if aside else announce
+        explored = explore(recording, world.system, effects, repeating, aside, jobs, progress, told)
+        return _answer(explored, world, aside, jobs, progress)
+
+    first = latest = beside(())
+    for _ in range(ROUNDS):
+        if latest.verdict != UNEXPLAINED:
+            break
+        found = _hiding(latest, world)
+        aside = (*latest.set_aside, *found)
+        if not found or share_pushed(aside, recording, world.system) > MOST_PUSHED:
+            break
+        latest = beside(aside)
+    return latest if latest.verdict != UNEXPLAINED and latest.pushes else first
+
+
+def _answer(explored: Explored, world: World, aside: tuple[Push, ...], jobs: int, progress: Report | None) -> Answer:
+    search, comparison, groups = explored.search, explored.comparison, explored.groups
+    repeats = [cause for cause, _ in explored.repeats]
+    with_repeats = errors_with_repeats(explored.prepared, search) if repeats else None
+    measured = measure(search, comparison, groups, with_repeats, jobs, staged(progress, "predictions"))
+    explaining = (*repeats, *causes(search, comparison, groups, measured.closed))
+    coarse = bool(explored.prepared.coarse)
+    verdict = verdict_of(comparison, measured.gap, measured.improvable, explaining, bool(repeats), coarse)
+    found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
+    closes = verdict == UNEXPLAINED and not measured.gap.closed <= 0  # NaN where the source predicts within the noise
+    partial = tuple(without_slight(explaining)) if closes else ()
+    source_leaves = [] if found else left_by_source(search)
+    # Where the causes explain the recording, the pushes are those beyond them.
+    pushed = _beyond(explored, comparison.best, world, comparison.functions) if found else ()
+    pushed = pushed if found else _beyond(explored, search.source, world, source_leaves)
+    return Answer(explored, measured, verdict, found, partial, source_leaves, pushed, aside)
+
+
+def _hiding(unexplained: Answer, world: World) -> tuple[Push, ...]:
+    """Pushes that may hide what else acts: beyond the source or, if there are none, beyond the best set, of which an
+    effect may imitate them, without each of its effects, or with all of them. None that are set aside already."""
+    explored = unexplained.explored
+    search, best = explored.search, explored.comparison.best
+
+    def each() -> Iterator[tuple[Push, ...]]:
+        yield unexplained.pushes
+        for effect in sorted(best.effects, key=lambda one: not _is_in_time(one)):
+            yield _beyond(explored, search.without(best, effect), world)
+        yield _beyond(explored, best, world)
+
+    for found in each():
+        further = tuple(one for one in found if not any(one.overlaps(other) for other in unexplained.set_aside))
+        if further:
+            return further
+    return ()
+
+
+def _is_in_time(effect: type[Effect]) -> bool:
+    """Whether the effect acts for a stretch of time."""
+    region = effect.region()
+    return region is not None and region[0].unit == "s"
+
+
+def _beyond(
+    explored: Explored, found: ScoredModel, world: World, functions: Sequence[SmoothFunction] = ()
+) -> tuple[Push, ...]:
+    """The pushes beyond the source with the effects of a set, with their phases in each episode; it leaves these
+    functions unexplained."""
+    whole = explored.prepared.whole
+    if whole is None:
+        return ()
+    by_effect = found.by_effect(found.fits.theta[0])
+
+    def explained(episode: int) -> World:
+        effects = [in_episode(effect, values.tolist(), episode) for effect, values in by_effect.items()]
+        return world.with_effects(effects).double()
+
+    if not any(has_episode_phases(effect) for effect in found.effects):
+        return pushes(whole, explained(0), functions)
+    return pushes(whole, [explained(episode) for episode in range(len(whole.episodes))], functions)

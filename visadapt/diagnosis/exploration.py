@@ -1,0 +1,76 @@
+"""Which sets of effects explain a recording of states: prepare the rows, search, compare the best sets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from visadapt.diagnosis.result import Cause, Push
+from visadapt.diagnosis.search import duration
+from visadapt.diagnosis.search.all_rows import best_on_all_rows, on_all_rows
+from visadapt.diagnosis.search.causes import Alternative, alternatives
+from visadapt.diagnosis.search.coloured import colour_left_by, with_coloured_noise
+from visadapt.diagnosis.search.jumps import with_jumps
+from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
+from visadapt.diagnosis.search.preparation import PreparedRecording, prepare
+from visadapt.diagnosis.search.repeated_causes import repeated_reading_causes
+from visadapt.diagnosis.search.search import Search
+from visadapt.diagnosis.search.searched_effects import searched
+from visadapt.effects import Effect
+from visadapt.progress import Report, staged
+from visadapt.recordings import Recording
+from visadapt.systems import System
+
+
+@dataclass(frozen=True)
+class Explored:
+    """A recording of states, and which sets of effects explain it."""
+
+    effects: list[type[Effect]]  # that may be named
+    prepared: PreparedRecording
+    search: Search
+    comparison: ModelComparison
+    groups: list[list[Alternative]]  # the effects of the best set, each with those that fit as well in its place
+    repeats: list[tuple[Cause, float]]  # causes of repeated readings, and the log likelihood lost without them
+
+
+def explore(
+    recording: Recording,
+    system: System,
+    effects: Sequence[type[Effect]],
+    repeating: type[Effect],
+    pushes: Sequence[Push] = (),
+    jobs: int = 1,
+    progress: Report | None = None,
+    announce: Callable[[str], object] | None = None,
+) -> Explored:
+    """Search for the sets of `effects` that explain a recording of states, and compare the best of them.
+
+    Args:
+        repeating: the effect that repeats whole rows.
+        pushes: the rows within them are left out.
+        jobs, progress, announce: as `diagnose` takes them.
+    """
+    candidates = searched(effects, system)
+    prepared = prepare(recording, system, candidates, pushes)
+    rows = prepared.rows
+    search = Search(system, rows.select(prepared.searched), candidates, prepared.source, jobs)
+    if announce is not None:
+        announce(duration.announcement(rows, len(effects), duration.expected(search, rows), jobs))
+    jumping = with_jumps(search)
+    if jumping is not None:
+        search, rows = jumping, replace(rows, jumps=True)
+    if jumping is not None and colour_left_by(search, search.best) is not None:
+        # A machine that resonates: its larger sets are looked for with coloured noise alone.
+        search = best_on_all_rows(search, rows)
+    else:
+        search.run(staged(progress, "search beside pushes" if pushes else "search"))
+        search = on_all_rows(search, rows)
+    comparison = compare(search)
+    repeats = repeated_reading_causes(prepared, search, comparison, repeating)
+    again = staged(progress, "search with coloured noise")
+    search, comparison = with_coloured_noise(search, comparison, prepared.searched, again)
+    # Periodic effects may have got a phase for each episode.
+    in_use = {effect.name: effect for effect in search.catalogue}
+    named = [in_use.get(effect.name, effect) for effect in effects]
+    return Explored(named, prepared, search, comparison, alternatives(comparison, named, system), repeats)
