@@ -10,6 +10,10 @@ from visadapt.recordings import Episode, RecordingError, load_recording, write_r
 from visadapt.systems import Quadrotor
 
 
+RIGHT_AND_DOWN = np.array([1, -1, -1, 1, -1, -1, 1, 1, -1, -1, 1, -1, -1])
+"""Signs of a vehicle's states in axes north, east and down."""
+
+
 class TestUnits:
     @pytest.mark.parametrize("columns", [("theta",), ("theta_dot",), ("theta", "theta_dot")])
     @pytest.mark.parametrize("start", [0.03, 0.2, 3.0])
@@ -162,6 +166,15 @@ class TestUnits:
             (lambda s: s * ([1] * 7 + [-1] * 3 + [1] * 3), "rotates body into world axes is right"),
             (lambda s: s * ([1] * 10 + [180 / np.pi] * 3), "rad/s are right"),
             (lambda s: s * [1, 1, -1, 1, 1, -1, *[1] * 7], "column 'z' accelerates against the thrust"),
+            (
+                lambda s: s * RIGHT_AND_DOWN,
+                "pointed north, east and down; .* right: y, y_dot, .*, z, z_dot with",
+            ),
+            (
+                lambda s: s * RIGHT_AND_DOWN * [1, 1, -1, 1, 1, -1, *[1] * 7],
+                "attitude's forward, right and down; .*: y, ",
+            ),
+            (lambda s: s[:, [1, 0, 2, 4, 3, *range(5, 13)]] * [-1, 1, 1, -1, *[1] * 9], "east and north, .*: y for x"),
         ],
     )
     def test_an_attitude_that_is_told_otherwise(self, file, change, said):

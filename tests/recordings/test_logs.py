@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from tests.cli.commands import refused
 from tests.logs import LATE, PERIOD, PX4, ROS, ROWS, START, motion, ros_bag, ulog
 from visadapt.recordings import RecordingError, load_recording
-from visadapt.systems import CartPole
+from visadapt.systems import CartPole, Quadrotor
 
 LOGS = {
     "ROS 1": (lambda folder: ros_bag(folder / "run.bag", 1), ROS | {"command": "/motor/command.temperature"}),
@@ -105,7 +105,7 @@ def test_rows_before_the_first_command_that_is_a_number_are_left_out(tmp_path):
     (episode,) = found.episodes
     assert episode.time[0] == 0
     assert episode.state[0, 0] == pytest.approx(-0.1, abs=1e-6)
-    assert "18 rows before the first or after the last whole set of numbers are left out" in " ".join(found.warnings)
+    assert "18 rows in which a number is missing are left out" in " ".join(found.warnings)
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -167,3 +167,107 @@ def test_columns_that_are_not_given_and_damaged_logs_are_one_line(tmp_path, caps
         (tmp_path / name).write_bytes(damaged)
         said = refused(capsys, "diagnose", name, "--system", "cartpole", "--columns", columns)
         assert said.startswith(f"visadapt: {name}: ") or f"{name}: " in said
+
+
+def headed(path, topics):
+    """A bag of ROS 2 of topics {name: (type, stamps in s, values (N, F))} whose messages have headers; without a stamp
+    where it is NaN."""
+    store = get_typestore(Stores.LATEST)
+    make = store.types
+    with rosbag2.Writer(path, version=9) as writer:
+        for topic, (kind, stamps, values) in topics.items():
+            connection = writer.add_connection(topic, kind, typestore=store)
+            now = 0.0
+            for time, numbers in zip(stamps, values, strict=True):
+                now = np.fmax(now + 1e-4, time)
+                whole = 0.0 if np.isnan(time) else START + time
+                stamp = make["builtin_interfaces/msg/Time"](int(whole), int(1e9 * (whole % 1)))
+                inner = make[kind.replace("Stamped", "")](*numbers)
+                message = make[kind](make["std_msgs/msg/Header"](stamp, ""), inner)
+                raw = store.serialize_cdr(message, kind)
+                writer.write(connection, int(1e9 * (START + now)), raw)
+    return path
+
+
+STEADY = 0.05 * np.arange(60)
+CART = {"x": "/cart.point.x", "theta": "/cart.point.y", "command": "/motor.point.x"}
+
+
+def a_cart(stamps):
+    """Its topics; the readings have these stamps (N,)."""
+    point = "geometry_msgs/msg/PointStamped"
+    known = np.where(np.isnan(stamps), STEADY[: len(stamps)], stamps)
+    readings = np.column_stack((0.3 * np.sin(2 * known), 0.1 * np.sin(5 * known), 0 * known))
+    commands = np.column_stack((np.sin(7 * STEADY), 0 * STEADY, 0 * STEADY))
+    return {"/cart": (point, stamps, readings), "/motor": (point, STEADY, commands)}
+
+
+def test_messages_that_a_network_exchanged_are_put_in_order(tmp_path):
+    exchanged = STEADY[[*range(20), 21, 20, *range(22, 60)]]
+    (plain,) = load_recording(headed(tmp_path / "plain", a_cart(STEADY)), CartPole(), CART).episodes
+    found = load_recording(headed(tmp_path / "run", a_cart(exchanged)), CartPole(), CART)
+    np.testing.assert_array_equal(found.episodes[0].state, plain.state)
+    assert "/cart: 2 messages are put in the order of their stamps" in " ".join(found.warnings)
+
+
+def test_a_clock_that_is_set_back_is_refused(tmp_path):
+    back = np.concatenate((STEADY[:40], STEADY[:20]))
+    says = "the clock of /cart runs backwards after its message 40; the log of one run"
+    with pytest.raises(RecordingError, match=says):
+        load_recording(headed(tmp_path / "run", a_cart(back)), CartPole(), CART)
+
+
+def test_a_message_without_a_stamp_is_left_out(tmp_path):
+    stamps = STEADY.copy()
+    stamps[30] = np.nan
+    found = load_recording(headed(tmp_path / "run", a_cart(stamps)), CartPole(), CART)
+    said = " ".join(found.warnings)
+    assert "/cart: 1 of its messages have no stamp: they are left out" in said
+    assert "times at which its messages were recorded" not in said
+    assert len(found.episodes) == 2  # a row is missing
+
+
+def test_a_log_that_stamps_rows_late_lacks_none(tmp_path):
+    late = 0.018 * np.random.default_rng(0).random(60)  # of 50 ms
+    late[[15, 40]] = 0.045  # steps of up to 1.9 periods
+    stamps = dict.fromkeys(["/x", "/theta", "/u"], STEADY + late)
+    found = load_recording(numbers(tmp_path / "run", stamps), CartPole(), FIELDS)
+    assert len(found.episodes) == 1
+    said = " ".join(found.warnings)
+    assert "/x: its stamps are the times at which its messages were recorded" in said
+    assert "unsteady clock" in said
+
+
+def test_rows_without_a_command_are_left_out(tmp_path):
+    topics = a_cart(STEADY)
+    topics["/motor"][2][30:35] = np.nan
+    found = load_recording(headed(tmp_path / "run", topics), CartPole(), CART)
+    assert "rows in which a number is missing are left out" in " ".join(found.warnings)
+    assert [len(each.time) for each in found.episodes] == [30, 25]
+
+
+QUADROTOR = {name: f"/pose.point.{name}" for name in "xyz"}
+QUADROTOR |= {f"q_{name}": f"/attitude.quaternion.{name}" for name in "wxyz"}
+QUADROTOR |= {f"omega_{name}": f"/rates.vector.{name}" for name in "xyz"}
+QUADROTOR |= {f"rate_{name}": f"/motors.quaternion.{name}" for name in "xyz"} | {"thrust": "/motors.quaternion.w"}
+
+
+def test_an_attitude_that_is_interpolated_is_converted_too(tmp_path):
+    """Turns in axes that point forward, right and down, read in axes that point forward, left and up."""
+    fast = 0.013 * np.arange(240)
+    half, rate, nothing = 0.15 * np.sin(fast), 0.3 * np.cos(fast), 0 * fast
+    rows, still = 0 * STEADY, 0 * STEADY + 0.01 * np.sin(3 * STEADY)
+    stamped = "geometry_msgs/msg/{}Stamped".format
+    topics = {
+        "/pose": (stamped("Point"), STEADY, np.column_stack((still, still, still - 1))),
+        "/attitude": (stamped("Quaternion"), fast, np.column_stack((nothing, nothing, np.sin(half), np.cos(half)))),
+        "/rates": (stamped("Vector3"), fast, np.column_stack((nothing, nothing, rate))),
+        "/motors": (stamped("Quaternion"), STEADY, np.column_stack((rows, rows, 0.6 * np.cos(STEADY), still))),
+    }
+    turned = ("y", "z", "q_y", "q_z", "omega_y", "omega_z", "rate_y", "rate_z")
+    given = {name: f"{place}*-1" if name in turned else place for name, place in QUADROTOR.items()}
+    found = load_recording(headed(tmp_path / "run", topics), Quadrotor(), given)
+    (episode,) = found.episodes
+    states = dict(zip(found.measured, episode.state.T, strict=True))
+    np.testing.assert_allclose(states["q_z"], -np.sin(0.15 * np.sin(episode.time)), atol=1e-4)
+    np.testing.assert_allclose(states["omega_z"], -0.3 * np.cos(episode.time), atol=1e-4)

@@ -143,6 +143,16 @@ class Effect(nn.Module):
         for key, value in values.items():
             self._parameters[key] = nn.Parameter(torch.as_tensor(value, dtype=torch.get_default_dtype()))
 
+    def extra_repr(self) -> str:
+        """The parameters with their values, as `print` shows them.
+
+        >>> import visadapt as va
+        >>> va.effects.CoulombFriction(force=1.5)
+        CoulombFriction(force=1.5)
+        """
+        values = {parameter.name: getattr(self, parameter.name) for parameter in self.table}
+        return ", ".join(f"{name}={v.item():.6g}" for name, v in values.items() if v.numel() == 1)
+
     @classmethod
     def is_simpler(cls, values: Sequence[float]) -> bool:
         """Whether, at these values of its parameters (P,), some of them do nothing: a simpler effect does the same."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visadapt.recordings.attitude import check_attitude
+from visadapt.recordings.axes import check_axes
 from visadapt.recordings.clock import GAP_PERIODS, UNITS_S, Note, RawEpisode
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.physics import (
@@ -132,6 +133,7 @@ def _check_answers(judged: Sequence[RawEpisode], system: System, angles: Sequenc
     """Raises RecordingError where states answer the commands as the source says only with another sign, zero, unit, or
     as each other; `angles` and `lengths` name the states in rad and in m."""
     whole = judged[0]
+    check_axes(judged, system)
     if isinstance(system, RigidBody) and is_turned_round(judged, system, "z"):
         raise RecordingError(
             f"{whole.origin}: {whole.column('z')} accelerates against the thrust, as if it pointed down; up is right"

@@ -19,6 +19,10 @@ Note = Callable[[str, str], None]
 
 GAP_PERIODS = 1.5
 """Step, in periods, above which rows are missing."""
+LATER_PERIODS = 0.5
+AROUND = 5
+"""Periods by which the clock is later after a gap than before it, at least: rows that a log stamps late, or early, are
+followed by others that are not. It is the median of AROUND rows on either side."""
 MOST_GAPS = 0.05
 """Share of gaps among the steps above which a clock is irregular; below it, rows are missing."""
 MOST_DECIMALS = 6
@@ -156,13 +160,24 @@ def uninterrupted(raw: RawEpisode, note: Note) -> list[RawEpisode]:
     if len(steps) == 0:
         return [raw]
     period = float(np.median(steps))
-    gaps = steps > GAP_PERIODS * period * (1 + 1e-6)
+    gaps = (steps > GAP_PERIODS * period * (1 + 1e-6)) & (_later_by(raw.time, period) > LATER_PERIODS * period)
     irregular = gaps.mean() > MOST_GAPS and gaps.sum() > 1
     longest = max(HARMLESS_GAP_S, (LONGEST_STEP_PERIODS if irregular else GAP_PERIODS) * period)
-    cuts = (np.flatnonzero(steps > longest * (1 + 1e-6)) + 1).tolist()
+    long = steps > longest * (1 + 1e-6)
+    cuts = (np.flatnonzero(long if irregular else long & gaps) + 1).tolist()
     for cut in cuts:
         note("rows are missing here; the episode was split", f"{raw.origin}, {raw.place(cut)}")
     return [_clocked(raw.part(start, end), note) for start, end in pairwise([0, *cuts, len(raw.time)])]
+
+
+def _later_by(time: NDArray[np.float64], period: float) -> NDArray[np.float64]:
+    """By how many s the rows after each step (T - 1,) are later than a steady clock of the rows before it expects."""
+    late = time - period * np.arange(len(time))
+    padded = np.pad(late, AROUND, mode="edge")
+    around = np.lib.stride_tricks.sliding_window_view(padded, AROUND)
+    steps = np.arange(1, len(time)) + AROUND
+    later: NDArray[np.float64] = np.median(around[steps], 1) - np.median(around[steps - AROUND], 1)
+    return later
 
 
 def _clocked(part: RawEpisode, note: Note) -> RawEpisode:

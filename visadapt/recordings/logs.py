@@ -24,6 +24,13 @@ from visadapt.recordings.topics import Read, Topic
 from visadapt.systems import RigidBody, System
 from visadapt.systems.rigid_body import ATTITUDE, continuous_quaternion
 
+MOST_DISPLACED = 10
+"""Places by which a message of a topic may come too early or too late, as a network delivers it, to be put in order."""
+
+LEAST_KNOWN = 0.5
+"""Share of the rows in which all numbers are known from which the others are left out: a column that has hardly any is
+named instead."""
+
 GAP = 5.0
 """Longest interval between a topic's readings, in median intervals, that is interpolated; longer ones have no rows."""
 
@@ -46,15 +53,16 @@ def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], n
     wanted: dict[str, set[str]] = {}
     for topic, field in columns.values():
         wanted.setdefault(topic, set()).add(field)
-    log = _Log(path, system, columns, named, _topics(path, read, wanted))
-    log.check_stamps()
+    topics = {name: _in_order(path, name, topic, note) for name, topic in _topics(path, read, wanted).items()}
+    log = _Log(path, system, columns, named, topics)
+    log.check_messages()
     rows = log.rows(note)
     time = log.topics[log.slowest].time[rows]
     action = np.column_stack([log.command(one.name, time) for one in system.actions])
     states = np.column_stack([log.state(name, rows) for name in log.measured])
-    kept = _without_gaps_at_the_ends(np.column_stack([action, states]))
+    kept = _whole(np.column_stack([action, states]))
     if dropped := len(rows) - len(rows[kept]):
-        note(f"{dropped} rows before the first or after the last whole set of numbers are left out", str(path))
+        note(f"{dropped} rows in which a number is missing are left out", str(path))
     time, rows = time[kept], rows[kept]
     others = "".join(f"; {name} is interpolated to them" for name in log.of_states if name != log.slowest)
     note(f"rows are the readings of {log.slowest}{others}; a command is the mean until the next row", str(path))
@@ -109,16 +117,14 @@ class _Log:
         """The topic of states whose messages are furthest apart, which gives the rows."""
         return max(self.of_states, key=lambda name: np.median(np.diff(self.topics[name].time)))
 
-    def check_stamps(self) -> None:
-        """Raises RecordingError where a topic has too few messages, or a clock that runs backwards."""
+    def check_messages(self) -> None:
+        """Raises RecordingError where a topic has too few messages."""
         for name in {topic for topic, _ in self.columns.values()}:
             stamps = self.topics[name].time
             if not len(stamps):
                 raise RecordingError(f"{self.path}: {name} has no messages")
             if len(stamps) < 2 and name in self.of_states:
                 raise RecordingError(f"{self.path}: {name} has a single message; readings all along are right")
-            if (back := np.flatnonzero(np.diff(stamps) < 0)).size:
-                raise RecordingError(f"{self.path}: the clock of {name} runs backwards after its message {back[0] + 1}")
 
     def rows(self, note: Note) -> NDArray[np.intp]:
         """The messages of the slowest topic (T,) for which all other topics have a value."""
@@ -144,32 +150,56 @@ class _Log:
 
     def state(self, name: str, rows: NDArray[np.intp]) -> NDArray[np.float64]:
         """A measured state in these rows (T,): as read there, or interpolated to the rows' stamps."""
-        topic, field = self.columns[name]
-        stamps, values = self.topics[topic].time, self.conversions[name].converted(self.topics[topic].values[field])
+        topic, values = self.columns[name][0], self.values(name)
         if topic == self.slowest:
             return values[rows]
         attitude = self.system.states[ATTITUDE] if isinstance(self.system, RigidBody) else ()
         quaternion = [state.name for state in attitude]
         if name in quaternion:
-            columns = [self.columns[each] for each in quaternion if each in self.columns]
-            fields = [other for its_topic, other in columns if its_topic == topic]
-            whole = np.column_stack([self.topics[topic].values[each] for each in fields])
-            values = continuous_quaternion(torch.from_numpy(whole)).numpy()[:, fields.index(field)]
+            together = [each for each in quaternion if each in self.columns and self.columns[each][0] == topic]
+            whole = np.column_stack([self.values(each) for each in together])
+            values = continuous_quaternion(torch.from_numpy(whole)).numpy()[:, together.index(name)]
         if self.system.states[self.system.index(name)].unit == "rad":
             values = np.unwrap(values)
-        return np.interp(self.topics[self.slowest].time[rows], stamps, values)
+        return np.interp(self.topics[self.slowest].time[rows], self.topics[topic].time, values)
 
     def command(self, name: str, time: NDArray[np.float64]) -> NDArray[np.float64]:
         """The command of an action in rows with these stamps (T,)."""
+        return _held(time, self.topics[self.columns[name][0]].time, self.values(name))
+
+    def values(self, name: str) -> NDArray[np.float64]:
+        """A measured state, or an action, in our units in every message (N,) of its topic."""
         topic, field = self.columns[name]
-        values = self.conversions[name].converted(self.topics[topic].values[field])
-        return _held(time, self.topics[topic].time, values)
+        return self.conversions[name].converted(self.topics[topic].values[field])
 
 
-def _without_gaps_at_the_ends(numbers: NDArray[np.float64]) -> slice:
-    """The rows (T, n) from the first to the last whose numbers are all known; all rows where none is."""
+def _in_order(path: Path, name: str, topic: Topic, note: Note) -> Topic:
+    """The topic with its messages in the order of their stamps, where they come almost in it; with its notes made.
+
+    Raises:
+        RecordingError: a message is more than MOST_DISPLACED places from its own.
+    """
+    for each in topic.notes:
+        note(f"{name}: {each}", str(path))
+    order = np.argsort(topic.time, kind="stable")
+    displaced = np.abs(order - np.arange(len(order)))
+    if not displaced.any():
+        return topic
+    if displaced.max() > MOST_DISPLACED:
+        back = np.flatnonzero(np.diff(topic.time) < 0)[0]
+        raise RecordingError(
+            f"{path}: the clock of {name} runs backwards after its message {back + 1}; the log of one run, whose clock "
+            "is never set back, is right"
+        )
+    note(f"{name}: {(displaced > 0).sum()} messages are put in the order of their stamps", str(path))
+    return Topic(topic.time[order], {field: values[order] for field, values in topic.values.items()})
+
+
+def _whole(numbers: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which rows (T, n) have all numbers; all rows, where most of those between the first and the last lack one."""
     known = np.isfinite(numbers.sum(1))
-    return slice(int(known.argmax()), len(known) - int(known[::-1].argmax())) if known.any() else slice(None)
+    within = known[known.argmax() : len(known) - known[::-1].argmax()]
+    return known if known.any() and within.mean() >= LEAST_KNOWN else np.ones_like(known)
 
 
 def _held_until(stamps: NDArray[np.float64]) -> float:

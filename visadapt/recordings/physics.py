@@ -1,8 +1,8 @@
 """Units and order of a recording's columns, judged by the source physics.
 
 The numbers alone often do not decide: 5 may be radians or degrees. But a command's effect on an angle is 57 times as
-large in degrees, and a cart that is pushed accelerates opposite to its pole. So accelerations from second differences
-are compared with the source's.
+large in degrees, and a cart that is pushed accelerates opposite to its pole. So accelerations, which are second
+differences of positions or differences of measured rates, are compared with the source's.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def are_degrees(episodes: Sequence[RawEpisode], system: System) -> bool:
     def scaled(columns: Columns) -> Columns:
         return {name: values * (DEGREE if name in angular else 1) for name, values in columns.items()}
 
-    radians, degrees = _agreements(episodes, system)[angle], _agreements(episodes, system, scaled)[angle]
+    radians, degrees = agreements(episodes, system)[angle], agreements(episodes, system, scaled)[angle]
     explained = degrees.correlation > EXPLAINED_CORRELATION and 1 / 3 < degrees.slope < 3
     return explained and (degrees.correlation > radians.correlation + 0.2 or radians.slope > 10)
 
@@ -100,7 +100,7 @@ def is_half_a_turn_off(episodes: Sequence[RawEpisode], system: System) -> bool:
         return {name: -values if name in (angle, rate) else values for name, values in columns.items()}
 
     def error(changed: Callable[[Columns], Columns]) -> float:
-        return _agreements(episodes, system, changed)[angle].error
+        return agreements(episodes, system, changed)[angle].error
 
     there = error(further)
     return there < EXPLAINED_ERROR and all(
@@ -111,9 +111,9 @@ def is_half_a_turn_off(episodes: Sequence[RawEpisode], system: System) -> bool:
 def is_turned_round(episodes: Sequence[RawEpisode], system: System, name: str) -> bool:
     """Whether the source explains a variable's acceleration with the other sign, and not as it is; False where that
     cannot be decided, as in `are_degrees`."""
-    if not _can_decide(episodes, system, [name]):
+    if not can_decide(episodes, system, [name]):
         return False
-    found = _agreements(episodes, system)[name]
+    found = agreements(episodes, system)[name]
     there = found.opposite.error
     return there < EXPLAINED_ERROR and found.error > OTHERS_ERROR_RATIO * there
 
@@ -122,9 +122,9 @@ def is_in_newtons(episodes: Sequence[RawEpisode], system: System, largest: float
     """Whether a command that stays within [-1, 1] moves the system as a force in N does, instead of as a share of the
     `largest` force in N; False where that cannot be decided."""
     names = [variable.name for variable in system.states if system.rate_of(variable.name)]
-    if not _can_decide(episodes, system, names):
+    if not can_decide(episodes, system, names):
         return False
-    found = _agreements(episodes, system).values()
+    found = agreements(episodes, system).values()
     slopes = [one.slope for one in found if one.correlation > EXPLAINED_CORRELATION]
     return bool(slopes) and all(1 / 3 < slope * largest < 3 for slope in slopes)
 
@@ -135,7 +135,7 @@ def exchanged(episodes: Sequence[RawEpisode], system: System, one: str, other: s
     A delayed command could look like that, so every delay up to `LONGEST_DELAY` is tried for the columns as
     they are. False where that cannot be decided.
     """
-    if not _can_decide(episodes, system, (one, other)):
+    if not can_decide(episodes, system, (one, other)):
         return False
     rate, other_rate = system.rate_of(one) or "", system.rate_of(other) or ""
     to = {one: other, other: one, rate: other_rate, other_rate: rate}
@@ -146,12 +146,12 @@ def exchanged(episodes: Sequence[RawEpisode], system: System, one: str, other: s
     def correlations(found: Mapping[str, Agreement]) -> tuple[float, float]:
         return found[one].correlation, found[other].correlation
 
-    crossed = _agreements(episodes, system, swapped)
+    crossed = agreements(episodes, system, swapped)
     if not all(1 / 4 < crossed[name].slope < 4 for name in (one, other)):
         return False
     period = min(_period(raw) for raw in episodes)
     latest = round(LONGEST_DELAY * system.prediction_time / period)
-    unchanged = [correlations(_agreements(episodes, system, delay=k * period)) for k in range(latest + 1)]
+    unchanged = [correlations(agreements(episodes, system, delay=k * period)) for k in range(latest + 1)]
     explained = min(correlations(crossed))
     return explained > EXPLAINED_CORRELATION and max(map(min, unchanged)) < 0.7 * explained and max(unchanged[0]) < 0
 
@@ -160,10 +160,11 @@ def _only_angle(episodes: Sequence[RawEpisode], system: System) -> str | None:
     """The system's angle, by which its unit and zero are judged; None where it has none or several, or where that
     cannot be decided."""
     angles = [variable.name for variable in system.states if variable.unit == "rad"]
-    return angles[0] if len(angles) == 1 and _can_decide(episodes, system, angles) else None
+    return angles[0] if len(angles) == 1 and can_decide(episodes, system, angles) else None
 
 
-def _can_decide(episodes: Sequence[RawEpisode], system: System, names: Sequence[str]) -> bool:
+def can_decide(episodes: Sequence[RawEpisode], system: System, names: Sequence[str]) -> bool:
+    """Whether episodes are long enough, their commands change, and all states are known, to judge these variables."""
     judged = _judged(episodes, system)
     duration = sum(float(raw.time[:MOST_ROWS][-1] - raw.time[0]) for raw in judged)
     measured = episodes[0].measured
@@ -195,7 +196,7 @@ def _unchanged(columns: Columns) -> Columns:
     return columns
 
 
-def _agreements(
+def agreements(
     episodes: Sequence[RawEpisode],
     system: System,
     changed: Callable[[Columns], Columns] = _unchanged,
@@ -210,13 +211,16 @@ def _agreements(
     for raw in _judged(episodes, system):
         columns = changed({name: values[:MOST_ROWS] for name, values in raw.states.items()})
         each.append(_accelerations(raw, columns, system, delay))
-    return {name: _agreement(*(np.concatenate([one[name][k] for one in each]) for k in (0, 1))) for name in each[0]}
+    return {
+        name: _agreement(*(np.concatenate([one[name][k] for one in each], axis=-1) for k in (0, 1))) for name in each[0]
+    }
 
 
 def _accelerations(
     raw: RawEpisode, columns: Columns, system: System, delay: float
 ) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Of an episode, by the name of each variable with a rate: measured and predicted accelerations."""
+    """Of an episode of T rows, by name of each variable with a rate: accelerations (1 or 2, T) from its readings and
+    from those of its rate, and accelerations (T,) as predicted."""
     names = [variable.name for variable in system.states]
     angles = [variable.name for variable in system.states if variable.unit == "rad"]
     columns = {name: np.unwrap(values) if name in angles else values for name, values in columns.items()}
@@ -242,14 +246,18 @@ def _accelerations(
     found = {}
     for name, rate in rates.items():
         values = columns[name]
-        measured = (values[2 * stride :] - 2 * values[stride:-stride] + values[: -2 * stride]) / (span / 2) ** 2
-        found[name] = measured, predicted[:, names.index(rate)]
+        measured = [(values[2 * stride :] - 2 * values[stride:-stride] + values[: -2 * stride]) / (span / 2) ** 2]
+        if rate in columns:
+            measured.append((columns[rate][2 * stride :] - columns[rate][: -2 * stride]) / span)
+        found[name] = np.stack(measured), predicted[:, names.index(rate)]
     return found
 
 
 def _agreement(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> Agreement:
-    found = correlation(measured, predicted)
-    return Agreement(found, found * float(measured.std() / predicted.std()) if found else 0.0)
+    """How the less noisy of the measured accelerations (1 or 2, T) follow those that are predicted (T,)."""
+    found = [correlation(one, predicted) for one in measured]
+    best = int(np.abs(found).argmax())
+    return Agreement(found[best], found[best] * float(measured[best].std() / predicted.std()) if found[best] else 0.0)
 
 
 def correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import io
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +18,12 @@ from visadapt.recordings.episode import RecordingError
 
 MOST_NAMES = 40
 """Most names that a message lists."""
+MOST_UNSTAMPED = 0.1
+"""Share of a topic's messages whose header has no stamp up to which these are left out."""
+SAME_CLOCK_S = 0.05
+"""Median difference between the stamps in headers and the times of recording up to which both are of one clock."""
+RECORDED = "its stamps are the times at which its messages were recorded: their delays are in the clock"
+"""The note on a topic whose messages have no stamps of their own."""
 ULOG_HEADER = 3
 """Bytes of the header of a message of ULog: size and kind."""
 
@@ -30,6 +36,8 @@ class Topic:
     """(N,) s"""
     values: Mapping[str, NDArray[np.float64]]
     """by field, (N,)"""
+    notes: tuple[str, ...] = ()
+    """what a reader must know of its stamps"""
 
 
 Read = Callable[[Path, Mapping[str, set[str]]], dict[str, Topic]]
@@ -84,7 +92,8 @@ def _read_ulog(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
 
 
 def _read_bag(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
-    """Stamps are those of the messages' headers where all have one, else the times at which messages were recorded."""
+    """Stamps are those of the messages' headers. Messages of a topic without them have the times at which they were
+    recorded, and so have all topics, if that is another clock than the headers'."""
     highlevel, stores = _import(path, "rosbags.highlevel"), _import(path, "rosbags.typesys")
     fields = {name: sorted(each) for name, each in wanted.items()}
     rows: dict[str, list[list[float]]] = {name: [] for name in wanted}
@@ -105,11 +114,25 @@ def _read_bag(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
             written = 0.0 if header is None else header.sec + 1e-9 * header.nanosec
             rows[name].append([1e-9 * stamp, written, *numbers])
     tables = {name: np.array(each).reshape(-1, 2 + len(fields[name])) for name, each in rows.items()}
-    clock = int(all((table[:, 1] > 0).all() for table in tables.values()))
-    return {
-        name: Topic(table[:, clock], dict(zip(fields[name], table[:, 2:].T, strict=True)))
-        for name, table in tables.items()
-    }
+    by_header = _stamped(tables)
+    return {name: _topic(table, fields[name], name in by_header) for name, table in tables.items()}
+
+
+def _stamped(tables: Mapping[str, NDArray[np.float64]]) -> set[str]:
+    """The topics whose stamps are those in the headers, of tables (N, 2 + F): time of recording, stamp, fields."""
+    having = {name: table[:, 1] > 0 for name, table in tables.items()}
+    stamped = {name for name, own in having.items() if len(own) and own.mean() >= 1 - MOST_UNSTAMPED}
+    late = [float(np.median(np.diff(tables[name][having[name], 1::-1]))) for name in stamped]
+    # Stamps of two clocks must not meet in one recording.
+    return stamped if len(stamped) == len(tables) or all(abs(each) < SAME_CLOCK_S for each in late) else set()
+
+
+def _topic(table: NDArray[np.float64], fields: Sequence[str], by_header: bool) -> Topic:
+    kept = table[:, 1] > 0 if by_header else np.ones(len(table), bool)
+    notes = [] if by_header else [RECORDED]
+    if not kept.all():
+        notes.append(f"{(~kept).sum()} of its messages have no stamp: they are left out")
+    return Topic(table[kept, int(by_header)], dict(zip(fields, table[kept, 2:].T, strict=True)), tuple(notes))
 
 
 def _number(path: Path, message: Any, topic: str, field: str) -> float:
