@@ -9,7 +9,6 @@ from tests.recorded import a_run, a_table, load, refuses, write
 from visadapt.recordings import Episode, RecordingError, load_recording, write_recording
 from visadapt.systems import Quadrotor
 
-
 RIGHT_AND_DOWN = np.array([1, -1, -1, 1, -1, -1, 1, 1, -1, -1, 1, -1, -1])
 """Signs of a vehicle's states in axes north, east and down."""
 
