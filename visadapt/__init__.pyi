@@ -2,6 +2,7 @@ from . import effects as effects
 from .diagnosis.diagnose import diagnose as diagnose
 from .diagnosis.planning import Plan as Plan, plan as plan
 from .diagnosis.result import Diagnosis as Diagnosis
+from .diagnosis.saved import load_effects as load_effects
 from .effects.base import (
     ActuationEffect as ActuationEffect,
     DynamicsEffect as DynamicsEffect,

@@ -237,6 +237,6 @@ READERS = {
         "found.json",
         _text(json.dumps(DIAGNOSIS)),
         (damage.odd_json, damage.damaged_text),
-        load_effects,
+        lambda path: load_effects(path, CartPole()),
     ),
 }

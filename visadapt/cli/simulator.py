@@ -46,9 +46,7 @@ def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
     catalogue(system)  # makes the effects of a system of one's own known, by which they are named
     effects: list[Effect] = []
     if options.diagnosis:
-        diagnosed, effects = load_effects(options.diagnosis)
-        if diagnosed != system.name:
-            raise InputError(f"{options.diagnosis}: a diagnosis of a {diagnosed}, where a {system.name} is given")
+        effects = load_effects(options.diagnosis, system)
         for warning in read_json(Path(options.diagnosis)).get("warnings") or ():
             print(f"visadapt: {options.diagnosis}: {printable(str(warning))}", file=sys.stderr)
     given = [_effect(text, system) for text in options.effect]

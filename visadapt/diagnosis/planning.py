@@ -25,13 +25,14 @@ from torch import Tensor
 
 from visadapt.diagnosis.explanations import explanations
 from visadapt.diagnosis.policy_bound import StatesToActions, actions
-from visadapt.diagnosis.result import AMBIGUOUS, Diagnosis, named_effects
+from visadapt.diagnosis.result import AMBIGUOUS, Diagnosis, Push, named_effects
 from visadapt.diagnosis.search.fitted_models import FittedModels
 from visadapt.diagnosis.search.preparation import limited, prepare
 from visadapt.effects import EFFECTS, Effect
 from visadapt.estimation.fit_states import CAREFUL, QUICK, with_effect
 from visadapt.estimation.likelihood import FitState
 from visadapt.history import History
+from visadapt.processes import one_thread
 from visadapt.progress import Progress
 from visadapt.recordings import Episode, Recording
 from visadapt.storage.atomic_files import replacing
@@ -95,6 +96,7 @@ class Plan:
             np.savetxt(temporary, np.column_stack((self.time, self.added)), "%.9g", ",", header=header, comments="")
 
 
+@one_thread()
 @torch.inference_mode()
 def plan(
     found: Diagnosis,
@@ -136,7 +138,8 @@ def plan(
     if not recording.measured:
         raise ValueError("a plan needs a recording of states, not of frames")
     sets = _explained(found)
-    trials = _Trials.of(sets, recording, source.system, policy, samples, torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed)
+    trials = _Trials.of(sets, recording, found.where.pushes, source.system, policy, samples, generator)
     worth = trials.worth(sets, progress)
     best = int(worth.nan_to_num(-math.inf).argmax())
     white = [k for k, name in enumerate(trials.names) if name.startswith("white")]
@@ -169,6 +172,7 @@ class _Trials:
         cls,
         sets: Sequence[Sequence[Effect]],
         recording: Recording,
+        pushes: Sequence[Push],
         system: System,
         policy: StatesToActions | None,
         samples: int,
@@ -179,7 +183,7 @@ class _Trials:
         Raises:
             ValueError: the machine leaves the ranges of its states under every excitation.
         """
-        noise, start, measured = _noise_and_start(sets[0], recording, system)
+        noise, start, measured = _noise_and_start(sets[0], recording, system, pushes)
         names, unit = _excitations(system, recording.period, samples, generator)
         sizes = torch.tensor(SIZES, dtype=unit.dtype)[:, None, None, None]
         added = (sizes * unit).flatten(0, 1)
@@ -237,12 +241,12 @@ def _start(source: FitState, effects: Sequence[Effect]) -> FitState:
 
 
 def _noise_and_start(
-    effects: Sequence[Effect], recording: Recording, system: System
+    effects: Sequence[Effect], recording: Recording, system: System, pushes: Sequence[Push]
 ) -> tuple[Tensor, Tensor, tuple[int, ...]]:
     """Standard deviations (n,) of the measurement noise, 0 of what was not measured; the first state (n,); and the
     columns of the state that were measured, without velocities that were derived."""
     classes = tuple(type(effect) for effect in effects)
-    prepared = prepare(limited(recording, system), system, classes)
+    prepared = prepare(limited(recording, system), system, classes, pushes)
     models = FittedModels(system, prepared.rows, classes, prepared.source)
     fits = models.fit([(classes, _start(models.source.fits, effects))], CAREFUL)[0].fits
     noise = torch.zeros(len(system.states), dtype=torch.float64)

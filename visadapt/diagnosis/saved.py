@@ -1,4 +1,4 @@
-"""The effects that a diagnosis named, from the JSON file that `visadapt diagnose --json` wrote."""
+"""The effects that a diagnosis named, from the JSON file that it was saved as."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from typing import Any
 
 from visadapt.diagnosis.result import SCHEMA_VERSION, Cause, Estimate, named_effects
 from visadapt.effects import EFFECTS, Effect
+from visadapt.effects.catalogue import catalogue
+from visadapt.systems import System
 
 READABLE = (1, SCHEMA_VERSION)  # Versions of the file in which the causes have the same meaning
 
@@ -19,13 +21,29 @@ class DiagnosisFileError(ValueError):
     """A file of a diagnosis that gives no effects; the message is one line that says which and why."""
 
 
-def load_effects(path: str | os.PathLike[str]) -> tuple[str, list[Effect]]:
-    """The system that was diagnosed, by name, and the effects that were named, as `Diagnosis.effects` gives them.
+def load_effects(path: str | os.PathLike[str], system: System) -> list[Effect]:
+    """The effects that a saved diagnosis of a system named, as `Diagnosis.effects` gives them.
+
+    Args:
+        path: what `visadapt diagnose --json` wrote, or `json.dump` of `Diagnosis.to_json()`.
+        system: whose effects they are.
 
     Raises:
-        DiagnosisFileError: the file is missing or holds no diagnosis, the diagnosis named no effect, or one that is
-            not known here or whose value the recording left open.
+        DiagnosisFileError: the file is missing or holds no diagnosis, it is one of another system, it named no effect,
+            or one that is not known here or whose value the recording left open.
+
+    >>> import json, pathlib, tempfile, torch, visadapt as va
+    >>> target, policy = va.SyntheticTarget(va.constant_force(2.0)), va.load_policy(va.shipped("cartpole_states"))
+    >>> runs = va.run(target, policy, 2, 30, torch.Generator().manual_seed(0), exploration=0.3)
+    >>> path, system = pathlib.Path(tempfile.mkdtemp()) / "run.h5", va.CartPole()
+    >>> va.write_recording(path, [run.episode for run in runs], ["x", "x_dot", "theta", "theta_dot"], ["command"])
+    >>> run = va.load_recording(path, system)
+    >>> found = va.diagnose(run, va.World(system), catalogue=[va.effects.ConstantForce])
+    >>> _ = path.with_suffix(".json").write_text(json.dumps(found.to_json()))
+    >>> [effect.name for effect in va.load_effects(path.with_suffix(".json"), system)]
+    ['constant_force']
     """
+    catalogue(system)  # makes the effects of a system of one's own known, by which a file names them
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
@@ -37,11 +55,13 @@ def load_effects(path: str | os.PathLike[str]) -> tuple[str, list[Effect]]:
             f"{path}: no diagnosis of version 1 to {SCHEMA_VERSION}, such as `visadapt diagnose --json` writes"
         )
     try:
+        if content["system"] != system.name:
+            raise ValueError(f"a diagnosis of a {content['system']}, where a {system.name} is given")
         causes = tuple(_cause(each) for each in content["causes"])
         for cause in causes:
             if cause.effect not in EFFECTS:
                 raise ValueError(f"names {cause.effect}, which is not known here: give the file that defines it")
-        return content["system"], named_effects(content["verdict"], causes)
+        return named_effects(content["verdict"], causes)
     except (KeyError, TypeError, AttributeError) as error:
         raise DiagnosisFileError(f"{path}: not a whole diagnosis: {error}") from error
     except (ValueError, OverflowError) as error:

@@ -17,7 +17,6 @@ from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED
 from visadapt.diagnosis.saved import load_effects
 from visadapt.diagnosis.words import DERIVED, OPPOSITE, listed
-from visadapt.effects.catalogue import catalogue
 from visadapt.learning.explanation import Explain, Explanation
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
@@ -53,7 +52,6 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
     """
     if len(source.effects):
         raise ValueError("a diagnosis starts from the bare system: give the source without effects")
-    catalogue(source.system)  # makes the effects of a system of one's own known, by which a file names them
     shortest = source.system.prediction_time
 
     def explain(recordings: Sequence[Path], path: Path) -> Explanation:
@@ -74,7 +72,7 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         _refuse_opposite_signs(path, content["warnings"])
         verdict = content["verdict"]
         slight = frozenset(cause["effect"] for cause in content["causes"] if cause["slight"])
-        effects = load_effects(path)[1] if verdict in (IDENTIFIED, AMBIGUOUS) else []
+        effects = load_effects(path, source.system) if verdict in (IDENTIFIED, AMBIGUOUS) else []
 
         def experiment(policy: Policy, steps: int) -> Tensor | None:
             """Commands (steps, n_action) to add that tell the causes apart, also written to plan.csv; or None."""

@@ -246,7 +246,10 @@ def _with_commands_that_act(draft: _Draft) -> tuple[_Draft, FitState]:
     other = earlier.source_fit()
     if other.likelihood[0] <= fitted.likelihood[0] + EARLIER_LOG_ODDS:
         return replace(draft, source=fitted), fitted
-    told = "each command is recorded a row late, beside the readings that it led to: the commands were moved a row up"
+    told = (
+        "each command is recorded a row late, or nearly, beside the readings that it led to: the commands were moved a "
+        "row up, and a delay of less than a row may come of it"
+    )
     return replace(earlier, source=other, warnings=(*draft.warnings, told)), other
 
 
